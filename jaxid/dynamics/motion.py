@@ -1,0 +1,28 @@
+"""The currency between the rooms: joint angles, velocities and accelerations, always together."""
+
+import equinox as eqx
+
+from jaxid.types import AnyArray, Float
+
+
+class Motion(eqx.Module):
+    """Joint coordinates and their derivatives at one or many instants.
+
+    Attributes:
+        q: Joint coordinates [rad or m].
+        qd: Velocities [rad/s or m/s].
+        qdd: Accelerations [rad/s² or m/s²].
+    """
+
+    q: Float[AnyArray, "*batch joints"]
+    qd: Float[AnyArray, "*batch joints"]
+    qdd: Float[AnyArray, "*batch joints"]
+
+    def __getitem__(self, index) -> "Motion":
+        """The motion at some of its instants: indexes the leading axis."""
+        return Motion(self.q[index], self.qd[index], self.qdd[index])
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self.q.shape[-1]

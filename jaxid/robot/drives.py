@@ -1,0 +1,112 @@
+"""From motors to joints and back: gears, coupled axes, and the duality of power."""
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxid.robot.limits import per_joint
+from jaxid.types import AnyArray, Float
+
+
+class Drives(eqx.Module):
+    r"""The motors of a robot: $q_M = A (q - q_0)$ and, since power is the same, $Q = A^T M$ (Eq. 19).
+
+    For independent axes $A$ is the diagonal matrix of gear ratios; a wrist whose motors turn more
+    than one axis has entries beside the diagonal.
+
+    Attributes:
+        reduction: $A$, motor angle for joint angle; [1] for a revolute joint, [rad/m] for a rail.
+        zero: Joint angle $q_0$ at which the motor angles are zero [rad or m].
+        max_torques: Largest torque of each motor, on the motor's side [N m]; infinite if unknown.
+        rotor_inertia: Inertia of each motor, on the motor's side [kg m²]; NaN if unknown.
+    """
+
+    reduction: Float[AnyArray, "joints joints"]
+    zero: Float[AnyArray, " joints"]
+    max_torques: Float[AnyArray, " joints"]
+    rotor_inertia: Float[AnyArray, " joints"]
+
+    @classmethod
+    def of(
+        cls,
+        joints: int,
+        *,
+        reduction: ArrayLike | None = None,
+        zero: ArrayLike | None = None,
+        max_torques: ArrayLike | None = None,
+        rotor_inertia: ArrayLike | None = None,
+    ) -> "Drives":
+        """Builds drives from gear ratios (one for each joint) or a full matrix; direct if None.
+
+        Raises:
+            ValueError: If a length is wrong, or the matrix cannot be inverted.
+        """
+        matrix = np.eye(joints) if reduction is None else np.array(reduction, dtype=np.float64)
+        if matrix.shape == (joints,):
+            matrix = np.diag(matrix)
+        if matrix.shape != (joints, joints) or not np.isfinite(matrix).all():
+            raise ValueError(
+                f"`reduction` must be {joints} gear ratios or a {joints} x {joints} matrix of "
+                f"finite numbers, but has shape {matrix.shape}."
+            )
+        largest = np.abs(matrix).max(axis=1)
+        if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
+            raise ValueError(
+                "`reduction` must be invertible, but some joint is moved by no motor of its own: "
+                "is a gear ratio zero?"
+            )
+        return cls(
+            matrix,
+            per_joint("zero", zero, joints, 0.0),
+            per_joint("max_torques", max_torques, joints, np.inf),
+            per_joint("rotor_inertia", rotor_inertia, joints, np.nan),
+        )
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether motor and joint are the same thing: unit gears and no offset."""
+        eye = np.eye(len(self.zero))
+        return np.array_equal(self.reduction, eye) and not np.any(self.zero)
+
+    def joint_angles(
+        self, motor_angles: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints"]:
+        """Joint angles [rad or m] of motor angles [rad]."""
+        return self.joint_velocities(motor_angles) + self.zero
+
+    def joint_velocities(
+        self, motor_velocities: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints"]:
+        """Joint velocities [rad/s or m/s] of motor velocities [rad/s]; accelerations likewise."""
+        return motor_velocities @ np.linalg.inv(self.reduction).T
+
+    def joint_forces(
+        self, motor_torques: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints"]:
+        """Generalized forces [N m or N] of motor torques [N m] (Eq. 19)."""
+        return motor_torques @ self.reduction
+
+    def motor_angles(
+        self, angles: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints"]:
+        """Motor angles [rad] of joint angles [rad or m]."""
+        return self.motor_velocities(angles - self.zero)
+
+    def motor_velocities(
+        self, velocities: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints"]:
+        """Motor velocities [rad/s] of joint velocities [rad/s or m/s]."""
+        return velocities @ self.reduction.T
+
+    def motor_torques(
+        self, forces: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints"]:
+        """Motor torques [N m] of generalized forces [N m or N]."""
+        return forces @ np.linalg.inv(self.reduction)
+
+    @property
+    def max_forces(self) -> Float[AnyArray, " joints"]:
+        r"""Largest generalized forces that the motors can make, $|A|^T M_{max}$ [N m or N] (Eq. 30)."""
+        weights = np.abs(self.reduction)
+        used = np.where(weights > 0, self.max_torques[:, None], 0.0)
+        return (weights * used).sum(axis=0)

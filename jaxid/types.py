@@ -1,0 +1,33 @@
+"""Shape vocabulary: the axes' names that annotations use, and the aliases that carry them.
+
+Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (columns of the base
+regressor), `samples` (rows of a log), `rows` (what is left of them after filtering), `batch`.
+"""
+
+import jax
+import numpy as np
+from jaxtyping import Array as Array
+from jaxtyping import Bool as Bool
+from jaxtyping import Float as Float
+from jaxtyping import Int as Int
+from jaxtyping import PRNGKeyArray as PRNGKeyArray
+
+AnyArray = jax.Array | np.ndarray
+"""A JAX array, or a NumPy array: what stays in NumPy stays a constant when JAX traces."""
+
+
+def require_float64(what: str) -> None:
+    """Refuses to go on in single precision.
+
+    Args:
+        what: The task that needs double precision, as it reads in a sentence.
+
+    Raises:
+        RuntimeError: If JAX's 64-bit mode is off.
+    """
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise RuntimeError(
+            f"{what} needs float64, but JAX runs in float32: call "
+            '`jax.config.update("jax_enable_x64", True)` at the start of the program, '
+            "or set the environment variable JAX_ENABLE_X64=1."
+        )
