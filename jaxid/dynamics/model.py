@@ -1,0 +1,197 @@
+"""A model: a robot and the terms of its equations of motion, linear in the parameters."""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.dynamics import projection
+from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.terms import (
+    AbstractTerm,
+    CoulombFriction,
+    RigidBodies,
+    RotorInertia,
+    ViscousFriction,
+)
+from jaxid.robot.robot import Robot
+from jaxid.types import AnyArray, Float
+
+DEFAULT_TERMS = (RigidBodies(), ViscousFriction(), CoulombFriction(), RotorInertia())
+
+
+class Model(eqx.Module):
+    r"""The equations of motion $\Theta(q, \dot q, \ddot q)\, p = Q_m$ (Eqs. 16, 18).
+
+    The columns stand in the order of the terms, the paper's order by default: bodies, viscous,
+    Coulomb, rotors. Every method takes any leading batch axes and works under `jit`, `vmap` and
+    `grad`, also with respect to the robot's geometry.
+
+    Attributes:
+        robot: What is known.
+        terms: What is linear in unknown parameters.
+    """
+
+    robot: Robot
+    terms: tuple[AbstractTerm, ...] = DEFAULT_TERMS
+
+    def __check_init__(self):
+        names = self.parameter_names
+        if not self.terms:
+            raise ValueError("`terms` must hold at least one term, but is empty.")
+        if len(set(names)) != len(names):
+            twice = next(n for n in names if names.count(n) > 1)
+            raise ValueError(
+                f"`terms` must not contribute the same parameter twice, but `{twice}` comes twice."
+            )
+
+    @property
+    def parameters(self) -> tuple[tuple[str, str], ...]:
+        """Names and units of all standard parameters."""
+        return tuple(p for term in self.terms for p in term.parameters(self.robot))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the standard parameters, in the order of the columns."""
+        return tuple(name for name, _ in self.parameters)
+
+    @property
+    def parameter_units(self) -> tuple[str, ...]:
+        """Units of the standard parameters."""
+        return tuple(unit for _, unit in self.parameters)
+
+    @property
+    def size(self) -> int:
+        """Number of standard parameters."""
+        return len(self.parameters)
+
+    def split(self, p: Float[AnyArray, " standard"]) -> list[Float[AnyArray, " columns"]]:
+        """The parameters of each term.
+
+        Raises:
+            ValueError: If there is not one number for each standard parameter.
+        """
+        sizes = [len(term.parameters(self.robot)) for term in self.terms]
+        if p.shape != (sum(sizes),):
+            raise ValueError(
+                f"`p` must hold one number for each standard parameter ({sum(sizes)}), "
+                f"but has shape {p.shape}."
+            )
+        ends = np.cumsum(sizes)
+        return [p[e - s : e] for s, e in zip(sizes, ends, strict=True)]
+
+    def columns(self, q, qd, qdd) -> Float[AnyArray, "joints standard"]:
+        r"""The regressor $\Theta$ of one sample, as it is defined (Eqs. 16, 18)."""
+        return jnp.concatenate([t.columns(self.robot, q, qd, qdd) for t in self.terms], axis=1)
+
+    def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
+        """The generalized forces of one sample, as they are defined (Eq. 11)."""
+        parts = zip(self.terms, self.split(p), strict=True)
+        return sum(t.forces(self.robot, x, q, qd, qdd) for t, x in parts)
+
+    def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
+        r"""The regressor $\Theta(q, \dot q, \ddot q)$ (Eqs. 16, 18).
+
+        Args:
+            motion: Joint motion at any number of instants.
+        """
+        self._check(motion.q)
+        return over_batch(self.columns, motion.q, motion.qd, motion.qdd)
+
+    def inverse_dynamics(
+        self, p: Float[AnyArray, " standard"], motion: Motion
+    ) -> Float[AnyArray, "*batch joints"]:
+        r"""The generalized forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
+
+        Args:
+            p: Standard parameters.
+            motion: Joint motion at any number of instants.
+        """
+        self._check(motion.q)
+        p = jnp.asarray(p)
+        return over_batch(
+            lambda q, qd, qdd: self.forces(p, q, qd, qdd), motion.q, motion.qd, motion.qdd
+        )
+
+    def mass_matrix(
+        self, p: Float[AnyArray, " standard"], q: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints joints"]:
+        r"""The mass matrix $M(q)$, rotors included (Eq. 38).
+
+        Args:
+            p: Standard parameters.
+            q: Joint coordinates [rad or m].
+        """
+        self._check(q)
+        parts = list(zip(self.terms, self.split(jnp.asarray(p)), strict=True))
+        return over_batch(lambda x: sum(t.mass_matrix(self.robot, s, x) for t, s in parts), q)
+
+    def bias_forces(
+        self,
+        p: Float[AnyArray, " standard"],
+        q: Float[AnyArray, "*batch joints"],
+        qd: Float[AnyArray, "*batch joints"],
+    ) -> Float[AnyArray, "*batch joints"]:
+        r"""The forces $h(q, \dot q)$ that are left without accelerations [N m or N] (Eq. 38).
+
+        Args:
+            p: Standard parameters.
+            q: Joint coordinates [rad or m].
+            qd: Joint velocities [rad/s or m/s].
+        """
+        self._check(q)
+        p = jnp.asarray(p)
+        return over_batch(lambda x, v: self.forces(p, x, v, jnp.zeros_like(x)), q, qd)
+
+    def kinetic_energy(
+        self,
+        p: Float[AnyArray, " standard"],
+        q: Float[AnyArray, "*batch joints"],
+        qd: Float[AnyArray, "*batch joints"],
+    ) -> Float[AnyArray, "*batch"]:
+        r"""The kinetic energy $\frac12 \dot q^T M \dot q$ [J]."""
+        M = self.mass_matrix(p, q)
+        return 0.5 * jnp.einsum("...i,...ij,...j->...", qd, M, qd)
+
+    def potential_energy(
+        self, p: Float[AnyArray, " standard"], q: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch"]:
+        """The potential energy of gravity and springs [J], zero at the ground's origin."""
+        self._check(q)
+        p = jnp.asarray(p)
+        return over_batch(
+            lambda x: jnp.concatenate([t.potential_columns(self.robot, x) for t in self.terms]) @ p,
+            q,
+        )
+
+    def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
+        """What the known tool adds to the measured forces [N m or N]; zero without a tool."""
+        tool = self.robot.tool
+        if tool is None:
+            return jnp.zeros_like(motion.q)
+        p = np.zeros((self.robot.joints, 10))
+        p[tool.body] = tool.parameters
+        return over_batch(
+            lambda q, qd, qdd: projection.rigid_body_forces(self.robot, p, q, qd, qdd),
+            motion.q,
+            motion.qd,
+            motion.qdd,
+        )
+
+    def _check(self, q: Float[AnyArray, "*batch joints"]) -> None:
+        if q.shape[-1:] != (self.robot.joints,):
+            raise ValueError(
+                f"the motion must have one coordinate for each joint ({self.robot.joints}) along "
+                f"its last axis, but has shape {q.shape}."
+            )
+
+
+def over_batch(function: Callable, *arrays: Float[AnyArray, "*batch joints"]):
+    """Applies a function of single samples to arrays with any leading batch axes."""
+    batch = arrays[0].shape[:-1]
+    flat = [jnp.reshape(x, (math.prod(batch), x.shape[-1])) for x in arrays]
+    out = jax.vmap(function)(*flat)
+    return jnp.reshape(out, (*batch, *out.shape[1:]))

@@ -1,0 +1,180 @@
+r"""The Projection Equation for one sample, on 3-vectors (Eqs. 1-12), written once.
+
+One recursion from the ground to the tips gives every body's angular velocity, angular acceleration
+and the acceleration $a = \dot v_o + \tilde\omega v_o - g$ of its origin, in the body's own frame.
+That is all that the regressor of a body needs (Eq. 10). The Jacobian that projects it into the
+space of the joints (Eqs. 5-7) is $\partial (v_o, \omega) / \partial \dot q$, and since $a$ and
+$\dot\omega$ are affine in $\ddot q$ with the same factors, it is taken from them: the velocity of
+the origin itself is never formed. Everything else is a derivative of this recursion.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.robot.kinematics import placement_in_parent, placements, skew
+from jaxid.robot.robot import Robot
+from jaxid.types import AnyArray, Float
+
+Vector = Float[AnyArray, "3"]
+
+
+def body_motions(
+    robot: Robot,
+    q: Float[AnyArray, " joints"],
+    qd: Float[AnyArray, " joints"],
+    qdd: Float[AnyArray, " joints"],
+) -> list[tuple[Vector, Vector, Vector]]:
+    r"""Motion of every body in its own frame: $(a, \omega, \dot\omega)$ (Eqs. 6, 8).
+
+    Args:
+        robot: The kinematic tree.
+        q: Joint coordinates [rad or m].
+        qd: Joint velocities [rad/s or m/s].
+        qdd: Joint accelerations [rad/s² or m/s²].
+
+    Returns:
+        For each body the acceleration of its origin less gravity [m/s²], its angular velocity
+        [rad/s] and its angular acceleration [rad/s²].
+    """
+    motions: list[tuple[Vector, Vector, Vector]] = []
+    ground = (-robot.gravity, np.zeros(3), np.zeros(3))
+    for i, parent in enumerate(robot.parent):
+        a, w, wd = motions[parent] if parent >= 0 else ground
+        R, r = placement_in_parent(robot, i, q[i])
+        axis = robot.axis[i]
+        a = R.T @ (a + (skew(wd) + skew(w) @ skew(w)) @ r)
+        w, wd = R.T @ w, R.T @ wd
+        if robot.revolute[i]:
+            w, wd = w + axis * qd[i], wd + axis * qdd[i] + jnp.cross(w, axis) * qd[i]
+        else:
+            a = a + axis * qdd[i] + 2.0 * jnp.cross(w, axis) * qd[i]
+        motions.append((a, w, wd))
+    return motions
+
+
+def partial_velocities(
+    robot: Robot,
+    q: Float[AnyArray, " joints"],
+    qd: Float[AnyArray, " joints"],
+    qdd: Float[AnyArray, " joints"],
+):
+    r"""The map $\ddot q \to (a, \dot\omega)$ of every body; its slope is $F_{o,i}$ (Eqs. 5, 7)."""
+
+    def accelerations(x):
+        return [jnp.concatenate([a, wd]) for a, _, wd in body_motions(robot, q, qd, x)]
+
+    return accelerations
+
+
+def momentum_matrix(w: Vector) -> Float[AnyArray, "3 6"]:
+    r"""The matrix $[\Omega\;|\;-\hat\Omega]$ that makes $J^o\omega$ of $(A, B, C, D, E, F)$ (Eq. 9)."""
+    x, y, z = w[0], w[1], w[2]
+    o = 0.0 * x
+    return jnp.array([[x, o, o, o, -z, -y], [o, y, o, -z, o, -x], [o, o, z, -y, -x, o]])
+
+
+def body_regressor(a: Vector, w: Vector, wd: Vector) -> Float[AnyArray, "6 10"]:
+    r"""The regressor $\bar\Theta_i$ of one free body (Eq. 10).
+
+    Multiplied with the body's parameters $p_i = (m, m r_c, A, B, C, D, E, F)$ it gives the force
+    [N] and the moment [N m] that the motion asks for at the body's origin, in the body's frame.
+
+    Args:
+        a: Acceleration of the origin less gravity [m/s²].
+        w: Angular velocity [rad/s].
+        wd: Angular acceleration [rad/s²].
+    """
+    force = [a[:, None], skew(wd) + skew(w) @ skew(w), np.zeros((3, 6))]
+    moment = [np.zeros((3, 1)), -skew(a), momentum_matrix(wd) + skew(w) @ momentum_matrix(w)]
+    return jnp.block([force, moment])
+
+
+def rigid_body_regressor(
+    robot: Robot,
+    q: Float[AnyArray, " joints"],
+    qd: Float[AnyArray, " joints"],
+    qdd: Float[AnyArray, " joints"],
+) -> Float[AnyArray, "joints joints 10"]:
+    r"""$\Theta_i = F_{o,i}^T \bar\Theta_i$ of every body, side by side (Eq. 11).
+
+    Returns:
+        For each joint (first axis) the columns of each body (second axis).
+    """
+    F = jax.jacfwd(partial_velocities(robot, q, qd, qdd))(qdd)
+    bodies = [body_regressor(*m) for m in body_motions(robot, q, qd, qdd)]
+    return jnp.stack([f.T @ b for f, b in zip(F, bodies, strict=True)], axis=1)
+
+
+def rigid_body_forces(
+    robot: Robot,
+    p: Float[AnyArray, "joints 10"],
+    q: Float[AnyArray, " joints"],
+    qd: Float[AnyArray, " joints"],
+    qdd: Float[AnyArray, " joints"],
+) -> Float[AnyArray, " joints"]:
+    r"""The generalized forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
+
+    The projection is the transpose of the map that gives the accelerations: it is applied, and the
+    Jacobian is never built.
+    """
+    motions = body_motions(robot, q, qd, qdd)
+    wrenches = [body_regressor(*m) @ p[i] for i, m in enumerate(motions)]
+    _, project = jax.vjp(partial_velocities(robot, q, qd, qdd), qdd)
+    return project(wrenches)[0]
+
+
+def rigid_body_mass_matrix(
+    robot: Robot, p: Float[AnyArray, "joints 10"], q: Float[AnyArray, " joints"]
+) -> Float[AnyArray, "joints joints"]:
+    r"""The mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38) by composite bodies.
+
+    What hangs on a joint moves as one body when that joint alone moves. Mass, first moment and
+    inertia of these composite bodies are summed from the tips to the ground; the wrench that one
+    of them needs for a unit acceleration of its joint is carried to the ground and felt by every
+    joint on the way.
+    """
+    n = robot.joints
+    frames = [placement_in_parent(robot, i, q[i]) for i in range(n)]
+    composite = [(p[i][0], p[i][1:4], inertia_tensor(p[i][4:])) for i in range(n)]
+    M: list[list] = [[np.zeros(()) for _ in range(n)] for _ in range(n)]
+    for i in reversed(range(n)):
+        m, h, J = composite[i]
+        axis = robot.axis[i]
+        force, moment = (
+            (-jnp.cross(h, axis), J @ axis) if robot.revolute[i] else (m * axis, jnp.cross(h, axis))
+        )
+        j = i
+        while True:
+            M[i][j] = M[j][i] = jnp.dot(robot.axis[j], moment if robot.revolute[j] else force)
+            R, r = frames[j]
+            j = robot.parent[j]
+            if j < 0:
+                break
+            force = R @ force
+            moment = R @ moment + jnp.cross(r, force)
+        parent = robot.parent[i]
+        if parent >= 0:
+            R, r = frames[i]
+            h = R @ h
+            # Steiner, with r x h terms since h is measured from the old origin.
+            J = R @ J @ R.T - skew(r) @ skew(h) - skew(h) @ skew(r) - m * (skew(r) @ skew(r))
+            mp, hp, Jp = composite[parent]
+            composite[parent] = (mp + m, hp + h + m * r, Jp + J)
+    return jnp.stack([jnp.stack([jnp.asarray(x) for x in row]) for row in M])
+
+
+def inertia_tensor(j: Float[AnyArray, "6"]) -> Float[AnyArray, "3 3"]:
+    """The tensor $J^o$ of the moments $(A, B, C, D, E, F)$ [kg m²] (Eq. 9)."""
+    A, B, C, D, E, F = (j[k] for k in range(6))
+    return jnp.array([[A, -F, -E], [-F, B, -D], [-E, -D, C]])
+
+
+def potential_energy_columns(
+    robot: Robot, q: Float[AnyArray, " joints"]
+) -> Float[AnyArray, "joints 10"]:
+    r"""Potential energy of unit parameters: $-g^T (m\, r_o + R\, m r_c)$ [J], zero at the ground."""
+    rotations, origins = placements(robot, q)
+    mass = -origins @ robot.gravity
+    moment = -jnp.einsum("bij,i->bj", rotations, jnp.asarray(robot.gravity))
+    return jnp.concatenate([mass[:, None], moment, jnp.zeros((robot.joints, 6))], axis=1)

@@ -1,0 +1,324 @@
+"""The terms of a model: each contributes columns that are linear in parameters of its own."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.dynamics import projection
+from jaxid.robot.robot import AXES, Robot
+from jaxid.types import AnyArray, Float
+
+INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")
+INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
+PRINCIPAL = 7
+
+
+class AbstractTerm(eqx.Module):
+    """One effect in the equations of motion that is linear in unknown parameters.
+
+    A new effect is one class with two methods; regressor, inverse dynamics, mass matrix, base
+    parameters and the compiled forms follow from them.
+    """
+
+    @abstractmethod
+    def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
+        """Name and unit of each parameter, in the order of the columns."""
+
+    @abstractmethod
+    def columns(
+        self,
+        robot: Robot,
+        q: Float[AnyArray, " joints"],
+        qd: Float[AnyArray, " joints"],
+        qdd: Float[AnyArray, " joints"],
+    ) -> Float[AnyArray, "joints columns"]:
+        """Generalized forces [N m or N] of unit parameters, for one sample."""
+
+    def forces(
+        self,
+        robot: Robot,
+        p: Float[AnyArray, " columns"],
+        q: Float[AnyArray, " joints"],
+        qd: Float[AnyArray, " joints"],
+        qdd: Float[AnyArray, " joints"],
+    ) -> Float[AnyArray, " joints"]:
+        """Generalized forces [N m or N] of given parameters, for one sample."""
+        return self.columns(robot, q, qd, qdd) @ p
+
+    def mass_matrix(
+        self, robot: Robot, p: Float[AnyArray, " columns"], q: Float[AnyArray, " joints"]
+    ) -> Float[AnyArray, "joints joints"]:
+        """What multiplies the accelerations in these forces (Eq. 38)."""
+        rest = jnp.zeros_like(q)
+        return jax.jacfwd(lambda qdd: self.forces(robot, p, q, rest, qdd))(rest)
+
+    def potential_columns(
+        self, robot: Robot, q: Float[AnyArray, " joints"]
+    ) -> Float[AnyArray, " columns"]:
+        """Potential energy [J] of unit parameters; none unless the term stores energy."""
+        return jnp.zeros(len(self.parameters(robot)), q.dtype)
+
+
+class RigidBodies(AbstractTerm):
+    r"""Inertia and gravity of the bodies by the Projection Equation (Eqs. 1-12).
+
+    Ten parameters for each body: mass $m$ [kg], first moment $m r_c$ [kg m], and the moments
+    $A, B, C, D, E, F$ [kg m²] of $J^o$ about the origin of the body's frame (Eq. 9).
+
+    Attributes:
+        principal_axes: Leave out $D, E, F$ as the paper does (Eq. 12): seven for each body.
+    """
+
+    principal_axes: bool = eqx.field(static=True, default=False)
+
+    @property
+    def _kept(self) -> int:
+        return PRINCIPAL if self.principal_axes else len(INERTIAL_NAMES)
+
+    def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
+        """`m1`, `mx1`, … `F1`, then those of the next body."""
+        return tuple(
+            (f"{name}{i + 1}", unit)
+            for i in range(robot.joints)
+            for name, unit in zip(
+                INERTIAL_NAMES[: self._kept], INERTIAL_UNITS[: self._kept], strict=True
+            )
+        )
+
+    def columns(self, robot, q, qd, qdd):
+        r"""The columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
+        theta = projection.rigid_body_regressor(robot, q, qd, qdd)
+        return theta[:, :, : self._kept].reshape(robot.joints, -1)
+
+    def all_ten(self, robot: Robot, p: Float[AnyArray, " columns"]) -> Float[AnyArray, "joints 10"]:
+        """The parameters of all bodies, with zeros for products of inertia that are left out."""
+        bodies = p.reshape(robot.joints, self._kept)
+        if not self.principal_axes:
+            return bodies
+        zeros = np.zeros((robot.joints, len(INERTIAL_NAMES) - PRINCIPAL))
+        return jnp.concatenate([bodies, zeros.astype(bodies.dtype)], axis=1)
+
+    def forces(self, robot, p, q, qd, qdd):
+        """The projected wrenches of all bodies; the regressor is not built (Eq. 11)."""
+        return projection.rigid_body_forces(robot, self.all_ten(robot, p), q, qd, qdd)
+
+    def mass_matrix(self, robot, p, q):
+        """The mass matrix of the bodies (Eq. 38)."""
+        return projection.rigid_body_mass_matrix(robot, self.all_ten(robot, p), q)
+
+    def potential_columns(self, robot, q):
+        """Potential energy of masses and first moments."""
+        return projection.potential_energy_columns(robot, q)[:, : self._kept].ravel()
+
+
+class AbstractTransition(eqx.Module):
+    """How a friction force passes from one direction of motion to the other."""
+
+    @abstractmethod
+    def __call__(self, qd: Float[AnyArray, " joints"]) -> Float[AnyArray, " joints"]:
+        """A number between -1 and 1 for each speed [rad/s or m/s]."""
+
+
+class Tanh(AbstractTransition):
+    r"""The smooth transition $\tanh(\dot q / \epsilon_c)$ (Eq. 14).
+
+    Attributes:
+        epsilon: Speed of the transition, one for all joints or one for each, in the joint's own
+            unit [rad/s or m/s].
+        dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
+    """
+
+    epsilon: float | Float[AnyArray, "..."] = 0.01
+    dead_zone: float | Float[AnyArray, "..."] = 0.0
+
+    def __check_init__(self):
+        if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
+            raise ValueError(
+                f"`epsilon` must be a positive speed, but is {self.epsilon}: "
+                "use `HardSign` for a transition without width."
+            )
+
+    def __call__(self, qd):
+        """The smooth sign of the speed."""
+        return _outside(self.dead_zone, qd, jnp.tanh(qd / self.epsilon))
+
+
+class HardSign(AbstractTransition):
+    """The sign of the speed: it says nothing at standstill, where a dead zone belongs.
+
+    Attributes:
+        dead_zone: Speed below which there is no force [rad/s or m/s].
+    """
+
+    dead_zone: float | Float[AnyArray, "..."] = 0.0
+
+    def __call__(self, qd):
+        """The sign of the speed."""
+        return _outside(self.dead_zone, qd, jnp.sign(qd))
+
+
+def _outside(dead_zone, qd, value):
+    if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
+        return value
+    return jnp.where(jnp.abs(qd) > dead_zone, value, jnp.zeros_like(value))
+
+
+def _each(robot: Robot, name: str, unit_r: str, unit_p: str) -> tuple[tuple[str, str], ...]:
+    """One parameter for each joint, with the unit of a revolute or a prismatic one."""
+    return tuple((f"{name}{i + 1}", unit_r if r else unit_p) for i, r in enumerate(robot.revolute))
+
+
+class ViscousFriction(AbstractTerm):
+    r"""Friction that grows with speed, $\mathrm{diag}\{\dot q_i\}$ (Eq. 13)."""
+
+    def parameters(self, robot):
+        """`fv1`, … [N m s/rad or N s/m]."""
+        return _each(robot, "fv", "N m s", "N s/m")
+
+    def columns(self, robot, q, qd, qdd):
+        """The diagonal matrix of speeds."""
+        return jnp.diag(qd)
+
+
+class CoulombFriction(AbstractTerm):
+    r"""Dry friction, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14).
+
+    Attributes:
+        transition: From one direction of motion to the other.
+    """
+
+    transition: AbstractTransition = Tanh()
+
+    def parameters(self, robot):
+        """`fc1`, … [N m or N]."""
+        return _each(robot, "fc", "N m", "N")
+
+    def columns(self, robot, q, qd, qdd):
+        """The diagonal matrix of smooth signs."""
+        return jnp.diag(self.transition(qd))
+
+
+class AsymmetricCoulombFriction(AbstractTerm):
+    """Dry friction with one level for each direction of motion.
+
+    It takes the place of `CoulombFriction` together with `ConstantOffset`, whose columns its own
+    ones span.
+
+    Attributes:
+        transition: From one direction of motion to the other.
+    """
+
+    transition: AbstractTransition = Tanh()
+
+    def parameters(self, robot):
+        """`fcp1`, … for positive, then `fcn1`, … for negative speeds [N m or N]."""
+        return (*_each(robot, "fcp", "N m", "N"), *_each(robot, "fcn", "N m", "N"))
+
+    def columns(self, robot, q, qd, qdd):
+        """The shares of the two directions."""
+        s = self.transition(qd)
+        return jnp.concatenate([jnp.diag(0.5 * (1.0 + s)), jnp.diag(0.5 * (s - 1.0))], axis=1)
+
+
+class ConstantOffset(AbstractTerm):
+    """A constant force at each joint: a torque sensor's or current's offset, or uneven friction."""
+
+    def parameters(self, robot):
+        """`fo1`, … [N m or N]."""
+        return _each(robot, "fo", "N m", "N")
+
+    def columns(self, robot, q, qd, qdd):
+        """The identity."""
+        return jnp.eye(robot.joints, dtype=q.dtype)
+
+
+class RotorInertia(AbstractTerm):
+    r"""Inertia of the motors' rotors, felt through the gear: $i_{Gk}^2 C_{M,k}$ (Eq. 17)."""
+
+    def parameters(self, robot):
+        """`Ia1`, … [kg m² or kg]."""
+        return _each(robot, "Ia", "kg m²", "kg")
+
+    def columns(self, robot, q, qd, qdd):
+        """The diagonal matrix of accelerations."""
+        return jnp.diag(qdd)
+
+
+class LinearSpring(AbstractTerm):
+    """A spring at each joint that pulls it to a rest position, such as a counterbalance.
+
+    Attributes:
+        rest: Position without force [rad or m]; an unknown one shows up as a `ConstantOffset`.
+    """
+
+    rest: float | Float[AnyArray, " joints"] = 0.0
+
+    def parameters(self, robot):
+        """`ks1`, … [N m/rad or N/m]."""
+        return _each(robot, "ks", "N m/rad", "N/m")
+
+    def columns(self, robot, q, qd, qdd):
+        """The diagonal matrix of deflections."""
+        return jnp.diag(q - self.rest)
+
+    def potential_columns(self, robot, q):
+        """Half the squares of the deflections."""
+        return 0.5 * (q - self.rest) ** 2
+
+
+class CoupledDrives(AbstractTerm):
+    r"""What motors that turn more than one axis add to the drives' own columns.
+
+    A motor whose row of the reduction has further entries beside that of its own joint feels
+    its rotor inertia and friction on all of these axes. The diagonal parts belong to
+    `RotorInertia`, `ViscousFriction` and `CoulombFriction` of the axes; here are the parts beside
+    the diagonal, and the Coulomb friction of the motor's own motion.
+
+    Attributes:
+        transition: Of the Coulomb friction, at speeds measured on the side of the motor's own
+            joint [rad/s or m/s].
+    """
+
+    transition: AbstractTransition = Tanh()
+
+    def couplings(self, robot: Robot) -> tuple[tuple[int, np.ndarray], ...]:
+        """The motors that turn more than one axis, with their ratios relative to their own joint."""
+        A = np.asarray(robot.drives.reduction)
+        scale = np.abs(A).max()
+        return tuple(
+            (i, A[i] / A[i, i])
+            for i in range(robot.joints)
+            if A[i, i] != 0 and (np.abs(np.delete(A[i], i)) > 1e-12 * scale).any()
+        )
+
+    def parameters(self, robot):
+        """`Iam6`, `fvm6`, `fcm6` for a coupled motor 6."""
+        found = [i for i, _ in self.couplings(robot)]
+        if not found:
+            raise ValueError(
+                f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` out, or give "
+                "`drives.reduction` as a matrix with entries beside its diagonal."
+            )
+        units = [
+            ("kg m²", "N m s", "N m") if robot.revolute[i] else ("kg", "N s/m", "N") for i in found
+        ]
+        return tuple(
+            (f"{name}{i + 1}", unit[k])
+            for k, name in enumerate(("Iam", "fvm", "fcm"))
+            for i, unit in zip(found, units, strict=True)
+        )
+
+    def columns(self, robot, q, qd, qdd):
+        """Inertia and viscous parts beside the diagonal; Coulomb friction of the motor's motion."""
+        inertia, viscous, dry = [], [], []
+        for _, ratios in self.couplings(robot):
+            beside = np.outer(ratios, ratios)
+            np.fill_diagonal(beside, 0.0)
+            inertia.append(beside.astype(qdd.dtype) @ qdd)
+            viscous.append(beside.astype(qd.dtype) @ qd)
+            r = ratios.astype(qd.dtype)
+            dry.append(r * self.transition(jnp.dot(r, qd)))
+        return jnp.stack([*inertia, *viscous, *dry], axis=1)
