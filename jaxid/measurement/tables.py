@@ -1,0 +1,297 @@
+"""Files of numbers: CSV, Parquet, NPZ and MAT, seen alike as named columns."""
+
+import dataclasses
+import difflib
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from jaxid.measurement.columns import Selection
+
+TEXT = (".csv", ".tsv", ".txt", ".dat")
+SEPARATORS = (";", "\t", ",", " ")
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """The columns of one file, not yet checked.
+
+    Attributes:
+        source: Name of the file, as messages cite it.
+        columns: By name: one column, or a whole array (samples x joints).
+        first_line: Line of the file that holds the first row of numbers; None if not a text.
+        named: Whether the columns have names of their own.
+    """
+
+    source: str
+    columns: dict[str, pl.Series | np.ndarray]
+    first_line: int | None = None
+    named: bool = True
+
+    def row(self, index: int) -> str:
+        """Where a row is found in the file."""
+        return f"row {index + 1}" if self.first_line is None else f"line {index + self.first_line}"
+
+    def expand(self, what: str, selection: Selection) -> tuple[str, ...]:
+        """Names of the columns of a selection, in the order of the joints.
+
+        Raises:
+            ValueError: If there is no such column, or a number is missing within a pattern.
+        """
+        if isinstance(selection, tuple):
+            return tuple(self._name(what, one) for one in selection)
+        if isinstance(selection, int) or "{}" not in selection:
+            return (self._name(what, selection),)
+        pattern = re.escape(selection).replace(re.escape("{}"), r"(\d+)")
+        found = {int(m[1]): c for c in self.columns if (m := re.fullmatch(pattern, c))}
+        if not found:
+            return (self._name(what, selection.replace("{}", "1")),)
+        first = min(found)
+        numbers = range(min(first, 1), max(found) + 1)
+        missing = [number for number in numbers if number not in found]
+        if missing:
+            raise ValueError(
+                f"`{self.source}` has no column `{selection.replace('{}', str(missing[0]))}` for "
+                f"`{what}`, though it has `{found[max(found)]}`: name the columns one by one."
+            )
+        return tuple(found[number] for number in numbers)
+
+    def _name(self, what: str, column: str | int) -> str:
+        names = list(self.columns)
+        if isinstance(column, int):
+            if not 0 <= column < len(names):
+                raise ValueError(
+                    f"`{what}` asks for column {column} of `{self.source}`, but its columns are "
+                    f"numbered from 0 to {len(names) - 1}."
+                )
+            return names[column]
+        if column in self.columns:
+            return column
+        if not self.named:
+            raise ValueError(
+                f"`{self.source}` has no header, so `{what}` cannot name the column `{column}`: "
+                f"give positions from 0 to {len(names) - 1}."
+            )
+        near = difflib.get_close_matches(column, names, n=1, cutoff=0.5)
+        hint = f" (did you mean `{near[0]}`?)" if near else ""
+        shown = ", ".join(f"`{name}`" for name in names[:40])
+        more = f" and {len(names) - 40} more" if len(names) > 40 else ""
+        raise ValueError(
+            f"`{self.source}` has no column `{column}` for `{what}`{hint}: it has {shown}{more}."
+        )
+
+    def array(self, what: str, selection: Selection) -> np.ndarray:
+        """The numbers of some columns (samples x columns).
+
+        Raises:
+            ValueError: If a column is missing, has another length, or holds what is no number.
+        """
+        names = self.expand(what, selection)
+        blocks = [self._numbers(name) for name in names]
+        for name, block in zip(names, blocks, strict=True):
+            if len(block) != len(blocks[0]):
+                raise ValueError(
+                    f"column `{name}` of `{self.source}` has {len(block)} samples, but "
+                    f"`{names[0]}` has {len(blocks[0])}: they must be of one log."
+                )
+        return np.concatenate(blocks, axis=1)
+
+    def stamps(self, selection: str | int) -> tuple[np.ndarray, bool]:
+        """The time stamps, and whether they were dates (then in seconds).
+
+        Raises:
+            ValueError: Like `array`.
+        """
+        name = self._name("time", selection)
+        column = self.columns[name]
+        if isinstance(column, pl.Series) and column.dtype.is_temporal():
+            ticks = column.cast(pl.Datetime("ns") if column.dtype != pl.Duration else column.dtype)
+            if column.dtype == pl.Duration:
+                ticks = column.cast(pl.Duration("ns"))
+            ticks = ticks.cast(pl.Int64)
+            self._refuse_first(name, ticks.is_null().to_numpy(), ticks, "is empty")
+            whole = ticks.to_numpy()
+            return (whole - whole[0]) * 1e-9, True
+        if isinstance(column, pl.Series) and column.dtype.is_integer() and not column.null_count():
+            column = column.to_numpy()
+        if isinstance(column, np.ndarray) and column.ndim == 1 and column.dtype.kind in "iu":
+            # Nanoseconds since 1970 do not fit into float64: the difference does.
+            return (column.astype(np.int64) - np.int64(column[0])).astype(np.float64), False
+        block = self._numbers(name)
+        if block.shape[1] != 1:
+            raise ValueError(
+                f"`{name}` of `{self.source}` must be one column of time stamps, "
+                f"but is an array of {block.shape[1]} columns."
+            )
+        return block[:, 0], False
+
+    def _numbers(self, name: str) -> np.ndarray:
+        column = self.columns[name]
+        if isinstance(column, pl.Series):
+            if isinstance(column.dtype, pl.List | pl.Array):
+                return self._nested(name, column)
+            if column.dtype.is_numeric() or column.dtype == pl.Boolean:
+                numbers = column.cast(pl.Float64)
+            else:
+                numbers = column.cast(pl.String, strict=False).str.strip_chars()
+                numbers = numbers.cast(pl.Float64, strict=False)
+            self._refuse_first(name, column.is_null().to_numpy(), column, "is empty")
+            self._refuse_first(name, numbers.is_null().to_numpy(), column, "is `{}`, no number")
+            array = numbers.to_numpy()
+        else:
+            if column.dtype.kind not in "iufb" or column.ndim > 2:
+                raise ValueError(
+                    f"`{name}` of `{self.source}` must be an array of real numbers of one or two "
+                    f"axes, but holds {column.dtype} with {column.ndim} axes."
+                )
+            array = np.asarray(column, np.float64)
+        array = np.array(array.reshape(len(array), -1), np.float64)
+        bad = ~np.isfinite(array).all(axis=1)
+        self._refuse_first(name, bad, array.min(axis=1) + array.max(axis=1), "is not finite ({})")
+        return array
+
+    def _nested(self, name: str, column: pl.Series) -> np.ndarray:
+        lengths = column.list.len() if isinstance(column.dtype, pl.List) else column.arr.len()
+        uneven = (lengths.fill_null(-1) != lengths[0]).to_numpy()
+        self._refuse_first(name, uneven, lengths, "has {} numbers, not as many as the first row")
+        rows = np.array(column.to_list(), dtype=object)
+        empty = np.equal(rows, None).any(axis=tuple(range(1, rows.ndim)))
+        self._refuse_first(name, empty, rows, "has an empty cell")
+        return Table(self.source, {name: rows.astype(np.float64)})._numbers(name)
+
+    def _refuse_first(self, name: str, bad: np.ndarray, column: Any, complaint: str) -> None:
+        rows = np.flatnonzero(bad)
+        if rows.size:
+            first = int(rows[0])
+            more = f" (and {rows.size - 1} more)" if rows.size > 1 else ""
+            raise ValueError(
+                f"column `{name}` of `{self.source}`, {self.row(first)}, "
+                f"{complaint.format(column[first])}{more}: repair the log or remove those rows."
+            )
+
+
+def read_table(path: str | Path) -> Table:
+    """Opens a file of numbers by its suffix.
+
+    Raises:
+        ValueError: If the file is missing, of an unknown kind, or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"`{path}` is no file: check the path of the log.")
+    suffix = path.suffix.lower()
+    if suffix in TEXT:
+        return _read_text(path)
+    if suffix == ".parquet":
+        return _read_parquet(path)
+    if suffix == ".npz":
+        return _read_npz(path)
+    if suffix == ".mat":
+        return _read_mat(path)
+    raise ValueError(
+        f"`{path.name}` must end in {', '.join(TEXT)}, .parquet, .npz or .mat, to be read as a "
+        "log: convert it to one of them."
+    )
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _read_text(path: Path) -> Table:
+    raw = path.read_bytes()
+    line = raw.split(b"\n", 1)[0].decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
+    if not line.strip():
+        raise ValueError(f"`{path.name}` must start with a header or with numbers, but is empty.")
+    separator = next((s for s in SEPARATORS if s in line.strip()), ",")
+    if separator == " ":
+        raw = b"\n".join(b" ".join(row.split()) for row in raw.splitlines())
+        line = " ".join(line.split())
+    cells = [cell.strip().strip('"') for cell in line.split(separator)]
+    named = not all(_is_number(cell) for cell in cells if cell) or not any(cells)
+    names = cells if named else [str(i) for i in range(len(cells))]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(
+            f"the header of `{path.name}` names the column `{twice[0]}` twice: rename one of them."
+        )
+    decimal_comma = separator == ";" and re.search(rb"\d,\d", raw[:65536]) is not None
+    try:
+        frame = pl.read_csv(
+            io.BytesIO(raw),
+            separator=separator,
+            has_header=False,
+            new_columns=names,
+            skip_rows=int(named),
+            infer_schema_length=None,
+            decimal_comma=decimal_comma,
+            encoding="utf8-lossy",
+        )
+    except pl.exceptions.PolarsError as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
+        raise ValueError(
+            f"`{path.name}` is no table with {len(names)} columns in every line ({reason}): "
+            "repair or remove the lines that differ."
+        ) from error
+    if frame.width != len(names):
+        raise ValueError(
+            f"`{path.name}` has {len(names)} names in its header, but {frame.width} columns of "
+            "numbers: make them agree."
+        )
+    return Table(path.name, frame.to_dict(as_series=True), 1 + int(named), named)
+
+
+def _read_parquet(path: Path) -> Table:
+    try:
+        frame = pl.read_parquet(path)
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise ValueError(f"`{path.name}` is no Parquet file, or is damaged: {error}.") from error
+    return Table(path.name, frame.to_dict(as_series=True))
+
+
+def _read_npz(path: Path) -> Table:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(
+            f"`{path.name}` is no NPZ file of plain arrays ({error}): save the log with "
+            "`numpy.savez` and without objects."
+        ) from error
+    return Table(path.name, _arrays(arrays))
+
+
+def _read_mat(path: Path) -> Table:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except NotImplementedError as error:
+        raise ValueError(
+            f"`{path.name}` is a MAT file of version 7.3, which cannot be read: save it with "
+            "`save(name, ..., '-v7')`, or as CSV."
+        ) from error
+    except (MatReadError, ValueError, OSError, TypeError) as error:
+        raise ValueError(f"`{path.name}` is no MAT file, or is damaged: {error}.") from error
+    return Table(path.name, _arrays({k: v for k, v in content.items() if not k.startswith("__")}))
+
+
+def _arrays(content: dict[str, Any], prefix: str = "") -> dict[str, pl.Series | np.ndarray]:
+    """Arrays by name; those in a structure are named like `log.q`."""
+    found: dict[str, pl.Series | np.ndarray] = {}
+    for name, value in content.items():
+        if isinstance(value, dict):
+            found |= _arrays(value, f"{prefix}{name}.")
+        elif isinstance(value, np.ndarray) and value.ndim > 0:
+            # MATLAB's and others' single rows are columns here.
+            found[prefix + name] = value.ravel() if 1 in value.shape else value
+    return found

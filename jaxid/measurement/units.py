@@ -1,0 +1,87 @@
+"""Units of the columns of a log: factors to SI, so that all that follows is in SI."""
+
+import dataclasses
+import difflib
+import enum
+
+import numpy as np
+
+
+class Quantity(enum.Enum):
+    """What a unit measures."""
+
+    TIME = "a time"
+    COORDINATE = "an angle or a length"
+    VELOCITY = "a velocity"
+    FORCE = "a torque or a force"
+    CURRENT = "a current"
+
+
+@dataclasses.dataclass(frozen=True)
+class Unit:
+    """A unit: its symbol, its size in SI units, and what it measures.
+
+    A drive that counts in its own unit gets one here: `Unit("count", 2 * pi / 4096,
+    Quantity.COORDINATE)` for an encoder, `Unit("permille", 1e-3 * rated, Quantity.FORCE)`
+    for a torque in thousandths of the rated one.
+
+    Attributes:
+        symbol: As it is written, like `deg`.
+        factor: Size in rad, m, rad/s, m/s, N m, N, A or s.
+        quantity: What it measures.
+    """
+
+    symbol: str
+    factor: float
+    quantity: Quantity
+
+    def __post_init__(self) -> None:
+        """Refuses factors that cannot be undone."""
+        if not np.isfinite(self.factor) or self.factor == 0:
+            raise ValueError(
+                f"`factor` of the unit `{self.symbol}` must be finite and not zero, "
+                f"but is {self.factor}."
+            )
+
+
+S = Unit("s", 1.0, Quantity.TIME)
+MS = Unit("ms", 1e-3, Quantity.TIME)
+US = Unit("us", 1e-6, Quantity.TIME)
+NS = Unit("ns", 1e-9, Quantity.TIME)
+RAD = Unit("rad", 1.0, Quantity.COORDINATE)
+DEG = Unit("deg", np.pi / 180, Quantity.COORDINATE)
+REV = Unit("rev", 2 * np.pi, Quantity.COORDINATE)
+M = Unit("m", 1.0, Quantity.COORDINATE)
+MM = Unit("mm", 1e-3, Quantity.COORDINATE)
+RAD_PER_S = Unit("rad/s", 1.0, Quantity.VELOCITY)
+DEG_PER_S = Unit("deg/s", np.pi / 180, Quantity.VELOCITY)
+RPM = Unit("rpm", np.pi / 30, Quantity.VELOCITY)
+M_PER_S = Unit("m/s", 1.0, Quantity.VELOCITY)
+MM_PER_S = Unit("mm/s", 1e-3, Quantity.VELOCITY)
+NM = Unit("N m", 1.0, Quantity.FORCE)
+N = Unit("N", 1.0, Quantity.FORCE)
+A = Unit("A", 1.0, Quantity.CURRENT)
+MA = Unit("mA", 1e-3, Quantity.CURRENT)
+
+ALL = (
+    *(S, MS, US, NS),
+    *(RAD, DEG, REV, M, MM),
+    *(RAD_PER_S, DEG_PER_S, RPM, M_PER_S, MM_PER_S),
+    *(NM, N, A, MA),
+)
+"""Every unit that has a name here."""
+
+
+def unit(symbol: str) -> Unit:
+    """The unit that is written so: `unit("deg")` is `DEG`.
+
+    Raises:
+        ValueError: If no unit is written so.
+    """
+    found = [known for known in ALL if known.symbol == symbol]
+    if not found:
+        symbols = [known.symbol for known in ALL]
+        near = difflib.get_close_matches(symbol, symbols, n=1)
+        hint = f" (did you mean `{near[0]}`?)" if near else ""
+        raise ValueError(f"`{symbol}` is no known unit{hint}: write one of {', '.join(symbols)}.")
+    return found[0]
