@@ -39,7 +39,8 @@ class Limits(eqx.Module):
         acceleration: Largest acceleration [rad/s² or m/s²].
         jerk: Largest jerk [rad/s³ or m/s³].
         force: Largest generalized force [N m or N].
-        assumed: Names of those fields whose numbers nobody published.
+        assumed: Names of those fields whose numbers nobody published, or `field of joint` where
+            only one joint's number is assumed.
     """
 
     position_min: Float[AnyArray, " joints"]

@@ -30,6 +30,33 @@ class Tool(eqx.Module):
     centre_of_mass: Float[AnyArray, "3"]
     inertia: Float[AnyArray, "3 3"]
 
+    @classmethod
+    def of(
+        cls, body: int, *, mass: float, centre_of_mass: ArrayLike, inertia: ArrayLike | None = None
+    ) -> "Tool":
+        """Builds a tool and checks it; a point mass if no inertia is given.
+
+        Raises:
+            ValueError: If the mass is not positive, or the inertia belongs to no body.
+        """
+        m, r = np.array(mass, np.float64), np.array(centre_of_mass, np.float64)
+        J = np.zeros((3, 3)) if inertia is None else np.array(inertia, np.float64)
+        if m.shape != () or not 0.0 < m < np.inf:
+            raise ValueError(f"`mass` of the tool must be a positive number [kg], but is {mass}.")
+        if r.shape != (3,) or not np.isfinite(r).all():
+            raise ValueError("`centre_of_mass` of the tool must hold three finite numbers [m].")
+        if J.shape != (3, 3) or not np.abs(J - J.T).max() <= 1e-9 * np.abs(J).max() < np.inf:
+            raise ValueError("`inertia` of the tool must be a symmetric 3 x 3 matrix [kg m²].")
+        principal = np.linalg.eigvalsh(J)
+        slack = 1e-9 * np.abs(principal).max()
+        if principal[0] < -slack or principal[2] > principal[0] + principal[1] + slack:
+            raise ValueError(
+                "`inertia` of the tool belongs to no body: its principal moments are "
+                f"{principal[0]:.3g}, {principal[1]:.3g}, {principal[2]:.3g} kg m², but none may be "
+                "negative or larger than the sum of the others; is it about the centre of mass?"
+            )
+        return cls(body, m, r, J)
+
     @property
     def parameters(self) -> Float[AnyArray, "10"]:
         """The ten parameters $(m, m r_c, A, B, C, D, E, F)$ about the body's origin (Eqs. 8, 9)."""
@@ -161,8 +188,12 @@ class Robot(eqx.Module):
             np.abs(length - 1.0)[:, None] > 1e-15, arrays["axis"] / length[:, None], arrays["axis"]
         )
         for j, R in enumerate(arrays["rotation"]):
-            if np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
-                raise ValueError(f"`rotation` of joint {j + 1} is no rotation matrix.")
+            _require_rotation(f"`rotation` of joint {j + 1}", R)
+        _require_rotation("`tip_rotation`", arrays["tip_rotation"])
+        tip = n - 1 if tip_body is None else tip_body
+        for what, body in (("tip_body", tip), ("tool.body", tip if tool is None else tool.body)):
+            if not 0 <= body < n:
+                raise ValueError(f"`{what}` must be a body from 0 to {n - 1}, but is {body}.")
         names = tuple(f"joint{i + 1}" for i in range(n)) if joint_names is None else joint_names
         if len(names) != n or len(set(names)) != n:
             raise ValueError(f"`joint_names` must be {n} different names, but is {names}.")
@@ -174,7 +205,7 @@ class Robot(eqx.Module):
             limits=Limits.of(n) if limits is None else limits,
             drives=Drives.of(n) if drives is None else drives,
             tool=tool,
-            tip_body=n - 1 if tip_body is None else tip_body,
+            tip_body=tip,
             source=source,
             notes=tuple(notes),
             **arrays,
@@ -213,6 +244,60 @@ class Robot(eqx.Module):
         """A copy with some fields replaced."""
         return dataclasses.replace(self, **fields)
 
+    def mounted(
+        self, rotation: ArrayLike | None = None, position: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> "Robot":
+        """The same robot on a base that is tilted and shifted; gravity stays as it is.
+
+        Args:
+            rotation: Attitude of the former ground frame on the new ground; upright if None.
+            position: Origin of the former ground frame on the new ground [m].
+
+        Raises:
+            ValueError: If the attitude is no rotation, or the position no point.
+        """
+        R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
+        r = np.array(position, dtype=np.float64)
+        if R.shape != (3, 3):
+            raise ValueError(
+                f"the base's rotation must be a 3 x 3 matrix, but has shape {R.shape}."
+            )
+        _require_rotation("the base's rotation", R)
+        if r.shape != (3,) or not np.isfinite(r).all():
+            raise ValueError("the base's position must hold three finite numbers [m].")
+        on_ground = np.array(self.parent) < 0
+        return self.replace(
+            rotation=np.where(on_ground[:, None, None], R @ self.rotation, self.rotation),
+            offset=np.where(on_ground[:, None], r + self.offset @ R.T, self.offset),
+        )
+
+    def with_tool(
+        self, *, mass: float, centre_of_mass: ArrayLike, inertia: ArrayLike | None = None
+    ) -> "Robot":
+        """The robot with a known load at its end-effector, in place of the load it had.
+
+        For a load elsewhere: `robot.replace(tool=Tool.of(body, ...))`.
+
+        Args:
+            mass: Mass [kg].
+            centre_of_mass: In the end-effector's frame [m].
+            inertia: About the centre of mass, along the end-effector's axes [kg m²]; a point mass
+                if None.
+
+        Raises:
+            ValueError: If the mass is not positive, or the inertia belongs to no body.
+        """
+        R = self.tip_rotation
+        tool = Tool.of(self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia)
+        return self.replace(
+            tool=Tool(
+                tool.body,
+                tool.mass,
+                self.tip_offset + R @ tool.centre_of_mass,
+                R @ tool.inertia @ R.T,
+            )
+        )
+
     def joint_unit(self, joint: int) -> str:
         """Unit of a joint's coordinate: rad or m."""
         return "rad" if self.revolute[joint] else "m"
@@ -220,3 +305,8 @@ class Robot(eqx.Module):
     def force_unit(self, joint: int) -> str:
         """Unit of a joint's generalized force: N m or N."""
         return "N m" if self.revolute[joint] else "N"
+
+
+def _require_rotation(what: str, R: np.ndarray) -> None:
+    if not np.abs(R.T @ R - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
+        raise ValueError(f"{what} is no rotation matrix.")

@@ -1,0 +1,298 @@
+"""Robots whose geometry is published, ready to use: `jid.robots.tx90l_on_rail()` and others.
+
+Each says in `source` where its numbers come from; in `limits.assumed` and `notes`, which of them
+nobody published. What is not listed is infinite (limits) or direct (drives).
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxid.robot.dh import from_dh
+from jaxid.robot.drives import Drives
+from jaxid.robot.limits import Limits
+from jaxid.robot.robot import Robot
+from jaxid.robot.snap import axis_rotation
+
+_HALF = np.pi / 2
+_X, _Y, _Z = np.eye(3)
+
+
+def tx90l_on_rail() -> Robot:
+    """The seven-axes manipulator of the paper: a Stäubli TX90L on a horizontal rail along x.
+
+    The bodies' frames are those in which the paper's base parameters come out (Eq. 24): the z axis
+    of the bodies 3, 4 and 6 is turned onto their joints' axes, and body 5, the forearm, has its
+    origin at the elbow.
+    """
+    upright, turned = np.eye(3), axis_rotation(_X, -_HALF)
+    attitudes = np.array([upright, upright, turned, turned, upright, turned, upright])
+    urdf_offset = np.array(
+        [
+            [0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.478],
+            [0.05, 0.0, 0.0],
+            [0.0, 0.05, 0.5],
+            [0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.55],
+            [0.0, 0.0, 0.1],
+        ]
+    )
+    parents = np.concatenate([[upright], attitudes[:-1]])
+    return Robot.of(
+        "TX90L on rail",
+        revolute=(False, *(True,) * 6),
+        axis=[_X, *[_Z] * 6],
+        rotation=np.einsum("iba,ibc->iac", parents, attitudes),
+        offset=np.einsum("iba,ib->ia", parents, urdf_offset),
+        joint_names=("rail", *(f"joint{i}" for i in range(1, 7))),
+        limits=Limits.of(
+            7,
+            position_min=[-1.5, *np.deg2rad([-180.0, -130.0, -145.0, -270.0, -115.0, -270.0])],
+            position_max=[1.5, *np.deg2rad([180.0, 147.5, 145.0, 270.0, 140.0, 270.0])],
+            velocity=[1.5, *np.deg2rad([400.0, 390.0, 420.0, 540.0, 475.0, 760.0])],
+            acceleration=[5.0, 8.0, 8.0, 10.0, 15.0, 15.0, 25.0],
+            force=[3000.0, 318.0, 130.0, 65.0, 34.0, 29.0, 11.0],
+            assumed=(
+                "position_min of rail",
+                "position_max of rail",
+                "velocity of rail",
+                "acceleration",
+                "force of rail",
+            ),
+        ),
+        source="ROS-Industrial staubli_experimental (geometry); manufacturer's manual (limits)",
+        notes=(
+            "assumed, for nobody published it: the rail's stroke (1.5 m to either side), speed "
+            "(1.5 m/s), acceleration (5 m/s²) and force (3000 N).",
+            "assumed, for nobody published it: the accelerations of the arm's joints.",
+            "gear ratios are not published: the drives are direct, so forces are those of the "
+            "joints; the paper states motor torques of 69 N m (rail) and 2.2 N m (last joint).",
+        ),
+    )
+
+
+def tx40() -> Robot:
+    """The Stäubli TX40, six axes, whose sixth motor turns with the fifth joint.
+
+    Its drives take the encoders' angles and motors' torques as they were recorded. Coordinates are
+    those of the published kinematic model, in which the arm lies flat at q = 0: joint 2 counts from
+    -90 degrees, joint 3 from +90 degrees of the manufacturer's zero, where the arm stands upright.
+    """
+    zero = np.array([0.0, -_HALF, _HALF, 0.0, 0.0, 0.0])
+    reduction = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    reduction[5, 4] = 32.0
+    return from_dh(
+        [
+            (0.0, 0.0, 0.0, 0.0),
+            (-_HALF, 0.0, 0.0, 0.0),
+            (0.0, 0.225, 0.035, 0.0),
+            (_HALF, 0.0, 0.225, 0.0),
+            (-_HALF, 0.0, 0.0, 0.0),
+            (_HALF, 0.0, 0.0, np.pi),
+        ],
+        convention="modified",
+        name="TX40",
+        base_position=(0.0, 0.0, 0.32),
+        limits=Limits.of(
+            6,
+            position_min=np.deg2rad([-180.0, -125.0, -138.0, -270.0, -120.0, -270.0]) + zero,
+            position_max=np.deg2rad([180.0, 125.0, 138.0, 270.0, 133.5, 270.0]) + zero,
+            velocity=np.deg2rad([287.0, 287.0, 430.0, 410.0, 320.0, 700.0]),
+            force=[131.84, 131.84, 103.49, 46.08, 43.19, 30.72],
+        ),
+        drives=Drives.of(6, reduction=reduction, zero=zero),
+        source="figaroh-examples and BIRDy (geometry, gears, limits)",
+        notes=(
+            "the ranges of the joints 2 and 3 are the manufacturer's, moved by -90 and +90 degrees "
+            "like the coordinates themselves.",
+            "accelerations and motors' torques are not published: they are taken as unlimited.",
+        ),
+    )
+
+
+def ur10() -> Robot:
+    """The Universal Robots UR10, six axes."""
+    return from_dh(
+        [
+            (_HALF, 0.0, 0.1273),
+            (0.0, -0.612, 0.0),
+            (0.0, -0.5723, 0.0),
+            (_HALF, 0.0, 0.163941),
+            (-_HALF, 0.0, 0.1157),
+            (0.0, 0.0, 0.0922),
+        ],
+        convention="standard",
+        name="UR10",
+        limits=Limits.of(
+            6,
+            position_min=-np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
+            position_max=np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
+            velocity=[2.16, 2.16, 3.15, 3.2, 3.2, 3.2],
+            force=[330.0, 330.0, 150.0, 54.0, 54.0, 54.0],
+        ),
+        source="unisa-acg inverse-dynamics-solver (geometry); ROS-Industrial universal_robot (limits)",
+        notes=("accelerations are not published: they are taken as unlimited.",),
+    )
+
+
+def ur10e() -> Robot:
+    """The Universal Robots UR10e, six axes."""
+    return from_dh(
+        [
+            (_HALF, 0.0, 0.1807),
+            (0.0, -0.6127, 0.0),
+            (0.0, -0.57155, 0.0),
+            (_HALF, 0.0, 0.17415),
+            (-_HALF, 0.0, 0.11985),
+            (0.0, 0.0, 0.11655),
+        ],
+        convention="standard",
+        name="UR10e",
+        limits=Limits.of(
+            6,
+            position_min=-np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
+            position_max=np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
+            velocity=np.deg2rad([120.0, 120.0, 180.0, 180.0, 180.0, 180.0]),
+            force=[330.0, 330.0, 150.0, 54.0, 54.0, 54.0],
+        ),
+        source="Universal_Robots_ROS2_Description",
+        notes=("accelerations are not published: they are taken as unlimited.",),
+    )
+
+
+def panda() -> Robot:
+    """The Franka Emika Panda, seven axes; the end-effector is the flange."""
+    return from_dh(
+        [
+            (0.0, 0.0, 0.333),
+            (-_HALF, 0.0, 0.0),
+            (_HALF, 0.0, 0.316),
+            (_HALF, 0.0825, 0.0),
+            (-_HALF, -0.0825, 0.384),
+            (_HALF, 0.0, 0.0),
+            (_HALF, 0.088, 0.0),
+        ],
+        convention="modified",
+        name="Panda",
+        tip_offset=(0.0, 0.0, 0.107),
+        limits=Limits.of(
+            7,
+            position_min=[-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973],
+            position_max=[2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973],
+            velocity=[2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61],
+            acceleration=[15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0],
+            jerk=[7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0],
+            force=[87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0],
+        ),
+        source="franka_description; libfranka's rate limits (acceleration, jerk)",
+    )
+
+
+def iiwa14() -> Robot:
+    """The KUKA LBR iiwa 14 R820, seven axes; frames as in its URDF, all upright at q = 0."""
+    reach = np.array([2.9668, 2.0942, 2.9668, 2.0942, 2.9668, 2.0942, 3.0541])
+    return Robot.of(
+        "LBR iiwa 14",
+        revolute=(True,) * 7,
+        axis=[_Z, _Y, _Z, -_Y, _Z, _Y, _Z],
+        rotation=np.tile(np.eye(3), (7, 1, 1)),
+        offset=[
+            (0.0, 0.0, 0.0),
+            (-0.00043624, 0.0, 0.36),
+            (0.0, 0.0, 0.0),
+            (0.00043624, 0.0, 0.42),
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.4),
+            (0.0, 0.0, 0.0),
+        ],
+        tip_offset=(0.0, 0.0, 0.126),
+        limits=Limits.of(
+            7,
+            position_min=-reach,
+            position_max=reach,
+            velocity=[1.4834, 1.4834, 1.7452, 1.3089, 2.2688, 2.356, 2.356],
+            force=[320.0, 320.0, 176.0, 176.0, 110.0, 40.0, 40.0],
+            assumed=("force",),
+        ),
+        source="ROS-Industrial kuka_experimental",
+        notes=(
+            "assumed, for the source does not state them: the largest torques of the joints.",
+            "accelerations are not published: they are taken as unlimited.",
+        ),
+    )
+
+
+def kr300() -> Robot:
+    """The KUKA KR300 R2500 ultra, six axes.
+
+    Coordinates are the link-side angles of the published recordings, as they stand in the files:
+    the angles that its authors add for their kinematic model, (0, -90, 90, 0, 0, 0) degrees, are in
+    the geometry. The drives take motor torques to the joints.
+    """
+    rows = np.array(
+        [
+            (_HALF, 0.35, -0.675, 0.0),
+            (0.0, 1.15, -0.189, 0.0),
+            (-_HALF, 0.041, 0.189, _HALF),
+            (_HALF, 0.0, -1.0, 0.0),
+            (-_HALF, 0.0, 0.0, 0.0),
+            (np.pi, 0.0, -0.24, 0.0),
+        ]
+    )
+    rows[:, 3] += [0.0, -_HALF, _HALF, 0.0, 0.0, 0.0]
+    return from_dh(
+        rows,
+        convention="standard",
+        name="KR300 R2500 ultra",
+        base_rotation=axis_rotation(_X, np.pi),
+        drives=Drives.of(
+            6,
+            reduction=[
+                256.85714285714283,
+                267.42857142857144,
+                252.33333333333334,
+                221.0,
+                239.61904761904762,
+                154.3231343283582,
+            ],
+        ),
+        source="Robot_Identification (Weigand)",
+        notes=(
+            "q is what the recordings hold, without an offset: do not add one.",
+            "limits are not published with the source: they are taken as infinite.",
+            "a hydraulic counterbalance acts on joint 2, which rigid bodies and friction do not "
+            "explain.",
+        ),
+    )
+
+
+def planar_arm(joints: int = 2, length: ArrayLike = 1.0) -> Robot:
+    """A textbook arm in a vertical plane: axes along z, gravity along -y, links along x at q = 0.
+
+    Args:
+        joints: Number of joints.
+        length: Length of the links [m], one for all or one for each.
+
+    Raises:
+        ValueError: If there is no joint, or the lengths do not fit.
+    """
+    lengths = np.array(length, dtype=np.float64)
+    if joints < 1:
+        raise ValueError(f"`joints` must be at least 1, but is {joints}.")
+    if lengths.shape not in ((), (joints,)):
+        raise ValueError(
+            f"`length` must be one length or one for each joint ({joints}), but has shape "
+            f"{lengths.shape}."
+        )
+    lengths = np.broadcast_to(lengths, (joints,))
+    ends = np.outer(lengths, _X)
+    return Robot.of(
+        f"planar arm, {joints} joints",
+        revolute=(True,) * joints,
+        axis=np.tile(_Z, (joints, 1)),
+        rotation=np.tile(np.eye(3), (joints, 1, 1)),
+        offset=np.vstack([np.zeros((1, 3)), ends[:-1]]),
+        gravity=(0.0, -9.81, 0.0),
+        tip_offset=ends[-1],
+        source="textbook",
+    )

@@ -1,0 +1,262 @@
+"""Robots from URDF files, and the inertial parameters that such a file claims."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxid.robot.limits import Limits
+from jaxid.robot.robot import GRAVITY, Robot, Tool
+from jaxid.robot.snap import (
+    SNAP_TOLERANCE,
+    angle_notes,
+    array_notes,
+    check_tolerance,
+    rpy_rotation,
+    snap_angles,
+    snap_axis,
+    snap_rotation,
+)
+from jaxid.robot.urdf_file import UrdfTree
+from jaxid.types import AnyArray, Float
+
+_TURNING = ("revolute", "continuous")
+_ZERO = (0.0, 0.0, 0.0)
+
+
+def load_urdf(
+    path: str | Path,
+    *,
+    tip: str | None = None,
+    base: str | None = None,
+    gravity: ArrayLike = GRAVITY,
+    base_rotation: ArrayLike | None = None,
+    base_position: ArrayLike = _ZERO,
+    snap_tolerance: float = SNAP_TOLERANCE,
+) -> Robot:
+    """Loads a robot from a URDF file; its inertias are left to `urdf_parameters`.
+
+    Joints turn (revolute, continuous) or slide (prismatic) about any axis. The frame of a body is
+    the frame of the link that its joint moves. Links on fixed joints become part of the body that
+    carries them. Joints come depth first, and in the order of the file where a link carries
+    several; so a parent comes before its children.
+
+    Limits that the file does not state, or states as zero, are infinite.
+
+    Args:
+        path: The file, expanded if it was a xacro file.
+        tip: Link of the end-effector: only the chain from `base` to it is loaded, with the links
+            fixed to it. If None, the whole tree below `base` is, and the end-effector is the last
+            link of the longest chain: of the most moving joints, then of the most links, then
+            first in the file.
+        base: Link that stands on the ground; the root if None.
+        gravity: In the frame of the ground [m/s²].
+        base_rotation: Attitude of the base link on the ground; upright if None.
+        base_position: Origin of the base link on the ground [m].
+        snap_tolerance: Angles, attitudes and axes this close to a quarter turn become exact [rad];
+            the robot's notes list them. Zero turns it off.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If it is no URDF, is no open tree, or has a mimic, floating or planar joint on
+            the way.
+    """
+    tree = UrdfTree(path)
+    body = _merge(tree, base, tip, snap_tolerance)
+    limits, limit_notes = _limits(tree, body.joints)
+    end_body, end_rotation, end_offset = body.links[body.tip]
+    massless = tuple(
+        f"joint `{joint.name}`: the file gives what it moves no mass; `urdf_parameters` takes zero."
+        for i, joint in enumerate(body.joints)
+        if not any(
+            tree.urdf.link_map[link].inertial is not None
+            for link, (carrier, _, _) in body.links.items()
+            if carrier == i
+        )
+    )
+    robot = Robot.of(
+        tree.urdf.name,
+        parent=tuple(body.parent),
+        revolute=tuple(joint.type in _TURNING for joint in body.joints),
+        axis=body.axis,
+        rotation=body.rotation,
+        offset=body.offset,
+        joint_names=tuple(joint.name for joint in body.joints),
+        gravity=gravity,
+        limits=limits,
+        tip_body=end_body,
+        tip_rotation=end_rotation,
+        tip_offset=end_offset,
+        source=tree.path,
+        notes=(*body.notes, *limit_notes, *massless),
+    )
+    return robot.mounted(base_rotation, base_position)
+
+
+def urdf_parameters(
+    path: str | Path,
+    *,
+    tip: str | None = None,
+    base: str | None = None,
+    snap_tolerance: float = SNAP_TOLERANCE,
+) -> Float[AnyArray, " inertial"]:
+    """Reads the inertial parameters of a URDF file: what its authors think, often from CAD (Eq. 9).
+
+    Ten for each body of `load_urdf` with the same arguments, in the order of its joints:
+    (m, m r_c, A, B, C, D, E, F) about the body's origin. Links on fixed joints are added to the
+    body that carries them; links without inertia count as massless. What hangs on a moving joint
+    that `tip` leaves out is left out.
+
+    Args:
+        path: The file.
+        tip: As in `load_urdf`.
+        base: As in `load_urdf`.
+        snap_tolerance: As in `load_urdf`.
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file cannot be loaded, or an inertia is not finite.
+    """
+    tree = UrdfTree(path)
+    body = _merge(tree, base, tip, snap_tolerance)
+    parameters = np.zeros((len(body.joints), 10))
+    for name, (i, R, r) in body.links.items():
+        inertial = tree.urdf.link_map[name].inertial
+        if i < 0 or inertial is None:
+            continue
+        J = np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia.to_matrix()
+        xyz = _ZERO if inertial.origin is None else inertial.origin.xyz
+        rpy = _ZERO if inertial.origin is None else inertial.origin.rpy
+        if not all(np.isfinite(v).all() for v in (inertial.mass, J, xyz, rpy)):
+            raise ValueError(f"`{tree.path}`: link `{name}` has an inertial that is not finite.")
+        attitude = R @ rpy_rotation(rpy)
+        link = Tool(
+            i, np.array(inertial.mass), r + R @ np.array(xyz), attitude @ J @ attitude.T
+        )  # unchecked: what a file claims may belong to no body at all
+        parameters[i] += link.parameters
+    return parameters.ravel()
+
+
+class _Bodies(NamedTuple):
+    """The moving joints and, for each link, its body (-1: ground) and its placement in it."""
+
+    joints: list[Any]
+    parent: list[int]
+    axis: list[np.ndarray]
+    rotation: list[np.ndarray]
+    offset: list[np.ndarray]
+    links: dict[str, tuple[int, np.ndarray, np.ndarray]]
+    tip: str
+    notes: tuple[str, ...]
+
+
+def _merge(tree: UrdfTree, base: str | None, tip: str | None, snap_tolerance: float) -> _Bodies:
+    tolerance = check_tolerance(snap_tolerance)
+    base = tree.root if base is None else tree.require_link("base", base)
+    chain = None
+    if tip is not None:
+        chain = {joint.name for joint in tree.chain(base, tree.require_link("tip", tip))}
+    out = _Bodies([], [], [], [], [], {base: (-1, np.eye(3), np.zeros(3))}, "", ())
+    notes: list[str] = []
+    length = {base: (0, 0)}
+    waiting = tree.children[base][::-1]
+    while waiting:
+        joint = waiting.pop()
+        fixed = joint.type == "fixed"
+        if not fixed and chain is not None and joint.name not in chain:
+            continue
+        rotation, offset, said = _origin(tree, joint, tolerance)
+        notes += said
+        carrier, R, r = out.links[joint.parent]
+        exact = snap_rotation(R @ rotation, tolerance)
+        notes += array_notes(joint.name, "attitude", R @ rotation, exact)
+        placement = (exact, r + R @ offset)
+        if fixed:
+            out.links[joint.child] = (carrier, *placement)
+        else:
+            axis, said = _axis(tree, joint, tolerance)
+            notes += said
+            out.links[joint.child] = (len(out.joints), np.eye(3), np.zeros(3))
+            out.joints.append(joint)
+            out.parent.append(carrier)
+            out.axis.append(axis)
+            out.rotation.append(placement[0])
+            out.offset.append(placement[1])
+        moving, links = length[joint.parent]
+        length[joint.child] = (moving + (not fixed), links + 1)
+        waiting += tree.children[joint.child][::-1]
+    end = max(length, key=lambda link: length[link]) if tip is None else tip
+    if out.links[end][0] < 0:
+        below = f"below link `{base}`" if tip is None else f"between links `{base}` and `{tip}`"
+        raise ValueError(
+            f"`{tree.path}` has no moving joint {below}: choose another `base` or `tip`."
+        )
+    return out._replace(tip=end, notes=tuple(notes))
+
+
+def _origin(
+    tree: UrdfTree, joint: Any, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    offset = tree.numbers(joint, "xyz", joint.origin and joint.origin.xyz, _ZERO)
+    rpy = tree.numbers(joint, "rpy", joint.origin and joint.origin.rpy, _ZERO)
+    snapped = snap_angles(rpy, tolerance)
+    notes = angle_notes(joint.name, ("roll", "pitch", "yaw"), rpy, snapped)
+    return rpy_rotation(snapped), offset, notes
+
+
+def _axis(tree: UrdfTree, joint: Any, tolerance: float) -> tuple[np.ndarray, tuple[str, ...]]:
+    if joint.type not in (*_TURNING, "prismatic"):
+        raise tree.error(
+            joint,
+            f"is {joint.type}, but only revolute, continuous and prismatic joints can be "
+            "identified: choose `tip` (or `base`) so that the chain avoids it, or make it fixed",
+        )
+    if joint.mimic is not None:
+        raise tree.error(
+            joint,
+            f"mimics joint `{joint.mimic.joint}`, but every joint must move freely: choose `tip` "
+            "(or `base`) so that the chain avoids it, or make it fixed",
+        )
+    axis = tree.numbers(joint, "axis", joint.axis, (1.0, 0.0, 0.0))
+    length = np.linalg.norm(axis)
+    if length < 1e-9:
+        raise tree.error(joint, "has the zero vector as its axis: give it a direction")
+    snapped = snap_axis(axis, tolerance)
+    return snapped, array_notes(joint.name, "axis", axis / length, snapped)
+
+
+def _limits(tree: UrdfTree, joints: list[Any]) -> tuple[Limits, tuple[str, ...]]:
+    n = len(joints)
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    speed, force = np.full(n, np.inf), np.full(n, np.inf)
+    notes: list[str] = []
+    for i, joint in enumerate(joints):
+        limit = joint.limit
+        if limit is None:
+            continue
+        given = (limit.lower, limit.upper, limit.velocity, limit.effort)
+        if np.isnan(given).any():
+            raise tree.error(joint, "has a limit that is not a number")
+        if joint.type != "continuous" and limit.lower == limit.upper == 0.0:
+            notes.append(f"joint `{joint.name}`: a range from 0 to 0 is taken as unknown.")
+        elif joint.type != "continuous":
+            low[i], high[i] = limit.lower, limit.upper
+            if low[i] >= high[i]:
+                raise tree.error(
+                    joint,
+                    f"ranges from {low[i]:g} to {high[i]:g}, but the lower end must be below "
+                    "the upper one",
+                )
+        for name, value, array in (
+            ("velocity", limit.velocity, speed),
+            ("effort", limit.effort, force),
+        ):
+            if value > 0.0:
+                array[i] = value
+            else:
+                notes.append(f"joint `{joint.name}`: {name} {value:g} is taken as unknown.")
+    return (
+        Limits.of(n, position_min=low, position_max=high, velocity=speed, force=force),
+        tuple(notes),
+    )
