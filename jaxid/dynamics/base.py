@@ -1,0 +1,203 @@
+"""Base parameters: the combinations of standard parameters that forces can tell apart (Eqs. 20-24)."""
+
+import enum
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.rank import (
+    AbstractRankMethod,
+    GramSchmidt,
+    SingularValues,
+    regrouping,
+)
+from jaxid.types import AnyArray, Float
+
+SAMPLES = 25
+CLEAR_GAP = 1e3
+LENGTH_POWERS = {"kg": 0, "kg m": 1, "kg m²": 2}
+
+
+class Identifiability(enum.Enum):
+    """What measured forces can say about one standard parameter."""
+
+    ALONE = "identifiable"
+    COMBINED = "only in combination"
+    NONE = "not identifiable"
+
+
+class BaseParameters(eqx.Module):
+    r"""A model regrouped to its base parameters: $\hat\Theta_1 (p_1 + \kappa p_2) = Q_m$ (Eq. 22).
+
+    Attributes:
+        model: The model with all its standard parameters.
+        indices: Columns of the independent standard parameters, in order (the paper's numbering).
+        dependent: Columns of the others.
+        kappa: How the dependent columns follow from the independent ones.
+        smallest_independent: Share of the least independent column that is new, of 1.
+        largest_dependent: Share of the most doubtful dependent column that is new, of 1.
+        notes: Doubts about the rank, in sentences; empty if there are none.
+    """
+
+    model: Model
+    indices: tuple[int, ...] = eqx.field(static=True)
+    dependent: tuple[int, ...] = eqx.field(static=True)
+    kappa: Float[AnyArray, "base dependent"]
+    smallest_independent: float
+    largest_dependent: float
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of base parameters."""
+        return len(self.indices)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of the standard parameter that leads each base parameter."""
+        names = self.model.parameter_names
+        return tuple(names[k] for k in self.indices)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the base parameters."""
+        units = self.model.parameter_units
+        return tuple(units[k] for k in self.indices)
+
+    def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
+        r"""The base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
+        return self.model.regressor(motion)[..., np.array(self.indices)]
+
+    def from_standard(
+        self, p: Float[AnyArray, "*batch standard"]
+    ) -> Float[AnyArray, "*batch base"]:
+        r"""The base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
+        p = jnp.asarray(p)
+        first, second = np.array(self.indices), np.array(self.dependent, dtype=int)
+        return p[..., first] + p[..., second] @ self.kappa.T
+
+    def to_standard(self, p: Float[AnyArray, "*batch base"]) -> Float[AnyArray, "*batch standard"]:
+        """The standard parameters with the same forces whose dependent ones are zero.
+
+        They are no physical masses and inertias, but give the same forces and mass matrix.
+        """
+        p = jnp.asarray(p)
+        full = jnp.zeros((*p.shape[:-1], self.model.size), p.dtype)
+        return full.at[..., np.array(self.indices)].set(p)
+
+    def inverse_dynamics(
+        self, p: Float[AnyArray, " base"], motion: Motion
+    ) -> Float[AnyArray, "*batch joints"]:
+        r"""The generalized forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
+        return self.model.inverse_dynamics(self.to_standard(p), motion)
+
+    def mass_matrix(
+        self, p: Float[AnyArray, " base"], q: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch joints joints"]:
+        """The mass matrix, which base parameters determine completely (Eq. 38)."""
+        return self.model.mass_matrix(self.to_standard(p), q)
+
+    @property
+    def identifiability(self) -> tuple[Identifiability, ...]:
+        """For every standard parameter whether forces determine it, alone or in combination."""
+        verdict = [Identifiability.NONE] * self.model.size
+        mixed = np.asarray(self.kappa) != 0.0
+        for row, k in enumerate(self.indices):
+            alone = not mixed[row].any()
+            verdict[k] = Identifiability.ALONE if alone else Identifiability.COMBINED
+        for column, k in enumerate(self.dependent):
+            if mixed[:, column].any():
+                verdict[k] = Identifiability.COMBINED
+        return tuple(verdict)
+
+
+def base_parameters(
+    model: Model, *, method: AbstractRankMethod | None = None, seed: int = 0
+) -> BaseParameters:
+    r"""Finds which combinations of parameters the forces determine (Eqs. 20-22).
+
+    The regressor is evaluated at random motions and stacked. Columns that earlier ones replace are
+    found by Gram-Schmidt in column order, and counted again by singular values.
+
+    Args:
+        model: The model.
+        method: How dependence is decided; the other way is always the cross-check.
+        seed: Of the random motions.
+
+    Returns:
+        The base parameters; a disagreement or a small gap stands in their `notes`.
+    """
+    method = GramSchmidt() if method is None else method
+    check = GramSchmidt() if isinstance(method, SingularValues) else SingularValues()
+    W, scale = observation_matrix(model, seed)
+    found = method(W)
+    other = check(W)
+    kappa, left = regrouping(W, found)
+    first, second = np.array(found.independent, int), np.array(found.dependent, int)
+    kappa = kappa * scale[first][:, None] / scale[second]
+    notes = _doubts(found, other, left)
+    return BaseParameters(
+        model,
+        found.independent,
+        found.dependent,
+        kappa,
+        found.smallest_independent,
+        found.largest_dependent,
+        notes,
+    )
+
+
+def observation_matrix(
+    model: Model, seed: int
+) -> tuple[Float[AnyArray, "rows standard"], Float[AnyArray, " standard"]]:
+    r"""The regressor at random motions, stacked and free of units: $\Theta_{QR}$ (Eq. 20).
+
+    Lengths are measured in the robot's own size, so that metres or millimetres make no difference.
+
+    Returns:
+        The matrix, and for each parameter the factor that its column was multiplied with.
+    """
+    robot = model.robot
+    size = characteristic_length(model)
+    samples = max(SAMPLES, math.ceil(3 * model.size / robot.joints))
+    rng = np.random.default_rng(seed)
+    unit = np.where(np.array(robot.revolute), 1.0, size)
+    q, qd, qdd = (rng.uniform(-s, s, (samples, robot.joints)) * unit for s in (3.0, 3.0, 6.0))
+    theta = np.asarray(model.regressor(Motion(q, qd, qdd)), np.float64)
+    theta = theta * unit[:, None]
+    # A body's mass, first moments and inertias are of the sizes 1, length and length squared.
+    scale = np.array([size ** LENGTH_POWERS.get(u, 0) for u in model.parameter_units])
+    return (theta * scale).reshape(samples * robot.joints, model.size), scale
+
+
+def characteristic_length(model: Model) -> float:
+    """The size of the robot: the largest distance between neighbouring joints [m], or 1."""
+    distances = np.linalg.norm(np.asarray(model.robot.offset), axis=-1)
+    return float(distances.max()) if distances.any() else 1.0
+
+
+def _doubts(found, other, left) -> tuple[str, ...]:
+    notes = []
+    if len(found.independent) != len(other.independent):
+        notes.append(
+            f"the two ways to count base parameters disagree: {len(found.independent)} and "
+            f"{len(other.independent)}; the geometry is nearly degenerate, or angles are rounded."
+        )
+    elif found.independent != other.independent:
+        notes.append(
+            "the two ways to count base parameters agree on their number but not on which columns "
+            "lead them; the geometry is nearly degenerate."
+        )
+    if found.dependent and found.gap < CLEAR_GAP:
+        notes.append(
+            f"independent and dependent columns are not clearly apart: the smallest independent "
+            f"share is {found.smallest_independent:.1e}, the largest dependent one "
+            f"{found.largest_dependent:.1e}."
+        )
+    if left > 1e-9:
+        notes.append(f"a dependent column is explained only to {left:.1e} of its size.")
+    return tuple(notes)
