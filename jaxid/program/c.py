@@ -1,0 +1,166 @@
+"""A scalar program as plain C for a real-time controller."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from .operation import TRUTH_VALUED, Operation
+from .program import Program, Reference
+
+_INFIX = {
+    Operation.ADD: "+",
+    Operation.SUBTRACT: "-",
+    Operation.MULTIPLY: "*",
+    Operation.DIVIDE: "/",
+    Operation.LESS: "<",
+    Operation.LESS_EQUAL: "<=",
+    Operation.EQUAL: "==",
+    Operation.NOT_EQUAL: "!=",
+    Operation.AND: "&",
+    Operation.OR: "|",
+}
+# A NaN on either side must come through, which C's fmax and fmin do not do.
+_FORMAT: dict[Operation, Callable[..., str]] = {
+    Operation.NEGATE: lambda x: f"-{x}",
+    Operation.NOT: lambda x: f"!{x}",
+    Operation.SELECT: lambda c, x, y: f"{c} ? {x} : {y}",
+    Operation.MAXIMUM: lambda x, y: f"(({x} > {y}) | ({x} != {x})) ? {x} : {y}",
+    Operation.MINIMUM: lambda x, y: f"(({x} < {y}) | ({x} != {x})) ? {x} : {y}",
+}
+_NAMES = {Operation.ABSOLUTE: "fabs"}
+_KEYWORDS = frozenset(
+    """alignas alignof and asm auto bool break case catch char class const constexpr continue default delete
+    do double else enum explicit export extern false float for friend goto if inline int long mutable
+    namespace new not operator or private protected public register restrict return short signed sizeof
+    static struct switch template this throw true try typedef typename union unsigned using virtual void
+    volatile while xor""".split()
+)
+
+
+class _Writer:
+    """Spells one program's numbers and operations in one precision."""
+
+    def __init__(self, double: bool):
+        self.type = "double" if double else "float"
+        self.round = np.float64 if double else np.float32
+        self.suffix = "" if double else "f"
+
+    def number(self, x: float) -> str:
+        rounded = self.round(x)
+        if math.isnan(x):
+            return "NAN"
+        if np.isinf(rounded):
+            return "INFINITY" if x > 0 else "(-INFINITY)"
+        digits = np.format_float_scientific(rounded, unique=True, trim="0")
+        text = digits if "e" not in digits or abs(x) > 1e6 or 0 < abs(x) < 1e-4 else None
+        text = text or np.format_float_positional(rounded, unique=True, trim="0")
+        return f"({text}{self.suffix})" if text.startswith("-") else text + self.suffix
+
+    def operand(self, x: Reference) -> str:
+        return f"t{x}" if isinstance(x, int) else self.number(x)
+
+    def expression(self, operation: Operation, operands: Sequence[Reference]) -> str:
+        spelled = [self.operand(x) for x in operands]
+        if operation in _INFIX:
+            return f" {_INFIX[operation]} ".join(spelled)
+        if operation is Operation.SIGN:
+            (x,) = spelled
+            return f"({x} != {x}) ? {x} : ({self.type})(({x} > 0) - ({x} < 0))"
+        if operation in _FORMAT:
+            return _FORMAT[operation](*spelled)
+        name = _NAMES.get(operation, operation.value)
+        return f"{name}{self.suffix}({', '.join(spelled)})"
+
+
+def to_c(
+    program: Program,
+    name: str,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    *,
+    double: bool = True,
+) -> str:
+    """Writes a program as one C99 function, which is also valid C++.
+
+    The function allocates nothing and has neither loops nor branches that jump: its run time does not
+    depend on the data, if the mathematical library's does not. It takes a pointer for each input, then a pointer for each
+    output, all of them rows of numbers in C order. Every entry of an output is written, constants too. Inputs
+    are read before outputs are written, so they may be the same memory.
+
+    Args:
+        program: Made by `trace`.
+        name: Name of the C function.
+        inputs: Names of the inputs; by default `input0`, `input1`, ...
+        outputs: Names of the outputs; by default `output0`, `output1`, ...
+        double: Whether the C code computes in `double`; in `float` otherwise.
+
+    Raises:
+        ValueError: If a name is no identifier of C, is used twice, or there are not
+            as many names as inputs or outputs.
+    """
+    inputs = _names(inputs, "input", len(program.input_shapes))
+    outputs = _names(outputs, "output", len(program.output_shapes))
+    _check_names([name, *inputs, *outputs])
+    writer = _Writer(double)
+    arguments = [f"const {writer.type} *{x}" for x in inputs]
+    arguments += [f"{writer.type} *{x}" for x in outputs]
+    lines, read = [], set()
+    for k, (operation, operands) in enumerate(program.nodes):
+        if operation is Operation.INPUT:
+            number, entry = operands
+            read.add(number)
+            expression = f"{inputs[int(number)]}[{entry}]"
+        else:
+            expression = writer.expression(operation, operands)
+        kind = "int" if operation in TRUTH_VALUED else writer.type
+        lines.append(f"const {kind} t{k} = {expression};")
+    lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in read]
+    start = 0
+    for output, shape in zip(outputs, program.output_shapes, strict=True):
+        size = math.prod(shape)
+        if not size:
+            lines.append(f"(void){output};")
+        entries = program.outputs[start : start + size]
+        lines += [f"{output}[{k}] = {writer.operand(x)};" for k, x in enumerate(entries)]
+        start += size
+    body = "\n".join(f"    {line}" for line in lines)
+    return f"""#include <math.h>
+
+/* Generated code: do not edit.
+{_description(program, inputs, outputs)}
+   {program.counts}. */
+#ifdef __cplusplus
+extern "C"
+#endif
+void {name}({", ".join(arguments) or "void"});
+
+void {name}({", ".join(arguments) or "void"})
+{{
+{body}
+}}
+"""
+
+
+def _description(program: Program, inputs: Sequence[str], outputs: Sequence[str]) -> str:
+    shapes = [*program.input_shapes, *program.output_shapes]
+    rows = zip([*inputs, *outputs], shapes, strict=True)
+    return "\n".join(f"   {name}: {math.prod(s)} numbers, shape {list(s)}." for name, s in rows)
+
+
+def _names(given: Sequence[str] | None, stem: str, count: int) -> list[str]:
+    names = [f"{stem}{k}" for k in range(count)] if given is None else list(given)
+    if len(names) != count:
+        raise ValueError(f"`{stem}s` must name the program's {count} {stem}s, but has {names}.")
+    return names
+
+
+def _check_names(names: list[str]) -> None:
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in _KEYWORDS:
+            raise ValueError(f"A name in C code must be an identifier of C, but got {name!r}.")
+        if re.fullmatch(r"t[0-9]+", name):
+            raise ValueError(f"The name {name!r} is taken by the generated code: choose another.")
+    if len(set(names)) < len(names):
+        raise ValueError(f"Names in C code must differ from each other, but are {names}.")

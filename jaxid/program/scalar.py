@@ -1,0 +1,240 @@
+"""Scalars as expressions that simplify themselves while they are built.
+
+Equal expressions are the same object: each one is looked up in the table of its `Graph`
+before it is made. A graph belongs to one trace and dies with it.
+
+The rules keep the value of every finite computation up to the rounding of one operation. They fold
+`0 x` to 0 and `x - x` to 0, so that a NaN or an infinity in x can disappear from
+the result: check inputs before they come here.
+"""
+
+import math
+
+from .operation import COMMUTATIVE, EVEN, ODD, TRUTH_VALUED, Operation, on_constants
+
+
+class Graph:
+    """The expressions of one trace, each one once."""
+
+    __slots__ = ("_table",)
+
+    def __init__(self):
+        self._table = {}
+
+    def node(self, operation: Operation, *operands: object) -> "Scalar":
+        """Finds the expression, or makes it; expressions are numbered as they are made."""
+        key = (operation, *operands)
+        found = self._table.get(key)
+        if found is None:
+            found = Scalar(self, operation, operands, len(self._table))
+            self._table[key] = found
+        return found
+
+
+class Scalar:
+    """One scalar operation in a `Graph`. Equality is identity, which the table makes sufficient."""
+
+    __slots__ = ("graph", "index", "operands", "operation")
+
+    def __init__(self, graph: Graph, operation: Operation, operands: tuple, index: int):
+        self.graph = graph
+        self.operation = operation
+        self.operands = operands
+        self.index = index
+
+    def __add__(self, other):
+        return add(self, other)
+
+    def __radd__(self, other):
+        return add(other, self)
+
+    def __sub__(self, other):
+        return add(self, negate(other))
+
+    def __rsub__(self, other):
+        return add(other, negate(self))
+
+    def __mul__(self, other):
+        return multiply(self, other)
+
+    def __rmul__(self, other):
+        return multiply(other, self)
+
+    def __neg__(self):
+        return negate(self)
+
+    def __repr__(self):
+        return f"<{self.operation} {self.index}>"
+
+
+Operand = Scalar | float | bool
+
+
+def _constant(x: Operand) -> bool:
+    return not isinstance(x, Scalar)
+
+
+def _magnitude(x: Operand) -> tuple[bool, Operand]:
+    """Splits x into (is negated, rest)."""
+    if isinstance(x, Scalar):
+        return (True, x.operands[0]) if x.operation is Operation.NEGATE else (False, x)
+    return (True, -x) if x < 0 else (False, x)
+
+
+def negate(x: Operand) -> Operand:
+    """-x; two minus signs cancel."""
+    if not isinstance(x, Scalar):
+        return -x
+    if x.operation is Operation.NEGATE:
+        return x.operands[0]
+    return x.graph.node(Operation.NEGATE, x)
+
+
+def add(x: Operand, y: Operand) -> Operand:
+    """x + y, ordered so that x + y, y + x and -(-x - y) share one node, and x - y and y - x another."""
+    if _constant(x):
+        if _constant(y):
+            return float(x + y)
+        x, y = y, x
+    if _constant(y):
+        if y == 0:
+            return x
+        negated, x = _magnitude(x)
+        total = x.graph.node(Operation.ADD, x, -float(y) if negated else float(y))
+        return negate(total) if negated else total
+    (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
+    if x.index > y.index:
+        x, y, x_negated, y_negated = y, x, y_negated, x_negated
+    if x is y:
+        if x_negated != y_negated:
+            return 0.0
+        total = multiply(2.0, x)
+    else:
+        kind = Operation.ADD if x_negated == y_negated else Operation.SUBTRACT
+        total = x.graph.node(kind, x, y)
+    return negate(total) if x_negated else total
+
+
+def multiply(x: Operand, y: Operand) -> Operand:
+    """x y with the sign in front; a constant factor stands first and is merged with one in y."""
+    if _constant(y):
+        x, y = y, x
+    if _constant(y):
+        return float(x * y)
+    if _constant(x) and x == 0:
+        return 0.0
+    (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
+    if _constant(x):
+        product = _scale(float(x), y)
+    else:
+        if x.index > y.index:
+            x, y = y, x
+        product = x.graph.node(Operation.MULTIPLY, x, y)
+    return product if x_negated == y_negated else negate(product)
+
+
+def _scale(factor: float, x: Scalar) -> Scalar:
+    if factor == 1:
+        return x
+    if x.operation is Operation.MULTIPLY and _constant(x.operands[0]):
+        merged = factor * x.operands[0]
+        if 1e-300 < merged < 1e300:
+            return _scale(merged, x.operands[1])
+    return x.graph.node(Operation.MULTIPLY, factor, x)
+
+
+def divide(x: Operand, y: Operand) -> Operand:
+    """x / y; a division by a constant becomes a multiplication by its reciprocal."""
+    if _constant(y):
+        if _constant(x):
+            return on_constants(Operation.DIVIDE, float(x), float(y))
+        reciprocal = on_constants(Operation.DIVIDE, 1.0, float(y))
+        if 1e-300 < abs(reciprocal) < 1e300:
+            return multiply(reciprocal, x)
+        return x.graph.node(Operation.DIVIDE, x, float(y))
+    if _constant(x) and x == 0:
+        return 0.0
+    (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
+    quotient = y.graph.node(Operation.DIVIDE, float(x) if _constant(x) else x, y)
+    return quotient if x_negated == y_negated else negate(quotient)
+
+
+def integer_power(x: Operand, exponent: int) -> Operand:
+    """x to a whole exponent, by repeated squaring."""
+    if exponent < 0:
+        return divide(1.0, integer_power(x, -exponent))
+    power, square = 1.0, x
+    while exponent:
+        if exponent & 1:
+            power = multiply(power, square)
+        exponent >>= 1
+        if exponent:
+            square = multiply(square, square)
+    return power
+
+
+def power(x: Operand, y: Operand) -> Operand:
+    """x to the y, where a small whole or half exponent needs no call of `pow`."""
+    if _constant(y) and not _constant(x):
+        if float(y).is_integer() and abs(y) <= 16:
+            return integer_power(x, int(y))
+        if y == 0.5:
+            return apply(Operation.SQUARE_ROOT, x)
+    return apply(Operation.POWER, x, y)
+
+
+def select(condition: Operand, if_true: Operand, if_false: Operand) -> Operand:
+    """if_true where the condition holds, else if_false."""
+    if _constant(condition):
+        return if_true if condition else if_false
+    if if_true is if_false or (_constant(if_true) and _constant(if_false) and if_true == if_false):
+        return if_true
+    return condition.graph.node(Operation.SELECT, condition, if_true, if_false)
+
+
+def logic(operation: Operation, *operands: Operand) -> Operand:
+    """Truth values combined by `AND`, `OR` or `NOT`."""
+    unknown = [x for x in operands if not _constant(x)]
+    if operation is Operation.NOT:
+        return apply(operation, *operands)
+    decisive = operation is Operation.OR
+    if any(bool(x) is decisive for x in operands if _constant(x)):
+        return decisive
+    if len(unknown) == 2 and unknown[0] is not unknown[1]:
+        return apply(operation, *unknown)
+    return unknown[0] if unknown else not decisive
+
+
+def apply(operation: Operation, *operands: Operand) -> Operand:
+    """Any other operation; a sign moves out of an odd function and vanishes in an even one."""
+    graph = next((x.graph for x in operands if not _constant(x)), None)
+    if graph is None:
+        return on_constants(operation, *operands)
+    if operation in ODD or operation in EVEN:
+        negated, x = _magnitude(operands[0])
+        result = graph.node(operation, x)
+        return negate(result) if negated and operation in ODD else result
+    if operation in COMMUTATIVE:
+        operands = tuple(sorted(operands, key=lambda x: -1 if _constant(x) else x.index))
+        if operation in (Operation.MAXIMUM, Operation.MINIMUM) and operands[0] is operands[1]:
+            return operands[0]
+    return graph.node(operation, *operands)
+
+
+def as_number(x: Operand) -> Operand:
+    """A truth value as 1 or 0; numbers stay."""
+    if _constant(x):
+        return float(x)
+    return select(x, 1.0, 0.0) if x.operation in TRUTH_VALUED else x
+
+
+def as_truth(x: Operand) -> Operand:
+    """A number as the truth value `x != 0`; truth values stay."""
+    if _constant(x):
+        return bool(x)
+    return x if x.operation in TRUTH_VALUED else apply(Operation.NOT_EQUAL, x, 0.0)
+
+
+def is_zero(x: Operand) -> bool:
+    """Whether x is the constant 0."""
+    return _constant(x) and not math.isnan(x) and x == 0

@@ -1,0 +1,117 @@
+"""Sine and cosine together, by Cody-Waite reduction and polynomials.
+
+XLA's own pair costs seven times as much in float64 on a CPU. The result is within 1.5e-16
+(float64) of the truth for |x| up to 3e9, or 1e-7 (float32) for |x| up to 1e5;
+beyond that it is NaN rather than wrong, as it is for x infinite or NaN.
+"""
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..types import Array
+
+_HALF_PI = Fraction("1.57079632679489661923132169163975144209858469968755291")
+
+
+def _pieces(bits: int, count: int) -> tuple[float, ...]:
+    """pi/2 as a sum of numbers of so few bits that a whole multiple of each is exact."""
+    rest, pieces = _HALF_PI, []
+    for _ in range(count):
+        scale = Fraction(2) ** bits
+        while rest * scale >= 2**bits:
+            scale /= 2
+        while rest * scale * 2 < 2**bits:
+            scale *= 2
+        piece = Fraction(int(rest * scale)) / scale
+        pieces.append(float(piece))
+        rest -= piece
+    return (*pieces, float(rest))
+
+
+class _Precision:
+    """What differs between float64 and float32."""
+
+    def __init__(self, bits, pieces, whole_bits, sine, cosine):
+        self.pieces = _pieces(bits, pieces)
+        self.limit = float(2**whole_bits)
+        self.sine = sine
+        self.cosine = cosine
+
+
+# Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded), lowest power
+# of z = r^2 first: sin r = r + r z P(z) with relative error 4e-18, and
+# cos r = 1 - z/2 + z^2 Q(z) with relative error 6e-20; in float32 4e-9 and 1e-10.
+_DOUBLE = _Precision(
+    22,
+    3,
+    31,
+    (
+        -0.1666666666666663,
+        0.008333333333322106,
+        -0.00019841269829579968,
+        2.755731361797405e-06,
+        -2.5050747214237465e-08,
+        1.5896197525373424e-10,
+    ),
+    (
+        0.041666666666666595,
+        -0.001388888888887304,
+        2.4801587288841394e-05,
+        -2.7557314176239385e-07,
+        2.087570041607911e-09,
+        -1.1358513953776357e-11,
+    ),
+)
+_SINGLE = _Precision(
+    8,
+    3,
+    16,
+    (-0.16666654602275977, 0.008332160290263908, -0.00019515217828349702),
+    (0.04166664567016134, -0.001388731561689898, 2.4433082734975143e-05),
+)
+
+
+def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
+    total = jnp.full_like(z, coefficients[-1])
+    for c in coefficients[-2::-1]:
+        total = total * z + c
+    return total
+
+
+@jax.custom_jvp
+def sine_cosine(x: Array) -> tuple[Array, Array]:
+    """Computes (sin x, cos x) of an array in float64 or float32.
+
+    Args:
+        x: Angles [rad]; |x| up to 3e9 in float64, up to 1e5 in float32, NaN beyond.
+    """
+    precision = _DOUBLE if x.dtype == np.float64 else _SINGLE
+    turns = jnp.round(x * float(1 / _HALF_PI))
+    r = x
+    for piece in precision.pieces:
+        r = r - turns * piece
+    z = r * r
+    s = r + r * (z * _horner(precision.sine, z))
+    c = 1 - (0.5 * z - z * z * _horner(precision.cosine, z))
+    quarter = turns - 4 * jnp.floor(turns * 0.25)
+    swapped = (quarter == 1) | (quarter == 3)
+    sine, cosine = jnp.where(swapped, c, s), jnp.where(swapped, s, c)
+    sine = jnp.where(quarter >= 2, -sine, sine)
+    cosine = jnp.where((quarter == 1) | (quarter == 2), -cosine, cosine)
+    known = jnp.abs(turns) <= precision.limit
+    return jnp.where(known, sine, jnp.nan), jnp.where(known, cosine, jnp.nan)
+
+
+@sine_cosine.defjvp
+def _sine_cosine_jvp(primals, tangents):
+    s, c = sine_cosine(*primals)
+    (dx,) = tangents
+    return (s, c), (c * dx, -s * dx)
+
+
+def library_sine_cosine(x: Array) -> tuple[Array, Array]:
+    """Computes (sin x, cos x) by JAX's own functions, for any x."""
+    return jnp.sin(x), jnp.cos(x)
