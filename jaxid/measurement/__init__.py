@@ -1,0 +1,1 @@
+"""Logs, recordings, filters, observations (Eqs. 19, 25, 26)."""

@@ -1,6 +1,7 @@
 """From time stamps as loggers write them to a uniform grid with gaps."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -52,7 +53,7 @@ class Clock:
     def segments(self) -> tuple[tuple[int, int], ...]:
         """Ranges of the grid without gaps."""
         ends = np.cumsum((0, *self.counts()))
-        return tuple((int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True))
+        return tuple((int(a), int(b)) for a, b in itertools.pairwise(ends))
 
     def resample(self, x: np.ndarray) -> np.ndarray:
         """The rows of a log on the grid: as they are, or by a cubic spline."""
@@ -110,9 +111,12 @@ def clock(
     # A gap is a pause that neither the limit nor the usual jitter explains.
     gaps = np.flatnonzero(steps > max(largest_gap * typical, typical + 8.0 * spread))
     regular = steps[steps < 1.5 * typical + 8.0 * spread]
-    sample_time = float(f"{regular.mean():.9g}")
+    sample_time = float(regular.mean())
+    # Stamps are rounded numbers: a round sample time that fits them as well is the true one.
+    if abs(float(f"{sample_time:.6g}") - sample_time) * len(t) < 0.01 * sample_time:
+        sample_time = float(f"{sample_time:.6g}")
     edges = [0, *(int(g) + 1 for g in gaps), len(t)]
-    ranges = [(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b - a >= 4]
+    ranges = [(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
     lonely = len(t) - sum(b - a for a, b in ranges)
     if not ranges:
         raise ValueError(
@@ -130,14 +134,10 @@ def clock(
         notes[-1] += f"(sample time {sample_time:.6g} s), split the log into segments"
     if lonely:
         notes.append(f"{lonely} rows between gaps are too few for a segment and were left out")
-    uneven = max(
-        np.abs(t[a:b] - t[a] - sample_time * np.arange(b - a)).max() for a, b in ranges
-    )
+    uneven = max(np.abs(t[a:b] - t[a] - sample_time * np.arange(b - a)).max() for a, b in ranges)
     exact = bool(uneven <= JITTER * sample_time)
     if not exact:
-        off = [
-            steps[a : b - 1] - sample_time for a, b in ranges
-        ]
+        off = [steps[a : b - 1] - sample_time for a, b in ranges]
         rms = float(np.sqrt(np.mean(np.concatenate(off) ** 2)))
         notes.append(
             f"time stamps jitter by {100 * rms / sample_time:.1f} % of the sample time (RMS): "

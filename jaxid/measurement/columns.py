@@ -148,4 +148,3 @@ def _factors(name: str, given: Unit | tuple[Unit, ...], joints: int) -> np.ndarr
     if isinstance(given, Unit):
         return np.full(joints, given.factor)
     return per_joint(name, tuple(one.factor for one in given), joints, 1.0)
-
