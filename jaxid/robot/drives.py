@@ -9,7 +9,7 @@ from jaxid.types import AnyArray, Float
 
 
 class Drives(eqx.Module):
-    r"""The motors of a robot: $q_M = A (q - q_0)$ and, since power is the same, $Q = A^T M$ (Eq. 19).
+    r"""The motors of a robot: $q_M = A (q - q_0)$ and, by equal power, $Q = A^T M$ (Eq. 19).
 
     For independent axes $A$ is the diagonal matrix of gear ratios; a wrist whose motors turn more
     than one axis has entries beside the diagonal.
@@ -106,7 +106,7 @@ class Drives(eqx.Module):
 
     @property
     def max_forces(self) -> Float[AnyArray, " joints"]:
-        r"""Largest generalized forces that the motors can make, $|A|^T M_{max}$ [N m or N] (Eq. 30)."""
+        r"""Largest generalized forces of the motors, $|A|^T M_{max}$ [N m or N] (Eq. 30)."""
         weights = np.abs(self.reduction)
         used = np.where(weights > 0, self.max_torques[:, None], 0.0)
         return (weights * used).sum(axis=0)

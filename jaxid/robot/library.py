@@ -130,7 +130,7 @@ def ur10() -> Robot:
             velocity=[2.16, 2.16, 3.15, 3.2, 3.2, 3.2],
             force=[330.0, 330.0, 150.0, 54.0, 54.0, 54.0],
         ),
-        source="unisa-acg inverse-dynamics-solver (geometry); ROS-Industrial universal_robot (limits)",
+        source="unisa-acg inverse-dynamics-solver; ROS-Industrial universal_robot (limits)",
         notes=("accelerations are not published: they are taken as unlimited.",),
     )
 

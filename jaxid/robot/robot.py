@@ -22,7 +22,7 @@ class Tool(eqx.Module):
         body: Index of the body that carries it (0 is the first).
         mass: Mass [kg].
         centre_of_mass: In the frame of the body [m].
-        inertia: Inertia tensor about its centre of mass, along the axes of the body's frame [kg m²].
+        inertia: Inertia tensor about its centre of mass, along the body's axes [kg m²].
     """
 
     body: int = eqx.field(static=True)
@@ -52,8 +52,8 @@ class Tool(eqx.Module):
         if principal[0] < -slack or principal[2] > principal[0] + principal[1] + slack:
             raise ValueError(
                 "`inertia` of the tool belongs to no body: its principal moments are "
-                f"{principal[0]:.3g}, {principal[1]:.3g}, {principal[2]:.3g} kg m², but none may be "
-                "negative or larger than the sum of the others; is it about the centre of mass?"
+                f"{principal[0]:.3g}, {principal[1]:.3g}, {principal[2]:.3g} kg m², but none may "
+                "be negative or larger than the sum of the others; is it about the centre of mass?"
             )
         return cls(body, m, r, J)
 
@@ -226,7 +226,7 @@ class Robot(eqx.Module):
 
     @property
     def max_forces(self) -> Float[AnyArray, " joints"]:
-        """Largest generalized force of every joint [N m or N]: of the joint, else of its motors (Eq. 30).
+        """Largest force of every joint [N m or N]: its own, else that of its motors (Eq. 30).
 
         Raises:
             ValueError: If neither is known for some joint.
@@ -235,8 +235,8 @@ class Robot(eqx.Module):
         if not np.isfinite(forces).all():
             j = int(np.flatnonzero(~np.isfinite(forces))[0])
             raise ValueError(
-                f"the largest force of joint `{self.joint_names[j]}` of `{self.name}` is not known: "
-                "give `limits.force` (joint side) or `drives.max_torques` (motor side)."
+                f"the largest force of joint `{self.joint_names[j]}` of `{self.name}` is not known:"
+                " give `limits.force` (joint side) or `drives.max_torques` (motor side)."
             )
         return forces
 
@@ -259,9 +259,7 @@ class Robot(eqx.Module):
         R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
         r = np.array(position, dtype=np.float64)
         if R.shape != (3, 3):
-            raise ValueError(
-                f"the base's rotation must be a 3 x 3 matrix, but has shape {R.shape}."
-            )
+            raise ValueError(f"the base's rotation must be a 3 x 3 matrix, not of shape {R.shape}.")
         _require_rotation("the base's rotation", R)
         if r.shape != (3,) or not np.isfinite(r).all():
             raise ValueError("the base's position must hold three finite numbers [m].")

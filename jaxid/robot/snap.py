@@ -7,7 +7,7 @@ parameter too many, at a condition number of 1e7. What is snapped stands in the 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.types import AnyArray, Float
+from jaxid.types import Float
 
 SNAP_TOLERANCE = 1e-4
 _QUARTER = np.pi / 2
@@ -29,14 +29,14 @@ def check_tolerance(tolerance: float) -> float:
     return float(tolerance)
 
 
-def snap_angles(angles: ArrayLike, tolerance: float) -> Float[AnyArray, "..."]:
+def snap_angles(angles: ArrayLike, tolerance: float) -> Float[np.ndarray, "..."]:
     """Moves angles [rad] within `tolerance` of a multiple of 90 degrees onto it."""
     angles = np.asarray(angles, dtype=np.float64)
     nearest = np.round(angles / _QUARTER) * _QUARTER
     return np.where(np.abs(angles - nearest) <= max(tolerance, _ROUNDING), nearest, angles)
 
 
-def snap_axis(axis: ArrayLike, tolerance: float) -> Float[AnyArray, "3"]:
+def snap_axis(axis: ArrayLike, tolerance: float) -> Float[np.ndarray, "3"]:
     """Turns a direction within `tolerance` [rad] of a coordinate axis onto it; unit length."""
     axis = np.asarray(axis, dtype=np.float64)
     axis = axis / np.linalg.norm(axis)
@@ -46,7 +46,7 @@ def snap_axis(axis: ArrayLike, tolerance: float) -> Float[AnyArray, "3"]:
     return clean(axis)
 
 
-def snap_rotation(rotation: ArrayLike, tolerance: float) -> Float[AnyArray, "3 3"]:
+def snap_rotation(rotation: ArrayLike, tolerance: float) -> Float[np.ndarray, "3 3"]:
     """Makes a rotation exact if all its entries are within `tolerance` of 0, 1 or -1."""
     rotation = np.asarray(rotation, dtype=np.float64)
     signs = np.round(rotation)
@@ -55,20 +55,20 @@ def snap_rotation(rotation: ArrayLike, tolerance: float) -> Float[AnyArray, "3 3
     return clean(rotation)
 
 
-def clean(values: Float[AnyArray, "..."]) -> Float[AnyArray, "..."]:
+def clean(values: Float[np.ndarray, "..."]) -> Float[AnyArray, "..."]:
     """Rounds to 0, 1 or -1 what differs from it by rounding alone, like 6e-17 for cos(pi/2)."""
     nearest = np.clip(np.round(values), -1.0, 1.0)
     return np.where(np.abs(values - nearest) <= _ROUNDING, nearest, values) + 0.0
 
 
-def axis_rotation(axis: ArrayLike, angle: float) -> Float[AnyArray, "3 3"]:
+def axis_rotation(axis: ArrayLike, angle: float) -> Float[np.ndarray, "3 3"]:
     """Rotation about a unit vector by an angle [rad]; exact for quarter turns about x, y, z."""
     x, y, z = np.asarray(axis, dtype=np.float64)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return clean(np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K)
 
 
-def rpy_rotation(rpy: ArrayLike) -> Float[AnyArray, "3 3"]:
+def rpy_rotation(rpy: ArrayLike) -> Float[np.ndarray, "3 3"]:
     """Rotation of URDF's roll, pitch and yaw [rad]: about the fixed x, then y, then z axis."""
     roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
     return axis_rotation(_Z, yaw) @ axis_rotation(_Y, pitch) @ axis_rotation(_X, roll)
@@ -86,7 +86,7 @@ def angle_notes(
 
 
 def array_notes(
-    joint: str, what: str, before: Float[AnyArray, "..."], after: Float[AnyArray, "..."]
+    joint: str, what: str, before: Float[np.ndarray, "..."], after: Float[AnyArray, "..."]
 ) -> tuple[str, ...]:
     """One sentence if snapping changed an axis or an attitude."""
     change = float(np.abs(np.asarray(before) - after).max())

@@ -1,9 +1,10 @@
 """A URDF file as a checked tree of links and joints; what cannot be trusted stops here."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from lxml import etree
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from urdf_parser_py.urdf import URDF
 
 _LARGEST_FILE = 64 * 2**20
@@ -48,13 +49,13 @@ class UrdfTree:
         except Exception as error:  # the library raises bare exceptions, among others
             reason = " ".join(str(error).split())
             raise ValueError(f"`{self.path}` is not a URDF that can be read: {reason}.") from error
-        self.children: dict[str, list] = {link.name: [] for link in self.urdf.links}
-        self.joint_above: dict[str, object] = {}
+        self.children: dict[str, list[Any]] = {link.name: [] for link in self.urdf.links}
+        self.joint_above: dict[str, Any] = {}
         for joint in self.urdf.joints:
             self._add(joint)
         self.root = self._find_root()
 
-    def _add(self, joint) -> None:
+    def _add(self, joint: Any) -> None:
         for end in (joint.parent, joint.child):
             if end not in self.children:
                 raise self.error(joint, f"connects link `{end}`, which the file does not define")
@@ -89,7 +90,7 @@ class UrdfTree:
             raise ValueError(f"`{self.path}` has no links.")
         return roots[0]
 
-    def error(self, joint, complaint: str) -> ValueError:
+    def error(self, joint: Any, complaint: str) -> ValueError:
         """A complaint about a joint, as one sentence that names the file and the joint."""
         return ValueError(f"`{self.path}`: joint `{joint.name}` {complaint}.")
 
@@ -106,7 +107,7 @@ class UrdfTree:
             )
         return link
 
-    def chain(self, base: str, tip: str) -> list:
+    def chain(self, base: str, tip: str) -> list[Any]:
         """The joints from one link to another, in this order.
 
         Raises:
@@ -123,7 +124,9 @@ class UrdfTree:
             link = joint.parent
         return joints[::-1]
 
-    def numbers(self, joint, what: str, values, default: tuple[float, ...]) -> np.ndarray:
+    def numbers(
+        self, joint: Any, what: str, values: list[float] | None, default: tuple[float, ...]
+    ) -> np.ndarray:
         """Numbers of a joint as an array.
 
         Raises:
