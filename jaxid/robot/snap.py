@@ -55,7 +55,7 @@ def snap_rotation(rotation: ArrayLike, tolerance: float) -> Float[np.ndarray, "3
     return clean(rotation)
 
 
-def clean(values: Float[np.ndarray, "..."]) -> Float[AnyArray, "..."]:
+def clean(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Rounds to 0, 1 or -1 what differs from it by rounding alone, like 6e-17 for cos(pi/2)."""
     nearest = np.clip(np.round(values), -1.0, 1.0)
     return np.where(np.abs(values - nearest) <= _ROUNDING, nearest, values) + 0.0
@@ -86,7 +86,7 @@ def angle_notes(
 
 
 def array_notes(
-    joint: str, what: str, before: Float[np.ndarray, "..."], after: Float[AnyArray, "..."]
+    joint: str, what: str, before: Float[np.ndarray, "..."], after: Float[np.ndarray, "..."]
 ) -> tuple[str, ...]:
     """One sentence if snapping changed an axis or an attitude."""
     change = float(np.abs(np.asarray(before) - after).max())
