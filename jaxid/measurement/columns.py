@@ -13,20 +13,28 @@ Selection = str | int | tuple[str | int, ...]
 """A name, a pattern with `{}` for the joint's number, a position from 0, or several of them."""
 
 
-def _selection(value: Selection | range | list | None) -> Selection | None:
-    return value if isinstance(value, str | int | None) else tuple(value)
+def _selection(value: Selection | range | list) -> Selection:
+    return value if isinstance(value, str | int) else tuple(value)
 
 
-def _numbers(value: Iterable[float] | None) -> tuple[float, ...] | None:
+def _optional_selection(value: Selection | range | list | None) -> Selection | None:
+    return None if value is None else _selection(value)
+
+
+def _numbers(value: Iterable[float | int] | np.ndarray | None) -> tuple[float, ...] | None:
     return None if value is None else tuple(float(v) for v in value)
 
 
-def _number(value: float | None) -> float | None:
+def _number(value: float | int | None) -> float | None:
     return None if value is None else float(value)
 
 
-def _units(value: Unit | Iterable[Unit] | None) -> Unit | tuple[Unit, ...] | None:
-    return value if isinstance(value, Unit | None) else tuple(value)
+def _units(value: Unit | Iterable[Unit]) -> Unit | tuple[Unit, ...]:
+    return value if isinstance(value, Unit) else tuple(value)
+
+
+def _optional_units(value: Unit | Iterable[Unit] | None) -> Unit | tuple[Unit, ...] | None:
+    return None if value is None else _units(value)
 
 
 class Columns(eqx.Module):
@@ -60,7 +68,9 @@ class Columns(eqx.Module):
 
     angles: Selection = eqx.field(static=True, converter=_selection)
     forces: Selection = eqx.field(static=True, converter=_selection)
-    velocities: Selection | None = eqx.field(static=True, converter=_selection, default=None)
+    velocities: Selection | None = eqx.field(
+        static=True, converter=_optional_selection, default=None
+    )
     time: str | int | None = eqx.field(static=True, default=None)
     sample_time: float | None = eqx.field(static=True, converter=_number, default=None)
     time_unit: Unit = eqx.field(static=True, default=units.S)
@@ -68,7 +78,7 @@ class Columns(eqx.Module):
         static=True, converter=_units, default=units.RAD
     )
     velocity_unit: Unit | tuple[Unit, ...] | None = eqx.field(
-        static=True, converter=_units, default=None
+        static=True, converter=_optional_units, default=None
     )
     force_unit: Unit | tuple[Unit, ...] = eqx.field(static=True, converter=_units, default=units.NM)
     torque_constants: tuple[float, ...] | None = eqx.field(

@@ -100,7 +100,7 @@ class Decimation(AbstractDecimation):
         factor = self.factors[stage]
         if factor == 1:
             return LowPass((), math.inf)
-        sos = signal.cheby1(8, 0.05, 0.8 / factor, output="sos")
+        sos = np.asarray(signal.cheby1(8, 0.05, 0.8 / factor, output="sos"), np.float64)
         return LowPass(as_sections(sos), 0.4 / factor)
 
     def check(self, cutoff: float, sample_time: float) -> None:

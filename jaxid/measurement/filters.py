@@ -63,11 +63,11 @@ class AbstractFilter(eqx.Module):
         return self.low_pass(sample_time).memory()
 
 
-def _optional(value: float | None) -> float | None:
+def _optional(value: float | int | None) -> float | None:
     return None if value is None else float(value)
 
 
-def _positive(owner: str, **values: float | None) -> None:
+def _positive(owner: str, **values: float | int | None) -> None:
     for name, value in values.items():
         if value is not None and not value > 0:
             raise ValueError(f"`{name}` of `{owner}` must be positive, but is {value:g}.")

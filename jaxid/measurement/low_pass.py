@@ -89,7 +89,7 @@ def butterworth(cutoff: float, order: int, sample_time: float) -> LowPass:
         return LowPass((), math.inf)
     refuse_above_nyquist("cutoff", cutoff, sample_time)
     sos = signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
-    return LowPass(as_sections(sos), cutoff)
+    return LowPass(as_sections(np.asarray(sos, np.float64)), cutoff)
 
 
 def first_order(omega: float, sample_time: float) -> LowPass:

@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import io
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ class Table:
     """
 
     source: str
-    columns: dict[str, pl.Series | np.ndarray]
+    columns: Mapping[str, pl.Series | np.ndarray]
     first_line: int | None = None
     named: bool = True
 
@@ -109,10 +110,8 @@ class Table:
         name = self._name("time", selection)
         column = self.columns[name]
         if isinstance(column, pl.Series) and column.dtype.is_temporal():
-            ticks = column.cast(pl.Datetime("ns") if column.dtype != pl.Duration else column.dtype)
-            if column.dtype == pl.Duration:
-                ticks = column.cast(pl.Duration("ns"))
-            ticks = ticks.cast(pl.Int64)
+            fine = pl.Duration("ns") if column.dtype == pl.Duration else pl.Datetime("ns")
+            ticks = column.cast(fine).cast(pl.Int64)
             self._refuse_first(name, ticks.is_null().to_numpy(), ticks, "is empty")
             whole = ticks.to_numpy()
             return (whole - whole[0]) * 1e-9, True
@@ -131,6 +130,8 @@ class Table:
 
     def _numbers(self, name: str) -> np.ndarray:
         column = self.columns[name]
+        if len(column) == 0:
+            raise ValueError(f"column `{name}` of `{self.source}` has no rows: is the log cut?")
         if isinstance(column, pl.Series):
             if isinstance(column.dtype, pl.List | pl.Array):
                 return self._nested(name, column)
@@ -150,7 +151,7 @@ class Table:
                 )
             array = np.asarray(column, np.float64)
         array = np.array(array.reshape(len(array), -1), np.float64)
-        bad = ~np.isfinite(array).all(axis=1)
+        bad = np.asarray(np.logical_not(np.isfinite(array)).any(axis=1))
         self._refuse_first(name, bad, array.min(axis=1) + array.max(axis=1), "is not finite ({})")
         return array
 
@@ -158,10 +159,11 @@ class Table:
         lengths = column.list.len() if isinstance(column.dtype, pl.List) else column.arr.len()
         uneven = (lengths.fill_null(-1) != lengths[0]).to_numpy()
         self._refuse_first(name, uneven, lengths, "has {} numbers, not as many as the first row")
-        rows = np.array(column.to_list(), dtype=object)
-        empty = np.equal(rows, None).any(axis=tuple(range(1, rows.ndim)))
-        self._refuse_first(name, empty, rows, "has an empty cell")
-        return Table(self.source, {name: rows.astype(np.float64)})._numbers(name)
+        cells = column.explode().cast(pl.Float64, strict=False)
+        empty = np.asarray(cells.is_null().to_numpy().reshape(len(column), -1).any(axis=1))
+        self._refuse_first(name, empty, column, "has an empty cell")
+        rows = cells.to_numpy().reshape(len(column), -1)
+        return Table(self.source, {name: rows})._numbers(name)
 
     def _refuse_first(self, name: str, bad: np.ndarray, column: Any, complaint: str) -> None:
         rows = np.flatnonzero(bad)
@@ -215,6 +217,9 @@ def _read_text(path: Path) -> Table:
     if separator == " ":
         raw = b"\n".join(b" ".join(row.split()) for row in raw.splitlines())
         line = " ".join(line.split())
+    elif b" " in raw:
+        mark = separator.encode()
+        raw = re.sub(rb" *" + mark + rb" *", mark, raw)
     cells = [cell.strip().strip('"') for cell in line.split(separator)]
     named = not all(_is_number(cell) for cell in cells if cell) or not any(cells)
     names = cells if named else [str(i) for i in range(len(cells))]

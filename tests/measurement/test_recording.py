@@ -1,0 +1,134 @@
+"""Time stamps as loggers write them: twins, gaps, jitter; and parts of recordings."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxid.measurement.recording import Recording
+
+
+def recording(time, **kwargs):
+    t = np.asarray(time)
+    x = np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1)
+    return Recording.of(x, 2 * x, time=t, **kwargs)
+
+
+def test_uniform_stamps_stay_as_they_are():
+    t = np.round(0.01 * np.arange(100), 4) + 5.0
+    r = recording(t)
+    assert r.sample_time == 0.01
+    np.testing.assert_allclose(r.time, 0.01 * np.arange(100), atol=1e-12)
+    np.testing.assert_array_equal(r.angles[:, 0], np.sin(3 * t))
+    assert r.notes == ("time counts from the first row, which was stamped 5 s",)
+
+
+def test_repeated_stamps_are_removed_and_counted():
+    t = np.insert(0.01 * np.arange(100), [10, 50, 50], [0.09, 0.49, 0.49])
+    r = recording(t)
+    assert r.samples == 100
+    np.testing.assert_allclose(r.angles[:, 0], np.sin(0.03 * np.arange(100)), atol=1e-12)
+    assert "3 of 103 rows repeat the time stamp" in r.notes[0]
+
+
+def test_backward_stamps_are_refused_with_their_row():
+    t = 0.01 * np.arange(100)
+    t[40:] -= 0.2
+    with pytest.raises(ValueError, match=r"backwards from 0.39 s to 0.2 s at row 41: sort"):
+        recording(t)
+    with pytest.raises(ValueError, match="stands still"):
+        recording(np.zeros(20))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    gaps=st.lists(st.integers(20, 480), min_size=1, max_size=4, unique=True),
+    width=st.floats(2.0, 1000.0),
+    noise=st.floats(0.0, 0.03),
+)
+def test_gaps_split(gaps, width, noise):
+    gaps = sorted({g for g in gaps if all(g - o >= 10 or g <= o for o in gaps)})
+    rng = np.random.default_rng(len(gaps))
+    steps = np.full(499, 0.002)
+    steps[np.array(gaps) - 1] *= width
+    t = np.concatenate([[0], np.cumsum(steps)]) + 0.002 * noise * rng.uniform(-0.5, 0.5, 500)
+    r = recording(t - t[0])
+    assert r.segments == tuple(zip([0, *gaps], [*gaps, 500], strict=True))
+    assert r.sample_time == pytest.approx(0.002, rel=1e-2)
+    assert f"{len(gaps)} gap" in r.notes[0]
+    for a, b in r.segments:
+        np.testing.assert_allclose(np.diff(r.time[a:b]), r.sample_time, rtol=1e-9)
+
+
+def test_short_gaps_are_bridged_on_demand():
+    t = np.delete(0.01 * np.arange(200), [50, 120, 121])
+    assert recording(t).segments == ((0, 50), (50, 119), (119, 197))
+    r = recording(t, largest_gap=3.5)
+    assert r.segments == ((0, 200),)
+    np.testing.assert_allclose(r.angles[:, 0], np.sin(3 * r.time), atol=1e-6)
+
+
+def test_lonely_rows_between_gaps_are_left_out():
+    t = np.concatenate([0.01 * np.arange(50), [1.0, 1.01], 2.0 + 0.01 * np.arange(50)])
+    r = recording(t)
+    assert r.segments == ((0, 50), (50, 100))
+    np.testing.assert_allclose(r.angles[50:, 0], np.sin(3 * t[52:]))
+    assert "2 rows between gaps" in r.notes[1]
+
+
+@pytest.mark.parametrize("jitter", [0.1, 0.2, 0.4])
+def test_jitter_is_undone_by_interpolation(jitter):
+    rng = np.random.default_rng(3)
+    t = 0.01 * np.arange(1000)
+    t[1:-1] += 0.01 * jitter * rng.uniform(-1, 1, 998)
+    r = recording(t)
+    assert r.segments == ((0, 1000),)
+    np.testing.assert_allclose(np.diff(r.time), r.sample_time, rtol=1e-9)
+    assert "jitter" in r.notes[-1]
+    assert "cubic splines" in r.notes[-1]
+    np.testing.assert_allclose(r.angles[:, 0], np.sin(3 * r.time), atol=1e-6)
+    assert np.abs(np.sin(0.03 * np.arange(1000)) - np.sin(3 * t)).max() > 1e-3
+
+
+def test_shapes_and_values_are_checked():
+    x = np.zeros((20, 2))
+    with pytest.raises(ValueError, match=r"`forces` of `recording` .* shape \(20, 3\)"):
+        Recording.of(x, np.zeros((20, 3)), sample_time=0.1)
+    with pytest.raises(ValueError, match="either `time` or `sample_time`"):
+        Recording.of(x, x)
+    with pytest.raises(ValueError, match=r"`sample_time` must be positive"):
+        Recording.of(x, x, sample_time=0.0)
+    with pytest.raises(ValueError, match=r"`time` .* shape \(19,\)"):
+        Recording.of(x, x, time=np.arange(19.0))
+    bad = x.copy()
+    bad[3, 1] = np.inf
+    with pytest.raises(ValueError, match="`velocities` .* joint 2 at row 4"):
+        Recording.of(x, x, velocities=bad, sample_time=0.1)
+
+
+def test_crop_and_split():
+    r = recording(np.concatenate([0.01 * np.arange(100), 3 + 0.01 * np.arange(100)]))
+    part = r.crop(0.5, 3.5)
+    assert part.segments == ((0, 50), (50, 100))
+    assert part.time[0] == pytest.approx(0.5)
+    assert part.time[-1] == pytest.approx(3.49)
+    assert r.crop(stop=0.5).segments == ((0, 50),)
+    with pytest.raises(ValueError, match="has 5 samples from 0.5 s to 0.55 s"):
+        r.crop(0.5, 0.55)
+    first, rest = r.split(0.6)
+    assert (first.samples, rest.samples) == (120, 80)
+    assert first.segments == ((0, 100), (100, 120))
+    assert rest.segments == ((0, 80),)
+    np.testing.assert_array_equal(np.concatenate([first.angles, rest.angles]), r.angles)
+    with pytest.raises(ValueError, match="`fraction`"):
+        r.split(0.01)
+
+
+def test_is_a_pytree():
+    r = recording(0.01 * np.arange(100))
+    doubled = jax.tree.map(lambda x: 2 * x, r)
+    np.testing.assert_array_equal(doubled.forces, 2 * r.forces)
+    assert eqx.tree_equal(jax.tree.map(lambda x: x / 2, doubled), r)
+    assert hash(jax.tree.structure(r)) is not None
