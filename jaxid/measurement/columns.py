@@ -127,25 +127,25 @@ class Columns(eqx.Module):
 
     def angle_scale(self, joints: int) -> np.ndarray:
         """Factors from the numbers in the log to angles [rad or m]."""
-        signs = per_joint("angle_signs", self.angle_signs, joints, 1.0)
+        signs = _per_joint("angle_signs", self.angle_signs, joints, 1.0)
         return signs * _factors("angle_unit", self.angle_unit, joints)
 
     def angle_shift(self, joints: int) -> np.ndarray:
         """What is added to the angles [rad or m]."""
-        return per_joint("angle_offsets", self.angle_offsets, joints, 0.0)
+        return _per_joint("angle_offsets", self.angle_offsets, joints, 0.0)
 
     def velocity_scale(self, joints: int) -> np.ndarray:
         """Factors from the numbers in the log to velocities [rad/s or m/s]."""
         if self.velocity_unit is None:
             return self.angle_scale(joints)
-        signs = per_joint("angle_signs", self.angle_signs, joints, 1.0)
+        signs = _per_joint("angle_signs", self.angle_signs, joints, 1.0)
         return signs * _factors("velocity_unit", self.velocity_unit, joints)
 
     def force_scale(self, joints: int) -> np.ndarray:
         """Factors from the numbers in the log to forces [N m or N]."""
         scale = _factors("force_unit", self.force_unit, joints)
-        scale = scale * per_joint("force_signs", self.force_signs, joints, 1.0)
-        return scale * per_joint("torque_constants", self.torque_constants, joints, 1.0)
+        scale = scale * _per_joint("force_signs", self.force_signs, joints, 1.0)
+        return scale * _per_joint("torque_constants", self.torque_constants, joints, 1.0)
 
 
 def _each(given: Unit | tuple[Unit, ...] | None) -> tuple[Unit, ...]:
@@ -157,4 +157,10 @@ def _each(given: Unit | tuple[Unit, ...] | None) -> tuple[Unit, ...]:
 def _factors(name: str, given: Unit | tuple[Unit, ...], joints: int) -> np.ndarray:
     if isinstance(given, Unit):
         return np.full(joints, given.factor)
-    return per_joint(name, tuple(one.factor for one in given), joints, 1.0)
+    return _per_joint(name, tuple(one.factor for one in given), joints, 1.0)
+
+
+def _per_joint(
+    name: str, value: tuple[float, ...] | None, joints: int, default: float
+) -> np.ndarray:
+    return per_joint(name, None if value is None else np.array(value), joints, default)

@@ -173,7 +173,7 @@ def observe(
     robot: Robot,
     filter: AbstractFilter,
     decimation: AbstractDecimation | None = None,
-    slow: ArrayLike | None = None,
+    slow: ArrayLike | tuple[float | int, ...] | None = None,
     name: str | None = None,
 ) -> Observations:
     """Prepares a recording for estimation: joint side, derivatives, rows and their mask.
@@ -200,7 +200,7 @@ def observe(
     decimation = Subsample(1) if decimation is None else decimation
     dt = recording.sample_time
     decimation.check(filter.low_pass(dt).cutoff, dt)
-    speeds = per_joint("slow", slow, n, 0.0)
+    speeds = per_joint("slow", None if slow is None else np.asarray(slow, np.float64), n, 0.0)
     edge = filter.edge(dt)
     fewest = 2 * edge + (FEWEST_ROWS - 1) * decimation.factor + 1
     used = [(a, b) for a, b in recording.segments if b - a >= max(fewest, 5)]

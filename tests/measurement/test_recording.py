@@ -104,7 +104,7 @@ def test_shapes_and_values_are_checked():
         Recording.of(x, x, time=np.arange(19.0))
     bad = x.copy()
     bad[3, 1] = np.inf
-    with pytest.raises(ValueError, match="`velocities` .* joint 2 at row 4"):
+    with pytest.raises(ValueError, match=r"`velocities` .* joint 2 at row 4"):
         Recording.of(x, x, velocities=bad, sample_time=0.1)
 
 
@@ -115,7 +115,7 @@ def test_crop_and_split():
     assert part.time[0] == pytest.approx(0.5)
     assert part.time[-1] == pytest.approx(3.49)
     assert r.crop(stop=0.5).segments == ((0, 50),)
-    with pytest.raises(ValueError, match="has 5 samples from 0.5 s to 0.55 s"):
+    with pytest.raises(ValueError, match=r"has 5 samples from 0.5 s to 0.55 s"):
         r.crop(0.5, 0.55)
     first, rest = r.split(0.6)
     assert (first.samples, rest.samples) == (120, 80)

@@ -1,0 +1,255 @@
+"""Filters: the laws that every member obeys, and each against its formula or scipy."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import signal
+
+from jaxid.measurement.decimation import Decimation, Subsample
+from jaxid.measurement.filters import PaperFilter, PeriodicFourier, ZeroPhaseButterworth
+from jaxid.measurement.low_pass import butterworth
+
+DT = 0.001
+OMEGA = 0.8
+PERIOD = 2 * np.pi / OMEGA
+FILTERS = [
+    ZeroPhaseButterworth(15),
+    ZeroPhaseButterworth(100, force_cutoff=20.0, margin=0.02),
+    ZeroPhaseButterworth(30, order=3, force_cutoff=np.inf),
+    PaperFilter(),
+    PeriodicFourier(PERIOD, 5),
+]
+every = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
+
+
+def fourier(t, seed=1, joints=3, harmonics=5):
+    """A Fourier motion and its exact derivatives, written without the package (Eq. 34)."""
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(-0.4, 0.4, (2, joints, harmonics))
+    wl = OMEGA * np.arange(1, harmonics + 1)
+    s, c = np.sin(t[:, None] * wl), np.cos(t[:, None] * wl)
+    q = (s @ (a / wl).T) - c @ (b / wl).T + rng.uniform(-1, 1, joints)
+    return q, c @ a.T + s @ b.T, -s @ (a * wl).T + c @ (b * wl).T
+
+
+@every
+@given(seed=st.integers(0, 1000), alpha=st.floats(-1e3, 1e3))
+@settings(max_examples=10, deadline=None)
+def test_smoothing_is_linear_and_acts_on_each_column_alone(filter, seed, alpha):
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(2, 600, 2, 3))
+    out = filter.smooth(x + alpha * y, DT)
+    apart = filter.smooth(x, DT) + alpha * filter.smooth(y, DT)
+    np.testing.assert_allclose(out, apart, atol=1e-12 * (1 + abs(alpha)))
+    np.testing.assert_allclose(
+        filter.smooth(x, DT)[:, 1, 2], filter.smooth(x[:, 1, 2], DT), atol=1e-13
+    )
+
+
+@every
+def test_constants_pass_unchanged_and_ramps_without_phase(filter):
+    t = DT * np.arange(4000)
+    np.testing.assert_allclose(filter.smooth(np.full((4000, 1), 3.7), DT), 3.7, rtol=1e-10)
+    edge = max(filter.edge(DT), 1)
+    inner = slice(edge, -edge)
+    # What is left of the start after the edge is a part of the step that a ramp's end makes.
+    np.testing.assert_allclose(filter.smooth(5 * t, DT)[inner], 5 * t[inner], atol=1e-2)
+
+
+@every
+@pytest.mark.parametrize("frequency", [0.5, 3.0, 12.0, 40.0])
+def test_sinusoids_pass_with_the_gain_of_the_formula_and_without_phase(filter, frequency):
+    low = filter.low_pass(DT)
+    n, k = 20000, 2 * np.pi * frequency
+    t = DT * np.arange(n)
+    gain = low.gain(np.array([frequency]), DT)[0]
+    out = filter.smooth(np.stack([np.sin(k * t), np.cos(k * t)], 1), DT)
+    middle = slice(8000, 12000)
+    np.testing.assert_allclose(out[middle, 0], gain * np.sin(k * t[middle]), atol=1e-9)
+    np.testing.assert_allclose(out[middle, 1], gain * np.cos(k * t[middle]), atol=1e-9)
+
+
+def test_gains_are_the_formulas():
+    f = np.array([0.1, 3.0, 15.0, 40.0])
+    warped = np.tan(np.pi * f * DT) / np.tan(np.pi * 15 * DT)
+    np.testing.assert_allclose(
+        ZeroPhaseButterworth(15).low_pass(DT).gain(f, DT), 1 / (1 + warped**8), rtol=1e-9
+    )
+    warped = 2 / DT * np.tan(np.pi * f * DT) / 100
+    np.testing.assert_allclose(
+        PaperFilter().low_pass(DT).gain(f, DT), 1 / (1 + warped**2), rtol=1e-12
+    )
+    np.testing.assert_array_equal(FILTERS[2].low_pass(DT).gain(f, DT), 1.0)
+
+
+def test_butterworth_is_scipys():
+    x = np.random.default_rng(0).normal(size=(500, 4))
+    sos = signal.butter(4, 15, output="sos", fs=1 / DT)
+    expected = signal.sosfiltfilt(sos, x, axis=0)
+    filter = ZeroPhaseButterworth(15)
+    np.testing.assert_allclose(filter.smooth(x, DT), expected, atol=1e-13)
+    np.testing.assert_allclose(filter.motion(x, None, DT).q, expected, atol=1e-13)
+    b, a = signal.butter(4, 15, fs=1 / DT)
+    np.testing.assert_allclose(filter.smooth(x, DT), signal.filtfilt(b, a, x, axis=0), atol=1e-6)
+
+
+@every
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-5, 1e-14])
+def test_memory_is_where_the_impulse_response_ends(filter, tolerance):
+    low = filter.low_pass(DT)
+    n = low.memory(tolerance)
+    assert low.memory() == filter.memory(DT)
+    impulse = np.zeros(4 * n + 401)
+    middle = len(impulse) // 2
+    impulse[middle] = 1.0
+    response = np.abs(low(impulse))
+    rounding = 1e-15 * response.max()
+    assert response[middle + n + 1 :].max() <= tolerance * response[middle] + rounding
+    if n and tolerance > 1e-10:
+        assert response[middle + n - 30 : middle + n + 1].max() > 0.1 * tolerance * response[middle]
+
+
+@every
+def test_motions_follow_the_desired_ones(filter):
+    """The comparison of Fig. 5, with a motion whose derivatives are known."""
+    t = DT * np.arange(round(2 * PERIOD / DT))
+    q, qd, qdd = fourier(t)
+    motion = filter.motion(q, None, DT)
+    edge = filter.edge(DT)
+    inner = slice(edge, -edge if edge else None)
+    for j in range(3):
+        for got, true in ((motion.q, q), (motion.qd, qd), (motion.qdd, qdd)):
+            assert np.corrcoef(got[inner, j], true[inner, j])[0, 1] > 0.999
+        assert np.polyfit(qdd[inner, j], motion.qdd[inner, j], 1)[0] == pytest.approx(1, abs=5e-3)
+
+
+def test_butterworth_derivatives_are_of_fourth_order():
+    """Difference stencils of second order would lose 6e-3 of a velocity here."""
+    dt, k = 0.008, 2 * np.pi * 4
+    t = dt * np.arange(1000)
+    q = np.sin(k * t)[:, None]
+    filter = ZeroPhaseButterworth(30)
+    gain = butterworth(30.0, 4, dt).gain(np.array([4.0]), dt)[0]
+    motion = filter.motion(q, None, dt)
+    inner = slice(100, -100)
+    bound = (k * dt) ** 4 / 30 * 1.05
+    assert np.abs(motion.qd[inner, 0] / k - gain * np.cos(k * t[inner])).max() < bound
+    assert np.abs(motion.qdd[inner, 0] / k**2 + gain * np.sin(k * t[inner])).max() < bound
+    measured = filter.motion(q, 2 * k * np.cos(k * t)[:, None], dt)
+    assert np.abs(measured.qd[inner, 0] / k - 2 * gain * np.cos(k * t[inner])).max() < 1e-9
+    assert np.abs(measured.qdd[inner, 0] / k**2 + 2 * gain * np.sin(k * t[inner])).max() < 2 * bound
+
+
+def test_paper_filter_velocity_lags_as_its_formula_says():
+    filter = PaperFilter(velocity=200.0)
+    k = 2 * np.pi * 5
+    t = DT * np.arange(4000)
+    qd = filter.motion(np.sin(k * t)[:, None], None, DT).qd[2000:, 0]
+    w = 2 / DT * math.tan(k * DT / 2)
+    lag, gain = math.atan(w / 200), w / math.hypot(1, w / 200)
+    np.testing.assert_allclose(qd, gain * np.cos(k * t[2000:] - lag), atol=1e-8 * k)
+    assert lag / k == pytest.approx(1 / 200, rel=0.02)
+
+
+def test_paper_filter_is_the_analogue_one_at_high_rates():
+    t = 1e-5 * np.arange(20000)
+    q = np.sin(30 * t) ** 3
+    qd = 90 * np.sin(30 * t) ** 2 * np.cos(30 * t)
+    expected = signal.lsim(([1.0], [1 / 1200, 1.0]), qd, t)[1]
+    got = PaperFilter().motion(q[:, None], None, 1e-5).qd[:, 0]
+    np.testing.assert_allclose(got, expected, atol=1e-4 * np.abs(qd).max())
+    assert np.abs(got - qd).max() > 1e-2 * np.abs(qd).max()
+
+
+def test_paper_filter_turns_the_sign_of_the_acceleration():
+    """Forward and backward, G(s) G(-s) gives minus the acceleration."""
+    t = DT * np.arange(16000)
+    q, _, qdd = fourier(t)
+    motion = PaperFilter().motion(q, None, DT)
+    inner = slice(200, -200)
+    for j in range(3):
+        assert np.corrcoef(motion.qdd[inner, j], qdd[inner, j])[0, 1] > 0.9999
+    k = 20.0
+    got = PaperFilter().motion(np.sin(k * t)[:, None], None, DT).qdd[4000:8000, 0]
+    w = 2 / DT * math.tan(k * DT / 2)
+    expected = -(w**2) / (1 + (w / 100) ** 2) * np.sin(k * t[4000:8000])
+    np.testing.assert_allclose(got, expected, atol=1e-8 * k**2)
+
+
+def test_paper_filter_refuses_slow_logs():
+    """1200 rad/s is beyond half of 100 Hz and even of 380 Hz."""
+    q = np.zeros((100, 1))
+    for use in (
+        lambda dt: PaperFilter().motion(q, None, dt),
+        lambda dt: PaperFilter().smooth(q, dt),
+        lambda dt: PaperFilter().edge(dt),
+    ):
+        with pytest.raises(ValueError, match=r"1200 rad/s, .* more than 382 Hz, .* has 380 Hz"):
+            use(1 / 380)
+        use(1 / 385)
+    with pytest.raises(ValueError, match="`acceleration`"):
+        PaperFilter(10.0, 400.0).edge(0.01)
+
+
+def test_periodic_fourier_is_exact_and_rejects_noise():
+    t = DT * np.arange(round(3.3 * PERIOD / DT))
+    q, qd, qdd = fourier(t)
+    filter = PeriodicFourier(PERIOD, 5)
+    motion = filter.motion(q, None, DT)
+    for got, true in ((motion.q, q), (motion.qd, qd), (motion.qdd, qdd)):
+        np.testing.assert_allclose(got, true, atol=1e-11)
+    noise = 1e-3 * np.random.default_rng(4).normal(size=q.shape)
+    noisy = filter.motion(q + noise, None, DT)
+    # Least squares leave sqrt(11 / samples) of white noise.
+    assert np.sqrt(np.mean((noisy.q - q) ** 2)) < 2e-3 * math.sqrt(11 / len(t))
+    assert np.sqrt(np.mean((noisy.qdd - qdd) ** 2)) < 1e-3
+
+
+def test_periodic_fourier_refuses_what_is_not_periodic():
+    t = DT * np.arange(round(2 * PERIOD / DT))
+    q, _, _ = fourier(t)
+    with pytest.raises(ValueError, match=r"joint 1 leave a Fourier series .* `period`"):
+        PeriodicFourier(0.9 * PERIOD, 5).motion(q, None, DT)
+    with pytest.raises(ValueError, match="record whole periods"):
+        PeriodicFourier(2.1 * PERIOD, 5).motion(q, None, DT)
+    PeriodicFourier(2 * PERIOD, 10).motion(q, None, DT)
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda: ZeroPhaseButterworth(0.0), "`cutoff` of `ZeroPhaseButterworth`"),
+        (lambda: ZeroPhaseButterworth(5.0, margin=-1.0), "`margin`"),
+        (lambda: ZeroPhaseButterworth(5.0, force_cutoff=-1.0), "`force_cutoff`"),
+        (lambda: PaperFilter(velocity=-1), "`velocity` of `PaperFilter`"),
+        (lambda: PeriodicFourier(0, 5), "`period`"),
+        (lambda: ZeroPhaseButterworth(70).smooth(np.zeros((99, 1)), 0.008), "faster than 140 Hz"),
+        (lambda: Subsample(0), "`every`"),
+        (lambda: Decimation((10, 20)), "13 or less"),
+    ],
+)
+def test_refusals(make, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        make()
+
+
+def test_decimation_is_scipys_with_gain_one():
+    x = np.random.default_rng(2).normal(size=(3000, 2, 2)).cumsum(axis=0)
+    expected = signal.decimate(signal.decimate(x, 10, axis=0), 5, axis=0)
+    # Scipy runs sections or coefficients, and pads them otherwise, depending on its version.
+    got = Decimation((10, 5))(x) * 10 ** (-0.05 / 20 * 4)
+    assert got.shape == (60, 2, 2)
+    np.testing.assert_allclose(got[8:-8], expected[8:-8], atol=1e-2 * np.abs(x).max())
+    np.testing.assert_allclose(Decimation((10, 5))(np.full(3000, 2.0)), 2.0, rtol=1e-9)
+
+
+def test_decimation_keeps_slow_and_drops_fast_sinusoids():
+    t = DT * np.arange(20000)
+    slow, fast = np.sin(2 * np.pi * 2 * t), np.sin(2 * np.pi * 60 * t)
+    out = Decimation((10,))(slow + fast)
+    np.testing.assert_allclose(out[50:-50], slow[::10][50:-50], atol=0.015)
+    assert np.abs(Subsample(10)(fast)).max() > 0.9
+    np.testing.assert_array_equal(Subsample(7)(slow), slow[::7])
