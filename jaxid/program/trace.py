@@ -1,8 +1,9 @@
 """From an ordinary JAX function to a scalar program: run its jaxpr on arrays of scalars."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from typing import Any
 
 import jax
 import numpy as np
@@ -61,6 +62,12 @@ _and, _or, _not = (
 )
 
 
+def _reduce(function: np.ufunc, x: np.ndarray, axes: Sequence, initial: float) -> Any:
+    for axis in sorted(axes, reverse=True):
+        x = function.reduce(x, axis=axis, initial=initial)
+    return x
+
+
 def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.ndarray:
     (contracted_x, contracted_y), (batch_x, batch_y) = dimension_numbers
     free_x = [k for k in range(x.ndim) if k not in (*contracted_x, *batch_x)]
@@ -71,20 +78,20 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
     right = y.transpose(*batch_y, *free_y, *contracted_y).reshape(*shared, 1, -1, contracted)
     total = _add.reduce(_multiply(left, right), axis=-1, initial=0.0)
     return np.asarray(total, object).reshape(
-        *shared, *(x.shape[k] for k in free_x), *(y.shape[k] for k in free_y)
+        (*shared, *(x.shape[k] for k in free_x), *(y.shape[k] for k in free_y))
     )
 
 
 def _select_n(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
     if not is_symbolic(which):
         return np.choose(np.broadcast_to(which, cases[0].shape).astype(int), cases)
-    return _select(which, cases[1], cases[0])
+    return np.asarray(_select(which, cases[1], cases[0]), object)
 
 
 def _select_truth(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
     if not is_symbolic(which):
         return _select_n(which, *cases)
-    return _or(_and(which, cases[1]), _and(_not(which), cases[0]))
+    return np.asarray(_or(_and(which, cases[1]), _and(_not(which), cases[0])), object)
 
 
 _ARITHMETIC: dict[str, Callable] = {
@@ -117,8 +124,8 @@ _ARITHMETIC: dict[str, Callable] = {
     "or": _or,
     "not": _not,
     "dot_general": _dot_general,
-    "reduce_sum": lambda x, *, axes, **_: _add.reduce(x, axis=tuple(axes), initial=0.0),
-    "reduce_prod": lambda x, *, axes, **_: _multiply.reduce(x, axis=tuple(axes), initial=1.0),
+    "reduce_sum": lambda x, *, axes, **_: _reduce(_add, x, axes, 0.0),
+    "reduce_prod": lambda x, *, axes, **_: _reduce(_multiply, x, axes, 1.0),
     "optimization_barrier": lambda *x: list(x),
     "tie": lambda _, x: x,
     **{o.value: _operation(o, 2) for o in COMPARISONS},
@@ -135,10 +142,11 @@ _WITH_PARAMETERS = ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")
 def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     if not is_symbolic(x):
         return x.astype(dtype)
-    if dtype == bool:
-        return _each(scalar.as_truth, 1)(x)
-    if np.issubdtype(dtype, np.floating):
-        return _each(scalar.as_number, 1)(x)
+    if dtype.kind == "b":
+        return np.asarray(_each(scalar.as_truth, 1)(x), object)
+    truth = all(scalar.is_truth(e) for e in x.flat)
+    if truth or np.issubdtype(dtype, np.floating):
+        return np.asarray(_each(scalar.as_number, 1)(x), object)
     raise ValueError(
         f"`trace` cannot translate a conversion to {dtype}: a program computes with real numbers."
     )
@@ -162,10 +170,13 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
         truth = equation.outvars[0].aval.dtype == bool
         which, cases = operands[0], [_entries(x) for x in operands[1:]]
         return [(_select_truth if truth else _select_n)(which, *cases)]
+    if name in ("div", "pow") and np.issubdtype(equation.outvars[0].aval.dtype, np.integer):
+        raise ValueError(f"`trace` cannot translate `{name}` of integers: use real numbers.")
     if name in _ARITHMETIC:
         parameters = equation.params if name in _WITH_PARAMETERS else {}
         result = _ARITHMETIC[name](*map(_entries, operands), **parameters)
-        return result if equation.primitive.multiple_results else [result]
+        results = result if equation.primitive.multiple_results else [result]
+        return [np.asarray(x, object) for x in results]
     reason = _INSTEAD.get(name, "it is not elementwise arithmetic, a sum, or a move of entries")
     raise ValueError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
 
@@ -177,8 +188,8 @@ def _entries_of_floats(x: np.ndarray) -> np.ndarray:
 def _known(constant: object) -> np.ndarray:
     if isinstance(constant, jax.core.Tracer):
         raise ValueError(
-            "The function given to `trace` closes over a value that JAX is tracing, which a program "
-            f"cannot hold ({constant}): pass it as an input, or trace outside of `jit` and `grad`."
+            "The function given to `trace` closes over a value that JAX is tracing, which a "
+            f"program cannot hold ({constant}): pass it as an input, or trace outside of `jit`."
         )
     return np.asarray(constant)
 
@@ -237,12 +248,13 @@ def _argument(graph: Graph, number: int, given: tuple[int, ...] | np.ndarray) ->
 def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
     """Translates a function of a few arrays into a scalar program.
 
-    The function is ordinary JAX: arithmetic, elementwise functions, `jnp.where` and comparisons, sums, matrix
-    products, and whatever moves entries; also `jvp`, `jacfwd`, `vjp` and `linear_transpose` of such. Loops are
-    Python loops, which the trace unrolls. Constants are folded and equal expressions are merged.
+    The function is ordinary JAX: arithmetic, elementwise functions, `jnp.where` and comparisons,
+    sums, matrix products, and whatever moves entries; also `jvp`, `jacfwd`, `vjp` and
+    `linear_transpose` of such. Loops are Python loops, which the trace unrolls. Constants are
+    folded and equal expressions are merged.
 
-    The trace is in float64, whatever the precision of the process. Folding `0 x` to 0 hides a NaN in x: check
-    inputs before they come to the program.
+    The trace is in float64, whatever the precision of the process. Folding `0 x` to 0 hides a NaN
+    in x: check inputs before they come to the program.
 
     Args:
         function: Takes one array per input and returns any PyTree of arrays.
