@@ -124,14 +124,11 @@ def clock(
             f"at the median, with {len(gaps)} gaps; check `time_unit`, or give `sample_time`."
         )
     if gaps.size:
-        longest = float(steps[gaps].max())
         notes.append(
-            f"{len(gaps)} gap(s) in time, the longest {longest:.6g} s after {t[gaps[0]]:.6g} s "
-            if len(gaps) == 1
-            else f"{len(gaps)} gaps in time, the longest {longest:.6g} s, the first after "
-            f"{t[gaps[0]]:.6g} s "
+            f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''} in time, the first after "
+            f"{t[gaps[0]]:.6g} s, the longest of {float(steps[gaps].max()):.6g} s (sample time "
+            f"{sample_time:.6g} s), split the log into segments"
         )
-        notes[-1] += f"(sample time {sample_time:.6g} s), split the log into segments"
     if lonely:
         notes.append(f"{lonely} rows between gaps are too few for a segment and were left out")
     uneven = max(np.abs(t[a:b] - t[a] - sample_time * np.arange(b - a)).max() for a, b in ranges)

@@ -214,7 +214,7 @@ def observe(
     notes = list(recording.notes)
     short = len(recording.segments) - len(used)
     if short:
-        notes.append(f"{short} segments are shorter than the filter's edges and were left out")
+        notes.append(f"{short} segment(s), shorter than the filter's edges, were left out")
 
     angles, forces, velocities = _joint_side(recording, robot)
     motions = [

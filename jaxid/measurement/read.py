@@ -16,7 +16,7 @@ def read_recording(
     *,
     forces_path: str | Path | None = None,
     velocities_path: str | Path | None = None,
-    largest_gap: float = 1.75,
+    largest_gap: float | int = 1.75,
 ) -> Recording:
     """Reads a log as CSV (any separator, with or without header), Parquet, NPZ or MAT.
 

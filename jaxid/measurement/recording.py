@@ -48,10 +48,10 @@ class Recording(eqx.Module):
         *,
         velocities: ArrayLike | None = None,
         time: ArrayLike | None = None,
-        sample_time: float | None = None,
+        sample_time: float | int | None = None,
         angles_on_motor_side: bool = False,
         forces_on_motor_side: bool = False,
-        largest_gap: float = 1.75,
+        largest_gap: float | int = 1.75,
         name: str = "recording",
         notes: tuple[str, ...] = (),
         first_row: int = 1,
@@ -141,7 +141,7 @@ class Recording(eqx.Module):
         """Time that was recorded, gaps not counted [s]."""
         return self.samples * self.sample_time
 
-    def crop(self, start: float = -np.inf, stop: float = np.inf) -> "Recording":
+    def crop(self, start: float | int = -np.inf, stop: float | int = np.inf) -> "Recording":
         """The part from `start` [s] on and before `stop` [s], on the clock of `time`.
 
         Raises:

@@ -162,7 +162,7 @@ def test_short_segments_are_left_out_and_reported():
     o = observe(a_recording(gaps=(2500, 2550)), a_robot(), ZeroPhaseButterworth(20.0))
     assert o.segments == ((0, 2500), (2500, 5950))
     assert o.time[2500] == pytest.approx(3.55)
-    assert "1 segments are shorter" in o.notes[-1]
+    assert "1 segment(s), shorter" in o.notes[-1]
 
 
 def test_is_a_pytree():
