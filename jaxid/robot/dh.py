@@ -1,10 +1,9 @@
 """Robots from tables of Denavit-Hartenberg parameters, in either convention."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits
+from jaxid.robot.limits import Limits, Numbers
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.snap import (
     SNAP_TOLERANCE,
@@ -19,17 +18,17 @@ CONVENTIONS = ("modified", "standard")
 
 
 def from_dh(
-    rows: ArrayLike,
+    rows: Numbers,
     *,
     convention: str,
     name: str = "robot",
     revolute: tuple[bool, ...] | None = None,
     joint_names: tuple[str, ...] | None = None,
-    base_rotation: ArrayLike | None = None,
-    base_position: ArrayLike = (0.0, 0.0, 0.0),
-    tip_rotation: ArrayLike | None = None,
-    tip_offset: ArrayLike = (0.0, 0.0, 0.0),
-    gravity: ArrayLike = GRAVITY,
+    base_rotation: Numbers | None = None,
+    base_position: Numbers = (0.0, 0.0, 0.0),
+    tip_rotation: Numbers | None = None,
+    tip_offset: Numbers = (0.0, 0.0, 0.0),
+    gravity: Numbers = GRAVITY,
     limits: Limits | None = None,
     drives: Drives | None = None,
     tool: Tool | None = None,

@@ -2,9 +2,8 @@
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import ArrayLike
 
-from jaxid.robot.limits import per_joint
+from jaxid.robot.limits import Numbers, per_joint
 from jaxid.types import AnyArray, Float
 
 
@@ -31,10 +30,10 @@ class Drives(eqx.Module):
         cls,
         joints: int,
         *,
-        reduction: ArrayLike | None = None,
-        zero: ArrayLike | None = None,
-        max_torques: ArrayLike | None = None,
-        rotor_inertia: ArrayLike | None = None,
+        reduction: Numbers | None = None,
+        zero: Numbers | None = None,
+        max_torques: Numbers | None = None,
+        rotor_inertia: Numbers | None = None,
     ) -> "Drives":
         """Builds drives from gear ratios (one for each joint) or a full matrix; direct if None.
 

@@ -5,11 +5,10 @@ nobody published. What is not listed is infinite (limits) or direct (drives).
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxid.robot.dh import from_dh
 from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits
+from jaxid.robot.limits import Limits, Numbers
 from jaxid.robot.robot import Robot
 from jaxid.robot.snap import axis_rotation
 
@@ -266,7 +265,7 @@ def kr300() -> Robot:
     )
 
 
-def planar_arm(joints: int = 2, length: ArrayLike = 1.0) -> Robot:
+def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
     """A textbook arm in a vertical plane: axes along z, gravity along -y, links along x at q = 0.
 
     Args:

@@ -1,13 +1,19 @@
 """What the joints can do: ranges, speeds, accelerations, jerks and forces."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxid.types import AnyArray, Float
 
+# NumPy's own `ArrayLike` turns tuples away when types are checked at run time.
+Numbers = AnyArray | Sequence[Any] | float | int
+"""What users may pass where an array is meant: an array, nested lists or tuples, one number."""
 
-def per_joint(name: str, value: ArrayLike | None, joints: int, unknown: float) -> np.ndarray:
+
+def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> np.ndarray:
     """Checks and copies one number for each joint; None stands for unknown everywhere.
 
     Raises:
@@ -56,12 +62,12 @@ class Limits(eqx.Module):
         cls,
         joints: int,
         *,
-        position_min: ArrayLike | None = None,
-        position_max: ArrayLike | None = None,
-        velocity: ArrayLike | None = None,
-        acceleration: ArrayLike | None = None,
-        jerk: ArrayLike | None = None,
-        force: ArrayLike | None = None,
+        position_min: Numbers | None = None,
+        position_max: Numbers | None = None,
+        velocity: Numbers | None = None,
+        acceleration: Numbers | None = None,
+        jerk: Numbers | None = None,
+        force: Numbers | None = None,
         assumed: tuple[str, ...] = (),
     ) -> "Limits":
         """Builds limits from what is known; the rest is infinite.

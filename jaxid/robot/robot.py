@@ -5,10 +5,9 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits
+from jaxid.robot.limits import Limits, Numbers
 from jaxid.types import AnyArray, Float
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -32,7 +31,7 @@ class Tool(eqx.Module):
 
     @classmethod
     def of(
-        cls, body: int, *, mass: float, centre_of_mass: ArrayLike, inertia: ArrayLike | None = None
+        cls, body: int, *, mass: float, centre_of_mass: Numbers, inertia: Numbers | None = None
     ) -> "Tool":
         """Builds a tool and checks it; a point mass if no inertia is given.
 
@@ -118,17 +117,17 @@ class Robot(eqx.Module):
         *,
         parent: tuple[int, ...] | None = None,
         revolute: tuple[bool, ...],
-        axis: ArrayLike,
-        rotation: ArrayLike,
-        offset: ArrayLike,
+        axis: Numbers,
+        rotation: Numbers,
+        offset: Numbers,
         joint_names: tuple[str, ...] | None = None,
-        gravity: ArrayLike = GRAVITY,
+        gravity: Numbers = GRAVITY,
         limits: Limits | None = None,
         drives: Drives | None = None,
         tool: Tool | None = None,
         tip_body: int | None = None,
-        tip_rotation: ArrayLike | None = None,
-        tip_offset: ArrayLike = (0.0, 0.0, 0.0),
+        tip_rotation: Numbers | None = None,
+        tip_offset: Numbers = (0.0, 0.0, 0.0),
         source: str = "",
         notes: tuple[str, ...] = (),
     ) -> "Robot":
@@ -245,7 +244,7 @@ class Robot(eqx.Module):
         return dataclasses.replace(self, **fields)
 
     def mounted(
-        self, rotation: ArrayLike | None = None, position: ArrayLike = (0.0, 0.0, 0.0)
+        self, rotation: Numbers | None = None, position: Numbers = (0.0, 0.0, 0.0)
     ) -> "Robot":
         """The same robot on a base that is tilted and shifted; gravity stays as it is.
 
@@ -270,7 +269,7 @@ class Robot(eqx.Module):
         )
 
     def with_tool(
-        self, *, mass: float, centre_of_mass: ArrayLike, inertia: ArrayLike | None = None
+        self, *, mass: float, centre_of_mass: Numbers, inertia: Numbers | None = None
     ) -> "Robot":
         """The robot with a known load at its end-effector, in place of the load it had.
 

@@ -5,8 +5,8 @@ parameter too many, at a condition number of 1e7. What is snapped stands in the 
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from jaxid.robot.limits import Numbers
 from jaxid.types import Float
 
 SNAP_TOLERANCE = 1e-4
@@ -29,14 +29,14 @@ def check_tolerance(tolerance: float) -> float:
     return float(tolerance)
 
 
-def snap_angles(angles: ArrayLike, tolerance: float) -> Float[np.ndarray, "..."]:
+def snap_angles(angles: Numbers, tolerance: float) -> Float[np.ndarray, "..."]:
     """Moves angles [rad] within `tolerance` of a multiple of 90 degrees onto it."""
     angles = np.asarray(angles, dtype=np.float64)
     nearest = np.round(angles / _QUARTER) * _QUARTER
     return np.where(np.abs(angles - nearest) <= max(tolerance, _ROUNDING), nearest, angles)
 
 
-def snap_axis(axis: ArrayLike, tolerance: float) -> Float[np.ndarray, "3"]:
+def snap_axis(axis: Numbers, tolerance: float) -> Float[np.ndarray, "3"]:
     """Turns a direction within `tolerance` [rad] of a coordinate axis onto it; unit length."""
     axis = np.asarray(axis, dtype=np.float64)
     axis = axis / np.linalg.norm(axis)
@@ -46,7 +46,7 @@ def snap_axis(axis: ArrayLike, tolerance: float) -> Float[np.ndarray, "3"]:
     return clean(axis)
 
 
-def snap_rotation(rotation: ArrayLike, tolerance: float) -> Float[np.ndarray, "3 3"]:
+def snap_rotation(rotation: Numbers, tolerance: float) -> Float[np.ndarray, "3 3"]:
     """Makes a rotation exact if all its entries are within `tolerance` of 0, 1 or -1."""
     rotation = np.asarray(rotation, dtype=np.float64)
     signs = np.round(rotation)
@@ -61,21 +61,21 @@ def clean(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.where(np.abs(values - nearest) <= _ROUNDING, nearest, values) + 0.0
 
 
-def axis_rotation(axis: ArrayLike, angle: float) -> Float[np.ndarray, "3 3"]:
+def axis_rotation(axis: Numbers, angle: float) -> Float[np.ndarray, "3 3"]:
     """Rotation about a unit vector by an angle [rad]; exact for quarter turns about x, y, z."""
     x, y, z = np.asarray(axis, dtype=np.float64)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return clean(np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K)
 
 
-def rpy_rotation(rpy: ArrayLike) -> Float[np.ndarray, "3 3"]:
+def rpy_rotation(rpy: Numbers) -> Float[np.ndarray, "3 3"]:
     """Rotation of URDF's roll, pitch and yaw [rad]: about the fixed x, then y, then z axis."""
     roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
     return axis_rotation(_Z, yaw) @ axis_rotation(_Y, pitch) @ axis_rotation(_X, roll)
 
 
 def angle_notes(
-    joint: str, names: tuple[str, ...], before: ArrayLike, after: ArrayLike
+    joint: str, names: tuple[str, ...], before: Numbers, after: Numbers
 ) -> tuple[str, ...]:
     """One sentence for each angle that snapping changed."""
     return tuple(

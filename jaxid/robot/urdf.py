@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from jaxid.robot.limits import Limits
+from jaxid.robot.limits import Limits, Numbers
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.snap import (
     SNAP_TOLERANCE,
@@ -30,9 +29,9 @@ def load_urdf(
     *,
     tip: str | None = None,
     base: str | None = None,
-    gravity: ArrayLike = GRAVITY,
-    base_rotation: ArrayLike | None = None,
-    base_position: ArrayLike = _ZERO,
+    gravity: Numbers = GRAVITY,
+    base_rotation: Numbers | None = None,
+    base_position: Numbers = _ZERO,
     snap_tolerance: float = SNAP_TOLERANCE,
 ) -> Robot:
     """Loads a robot from a URDF file; its inertias are left to `urdf_parameters`.

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+from forward_kinematics import (
+    body_transforms,
+    dh_frames,
+    from_rpy,
+    random_configuration,
+    tip_transform,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxid.robot.dh import from_dh
+
+# A realistic mixture: quarter twists, an oblique one, theta offsets, every length.
+ROWS = np.array(
+    [
+        (0.0, 0.1, 0.4, 0.2),
+        (-np.pi / 2, 0.05, 0.0, -np.pi / 2),
+        (0.7, 0.3, -0.1, 0.0),
+        (np.pi / 2, 0.0, 0.25, 1.1),
+        (np.pi, -0.2, 0.05, np.pi),
+    ]
+)
+kinds = st.lists(st.booleans(), min_size=5, max_size=5).map(tuple)
+
+
+@given(kinds, st.sampled_from(["modified", "standard"]), st.integers(0, 1000))
+def test_the_end_effector_is_the_product_of_the_table(revolute, convention, seed):
+    robot = from_dh(ROWS, convention=convention, revolute=revolute)
+    q = random_configuration(robot, seed)
+    expected = dh_frames(ROWS, q, convention, revolute)[-1]
+    np.testing.assert_allclose(tip_transform(robot, q), expected, atol=1e-13)
+
+
+@given(kinds, st.integers(0, 1000))
+def test_modified_bodies_are_the_frames_of_the_table(revolute, seed):
+    robot = from_dh(ROWS, convention="modified", revolute=revolute)
+    q = random_configuration(robot, seed)
+    expected = dh_frames(ROWS, q, "modified", revolute)[1:]
+    np.testing.assert_allclose(body_transforms(robot, q), expected, atol=1e-13)
+
+
+@given(kinds, st.integers(0, 1000))
+def test_standard_bodies_stand_on_their_own_joints_axis(revolute, seed):
+    robot = from_dh(ROWS, convention="standard", revolute=revolute)
+    q = random_configuration(robot, seed)
+    bodies = body_transforms(robot, q)
+    before = dh_frames(ROWS, q, "standard", revolute)[:-1]
+    np.testing.assert_allclose(bodies[:, :3, 2], before[:, :3, 2], atol=1e-13)
+    from_frame = bodies[:, :3, 3] - before[:, :3, 3]
+    np.testing.assert_allclose(np.cross(from_frame, before[:, :3, 2]), 0.0, atol=1e-13)
+    assert np.array_equal(robot.axis, np.tile([0.0, 0.0, 1.0], (5, 1)))
+
+
+@pytest.mark.parametrize("convention", ["modified", "standard"])
+def test_base_and_tip_frames_multiply_from_both_sides(convention):
+    base, tip = (
+        from_rpy([0.3, -0.2, 2.0], [1.0, 2.0, 3.0]),
+        from_rpy([1.0, 0.1, 0.4], [0, 0.1, 0.2]),
+    )
+    robot = from_dh(
+        ROWS[:, :3],
+        convention=convention,
+        base_rotation=base[:3, :3],
+        base_position=base[:3, 3],
+        tip_rotation=tip[:3, :3],
+        tip_offset=tip[:3, 3],
+    )
+    q = random_configuration(robot, 1)
+    expected = base @ dh_frames(ROWS[:, :3], q, convention)[-1] @ tip
+    np.testing.assert_allclose(tip_transform(robot, q), expected, atol=1e-13)
+
+
+def test_rounded_twists_and_offsets_are_snapped_and_noted():
+    robot = from_dh([(1.5708, 0, 0.1, -3.14159), (0.3, 0, 0, 0)], convention="modified")
+    assert set(np.abs(robot.rotation[0]).ravel()) == {0.0, 1.0}
+    assert robot.notes == (
+        "joint `joint1`: alpha 1.5708 rad snapped to pi/2 (1.57079632679).",
+        "joint `joint1`: theta -3.14159 rad snapped to -pi (-3.14159265359).",
+    )
+    off = from_dh([(1.5708, 0, 0.1)], convention="modified", snap_tolerance=0.0)
+    assert not off.notes
+    assert off.rotation[0][1, 1] == pytest.approx(np.cos(1.5708), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "sentence"),
+    [
+        (ROWS, {"convention": "craig"}, '`convention` must be "modified" or "standard"'),
+        ([(0.0, 1.0)], {"convention": "standard"}, "`rows` must hold 3 or 4 finite numbers"),
+        ([(0.0, np.nan, 0.0)], {"convention": "standard"}, "`rows` must hold 3 or 4 finite"),
+        (ROWS, {"convention": "standard", "revolute": (True,)}, "`revolute` must have one entry"),
+        (ROWS, {"convention": "standard", "snap_tolerance": 1.0}, "`snap_tolerance` must be"),
+        (ROWS, {"convention": "standard", "joint_names": ("a", "b")}, "`joint_names` must be 5"),
+    ],
+)
+def test_refusals(rows, options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        from_dh(rows, **options)

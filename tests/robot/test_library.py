@@ -1,0 +1,193 @@
+import json
+
+import numpy as np
+import pytest
+from forward_kinematics import (
+    about,
+    body_transforms,
+    dh_frames,
+    random_configuration,
+    tip_transform,
+    urdf_chain,
+)
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import CoulombFriction, RigidBodies, RotorInertia, ViscousFriction
+from jaxid.robot import library
+from jaxid.robot.urdf import load_urdf
+
+ALL = [
+    library.tx90l_on_rail,
+    library.tx40,
+    library.ur10,
+    library.ur10e,
+    library.panda,
+    library.iiwa14,
+    library.kr300,
+    library.planar_arm,
+]
+SEEDS = range(3)
+
+
+@pytest.fixture(scope="module")
+def facts(shared_data):
+    return json.loads((shared_data / "robots.json").read_text())
+
+
+@pytest.mark.parametrize("build", ALL)
+def test_every_robot_says_where_it_comes_from_and_what_is_assumed(build):
+    robot = build()
+    assert robot.source
+    for assumed in robot.limits.assumed:
+        field, _, joint = assumed.partition(" of ")
+        values = getattr(robot.limits, field)
+        assert np.isfinite(values[robot.joint_names.index(joint)] if joint else values).all()
+    if robot.limits.assumed:
+        assert any(note.startswith("assumed") for note in robot.notes)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_rail_robot_is_the_published_chain_on_a_rail(facts, seed):
+    robot = library.tx90l_on_rail()
+    q = random_configuration(robot, seed)
+    rows = [("prismatic", [0, 0, 0], [1, 0, 0]), *facts["tx90l"]["rows"]]
+    expected, ours = urdf_chain(rows, q), body_transforms(robot, q)
+    np.testing.assert_allclose(ours[:, :3, 3], expected[:, :3, 3], atol=1e-14)
+    turned = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    for i in range(7):
+        attitude = expected[i, :3, :3] @ (turned if i in (2, 3, 5) else np.eye(3))
+        np.testing.assert_allclose(ours[i, :3, :3], attitude, atol=1e-14)
+    assert np.array_equal(robot.axis[1:], np.tile([0.0, 0.0, 1.0], (6, 1)))
+    assert set(np.abs(robot.rotation).ravel()) == {0.0, 1.0}
+
+
+def test_rail_robot_has_the_published_limits(facts):
+    limits, arm = library.tx90l_on_rail().limits, facts["tx90l"]
+    np.testing.assert_allclose(limits.position_min[1:], np.deg2rad(arm["q_min_deg"]))
+    np.testing.assert_allclose(limits.position_max[1:], np.deg2rad(arm["q_max_deg"]))
+    np.testing.assert_allclose(limits.velocity[1:], np.deg2rad(arm["qd_max_deg"]))
+    assert limits.force[1:].tolist() == arm["tau_max"]
+    assert limits.force[0] == 3000.0
+
+
+def test_rail_robot_has_the_papers_base_parameters():
+    """44 of 70, and the regrouping of Eq. 24: a test of the frames, which decide its form."""
+    terms = (RigidBodies(principal_axes=True), ViscousFriction(), CoulombFriction(), RotorInertia())
+    base = base_parameters(Model(library.tx90l_on_rail(), terms))
+    assert len(base.model.parameter_names) == 70 + 7 * ("fo1" in base.model.parameter_names)
+    assert base.size == 44
+    names = base.model.parameter_names
+    regrouped = [
+        {names[d]: k for d, k in zip(base.dependent, row, strict=True) if abs(k) > 1e-9}
+        for row in base.kappa[:2]
+    ]
+    assert base.names[:2] == ("m1", "m2") or base.names[0] == "m1"
+    assert regrouped[0] == pytest.approx({"m2": 1.0, "m3": 1.0, "mz4": -20.0, "Ia1": 1.0})
+    assert base.names[1] == "mx2"
+    assert regrouped[1] == pytest.approx({"m3": 0.05, "mz4": -1.0})
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["panda", "ur10", "ur10e"])
+def test_arms_from_tables_are_their_tables(facts, name, seed):
+    robot = getattr(library, name)()
+    q = random_configuration(robot, seed)
+    convention = facts[name]["convention"].split()[0]
+    expected = dh_frames(facts[name]["rows"], q, convention)[-1]
+    expected[:3, 3] += facts[name].get("flange_d", 0.0) * expected[:3, 2]
+    np.testing.assert_allclose(tip_transform(robot, q), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur10e", "lbr_iiwa14"])
+def test_published_limits(facts, name):
+    known = facts[name]
+    limits = getattr(library, name.removeprefix("lbr_"))().limits
+    speed = known.get("qd_max", np.deg2rad(known.get("qd_max_deg", [])))
+    np.testing.assert_allclose(limits.velocity, speed)
+    for key, ours in (
+        ("q_max", limits.position_max),
+        ("q_min", limits.position_min),
+        ("qdd_max", limits.acceleration),
+        ("jerk_max", limits.jerk),
+        ("tau_max", limits.force),
+    ):
+        if key in known:
+            np.testing.assert_allclose(ours, known[key])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_iiwa_is_its_chain(facts, seed):
+    robot = library.iiwa14()
+    q = random_configuration(robot, seed)
+    expected = urdf_chain(facts["lbr_iiwa14"]["rows"], q)
+    np.testing.assert_allclose(body_transforms(robot, q), expected, atol=1e-14)
+    tip = expected[-1, :3, 3] + facts["lbr_iiwa14"]["tool_z"] * expected[-1, :3, 2]
+    np.testing.assert_allclose(tip_transform(robot, q)[:3, 3], tip, atol=1e-14)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_kr300_takes_the_recorded_angles_as_they_are(facts, seed):
+    robot = library.kr300()
+    q = random_configuration(robot, seed)
+    model_q = q + np.deg2rad([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
+    frames = about([1.0, 0.0, 0.0], np.pi) @ dh_frames(facts["kr300"]["rows"], model_q, "standard")
+    np.testing.assert_allclose(tip_transform(robot, q), frames[-1], atol=1e-13)
+    assert np.diag(robot.drives.reduction).tolist() == facts["kr300"]["gear"]
+    assert not robot.drives.zero.any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_tx40_is_its_published_urdf(shared_data, seed):
+    robot = library.tx40()
+    urdf = load_urdf(shared_data / "tx40" / "tx40_mdh_modified.urdf", tip="link_6")
+    q = random_configuration(robot, seed)
+    np.testing.assert_allclose(body_transforms(robot, q), body_transforms(urdf, q), atol=1e-13)
+    assert robot.limits.force.tolist() == urdf.limits.force.tolist()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_tx40_counts_its_offsets_once(facts, seed):
+    """The manufacturer's angles with the table's theta give the same arm as the drives' angles."""
+    robot = library.tx40()
+    motor = np.random.default_rng(seed).uniform(-100.0, 100.0, 6)
+    A = np.diag(np.array(facts["tx40"]["gear"], dtype=float))
+    A[5, 4] = 32.0
+    with_theta = dh_frames(facts["tx40"]["rows"], np.linalg.solve(A, motor), "modified")[-1]
+    with_theta[2, 3] += facts["tx40"]["base_z"]
+    q = robot.drives.joint_angles(motor)
+    np.testing.assert_allclose(tip_transform(robot, q), with_theta, atol=1e-12)
+
+
+def test_tx40_drives_are_those_of_the_data(shared_data):
+    robot = library.tx40()
+    motor = np.loadtxt(
+        shared_data / "tx40" / "motor_position.csv", delimiter=",", skiprows=1, max_rows=40000
+    )[::500]
+    A = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    A[5, 4] = 32.0
+    expected = np.linalg.solve(A, motor.T).T + [0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0]
+    q = robot.drives.joint_angles(motor)
+    np.testing.assert_allclose(q, expected, atol=1e-12)
+    assert (q > robot.limits.position_min).all()
+    assert (q < robot.limits.position_max).all()
+    torque = np.arange(1.0, 7.0)
+    np.testing.assert_allclose(robot.drives.joint_forces(torque), A.T @ torque)
+
+
+@pytest.mark.parametrize(("joints", "length"), [(1, 0.7), (3, (0.5, 0.4, 0.3))])
+def test_planar_arm_is_a_chain_of_angles_in_a_vertical_plane(joints, length):
+    robot = library.planar_arm(joints, length)
+    q = random_configuration(robot, 0)
+    angles = np.cumsum(q)
+    lengths = np.broadcast_to(length, joints)
+    expected = [lengths @ np.cos(angles), lengths @ np.sin(angles), 0.0]
+    np.testing.assert_allclose(tip_transform(robot, q)[:3, 3], expected, atol=1e-14)
+    assert robot.gravity.tolist() == [0.0, -9.81, 0.0]
+
+
+def test_planar_arm_refuses_what_is_no_arm():
+    with pytest.raises(ValueError, match="`joints` must be at least 1, but is 0"):
+        library.planar_arm(0)
+    with pytest.raises(ValueError, match="`length` must be one length or one for each joint"):
+        library.planar_arm(2, (1.0, 2.0, 3.0))
