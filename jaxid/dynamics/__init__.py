@@ -1,0 +1,1 @@
+"""What is linear in the unknowns: terms, models, base parameters."""

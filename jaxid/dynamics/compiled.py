@@ -55,6 +55,34 @@ def evaluate_rows(
     return rows
 
 
+def evaluate_forces(
+    model: Model, p: Float[AnyArray, " standard"], motion: Motion
+) -> Float[np.ndarray, "samples joints"]:
+    r"""The generalized forces $\Theta p$ [N m or N] in NumPy, without compiling (Eq. 16)."""
+    n = (model.robot.joints,)
+    program = _remember("forces", model, lambda: trace(model.forces, (model.size,), n, n, n))
+    return evaluate(program, np.asarray(p, np.float64), *_batch_last(motion)).T
+
+
+def evaluate_tool_forces(model: Model, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+    """What the known tool adds to the measured forces [N m or N], in NumPy."""
+    if model.robot.tool is None:
+        return np.zeros(motion.q.shape)
+    n = (model.robot.joints,)
+    program = _remember("tool", model, lambda: trace(model.known_forces, n, n, n))
+    return evaluate(program, *_batch_last(motion)).T
+
+
+def evaluate_mass_matrix(
+    model: Model, p: Float[AnyArray, " standard"], q: Float[AnyArray, "samples joints"]
+) -> Float[np.ndarray, "samples joints joints"]:
+    """The mass matrix in NumPy, without compiling (Eq. 38)."""
+    n = (model.robot.joints,)
+    program = _remember("mass matrix", model, lambda: trace(model.inertia, (model.size,), n))
+    M = evaluate(program, np.asarray(p, np.float64), np.asarray(q, np.float64).T)
+    return np.moveaxis(M, -1, 0)
+
+
 def structure(model: Model) -> np.ndarray:
     """Which column can act on which joint: False where the regressor is zero for every motion."""
     return np.asarray(regressor_program(model).nonzeros)

@@ -92,6 +92,20 @@ class Model(eqx.Module):
         parts = zip(self.terms, self.split(p), strict=True)
         return sum(t.forces(self.robot, x, q, qd, qdd) for t, x in parts)
 
+    def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
+        """The mass matrix of one sample, as it is defined (Eq. 38)."""
+        parts = zip(self.terms, self.split(p), strict=True)
+        return sum(t.mass_matrix(self.robot, x, q) for t, x in parts)
+
+    def known_forces(self, q, qd, qdd) -> Float[AnyArray, " joints"]:
+        """The generalized forces of the known tool at one sample [N m or N]."""
+        tool = self.robot.tool
+        if tool is None:
+            return jnp.zeros_like(q)
+        p = np.zeros((self.robot.joints, 10))
+        p[tool.body] = tool.parameters
+        return projection.rigid_body_forces(self.robot, p, q, qd, qdd)
+
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
         r"""The regressor $\Theta(q, \dot q, \ddot q)$ (Eqs. 16, 18).
 
@@ -126,8 +140,8 @@ class Model(eqx.Module):
             q: Joint coordinates [rad or m].
         """
         self._check(q)
-        parts = list(zip(self.terms, self.split(jnp.asarray(p)), strict=True))
-        return over_batch(lambda x: sum(t.mass_matrix(self.robot, s, x) for t, s in parts), q)
+        p = jnp.asarray(p)
+        return over_batch(lambda x: self.inertia(p, x), q)
 
     def bias_forces(
         self,
@@ -169,17 +183,8 @@ class Model(eqx.Module):
 
     def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         """What the known tool adds to the measured forces [N m or N]; zero without a tool."""
-        tool = self.robot.tool
-        if tool is None:
-            return jnp.zeros_like(motion.q)
-        p = np.zeros((self.robot.joints, 10))
-        p[tool.body] = tool.parameters
-        return over_batch(
-            lambda q, qd, qdd: projection.rigid_body_forces(self.robot, p, q, qd, qdd),
-            motion.q,
-            motion.qd,
-            motion.qdd,
-        )
+        self._check(motion.q)
+        return over_batch(self.known_forces, motion.q, motion.qd, motion.qdd)
 
     def _check(self, q: Float[AnyArray, "*batch joints"]) -> None:
         if q.shape[-1:] != (self.robot.joints,):

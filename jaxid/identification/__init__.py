@@ -1,0 +1,1 @@
+"""Estimation: factors, weights, estimators, and what the data do not determine."""

@@ -152,6 +152,38 @@ class Observations(eqx.Module):
                 )
         return tuple(found)
 
+    def between(self, start: float, stop: float) -> "Observations":
+        """The same observations, of which only rows from `start` to before `stop` [s] count.
+
+        The log is filtered as a whole: no rows are lost where it is divided.
+
+        Raises:
+            ValueError: If no row is left for some joint.
+        """
+        time = self.reduced_time
+        mask = np.asarray(self.mask) & ((time >= start) & (time < stop))[:, None]
+        if not mask.any(axis=0).all():
+            raise ValueError(
+                f"`{self.name}` has no rows from {start:g} s to {stop:g} s for every joint: its "
+                f"rows reach from {time[0]:g} s to {time[-1]:g} s."
+            )
+        return eqx.tree_at(lambda o: o.mask, self, mask)
+
+    def split(self, fraction: float) -> tuple["Observations", "Observations"]:
+        """Divides the rows in time: a part to identify with, and the rest to verify with.
+
+        Args:
+            fraction: Of the recording's duration that belongs to the first part, of 1.
+
+        Raises:
+            ValueError: If `fraction` is not between 0 and 1.
+        """
+        if not 0 < fraction < 1:
+            raise ValueError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")
+        time = np.asarray(self.time)
+        middle = float(time[0] + fraction * (time[-1] - time[0]))
+        return self.between(-np.inf, middle), self.between(middle, np.inf)
+
     @property
     def reduced_time(self) -> Float[np.ndarray, " rows"]:
         """Times of the rows [s]."""

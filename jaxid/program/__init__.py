@@ -1,4 +1,4 @@
-"""A small compiler: a function of a few scalars becomes a scalar program, then fused XLA, NumPy, or C.
+"""A small compiler: from a function of a few scalars to fused XLA, NumPy, or C.
 
 It knows no robot. `trace` runs an ordinary JAX function on scalars that fold constants and merge
 equal expressions; what is left is a straight line of operations, a `Program`.

@@ -30,12 +30,12 @@ _FORMAT: dict[Operation, Callable[..., str]] = {
     Operation.MINIMUM: lambda x, y: f"(({x} < {y}) | ({x} != {x})) ? {x} : {y}",
 }
 _NAMES = {Operation.ABSOLUTE: "fabs"}
-_KEYWORDS = frozenset(
-    """alignas alignof and asm auto bool break case catch char class const constexpr continue default delete
-    do double else enum explicit export extern false float for friend goto if inline int long mutable
-    namespace new not operator or private protected public register restrict return short signed sizeof
-    static struct switch template this throw true try typedef typename union unsigned using virtual void
-    volatile while xor""".split()
+_KEYWORDS = re.compile(
+    "alignas|alignof|and|asm|auto|bool|break|case|catch|char|class|const|constexpr|continue|default|"
+    "delete|do|double|else|enum|explicit|export|extern|false|float|for|friend|goto|if|inline|int|"
+    "long|mutable|namespace|new|not|operator|or|private|protected|public|register|restrict|return|"
+    "short|signed|sizeof|static|struct|switch|template|this|throw|true|try|typedef|typename|union|"
+    "unsigned|using|virtual|void|volatile|while|xor"
 )
 
 
@@ -84,10 +84,11 @@ def to_c(
 ) -> str:
     """Writes a program as one C99 function, which is also valid C++.
 
-    The function allocates nothing and has neither loops nor branches that jump: its run time does not
-    depend on the data, if the mathematical library's does not. It takes a pointer for each input, then a pointer for each
-    output, all of them rows of numbers in C order. Every entry of an output is written, constants too. Inputs
-    are read before outputs are written, so they may be the same memory.
+    The function allocates nothing and has no loops, and its choices compile to selections: its run
+    time does not depend on the data, if the mathematical library's does not. It takes a pointer for
+    each input, then one for each output, all to rows of numbers in C order. Every entry of an
+    output is written, constants too. All inputs are read before an output is written, so that they
+    may be the same memory.
 
     Args:
         program: Made by `trace`.
@@ -158,7 +159,7 @@ def _names(given: Sequence[str] | None, stem: str, count: int) -> list[str]:
 
 def _check_names(names: list[str]) -> None:
     for name in names:
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in _KEYWORDS:
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _KEYWORDS.fullmatch(name):
             raise ValueError(f"A name in C code must be an identifier of C, but got {name!r}.")
         if re.fullmatch(r"t[0-9]+", name):
             raise ValueError(f"The name {name!r} is taken by the generated code: choose another.")

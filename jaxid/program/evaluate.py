@@ -18,6 +18,12 @@ _BLOCK = 1024
 """Samples at a time: the values that are alive at once then stay in the cache."""
 
 
+def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
+    np.copyto(out, if_false)
+    np.copyto(out, if_true, where=condition)
+    return out
+
+
 class _Step(NamedTuple):
     function: Callable
     operands: tuple[Reference, ...]
@@ -53,8 +59,9 @@ def _plan(program: Program) -> _Plan:
             loads.append((cell[position], number, entry))
             continue
         operands = tuple(cell[x] if isinstance(x, int) else x for x in node.operands)
-        in_place = node.operation not in TRUTH_VALUED and node.operation is not Operation.SELECT
-        steps.append(_Step(NUMPY[node.operation], operands, cell[position], in_place))
+        function = _select if node.operation is Operation.SELECT else NUMPY[node.operation]
+        in_place = node.operation not in TRUTH_VALUED
+        steps.append(_Step(function, operands, cell[position], in_place))
         # Only now: no operation may write over an operand that it still reads.
         idle += [cell[k] for k in set(node.uses) if last_use[k] == position and k not in results]
     return _Plan(tuple(loads), tuple(steps), results, cells)
@@ -81,7 +88,7 @@ def evaluate(program: Program, *arrays: AnyArray) -> Any:
         leaf = np.empty((size, table.shape[1]))
         for row, x in zip(leaf, program.outputs[start : start + size], strict=True):
             row[:] = table[plan.results[x]] if isinstance(x, int) else x
-        leaves.append(leaf.reshape(*shape, *batch))
+        leaves.append(leaf.reshape((*shape, *batch)))
         start += size
     return jax.tree.unflatten(program.structure, leaves)
 
@@ -113,8 +120,9 @@ def _evaluate(
     inputs = []
     for x, shape in zip(given, program.input_shapes, strict=True):
         own = x.shape[len(shape) :]
-        aligned = x.reshape(*shape, *(1,) * (len(batch) - len(own)), *own)
-        inputs.append(np.broadcast_to(aligned, (*shape, *batch)).reshape(-1, samples))
+        aligned = x.reshape((*shape, *(1,) * (len(batch) - len(own)), *own))
+        whole = np.broadcast_to(aligned, (*shape, *batch))
+        inputs.append(whole.reshape(int(np.prod(shape, dtype=int)), samples))
     table = np.empty((len(plan.results), samples))
     scratch = np.empty((plan.cells - len(plan.results), min(samples, _BLOCK)))
     with np.errstate(all="ignore"):

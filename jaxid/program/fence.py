@@ -1,11 +1,12 @@
 """Fences: keep XLA from computing a shared value again in every result that needs it.
 
-XLA's CPU backend fuses elementwise operations into the loops of their consumers, and copies a shared
-operation into each of them. A program of a thousand operations with hundreds of
-results is then computed many times over. A fence on a shared value stops that.
+XLA's CPU backend fuses elementwise operations into the loops of their consumers, and copies a
+shared operation into each of them. A program of a thousand operations with hundreds of results is
+then computed many times over. A fence on a shared value stops that.
 """
 
 import abc
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -61,8 +62,8 @@ class BarrierFence(AbstractFence):
 class DivisionFence(AbstractFence):
     """Divides by a one that XLA cannot see through.
 
-    XLA does not copy a division, since divisions are dear, and x / 1 is exact, for NaN and infinities too. The
-    derivative has the same fence.
+    XLA does not copy a division, since divisions are dear, and x / 1 is exact, for NaN and
+    infinities too. The derivative has the same fence.
     """
 
     def anchor(self, reference: Array) -> Array:

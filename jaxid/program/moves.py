@@ -1,7 +1,7 @@
 """JAX primitives that only move entries of an array, on arrays of scalars.
 
-The common ones are written out for NumPy. The others (gather, scatter, dynamic slices) move the *positions*
-of the entries with JAX itself, and then the entries follow.
+The common ones are written out for NumPy. The others (gather, scatter, dynamic slices) move the
+*positions* of the entries with JAX itself, and then the entries follow.
 """
 
 from collections.abc import Callable
@@ -90,7 +90,7 @@ def move_by_index(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
     entries, labels, start = [], list(operands), 0
     for k in carriers:
         entries.append(operands[k].astype(object).ravel())
-        positions = np.arange(start, start + operands[k].size, dtype=np.int32)
+        positions = np.arange(start, start + operands[k].size, dtype=np.float64)
         labels[k] = positions.reshape(operands[k].shape)
         start += operands[k].size
     if any(is_symbolic(x) for x in labels):
@@ -99,9 +99,9 @@ def move_by_index(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
             "index with constant integers."
         )
     (moved,) = on_numbers(equation, *labels)
-    if moved.size and (moved.min() < 0 or moved.max() >= start):
+    if not ((moved >= 0) & (moved < start)).all():
         raise ValueError(f"`trace` met an index outside of its array in `{name}`: correct it.")
-    return np.concatenate(entries)[moved]
+    return np.concatenate(entries)[moved.astype(int)]
 
 
 def scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
@@ -114,9 +114,9 @@ def scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
         )
     total = target.astype(object).copy()
     for k, update in enumerate(updates.astype(object).ravel()):
-        one = np.zeros(updates.size, np.int32)
+        one = np.zeros(updates.size)
         one[k] = 1
-        zeros = np.zeros(target.shape, np.int32)
+        zeros = np.zeros(target.shape)
         (places,) = on_numbers(equation, zeros, indices, one.reshape(updates.shape))
         for place in np.argwhere(places):
             total[tuple(place)] = total[tuple(place)] + update

@@ -66,7 +66,7 @@ class OperationCounts:
 class Program:
     """A function as a straight line of scalar operations; made by `trace`.
 
-    Equality and hash are by identity, so that a program can be static metadata of a jitted function.
+    Equality and hash are by identity, so that a program can be static metadata under `jit`.
     """
 
     input_shapes: tuple[tuple[int, ...], ...]

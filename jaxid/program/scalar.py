@@ -91,7 +91,7 @@ def negate(x: Operand) -> Operand:
 
 
 def add(x: Operand, y: Operand) -> Operand:
-    """x + y, ordered so that x + y, y + x and -(-x - y) share one node, and x - y and y - x another."""
+    """Sum, ordered so that x + y, y + x and -(-x - y) share a node, as do x - y and y - x."""
     if _constant(x):
         if _constant(y):
             return float(x + y)
@@ -116,7 +116,7 @@ def add(x: Operand, y: Operand) -> Operand:
 
 
 def multiply(x: Operand, y: Operand) -> Operand:
-    """x y with the sign in front; a constant factor stands first and is merged with one in y."""
+    """Product with the sign in front; a constant factor stands first, merged with one in y."""
     if _constant(y):
         x, y = y, x
     if _constant(y):
@@ -144,7 +144,7 @@ def _scale(factor: float, x: Scalar) -> Scalar:
 
 
 def divide(x: Operand, y: Operand) -> Operand:
-    """x / y; a division by a constant becomes a multiplication by its reciprocal."""
+    """Quotient; a division by a constant becomes a multiplication by its reciprocal."""
     if _constant(y):
         if _constant(x):
             return on_constants(Operation.DIVIDE, float(x), float(y))
@@ -160,7 +160,7 @@ def divide(x: Operand, y: Operand) -> Operand:
 
 
 def integer_power(x: Operand, exponent: int) -> Operand:
-    """x to a whole exponent, by repeated squaring."""
+    """Whole power of x, by repeated squaring."""
     if exponent < 0:
         return divide(1.0, integer_power(x, -exponent))
     power, square = 1.0, x
@@ -174,7 +174,7 @@ def integer_power(x: Operand, exponent: int) -> Operand:
 
 
 def power(x: Operand, y: Operand) -> Operand:
-    """x to the y, where a small whole or half exponent needs no call of `pow`."""
+    """Power x^y, where a small whole or half exponent needs no call of `pow`."""
     if _constant(y) and not _constant(x):
         if float(y).is_integer() and abs(y) <= 16:
             return integer_power(x, int(y))
@@ -219,6 +219,11 @@ def apply(operation: Operation, *operands: Operand) -> Operand:
         if operation in (Operation.MAXIMUM, Operation.MINIMUM) and operands[0] is operands[1]:
             return operands[0]
     return graph.node(operation, *operands)
+
+
+def is_truth(x: Operand) -> bool:
+    """Whether x is a truth value, not a number."""
+    return isinstance(x, bool) if _constant(x) else x.operation in TRUTH_VALUED
 
 
 def as_number(x: Operand) -> Operand:

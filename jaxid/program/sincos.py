@@ -90,9 +90,12 @@ def sine_cosine(x: Array) -> tuple[Array, Array]:
     """
     precision = _DOUBLE if x.dtype == np.float64 else _SINGLE
     turns = jnp.round(x * float(1 / _HALF_PI))
+    *leading, middle, last = precision.pieces
     r = x
-    for piece in precision.pieces:
+    for piece in leading:
         r = r - turns * piece
+    # The steps above are exact; the rest is summed first, so that r is rounded only once.
+    r = r - (turns * middle + turns * last)
     z = r * r
     s = r + r * (z * _horner(precision.sine, z))
     c = 1 - (0.5 * z - z * z * _horner(precision.cosine, z))

@@ -1,6 +1,7 @@
 """From an ordinary JAX function to a scalar program: run its jaxpr on arrays of scalars."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
@@ -73,9 +74,10 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
     free_x = [k for k in range(x.ndim) if k not in (*contracted_x, *batch_x)]
     free_y = [k for k in range(y.ndim) if k not in (*contracted_y, *batch_y)]
     shared = [x.shape[k] for k in batch_x]
-    contracted = int(np.prod([x.shape[k] for k in contracted_x], dtype=int))
-    left = x.transpose(*batch_x, *free_x, *contracted_x).reshape(*shared, -1, 1, contracted)
-    right = y.transpose(*batch_y, *free_y, *contracted_y).reshape(*shared, 1, -1, contracted)
+    rows, columns = (math.prod(a.shape[k] for k in free) for a, free in ((x, free_x), (y, free_y)))
+    terms = math.prod(x.shape[k] for k in contracted_x)
+    left = x.transpose((*batch_x, *free_x, *contracted_x)).reshape((*shared, rows, 1, terms))
+    right = y.transpose((*batch_y, *free_y, *contracted_y)).reshape((*shared, 1, columns, terms))
     total = _add.reduce(_multiply(left, right), axis=-1, initial=0.0)
     return np.asarray(total, object).reshape(
         (*shared, *(x.shape[k] for k in free_x), *(y.shape[k] for k in free_y))

@@ -55,7 +55,8 @@ SineCosine = Callable[[Array], tuple[Array, Array]]
 class Lowered(eqx.Module):
     """A program that runs on JAX arrays whose batch axes stand last.
 
-    Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it inside of `jax.jit`.
+    Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it inside of
+    `jax.jit`: without, each operation is dispatched by itself.
     """
 
     program: Program = eqx.field(static=True)
@@ -150,7 +151,7 @@ def unpack(program: Program, packed: list, batch: tuple[int, ...], dtype: Any) -
         size = int(np.prod(shape, dtype=int))
         entries = full[start : start + size]
         stacked = jnp.stack(entries) if entries else jnp.zeros((0, *batch), dtype)
-        leaves.append(stacked.reshape(*shape, *batch))
+        leaves.append(stacked.reshape((*shape, *batch)))
         start += size
     return jax.tree.unflatten(program.structure, leaves)
 

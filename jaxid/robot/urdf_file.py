@@ -7,6 +7,8 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from urdf_parser_py.urdf import URDF
 
+from jaxid.robot.limits import Numbers
+
 _LARGEST_FILE = 64 * 2**20
 
 # What the kinematics and the inertias need, attributes and children. Meshes, transmissions and
@@ -125,7 +127,7 @@ class UrdfTree:
         return joints[::-1]
 
     def numbers(
-        self, joint: Any, what: str, values: list[float] | None, default: tuple[float, ...]
+        self, joint: Any, what: str, values: Numbers | None, default: tuple[float, ...]
     ) -> np.ndarray:
         """Numbers of a joint as an array.
 

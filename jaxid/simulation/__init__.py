@@ -1,0 +1,1 @@
+"""A virtual robot to experiment on."""

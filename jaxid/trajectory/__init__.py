@@ -1,0 +1,1 @@
+"""Motions to excite and to verify with."""

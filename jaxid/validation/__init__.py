@@ -1,0 +1,1 @@
+"""What a model is worth: torque errors and the definiteness of the mass matrix."""

@@ -1,0 +1,165 @@
+"""What least squares need of the observations: one triangular factor for each joint.
+
+The rows of a joint see only the bodies beyond it. Their columns and forces are reduced, chunk by
+chunk, to the R factor of a QR decomposition; weights of the joints are applied afterwards, for
+free, and recordings are added by stacking factors. The observation matrix is never held.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.compiled import evaluate_rows, evaluate_tool_forces, structure
+from jaxid.measurement.observations import Observations
+from jaxid.types import AnyArray, Float
+
+CHUNK = 65536
+"""Samples whose columns are held at once."""
+
+
+class JointFactor(eqx.Module):
+    r"""The R factor of $[\Theta_j \; Q_j]$, the rows of one joint and their forces.
+
+    Attributes:
+        columns: The base parameters that can act on this joint.
+        R: Upper triangle, or fewer rows; its last column belongs to the forces.
+        rows: Number of rows that it stands for.
+    """
+
+    columns: tuple[int, ...] = eqx.field(static=True)
+    R: Float[AnyArray, "height width"]
+    rows: int = eqx.field(static=True)
+
+    def joined(self, rows: Float[AnyArray, "height width"]) -> "JointFactor":
+        """The factor after more rows `[columns, forces]`."""
+        R = np.linalg.qr(np.vstack([self.R, rows]), mode="r")
+        return JointFactor(self.columns, R, self.rows + len(rows))
+
+    def residual_square(self, p: Float[AnyArray, " base"]) -> float:
+        """Sum of the squared residuals of this joint's rows [N² m² or N²]."""
+        x = np.append(np.asarray(p)[list(self.columns)], -1.0)
+        return float(np.sum((np.asarray(self.R) @ x) ** 2))
+
+    @property
+    def force_square(self) -> float:
+        """Sum of the squared forces of this joint's rows [N² m² or N²]."""
+        return float(np.sum(np.asarray(self.R)[:, -1] ** 2))
+
+
+class Factors(eqx.Module):
+    """The factors of all joints.
+
+    Attributes:
+        joints: One for each joint.
+        size: Number of base parameters.
+    """
+
+    joints: tuple[JointFactor, ...]
+    size: int = eqx.field(static=True)
+
+    def __add__(self, other: "Factors") -> "Factors":
+        """The factors of both sets of rows together."""
+        pairs = zip(self.joints, other.joints, strict=True)
+        joined = [a.joined(b.R) for a, b in pairs]
+        rows = [a.rows + b.rows for a, b in zip(self.joints, other.joints, strict=True)]
+        return Factors(
+            tuple(JointFactor(j.columns, j.R, n) for j, n in zip(joined, rows, strict=True)),
+            self.size,
+        )
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Number of rows of each joint."""
+        return np.array([j.rows for j in self.joints])
+
+    def weighted(
+        self, weights: Float[AnyArray, " joints"]
+    ) -> tuple[Float[np.ndarray, "height base"], Float[np.ndarray, " height"]]:
+        r"""Matrix and right-hand side with the norms of $W \Theta_B p$ and $W Q$ (Eq. 29)."""
+        blocks, forces = [], []
+        for joint, w in zip(self.joints, np.asarray(weights), strict=True):
+            R = w * np.asarray(joint.R)
+            block = np.zeros((len(R), self.size))
+            block[:, list(joint.columns)] = R[:, :-1]
+            blocks.append(block)
+            forces.append(R[:, -1])
+        R = np.linalg.qr(np.column_stack([np.vstack(blocks), np.concatenate(forces)]), mode="r")
+        return R[:, :-1], R[:, -1]
+
+    def residual_squares(self, p: Float[AnyArray, " base"]) -> Float[np.ndarray, " joints"]:
+        """Sum of the squared residuals of each joint [N² m² or N²]."""
+        return np.array([j.residual_square(p) for j in self.joints])
+
+    @property
+    def force_squares(self) -> Float[np.ndarray, " joints"]:
+        """Sum of the squared forces of each joint [N² m² or N²]."""
+        return np.array([j.force_square for j in self.joints])
+
+
+def empty(base: BaseParameters) -> Factors:
+    """Factors of no rows at all."""
+    return Factors(
+        tuple(
+            JointFactor(columns, np.zeros((0, len(columns) + 1)), 0)
+            for columns in _base_columns(base)
+        ),
+        base.size,
+    )
+
+
+def factorise(base: BaseParameters, recordings: Sequence[Observations]) -> Factors:
+    """Reduces observations to the factors of their joints (Eq. 26).
+
+    Columns are evaluated at the full rate and filtered like the forces, chunk by chunk.
+
+    Args:
+        base: The base parameters.
+        recordings: Observations of the same robot.
+    """
+    total = empty(base)
+    for observations in recordings:
+        for rows, columns, forces in reduced_rows(base, observations):
+            mask = np.asarray(observations.mask)[rows]
+            total = Factors(
+                tuple(
+                    joint.joined(np.column_stack([theta, forces[:, j]])[mask[:, j]])
+                    for j, (joint, theta) in enumerate(zip(total.joints, columns, strict=True))
+                ),
+                base.size,
+            )
+    return total
+
+
+def reduced_rows(base: BaseParameters, observations: Observations, samples: int = CHUNK):
+    """Goes through observations by chunks: row range, columns of each joint, and forces.
+
+    A known tool's forces are taken off the measured ones.
+
+    Args:
+        base: The base parameters.
+        observations: What was measured.
+        samples: Size of a chunk.
+
+    Yields:
+        Slice of the rows; for each joint its columns [rows, columns of the joint]; forces
+        [rows, joints] in [N m] or [N].
+    """
+    place = {k: i for i, k in enumerate(base.indices)}
+    for chunk in observations.chunks(samples):
+        part = slice(*chunk.samples)
+        motion = observations.motion[part]
+        forces = np.asarray(observations.forces)[part]
+        if base.model.robot.tool is not None:
+            forces = forces - evaluate_tool_forces(base.model, motion)
+        columns = []
+        for acting, theta in evaluate_rows(base.model, motion):
+            kept = [i for i, k in enumerate(acting) if k in place]
+            columns.append(chunk.reduce(theta[:, kept]))
+        yield slice(*chunk.rows), columns, chunk.reduce(forces)
+
+
+def _base_columns(base: BaseParameters) -> list[tuple[int, ...]]:
+    acting = structure(base.model)[:, list(base.indices)]
+    return [tuple(int(k) for k in np.flatnonzero(row)) for row in acting]

@@ -1,0 +1,86 @@
+"""What comes out of an identification."""
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.compiled import evaluate_forces
+from jaxid.dynamics.motion import Motion
+from jaxid.identification.estimators import AbstractEstimator
+from jaxid.identification.excited import UndeterminedDirection
+from jaxid.types import AnyArray, Float
+
+
+class ConditionNumbers(eqx.Module):
+    """Condition numbers of the observation matrix.
+
+    Attributes:
+        raw: As it is, in SI units.
+        weighted: With the rows weighted as they were for the fit.
+        scaled: Weighted, with columns of length one: free of units.
+    """
+
+    raw: float
+    weighted: float
+    scaled: float
+
+
+class Fit(eqx.Module):
+    """Identified base parameters with their uncertainty.
+
+    Attributes:
+        base: Which combinations of standard parameters they are.
+        parameters: The estimates, in the units of `base.units`.
+        covariance: Of the estimates; it takes the rows for independent and is too small where
+            filtered noise makes neighbouring rows alike.
+        weights: Of the joints' rows [1/(N m) or 1/N].
+        condition_numbers: Of the observation matrix.
+        rows: Number of rows of each joint.
+        residual_rms: Of each joint's rows [N m or N].
+        residual: Norm of all residuals relative to the norm of all forces, of 1.
+        undetermined: Combinations that these observations do not determine.
+        estimator: What made the fit.
+        recordings: Names of the observations.
+        notes: What the user should know, in sentences.
+    """
+
+    base: BaseParameters
+    parameters: Float[AnyArray, " base"]
+    covariance: Float[AnyArray, "base base"]
+    weights: Float[AnyArray, " joints"]
+    condition_numbers: ConditionNumbers
+    rows: tuple[int, ...] = eqx.field(static=True)
+    residual_rms: Float[AnyArray, " joints"]
+    residual: float
+    undetermined: tuple[UndeterminedDirection, ...]
+    estimator: AbstractEstimator
+    recordings: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def standard_deviations(self) -> Float[np.ndarray, " base"]:
+        """Standard deviations of the estimates; infinite where nothing is known."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def relative_standard_deviations(self) -> Float[np.ndarray, " base"]:
+        """Standard deviations in units of the estimates' sizes, of 1."""
+        size = np.abs(np.asarray(self.parameters))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(size > 0, self.standard_deviations / size, np.inf)
+
+    @property
+    def condition_number(self) -> float:
+        """Condition number of the observation matrix in SI units."""
+        return self.condition_numbers.raw
+
+    @property
+    def standard_parameters(self) -> Float[np.ndarray, " standard"]:
+        """Standard parameters with the same forces; no physical masses and inertias."""
+        full = np.zeros(self.base.model.size)
+        full[list(self.base.indices)] = np.asarray(self.parameters)
+        return full
+
+    def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+        """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39)."""
+        return evaluate_forces(self.base.model, self.standard_parameters, motion)

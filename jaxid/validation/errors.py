@@ -1,0 +1,103 @@
+"""How well a model predicts forces that were measured (Eq. 37)."""
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.dynamics.compiled import evaluate_tool_forces
+from jaxid.identification.fit import Fit
+from jaxid.measurement.observations import Observations
+from jaxid.types import AnyArray, Bool, Float
+
+
+class TorqueErrors(eqx.Module):
+    """Measured and predicted forces of one recording, and their differences.
+
+    Attributes:
+        name: Of the recording.
+        time: Of the rows [s].
+        measured: Forces, filtered and decimated [N m or N].
+        predicted: By the model, filtered and decimated alike [N m or N].
+        counted: Which rows count for which joint.
+        max_forces: Largest force of each joint [N m or N]; NaN where not known.
+    """
+
+    name: str = eqx.field(static=True)
+    time: Float[AnyArray, " rows"]
+    measured: Float[AnyArray, "rows joints"]
+    predicted: Float[AnyArray, "rows joints"]
+    counted: Bool[AnyArray, "rows joints"]
+    max_forces: Float[AnyArray, " joints"]
+
+    @property
+    def errors(self) -> Float[np.ndarray, "rows joints"]:
+        """Predicted less measured forces (Eq. 27); NaN where a row does not count [N m or N]."""
+        return np.where(
+            self.counted, np.asarray(self.predicted) - np.asarray(self.measured), np.nan
+        )
+
+    @property
+    def mean(self) -> Float[np.ndarray, " joints"]:
+        """Mean of the absolute errors of each joint [N m or N] (Eq. 37)."""
+        return np.nanmean(np.abs(self.errors), axis=0)
+
+    @property
+    def rms(self) -> Float[np.ndarray, " joints"]:
+        """Root of the mean of the squared errors of each joint [N m or N]."""
+        return np.sqrt(np.nanmean(self.errors**2, axis=0))
+
+    @property
+    def mean_percent(self) -> Float[np.ndarray, " joints"]:
+        """Mean of the absolute errors in percent of the largest force (Eq. 37)."""
+        return 100.0 * self.mean / np.asarray(self.max_forces)
+
+    @property
+    def rms_percent(self) -> Float[np.ndarray, " joints"]:
+        """RMS errors in percent of the largest force."""
+        return 100.0 * self.rms / np.asarray(self.max_forces)
+
+    @property
+    def force_rms(self) -> Float[np.ndarray, " joints"]:
+        """Root of the mean of the squared measured forces of each joint [N m or N]."""
+        measured = np.where(self.counted, np.asarray(self.measured), np.nan)
+        return np.sqrt(np.nanmean(measured**2, axis=0))
+
+    @property
+    def rms_relative(self) -> Float[np.ndarray, " joints"]:
+        """RMS errors relative to the RMS of the measured forces, of 1."""
+        return self.rms / self.force_rms
+
+    @property
+    def relative(self) -> float:
+        r"""Norm of all errors relative to the norm of all forces, $|Wp - Q| / |Q|$, of 1."""
+        measured = np.where(self.counted, np.asarray(self.measured), np.nan)
+        return float(np.sqrt(np.nansum(self.errors**2) / np.nansum(measured**2)))
+
+    @property
+    def explained(self) -> Float[np.ndarray, " joints"]:
+        """Share of each joint's variance that the model explains ($R^2$), of 1."""
+        measured = np.where(self.counted, np.asarray(self.measured), np.nan)
+        return 1.0 - np.nanmean(self.errors**2, axis=0) / np.nanvar(measured, axis=0)
+
+
+def torque_errors(fit: Fit, observations: Observations) -> TorqueErrors:
+    """Compares the forces that a model predicts with measured ones (Eqs. 27, 37).
+
+    The prediction is filtered and decimated like the measurement.
+
+    Args:
+        fit: The model.
+        observations: Of any recording of the same robot.
+    """
+    robot = fit.base.model.robot
+    predicted = fit.predict(observations.motion) + evaluate_tool_forces(
+        fit.base.model, observations.motion
+    )
+    known = np.where(np.isfinite(robot.limits.force), robot.limits.force, robot.drives.max_forces)
+    return TorqueErrors(
+        name=observations.name,
+        time=observations.reduced_time,
+        measured=observations.reduced_forces,
+        predicted=observations.reduce(predicted),
+        counted=np.asarray(observations.mask),
+        max_forces=np.where(np.isfinite(known), known, np.nan),
+    )
