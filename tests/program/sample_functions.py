@@ -1,0 +1,73 @@
+"""Functions that the tests of a program share, and hypothesis strategies that make more."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import strategies as st
+
+UNARY = (jnp.sin, jnp.cos, jnp.tanh, jnp.abs, lambda x: -x, lambda x: x * x, jnp.exp, lambda x: x)
+BINARY = (
+    jnp.add,
+    jnp.subtract,
+    jnp.multiply,
+    jnp.maximum,
+    jnp.minimum,
+    lambda x, y: x / (1.5 + y * y),
+    lambda x, y: jnp.where(x < y, x, 0.5 * y),
+)
+SIZE = 3
+
+
+@st.composite
+def random_functions(draw, smooth=False):
+    """A function of two vectors of `SIZE` entries, as a random straight line of operations."""
+    unary = (*UNARY[:3], *UNARY[4:6]) if smooth else UNARY
+    binary = (*BINARY[:3], BINARY[5]) if smooth else BINARY
+    constants = st.sampled_from([0.0, 1.0, -1.0, 2.0, -0.3, 0.7])
+    steps = draw(
+        st.lists(
+            st.tuples(
+                st.integers(0, len(unary) - 1),
+                st.integers(0, len(binary) - 1),
+                st.integers(0, 40),
+                st.integers(0, 40),
+                constants,
+            ),
+            min_size=1,
+            max_size=7,
+        )
+    )
+
+    def function(x, y):
+        values = [x, y, x[::-1], np.array([0.0, 1.0, -2.0])]
+        for u, b, i, j, c in steps:
+            left, right = values[i % len(values)], values[j % len(values)]
+            # Bounded, so that a chain of exponentials and squares stays a number.
+            values.append(binary[b](c * jnp.sin(unary[u](jnp.asarray(left))), right))
+        matrix = jnp.outer(values[-1], x)
+        return {"vector": values[-1], "matrix": matrix @ matrix.T, "sum": jnp.sum(values[-2])}
+
+    return function
+
+
+def samples(seed, batch, shape=(SIZE,), count=2):
+    return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, *shape, *batch))
+
+
+def reference(function, *arrays):
+    """The function on batch-last arrays by `vmap`, which shares nothing with a program."""
+    first = [jnp.moveaxis(jnp.asarray(x), -1, 0) for x in arrays]
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1), jax.vmap(function)(*first))
+
+
+def chain(angles, rates):
+    """Positions and velocities along a chain of three skew axes: shared values, many results."""
+    point, turn, results = jnp.zeros(3), jnp.eye(3), []
+    offset = np.array([0.3, 0.0, 0.5])
+    for k in range(3):
+        c, s = jnp.cos(angles[k]), jnp.sin(angles[k])
+        step = jnp.array([[c, -s, 0 * c], [0 * c, 0 * c, -1 + 0 * c], [s, c, 0 * c]])
+        turn = turn @ step
+        point = point + turn @ offset
+        results.append(point * rates[k] + jnp.cross(turn[:, 2], point))
+    return jnp.stack(results)

@@ -1,0 +1,178 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from sample_functions import SIZE, chain, random_functions, reference, samples
+
+from jaxid.program import (
+    BarrierFence,
+    DivisionFence,
+    NoFence,
+    default_fence,
+    evaluate,
+    library_sine_cosine,
+    lower,
+    sine_cosine,
+    trace,
+    unpack,
+)
+from jaxid.program.fence import fenced_nodes
+
+FENCES = (NoFence(), BarrierFence(), DivisionFence())
+each_fence = pytest.mark.parametrize("fence", FENCES, ids=lambda f: type(f).__name__)
+
+
+def close(a, b, rtol=1e-12, atol=1e-12):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=rtol, atol=atol), a, b)
+
+
+@given(random_functions())
+@settings(max_examples=8, deadline=None, derandomize=True)
+def test_a_lowered_program_equals_its_function(function):
+    x = samples(0, (5,))
+    lowered = lower(trace(function, (SIZE,), (SIZE,)))
+    close(jax.jit(lowered.dense)(*x), reference(function, *x))
+
+
+@given(random_functions(smooth=True))
+@settings(max_examples=6, deadline=None, derandomize=True)
+def test_the_derivative_of_a_lowered_program_is_its_functions(function):
+    x, y = samples(1, ())
+    lowered = lower(trace(function, (SIZE,), (SIZE,)))
+    close(
+        jax.jit(jax.jacfwd(lowered.dense))(x, y),
+        jax.jit(jax.jacfwd(function))(x, y),
+        rtol=1e-10,
+        atol=1e-10,
+    )
+
+
+@each_fence
+def test_values_derivatives_and_batches_behind_each_fence(fence):
+    lowered = lower(trace(chain, (3,), (3,)), fence)
+    x = samples(2, (6,))
+
+    def loss(f, a, b):
+        return jnp.sum(jnp.sin(f(a, b)))
+
+    def original(a, b):
+        return jnp.moveaxis(jax.vmap(chain, in_axes=-1)(a, b), 0, -1)
+
+    a, b = jnp.asarray(x[0]), jnp.asarray(x[1])
+    close(jax.jit(lowered.dense)(a, b), original(a, b))
+    gradient = jax.jit(jax.grad(lambda *x: loss(lowered.dense, *x), (0, 1)))
+    close(gradient(a, b), jax.grad(lambda *x: loss(original, *x), (0, 1))(a, b))
+    close(jax.jit(lambda *x: jax.jvp(lowered.dense, x, x))(a, b), jax.jvp(original, (a, b), (a, b)))
+    hessian = jax.jit(jax.hessian(lambda a: loss(lowered.dense, a, b[:, :1])))(a[:, :1])
+    close(hessian, jax.hessian(lambda a: loss(original, a, b[:, :1]))(a[:, :1]))
+    mapped = jax.jit(jax.vmap(lowered.dense, in_axes=-1, out_axes=-1))(a, b)
+    close(mapped, original(a, b))
+
+
+@each_fence
+def test_nan_in_one_sample_stays_there(fence):
+    lowered = lower(trace(chain, (3,), (3,)), fence)
+    x = samples(3, (4,))
+    clean = np.asarray(jax.jit(lowered.dense)(*x))
+    x[0, 0, 0] = np.nan
+    dirty = np.asarray(jax.jit(lowered.dense)(*x))
+    assert np.isnan(dirty[..., 0]).any()
+    np.testing.assert_array_equal(dirty[..., 1:], clean[..., 1:])
+
+
+@each_fence
+@pytest.mark.parametrize("first", [0.0, -0.0, -3.0, np.inf, -np.inf, np.nan, -np.nan])
+def test_no_first_entry_changes_what_a_fence_returns(fence, first):
+    for dtype in (np.float64, np.float32):
+        x = np.array([1.1, np.nan, np.inf, -0.0, 1e-30], dtype)
+        got = np.asarray(jax.jit(lambda a, b: fence(a, fence.anchor(b)))(x, dtype(first)))
+        np.testing.assert_array_equal(got, x)
+        np.testing.assert_array_equal(np.signbit(got), np.signbit(x))
+        assert got.dtype == dtype
+
+
+def test_xla_does_not_fold_the_division_away():
+    program = trace(chain, (3,), (3,))
+    x = samples(0, (64,))
+    text = jax.jit(lower(program, DivisionFence()).dense).lower(*x).compile().as_text()
+    assert len(fenced_nodes(program)) > 0
+    # The sine and cosine stand on one more fence, for both.
+    assert text.count(" divide(") >= len(fenced_nodes(program)) / 2
+
+
+@each_fence
+def test_single_precision_stays_single(fence):
+    lowered = lower(trace(lambda a, b: chain(a, b) + jnp.where(a > 0, 1.0, 0.0), (3,), (3,)), fence)
+    x = samples(4, (5,)).astype(np.float32)
+    packed = jax.jit(lowered)(*x)
+    assert {p.dtype for p in packed} == {np.dtype(np.float32)}
+    close(jax.jit(lowered.dense)(*x), evaluate(lowered.program, *x), rtol=1e-5, atol=1e-5)
+
+
+def test_packed_entries_and_constants():
+    program = trace(lambda x: {"a": jnp.array([x, 0.0]), "b": np.array(2.0)}, ())
+    packed = lower(program)(jnp.arange(3.0))
+    np.testing.assert_array_equal(packed[0], jnp.arange(3.0))
+    assert packed[1:] == [0.0, 2.0]
+    dense = unpack(program, packed, (3,), np.float64)
+    np.testing.assert_array_equal(dense["a"], [[0, 1, 2], [0, 0, 0]])
+    np.testing.assert_array_equal(dense["b"], [2, 2, 2])
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (2, 3)])
+def test_any_batch_shape(batch):
+    program = trace(chain, (3,), (3,))
+    x = samples(5, batch)
+    close(jax.jit(lower(program).dense)(*x), evaluate(program, *x))
+
+
+def test_batches_are_broadcast_and_wrong_shapes_refused():
+    lowered = lower(trace(lambda a, b: a * b, (2,), (2,)))
+    got = lowered.dense(jnp.ones(2), jnp.arange(6.0).reshape(2, 3))
+    np.testing.assert_array_equal(got, jnp.arange(6.0).reshape(2, 3))
+    with pytest.raises(ValueError, match="put the batch last"):
+        lowered(jnp.ones((3, 2)), jnp.ones((3, 2)))
+
+
+def test_all_operations_agree_with_numpy():
+    def function(x):
+        inside = 0.9 * jnp.sin(x)
+        return jnp.stack(
+            [
+                jnp.tan(inside), jnp.arcsin(inside), jnp.arccos(inside), jnp.arctan(x), jnp.sinh(x),
+                jnp.cosh(x), jnp.tanh(x), jnp.sqrt(x * x), jnp.cbrt(x), jnp.exp(x), jnp.abs(x),
+                jnp.log(x * x), jnp.expm1(x), jnp.log1p(x * x), jnp.abs(x) ** 0.3, jnp.sign(x),
+                jnp.arctan2(x, 1.0 - x), 1.0 / x, jnp.minimum(x, 0.3), jnp.maximum(x, -x * x),
+                jnp.where((x > 0) & (x < 1) | ~(x != 0.5), x, -x), x**5,
+            ]
+        )  # fmt: skip
+
+    program = trace(function, ())
+    x = np.linspace(-2.1, 2.0, 50)
+    close(jax.jit(lower(program).dense)(x), evaluate(program, x))
+    close(evaluate(program, x), function(jnp.asarray(x)))
+
+
+@pytest.mark.parametrize("pair", [sine_cosine, library_sine_cosine])
+def test_sines_of_computed_angles(pair):
+    program = trace(lambda x: jnp.sin(x[0] + x[1]) * jnp.cos(jnp.cos(x[0])), (2,))
+    x = samples(6, (9,), (2,), 1)[0]
+    close(lower(program, sine_cosine=pair).dense(x), evaluate(program, x), 1e-14, 1e-15)
+
+
+def test_fences_stand_where_much_would_be_computed_again():
+    def dear_and_shared(x):
+        y = jnp.exp(x)
+        return jnp.stack([y + 1.0, y + 2.0]), x + x
+
+    program = trace(dear_and_shared, ())
+    (fenced,) = fenced_nodes(program)
+    assert program.nodes[fenced].operation == "exp"
+    assert fenced_nodes(trace(lambda x: (x * x) * (x * x + 1.0), ())) == frozenset()
+
+
+def test_default_fence_by_platform_and_version():
+    assert isinstance(default_fence("cpu", (0, 10, 2)), DivisionFence)
+    assert isinstance(default_fence("cpu", (0, 12, 0)), BarrierFence)
+    assert isinstance(default_fence("gpu", (0, 12, 0)), NoFence)
