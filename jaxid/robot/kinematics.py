@@ -41,6 +41,7 @@ def placements(
     robot: Robot, q: Float[AnyArray, " joints"]
 ) -> tuple[Float[AnyArray, "joints 3 3"], Float[AnyArray, "joints 3"]]:
     """Attitudes and origins [m] of all bodies in the frame of the ground."""
+    q = jnp.asarray(q)
     rotations, origins = [], []
     for i, parent in enumerate(robot.parent):
         R, r = placement_in_parent(robot, i, q[i])

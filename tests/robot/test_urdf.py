@@ -1,0 +1,363 @@
+from importlib.metadata import distribution
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from forward_kinematics import (
+    body_transforms,
+    from_rpy,
+    random_configuration,
+    tip_transform,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from urdf_text import arm, inertial, joint, link, numbers, robot
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import RigidBodies
+from jaxid.robot.urdf import load_urdf, urdf_parameters
+
+SHARE = "cmeel.prefix/share/example-robot-data/robots"
+FOLDER = Path(str(distribution("example-robot-data").locate_file(SHARE)))
+TREES = {
+    "six axes": "ur_description/urdf/ur10_robot.urdf",
+    "six continuous axes": "kinova_description/robots/kinova.urdf",
+    "seven axes": "xarm_description/urdf/xarm7.urdf",
+    "an arm with a gripper": "z1_description/urdf/z1.urdf",
+    "a printed arm": "so_arm_description/urdf/so101.urdf",
+    "a mobile manipulator": "tiago_description/robots/tiago_no_hand.urdf",
+    "two arms and two hands": "tiago_description/robots/tiago_dual.urdf",
+    "a humanoid": "talos_data/robots/talos_reduced.urdf",
+    "another humanoid": "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+    "oblique axes": "icub_description/robots/icub.urdf",
+    "a dog with an arm": "anymal_b_simple_description/robots/anymal-kinova.urdf",
+    "wheels and arms": "centauro_description/urdf/centauro.urdf",
+    "a pendulum": "double_pendulum_description/urdf/double_pendulum_continuous.urdf",
+}
+CHAINS = {
+    "panda": ("panda_description/urdf/panda.urdf", None, "panda_hand"),
+    "baxter": ("baxter_description/urdf/baxter.urdf", "torso", "left_gripper_base_link"),
+    "pr2": ("pr2_description/urdf/pr2.urdf", None, "l_gripper_tool_frame"),
+    "talos": ("talos_data/robots/talos_full_v2.urdf", "torso_2_link", "wrist_right_ft_tool_link"),
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", None, "tool0"),
+}
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_file(text, name="arm.urdf"):
+        (tmp_path / name).write_text(text)
+        return tmp_path / name
+
+    return write_file
+
+
+class Oracle:
+    """Pinocchio's model of the same file, asked by names."""
+
+    def __init__(self, path):
+        self.model = pin.buildModelFromUrdf(str(path))
+        self.data = self.model.createData()
+
+    def set(self, names, q):
+        full = pin.neutral(self.model)
+        for name, value in zip(names, q, strict=True):
+            j = self.model.joints[self.model.getJointId(name)]
+            circle = [np.cos(value), np.sin(value)]
+            full[j.idx_q : j.idx_q + j.nq] = circle if j.nq == 2 else value
+        pin.framesForwardKinematics(self.model, self.data, full)
+
+    def joint(self, name):
+        return self.data.oMi[self.model.getJointId(name)].homogeneous
+
+    def frame(self, name):
+        return self.data.oMf[self.model.getFrameId(name, pin.BODY)].homogeneous
+
+    def parameters(self, name):
+        p = self.model.inertias[self.model.getJointId(name)].toDynamicParameters()
+        m, x, y, z, xx, xy, yy, xz, yz, zz = p
+        return [m, x, y, z, xx, yy, zz, -yz, -xz, -xy]
+
+
+@pytest.mark.parametrize("file", TREES.values(), ids=TREES.keys())
+def test_real_trees_agree_with_pinocchio(file):
+    path, oracle = FOLDER / file, Oracle(FOLDER / file)
+    ours = load_urdf(path, snap_tolerance=0.0)
+    assert sorted(ours.joint_names) == sorted(oracle.model.names[1:])
+    for seed in range(2):
+        q = random_configuration(ours, seed)
+        oracle.set(ours.joint_names, q)
+        expected = np.array([oracle.joint(name) for name in ours.joint_names])
+        np.testing.assert_allclose(body_transforms(ours, q), expected, atol=1e-10)
+    p = urdf_parameters(path, snap_tolerance=0.0).reshape(-1, 10)
+    expected = [oracle.parameters(name) for name in ours.joint_names]
+    np.testing.assert_allclose(p, expected, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("file", TREES.values(), ids=TREES.keys())
+def test_snapping_moves_a_real_robot_by_less_than_it_says(file):
+    exact, snapped = (load_urdf(FOLDER / file, snap_tolerance=tol) for tol in (0.0, 1e-4))
+    q = random_configuration(exact, 0)
+    moved = np.abs(body_transforms(exact, q) - body_transforms(snapped, q)).max()
+    assert moved <= 1e-4 * (1 + len(snapped.notes))
+
+
+@pytest.mark.parametrize(("file", "base", "tip"), CHAINS.values(), ids=CHAINS.keys())
+def test_real_chains_agree_with_pinocchio(file, base, tip):
+    oracle = Oracle(FOLDER / file)
+    ours = load_urdf(FOLDER / file, base=base, tip=tip, snap_tolerance=0.0)
+    assert ours.parent == tuple(range(-1, ours.joints - 1))
+    q = random_configuration(ours, 1)
+    oracle.set(ours.joint_names, q)
+    ground = np.eye(4) if base is None else np.linalg.inv(oracle.frame(base))
+    expected = ground @ np.array([oracle.joint(name) for name in ours.joint_names])
+    np.testing.assert_allclose(body_transforms(ours, q), expected, atol=1e-10)
+    np.testing.assert_allclose(tip_transform(ours, q), ground @ oracle.frame(tip), atol=1e-10)
+
+
+def test_panda_of_the_library_is_the_panda_of_the_file():
+    from jaxid.robot.library import panda
+
+    urdf = load_urdf(FOLDER / CHAINS["panda"][0], tip="panda_link8")
+    q = random_configuration(urdf, 2)
+    np.testing.assert_allclose(tip_transform(panda(), q), tip_transform(urdf, q), atol=1e-12)
+    assert set(np.abs(urdf.rotation).ravel()) == {0.0, 1.0}
+
+
+# Laws.
+
+small = st.integers(0, 10_000)
+
+
+def _tree(rng, split):
+    """A random tree of five bodies; with `split`, fixed joints lie between all of its parts."""
+    parts = [link("base")]
+    for i in range(5):
+        parent = "base" if i == 0 else f"link{rng.integers(-1, i)}"
+        parent = "base" if parent == "link-1" else parent
+        kind = ["revolute", "continuous", "prismatic"][rng.integers(3)]
+        rpy, xyz = rng.uniform(-3, 3, 3), rng.uniform(-1, 1, 3)
+        axis = numbers(rng.normal(size=3))
+        between = from_rpy(rng.uniform(-1.4, 1.4, 3), rng.uniform(-1, 1, 3))
+        com, turned = rng.uniform(-0.3, 0.3, 3), rng.uniform(-1.4, 1.4, 3)
+        moments = [*rng.uniform(1, 2, 6)]
+        if not split:
+            parts.append(link(f"link{i}", inertial(2.5, com, turned, moments)))
+            parts.append(
+                joint(
+                    f"j{i}", parent, f"link{i}", kind, rpy=numbers(rpy), xyz=numbers(xyz), axis=axis
+                )
+            )
+            continue
+        parts += [link(f"link{i}"), link(f"mid{i}")]
+        rest = np.linalg.inv(between) @ from_rpy(rpy, xyz)
+        parts.append(_fixed(f"first{i}", parent, f"mid{i}", between))
+        parts.append(joint(f"j{i}", f"mid{i}", f"link{i}", kind, axis=axis, **_place(rest)))
+        load = np.linalg.inv(between) @ from_rpy(turned, com)
+        parts.append(link(f"load{i}", inertial(2.5, load[:3, 3], _rpy(load), moments)))
+        parts.append(_fixed(f"second{i}", f"link{i}", f"load{i}", between))
+    return robot(*parts)
+
+
+def _rpy(T):
+    return Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
+
+
+def _fixed(name, parent, child, T):
+    return joint(name, parent, child, "fixed", **_place(T))
+
+
+def _place(T):
+    return {"rpy": numbers(_rpy(T)), "xyz": numbers(T[:3, 3])}
+
+
+@given(small)
+def test_fixed_joints_in_between_change_nothing(tmp_path_factory, seed):
+    folder = tmp_path_factory.mktemp("trees")
+    paths = folder / "plain.urdf", folder / "split.urdf"
+    for path, split in zip(paths, (False, True), strict=True):
+        path.write_text(_tree(np.random.default_rng(seed), split))
+    plain, split = (load_urdf(path, snap_tolerance=0.0) for path in paths)
+    assert split.joint_names == plain.joint_names
+    assert split.parent == plain.parent
+    assert split.revolute == plain.revolute
+    for field in ("axis", "rotation", "offset"):
+        np.testing.assert_allclose(getattr(split, field), getattr(plain, field), atol=1e-12)
+    p = [urdf_parameters(path, snap_tolerance=0.0) for path in paths]
+    np.testing.assert_allclose(p[1], p[0], atol=1e-11)
+
+
+@given(small)
+def test_every_axis_is_a_unit_vector_and_parents_come_first(tmp_path_factory, seed):
+    path = tmp_path_factory.mktemp("tree") / "tree.urdf"
+    path.write_text(_tree(np.random.default_rng(seed), False))
+    loaded = load_urdf(path)
+    np.testing.assert_allclose(np.linalg.norm(loaded.axis, axis=1), 1.0, atol=1e-15)
+    assert all(p < i for i, p in enumerate(loaded.parent))
+
+
+# Snapping.
+
+
+def test_a_rounded_quarter_turn_costs_no_base_parameter(write):
+    def wrist(angle):
+        return robot(
+            *(link(name) for name in ("base", "a", "b", "c")),
+            joint("j1", "base", "a"),
+            joint("j2", "a", "b", rpy=f"{angle} 0 0", xyz="0.1 0 0.4"),
+            joint("j3", "b", "c", rpy=f"-{angle} 0 0", xyz="0.3 0.05 0"),
+        )
+
+    def size(path, tolerance):
+        loaded = load_urdf(path, snap_tolerance=tolerance)
+        return base_parameters(Model(loaded, (RigidBodies(),))).size
+
+    rounded, exact = write(wrist("1.5708"), "rounded.urdf"), write(wrist(np.pi / 2), "exact.urdf")
+    assert size(rounded, 1e-4) == size(exact, 0.0)
+    assert load_urdf(rounded).notes[:2] == (
+        "joint `j2`: roll 1.5708 rad snapped to pi/2 (1.57079632679).",
+        "joint `j3`: roll -1.5708 rad snapped to -pi/2 (-1.57079632679).",
+    )
+    assert not [n for n in load_urdf(rounded, snap_tolerance=0.0).notes if "snapped" in n]
+    assert not [n for n in load_urdf(exact).notes if "snapped" in n]
+
+
+@pytest.mark.parametrize(("angle", "tolerance"), [("1.5708", 1e-4), ("1.57", 1e-3)])
+def test_a_roll_snaps_beside_an_oblique_yaw(write, angle, tolerance):
+    loaded = load_urdf(write(arm(rpy=f"{angle} 0 0.3")), snap_tolerance=tolerance)
+    assert loaded.rotation[0][2].tolist() == [0.0, 1.0, 0.0]
+
+
+def test_axes_and_sums_of_turns_snap(write):
+    half = np.pi / 4 + 1e-6
+    text = robot(
+        *(link(name) for name in ("base", "mid", "a")),
+        joint("first", "base", "mid", "fixed", rpy=f"{half} 0 0"),
+        joint("j1", "mid", "a", rpy=f"{half} 0 0", axis="0 2 0.00002"),
+    )
+    loaded = load_urdf(write(text))
+    assert set(np.abs(loaded.rotation[0]).ravel()) == {0.0, 1.0}
+    assert loaded.axis[0].tolist() == [0.0, 1.0, 0.0]
+    assert [note.split(" snapped")[0] for note in loaded.notes[:2]] == [
+        "joint `j1`: attitude",
+        "joint `j1`: axis",
+    ]
+
+
+# What the options mean.
+
+
+def _branches():
+    return robot(
+        *(link(name) for name in ("base", "tool", "flange", "a", "b", "c", "camera")),
+        joint("jc", "base", "c", "prismatic", xyz="0 1 0"),
+        joint("ja", "base", "a"),
+        joint("jb", "a", "b", xyz="1 0 0"),
+        joint("to_camera", "b", "camera", "fixed", xyz="0 0 5"),
+        joint("to_flange", "b", "flange", "fixed", xyz="0.5 0 0"),
+        joint("to_tool", "flange", "tool", "fixed", xyz="0 0 0.25"),
+    )
+
+
+def test_joints_come_depth_first_in_the_order_of_the_file(write):
+    loaded = load_urdf(write(_branches()))
+    assert loaded.joint_names == ("jc", "ja", "jb")
+    assert loaded.parent == (-1, -1, 1)
+    assert loaded.revolute == (False, True, True)
+
+
+def test_without_tip_the_end_effector_ends_the_longest_chain(write):
+    loaded = load_urdf(write(_branches()))
+    assert loaded.tip_body == 2
+    assert loaded.tip_offset.tolist() == [0.5, 0.0, 0.25]
+
+
+def test_tip_and_base_cut_out_a_chain(write):
+    path = write(_branches())
+    assert load_urdf(path, tip="camera").joint_names == ("ja", "jb")
+    assert load_urdf(path, tip="camera").tip_offset.tolist() == [0.0, 0.0, 5.0]
+    assert load_urdf(path, tip="a").joint_names == ("ja",)
+    below = load_urdf(path, base="a")
+    assert below.joint_names == ("jb",)
+    assert below.offset.tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_base_placement_and_gravity_are_the_users(write):
+    path = write(_branches())
+    base = from_rpy([0.2, 0.1, -1.0], [1.0, 2.0, 3.0])
+    mounted = load_urdf(
+        path, base_rotation=base[:3, :3], base_position=base[:3, 3], gravity=(0.0, 0.0, -1.62)
+    )
+    q = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(
+        tip_transform(mounted, q), base @ tip_transform(load_urdf(path), q), atol=1e-14
+    )
+    assert mounted.gravity.tolist() == [0.0, 0.0, -1.62]
+
+
+def test_parameters_of_a_chain_hold_what_is_fixed_to_it_and_no_more(write):
+    heavy = inertial(2.0, (0, 0, 0), (0, 0, 0), (1, 0, 0, 1, 0, 1))
+    text = robot(
+        link("base", heavy),
+        *(link(name, heavy) for name in ("a", "side", "finger")),
+        joint("j1", "base", "a"),
+        joint("to_side", "a", "side", "fixed", xyz="0 3 0"),
+        joint("to_finger", "a", "finger", "prismatic"),
+    )
+    p = urdf_parameters(write(text), tip="a")
+    assert p.tolist() == [4.0, 0.0, 6.0, 0.0, 2.0 + 18.0, 2.0, 2.0 + 18.0, 0.0, 0.0, 0.0]
+
+
+def test_a_body_without_mass_is_noted_and_counts_as_massless(write):
+    path = write(arm())
+    assert load_urdf(path).notes == (
+        "joint `j1`: the file gives what it moves no mass; `urdf_parameters` takes zero.",
+    )
+    assert urdf_parameters(path).tolist() == [0.0] * 10
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "expected"),
+    [
+        ("revolute", "", (-np.inf, np.inf, np.inf, np.inf)),
+        ("revolute", 'lower="-1" upper="2" velocity="3" effort="4"', (-1, 2, 3, 4)),
+        ("prismatic", 'upper="0.5" velocity="3"', (0, 0.5, 3, np.inf)),
+        ("revolute", 'lower="-1"', (-1, 0, np.inf, np.inf)),
+        ("revolute", 'effort="9"', (-np.inf, np.inf, np.inf, 9)),
+        ("continuous", 'lower="-1" upper="1" effort="9"', (-np.inf, np.inf, np.inf, 9)),
+        ("revolute", 'lower="0" upper="0" velocity="0" effort="-1"', (-np.inf, *(np.inf,) * 3)),
+    ],
+)
+def test_limits(write, kind, limit, expected):
+    limits = load_urdf(write(arm(kind=kind, inner=f"<limit {limit}/>" if limit else ""))).limits
+    read = (limits.position_min, limits.position_max, limits.velocity, limits.force)
+    assert [values.item() for values in read] == list(expected)
+
+
+def test_limits_taken_as_unknown_are_noted(write):
+    zeros = '<limit lower="0" upper="0" velocity="0" effort="-1"/>'
+    assert load_urdf(write(arm(inner=zeros))).notes[:3] == (
+        "joint `j1`: a range from 0 to 0 is taken as unknown.",
+        "joint `j1`: velocity 0 is taken as unknown.",
+        "joint `j1`: effort -1 is taken as unknown.",
+    )
+
+
+def test_the_axis_is_x_where_the_file_has_none(write):
+    text = arm().replace('<axis xyz="0 0 1"/>', "")
+    assert load_urdf(write(text)).axis.tolist() == [[1.0, 0.0, 0.0]]
+
+
+def test_foreign_elements_and_comments_go_unread(write, capfd):
+    junk = "<!-- c --><gazebo><plugin/></gazebo><transmission/><material/><link_extra a='1'/>"
+    text = arm(inner="<!-- c --><safety_controller/><dynamics damping='x'/>")
+    loaded = load_urdf(write(text.replace("<joint", junk + "<joint")))
+    assert loaded.joint_names == ("j1",)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_robot_without_a_name_takes_that_of_its_file(write):
+    assert load_urdf(write(arm().replace(' name="arm"', ""), "left.urdf")).name == "left"
