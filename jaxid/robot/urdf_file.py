@@ -78,9 +78,11 @@ class UrdfTree:
                 f"`{self.path}` has several root links ({_listed(roots)}), but must be one tree: "
                 "connect them by fixed joints."
             )
-        reached: list[str] = list(roots)
-        for link in reached:
-            reached.extend(joint.child for joint in self.children[link])
+        waiting, reached = list(roots), set(roots)
+        while waiting:
+            below = [joint.child for joint in self.children[waiting.pop()]]
+            waiting += below
+            reached.update(below)
         for link in self.children:
             if link not in reached:
                 raise self.error(
@@ -209,9 +211,11 @@ def _number(text: str | None) -> float:
 
 
 def _require_unique(path: str, what: str, names: list[str | None]) -> None:
-    for i, name in enumerate(names):
-        if name in names[:i]:
+    seen: set[str | None] = set()
+    for name in names:
+        if name is not None and name in seen:
             raise ValueError(f"`{path}` has two {what}s named `{name}`: rename one.")
+        seen.add(name)
 
 
 def _listed(names: list[str]) -> str:

@@ -1,4 +1,6 @@
 import json
+from importlib.metadata import distribution
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,6 +115,14 @@ def test_published_limits(facts, name):
     ):
         if key in known:
             np.testing.assert_allclose(ours, known[key])
+
+
+def test_ur10_has_the_limits_of_its_urdf():
+    share = "cmeel.prefix/share/example-robot-data/robots/ur_description/urdf/ur10_robot.urdf"
+    urdf = load_urdf(Path(str(distribution("example-robot-data").locate_file(share)))).limits
+    ours = library.ur10().limits
+    for field in ("position_min", "position_max", "velocity", "force"):
+        np.testing.assert_allclose(getattr(ours, field), getattr(urdf, field), rtol=1e-11)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

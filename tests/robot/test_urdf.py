@@ -203,23 +203,26 @@ def test_every_axis_is_a_unit_vector_and_parents_come_first(tmp_path_factory, se
 
 
 def test_a_rounded_quarter_turn_costs_no_base_parameter(write):
-    def wrist(angle):
+    # Two vertical axes, but only as vertical and parallel as the angle is a quarter turn.
+    def arm_of(angle):
         return robot(
-            *(link(name) for name in ("base", "a", "b", "c")),
-            joint("j1", "base", "a"),
-            joint("j2", "a", "b", rpy=f"{angle} 0 0", xyz="0.1 0 0.4"),
-            joint("j3", "b", "c", rpy=f"-{angle} 0 0", xyz="0.3 0.05 0"),
+            *(link(name) for name in ("base", "wall", "a", "b")),
+            joint("mount", "base", "wall", "fixed", rpy=f"{angle} 0 0"),
+            joint("j1", "wall", "a", axis="0 1 0"),
+            joint("j2", "a", "b", rpy=f"-{angle} 0 0", xyz="0.1 0 0.4"),
         )
 
     def size(path, tolerance):
         loaded = load_urdf(path, snap_tolerance=tolerance)
         return base_parameters(Model(loaded, (RigidBodies(),))).size
 
-    rounded, exact = write(wrist("1.5708"), "rounded.urdf"), write(wrist(np.pi / 2), "exact.urdf")
-    assert size(rounded, 1e-4) == size(exact, 0.0)
+    rounded = write(arm_of("1.5708"), "rounded.urdf")
+    exact = write(arm_of(np.pi / 2), "exact.urdf")
+    assert size(rounded, 1e-4) == size(exact, 0.0) == 4
+    assert size(rounded, 0.0) > 4
     assert load_urdf(rounded).notes[:2] == (
-        "joint `j2`: roll 1.5708 rad snapped to pi/2 (1.57079632679).",
-        "joint `j3`: roll -1.5708 rad snapped to -pi/2 (-1.57079632679).",
+        "joint `mount`: roll 1.5708 rad snapped to pi/2 (1.57079632679).",
+        "joint `j2`: roll -1.5708 rad snapped to -pi/2 (-1.57079632679).",
     )
     assert not [n for n in load_urdf(rounded, snap_tolerance=0.0).notes if "snapped" in n]
     assert not [n for n in load_urdf(exact).notes if "snapped" in n]
