@@ -3,23 +3,21 @@
     python benchmarks/fences.py [--quick]
 
 A new version of JAX can lose a fence silently: the results stay right and the program becomes many
-times slower. This prints run and compile time of a seven-joint regressor behind each fence, and says
-by name which one does not hold. Ratios are what counts; absolute times depend on the machine.
+times slower. This prints run and compile time of a seven-joint regressor behind each fence, and
+says by name which one does not hold. Ratios count; absolute times depend on the machine.
 """
 
 import argparse
-import os
 import statistics
+import sys
 import time
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from pathlib import Path
 
 import jax
-
-jax.config.update("jax_enable_x64", True)
-
 import jax.numpy as jnp
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from jaxid.program import (
     BarrierFence,
@@ -96,6 +94,7 @@ def compiled(lowered, inputs):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer samples and repetitions")
+    jax.config.update("jax_enable_x64", True)
     quick = parser.parse_args().quick
     samples, repetitions = (2048, 5) if quick else (16384, 9)
     program = trace(regressor, (JOINTS,), (JOINTS,), (JOINTS,))
@@ -115,7 +114,7 @@ def main():
         runs[fence, pair], compile_times[fence, pair] = compiled(lowered, inputs)
     expected = runs[fences[0], "library"](*inputs)
     times = {case: [] for case in cases}
-    for case, run in runs.items():
+    for run in runs.values():
         for got, want in zip(run(*inputs), expected, strict=True):
             np.testing.assert_allclose(got, want, rtol=1e-11, atol=1e-11)
     for _ in range(repetitions):

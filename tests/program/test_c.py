@@ -2,6 +2,7 @@ import ctypes
 import shutil
 import subprocess
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -45,8 +46,6 @@ def compiled(tmp_path_factory):
 
 
 def flat(program, *x):
-    import jax
-
     return [np.ravel(v) for v in jax.tree.leaves(evaluate(program, *x))]
 
 
@@ -101,9 +100,7 @@ def test_nan_comes_through_choices(compiled):
         assert np.isnan(np.concatenate(run(x, y))).all()
 
 
-def test_output_over_input_is_allowed(compiled):
-    if shutil.which("gcc") is None:
-        pytest.skip("no C compiler (gcc) on this machine")
+def test_inputs_are_read_before_an_output_is_written():
     program = trace(lambda x: x[::-1] * 2.0, (3,))
     text = to_c(program, "swap")
     body = text[text.rindex("{") :]

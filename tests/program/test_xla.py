@@ -103,7 +103,9 @@ def test_xla_does_not_fold_the_division_away():
 
 @each_fence
 def test_single_precision_stays_single(fence):
-    lowered = lower(trace(lambda a, b: chain(a, b) + jnp.where(a > 0, 1.0, 0.0), (3,), (3,)), fence)
+    lowered = lower(
+        trace(lambda a, b: chain(a, b) + jnp.where(a > 0, 1.0, 0.0)[:, None], (3,), (3,)), fence
+    )
     x = samples(4, (5,)).astype(np.float32)
     packed = jax.jit(lowered)(*x)
     assert {p.dtype for p in packed} == {np.dtype(np.float32)}
