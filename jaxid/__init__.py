@@ -25,8 +25,11 @@ from jaxid.identification.estimators import WeightedLeastSquares as WeightedLeas
 from jaxid.identification.fit import Fit as Fit
 from jaxid.identification.identify import identify as identify
 from jaxid.identification.solutions import Complete as Complete
+from jaxid.identification.solutions import CrossValidated as CrossValidated
+from jaxid.identification.solutions import Ridge as Ridge
 from jaxid.identification.solutions import Truncated as Truncated
 from jaxid.identification.weights import MaximumForces as MaximumForces
+from jaxid.identification.weights import MeasuredForces as MeasuredForces
 from jaxid.identification.weights import ResidualVariances as ResidualVariances
 from jaxid.identification.weights import Unweighted as Unweighted
 from jaxid.measurement.columns import Columns as Columns

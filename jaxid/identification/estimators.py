@@ -5,8 +5,8 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
-from jaxid.identification.factors import Factors
-from jaxid.identification.solutions import AbstractSolution, Complete, Solved
+from jaxid.identification.factors import Blocks
+from jaxid.identification.solutions import AbstractSolution, AbstractSpectralSolution, Complete
 from jaxid.identification.weights import AbstractWeights, MaximumForces, Unweighted
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
@@ -17,9 +17,9 @@ class AbstractEstimator(eqx.Module):
 
     @abstractmethod
     def __call__(
-        self, robot: Robot, factors: Factors
-    ) -> tuple[Float[np.ndarray, " joints"], Solved]:
-        """The weights of the joints and the solution."""
+        self, robot: Robot, blocks: Blocks
+    ) -> tuple[Float[np.ndarray, " joints"], AbstractSpectralSolution]:
+        """The weights of the joints, and how the weighted system is solved."""
 
 
 class LeastSquares(AbstractEstimator):
@@ -31,10 +31,10 @@ class LeastSquares(AbstractEstimator):
 
     solution: AbstractSolution = Complete()
 
-    def __call__(self, robot, factors):
+    def __call__(self, robot, blocks):
         """Every newton metre counts the same, on the shoulder and on the wrist."""
-        weights = Unweighted()(robot, factors, self.solution)
-        return weights, self.solution(*factors.weighted(weights))
+        weights = Unweighted()(robot, blocks.total)
+        return weights, self.solution.choose(blocks, weights)
 
 
 class WeightedLeastSquares(AbstractEstimator):
@@ -48,7 +48,7 @@ class WeightedLeastSquares(AbstractEstimator):
     weights: AbstractWeights = MaximumForces()
     solution: AbstractSolution = Complete()
 
-    def __call__(self, robot, factors):
-        """Finds the weights, then the parameters."""
-        weights = self.weights(robot, factors, self.solution)
-        return weights, self.solution(*factors.weighted(weights))
+    def __call__(self, robot, blocks):
+        """Finds the weights, then the solution."""
+        weights = self.weights(robot, blocks.total)
+        return weights, self.solution.choose(blocks, weights)

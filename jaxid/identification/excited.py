@@ -4,11 +4,17 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.factors import Blocks
 from jaxid.identification.solutions import NUMERICAL, Decomposition
 from jaxid.types import AnyArray, Float
 
-SHOWN = 0.2
+LARGEST_UNCERTAINTY = 0.1
+"""Share of the whole forces by which an undetermined combination may be wrong."""
+SHOWN = 0.3
 """Parameters below this share of a direction's largest one are left out of its sentence."""
+
+NAMED = 5
+"""Most parameters that a sentence names."""
 
 
 class UndeterminedDirection(eqx.Module):
@@ -18,8 +24,8 @@ class UndeterminedDirection(eqx.Module):
         parts: Indices of the base parameters in it, the largest first.
         shares: Their shares, as they count in the forces; the largest is 1.
         singular_value: Of the scaled observation matrix, relative to the largest.
-        uncertainty: Standard deviation of this combination's forces, were its size the recording's
-            whole forces: 1 means that nothing is known about it.
+        uncertainty: Standard deviation of the forces that this combination's parameters make one by
+            one, relative to the recording's whole forces, of 1; infinite if it was not moved.
     """
 
     parts: tuple[int, ...] = eqx.field(static=True)
@@ -31,36 +37,47 @@ class UndeterminedDirection(eqx.Module):
         """The combination in words, with the names of the base parameters."""
         names = [base.names[k] for k in self.parts]
         if len(names) == 1:
-            return f"{names[0]} is not determined."
-        return f"{' and '.join([', '.join(names[:-1]), names[-1]])} are not determined one by one."
+            return f"{names[0]} is not determined"
+        if len(names) > NAMED:
+            names = [*names[: NAMED - 1], f"{len(names) - NAMED + 1} others"]
+        return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
 
 
 def undetermined_directions(
-    decomposition: Decomposition, forces_norm: float, rows: int, largest_uncertainty: float
+    blocks: Blocks, weights: Float[AnyArray, " joints"], decomposition: Decomposition
 ) -> tuple[UndeterminedDirection, ...]:
-    """Finds directions in which the data leave more open than they tell.
+    r"""Finds directions in which the data leave more open than they tell.
 
-    Scale the parameters so that each one alone makes forces of its own column's length. A unit step
-    along a singular direction changes the forces by its singular value; the noise lets such a step
-    be as large as the residual's standard deviation over that value. Where this exceeds a share of
-    what would explain the whole recording, the data do not determine the direction.
+    Scale the parameters so that each of them alone makes forces of its own column's length. A step
+    along a singular direction changes the forces by the singular value $s$ only. The noise along it
+    is taken from how much contiguous blocks of time disagree about it, so that coloured noise and
+    errors of the model count: the sum $g_k$ of residuals times the direction's forces over block
+    $k$ gives the deviation $\sqrt{\sum g_k^2 K/(K-1)} / s^2$. Where parameters may thus make forces
+    of a tenth of the whole recording that cancel each other, the direction is not determined.
 
     Args:
-        decomposition: Of the weighted observation matrix with scaled columns.
-        forces_norm: Norm of the weighted forces.
-        rows: Number of rows.
-        largest_uncertainty: The share, of 1.
+        blocks: Factors of contiguous blocks of time.
+        weights: Of the joints.
+        decomposition: Of the weighted observation matrix.
     """
-    s = np.asarray(decomposition.values)
-    freedom = max(rows - len(s), 1)
-    noise = max(decomposition.rest / np.sqrt(freedom), np.finfo(float).eps * forces_norm)
-    found = []
-    for value, direction in zip(s, np.asarray(decomposition.directions), strict=True):
-        tiny = value <= NUMERICAL * s[0]
-        uncertainty = np.inf if tiny else noise / (value * forces_norm)
-        if tiny or uncertainty > largest_uncertainty:
-            found.append(_direction(direction, float(value / s[0]), float(uncertainty)))
-    return tuple(found)
+    s, V = np.asarray(decomposition.values), np.asarray(decomposition.directions)
+    size = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
+    live = s > NUMERICAL * s.max(initial=0.0)
+    inverse = np.where(live, 1.0 / np.where(live, s, 1.0) ** 2, 0.0)
+    p = decomposition.solve(inverse)
+    sums = np.zeros(len(s))
+    for part in blocks.parts:
+        R, z = part.weighted(weights)
+        g = V @ ((R.T @ (R @ p - z)) / np.asarray(decomposition.scale))
+        sums += g**2
+    count = len(blocks.parts)
+    deviations = np.sqrt(sums * count / max(count - 1, 1)) * inverse
+    floor = np.finfo(float).eps * size
+    uncertainty = np.where(live, np.maximum(deviations, floor) / max(size, floor), np.inf)
+    return tuple(
+        _direction(V[k], float(s[k] / s[0]), float(uncertainty[k]))
+        for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]
+    )
 
 
 def _direction(

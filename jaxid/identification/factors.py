@@ -5,6 +5,7 @@ chunk, to the R factor of a QR decomposition; weights of the joints are applied 
 free, and recordings are added by stacking factors. The observation matrix is never held.
 """
 
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -17,6 +18,8 @@ from jaxid.types import AnyArray, Float
 
 CHUNK = 65536
 """Samples whose columns are held at once."""
+BLOCKS = 10
+"""Blocks of time into which a recording is divided, for cross-validation."""
 
 
 class JointFactor(eqx.Module):
@@ -98,6 +101,26 @@ class Factors(eqx.Module):
         return np.array([j.force_square for j in self.joints])
 
 
+class Blocks(eqx.Module):
+    """Factors of contiguous blocks of time, which together are all observations.
+
+    Attributes:
+        parts: One for each block.
+    """
+
+    parts: tuple[Factors, ...]
+
+    @property
+    def total(self) -> Factors:
+        """The factors of all rows."""
+        return functools.reduce(lambda x, y: x + y, self.parts)
+
+    def without(self, block: int) -> Factors:
+        """The factors of all rows but those of one block."""
+        others = (*self.parts[:block], *self.parts[block + 1 :])
+        return functools.reduce(lambda x, y: x + y, others)
+
+
 def empty(base: BaseParameters) -> Factors:
     """Factors of no rows at all."""
     return Factors(
@@ -109,27 +132,43 @@ def empty(base: BaseParameters) -> Factors:
     )
 
 
-def factorise(base: BaseParameters, recordings: Sequence[Observations]) -> Factors:
-    """Reduces observations to the factors of their joints (Eq. 26).
+def factorise(
+    base: BaseParameters, recordings: Sequence[Observations], blocks: int = BLOCKS
+) -> Blocks:
+    """Reduces observations to the factors of their joints, by blocks of time (Eq. 26).
 
     Columns are evaluated at the full rate and filtered like the forces, chunk by chunk.
 
     Args:
         base: The base parameters.
         recordings: Observations of the same robot.
+        blocks: Number of blocks into which the counted rows of each recording are divided.
     """
-    total = empty(base)
+    parts = []
     for observations in recordings:
+        mask = np.asarray(observations.mask)
+        counted = np.flatnonzero(mask.any(axis=1))
+        edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
+        edges = [0, *edges[1:], observations.rows]
+        factors = [empty(base) for _ in edges[1:]]
         for rows, columns, forces in reduced_rows(base, observations):
-            mask = np.asarray(observations.mask)[rows]
-            total = Factors(
-                tuple(
-                    joint.joined(np.column_stack([theta, forces[:, j]])[mask[:, j]])
-                    for j, (joint, theta) in enumerate(zip(total.joints, columns, strict=True))
-                ),
-                base.size,
-            )
-    return total
+            for k, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+                low, high = max(first, rows.start), min(last, rows.stop)
+                if low < high:
+                    part = slice(low - rows.start, high - rows.start)
+                    factors[k] = _joined(factors[k], columns, forces, mask[rows], part)
+        parts += factors
+    return Blocks(tuple(parts))
+
+
+def _joined(
+    factors: Factors, columns: list[np.ndarray], forces: np.ndarray, mask: np.ndarray, part: slice
+) -> Factors:
+    joints = []
+    for j, (joint, theta) in enumerate(zip(factors.joints, columns, strict=True)):
+        kept = mask[part, j]
+        joints.append(joint.joined(np.column_stack([theta[part], forces[part, j]])[kept]))
+    return Factors(tuple(joints), factors.size)
 
 
 def reduced_rows(base: BaseParameters, observations: Observations, samples: int = CHUNK):

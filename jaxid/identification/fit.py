@@ -8,6 +8,7 @@ from jaxid.dynamics.compiled import evaluate_forces
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.estimators import AbstractEstimator
 from jaxid.identification.excited import UndeterminedDirection
+from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.types import AnyArray, Float
 
 
@@ -40,6 +41,7 @@ class Fit(eqx.Module):
         residual: Norm of all residuals relative to the norm of all forces, of 1.
         undetermined: Combinations that these observations do not determine.
         estimator: What made the fit.
+        solution: How the system was solved in the end, with everything chosen that it chose.
         recordings: Names of the observations.
         notes: What the user should know, in sentences.
     """
@@ -54,6 +56,7 @@ class Fit(eqx.Module):
     residual: float
     undetermined: tuple[UndeterminedDirection, ...]
     estimator: AbstractEstimator
+    solution: AbstractSpectralSolution
     recordings: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
 

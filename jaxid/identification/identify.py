@@ -7,13 +7,10 @@ import numpy as np
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.excited import undetermined_directions
-from jaxid.identification.factors import Factors, factorise
+from jaxid.identification.factors import Blocks, Factors, factorise
 from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.solutions import Decomposition, Solved
+from jaxid.identification.solutions import Decomposition
 from jaxid.measurement.observations import Observations
-
-LARGEST_UNCERTAINTY = 0.1
-"""Share of the whole forces by which an undetermined combination may be wrong."""
 
 
 def identify(
@@ -38,13 +35,13 @@ def identify(
     recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
     estimator = WeightedLeastSquares() if estimator is None else estimator
     _check(base, recordings)
-    factors = factorise(base, recordings)
-    return fit_factors(base, factors, estimator, tuple(o.name for o in recordings))
+    blocks = factorise(base, recordings)
+    return fit_blocks(base, blocks, estimator, tuple(o.name for o in recordings))
 
 
-def fit_factors(
+def fit_blocks(
     base: BaseParameters,
-    factors: Factors,
+    blocks: Blocks,
     estimator: AbstractEstimator,
     recordings: tuple[str, ...] = (),
 ) -> Fit:
@@ -52,39 +49,39 @@ def fit_factors(
 
     Args:
         base: What can be identified on this robot.
-        factors: Of one or several recordings.
+        blocks: Factors of one or several recordings.
         estimator: How.
         recordings: Their names.
 
     Raises:
         ValueError: If there are fewer rows than parameters, or weights are not known.
     """
+    factors = blocks.total
     rows = int(factors.rows.sum())
     if rows <= base.size:
         raise ValueError(
             f"there are {rows} rows for {base.size} base parameters: record longer, decimate less, "
             "or leave out fewer slow rows."
         )
-    weights, solved = estimator(base.model.robot, factors)
+    weights, solution = estimator(base.model.robot, blocks)
     R, z = factors.weighted(weights)
     decomposition = Decomposition.of(R, z)
-    p = np.asarray(solved.parameters)
+    inverse = solution.inverse(decomposition.values)
+    p = decomposition.solve(inverse)
     squares = factors.residual_squares(p)
-    undetermined = undetermined_directions(
-        decomposition, float(np.linalg.norm(z)), rows, LARGEST_UNCERTAINTY
-    )
     forces = float(np.sqrt(factors.force_squares.sum()))
     return Fit(
         base=base,
         parameters=p,
-        covariance=_covariance(factors, weights, solved, squares),
+        covariance=_covariance(factors, weights, decomposition, inverse, squares),
         weights=weights,
         condition_numbers=_condition_numbers(factors, R),
         rows=tuple(int(n) for n in factors.rows),
         residual_rms=np.sqrt(squares / np.maximum(factors.rows, 1)),
         residual=float(np.sqrt(squares.sum()) / forces) if forces > 0 else np.inf,
-        undetermined=undetermined,
+        undetermined=undetermined_directions(blocks, weights, decomposition),
         estimator=estimator,
+        solution=solution,
         recordings=recordings,
         notes=base.notes,
     )
@@ -103,25 +100,31 @@ def _check(base: BaseParameters, recordings: Sequence[Observations]) -> None:
 
 
 def _covariance(
-    factors: Factors, weights: np.ndarray, solved: Solved, squares: np.ndarray
+    factors: Factors,
+    weights: np.ndarray,
+    decomposition: Decomposition,
+    inverse: np.ndarray,
+    squares: np.ndarray,
 ) -> np.ndarray:
     r"""Covariance of the estimates when every joint has a variance of its own.
 
-    With $S S^T$ the inverse of the information, it is
-    $S S^T (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) S S^T$: right also where the weights are
-    not the reciprocals of the standard deviations.
+    The estimates are $B \Theta^T W^2 Q$, so their covariance is
+    $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights are not the
+    reciprocals of the standard deviations.
     """
-    root = np.asarray(solved.root)
-    freedom = 1.0 - solved.kept / float(factors.rows.sum())
-    inner = np.zeros((solved.kept, solved.kept))
+    s, scale = np.asarray(decomposition.values), np.asarray(decomposition.scale)
+    V = np.asarray(decomposition.directions) / scale
+    B = (V.T * inverse) @ V
+    freedom = 1.0 - float(np.sum(inverse * s**2)) / float(factors.rows.sum())
+    inner = np.zeros_like(B)
     for joint, w, square in zip(factors.joints, weights, squares, strict=True):
         variance = square / max(joint.rows * freedom, 1.0)
-        felt = np.asarray(joint.R)[:, :-1] @ root[list(joint.columns)]
-        inner += w**4 * variance * (felt.T @ felt)
-    covariance = root @ inner @ root.T
-    unknown = ~np.any(root != 0.0, axis=1)
-    covariance[unknown, unknown] = np.inf
-    return covariance
+        columns = list(joint.columns)
+        felt = w**2 * np.asarray(joint.R)[:, :-1] @ B[columns]
+        inner += variance * (felt.T @ felt)
+    unknown = ~np.any(B != 0.0, axis=1)
+    inner[unknown, unknown] = np.inf
+    return inner
 
 
 def _condition_numbers(factors: Factors, weighted: np.ndarray) -> ConditionNumbers:

@@ -1,32 +1,19 @@
-"""Least squares from a triangular factor: which directions of the parameters the data decide."""
+"""Least squares from factors: how much weight each direction of the parameters gets (Eq. 33)."""
 
 from abc import abstractmethod
 
 import equinox as eqx
 import numpy as np
 
+from jaxid.identification.factors import Blocks
 from jaxid.types import AnyArray, Float
 
 NUMERICAL = 1e-11
 """Singular values below this share of the largest are rounding."""
 
 
-class Solved(eqx.Module):
-    r"""Parameters, and the inverse of the information as far as the data decide.
-
-    Attributes:
-        parameters: The solution.
-        root: Matrix $S$ with $S S^T = (\Theta^T W^2 \Theta)^{-1}$ on the directions that are kept.
-        kept: Number of directions that are kept.
-    """
-
-    parameters: Float[AnyArray, " base"]
-    root: Float[AnyArray, "base kept"]
-    kept: int = eqx.field(static=True)
-
-
 class Decomposition(eqx.Module):
-    """Singular values of the observation matrix with its columns scaled to length one.
+    """Singular values of the weighted observation matrix with its columns scaled to length one.
 
     Scaled columns make the answer independent of units. A column of zeros stays zero.
 
@@ -34,7 +21,7 @@ class Decomposition(eqx.Module):
         scale: Lengths of the columns.
         values: Singular values, falling.
         directions: Rows are the directions in the scaled parameters.
-        forces: The forces along the left singular vectors.
+        forces: The weighted forces along the left singular vectors.
         rest: Norm of what the columns cannot explain.
     """
 
@@ -61,39 +48,47 @@ class Decomposition(eqx.Module):
         rest = float(np.sqrt(max(z @ z - forces @ forces, 0.0)))
         return cls(scale, s, Vt, forces, rest)
 
-    def solve(self, kept: int) -> Solved:
-        """The solution of least norm (in scaled parameters) in the first directions."""
-        V, s = np.asarray(self.directions)[:kept], np.asarray(self.values)[:kept]
-        scale = np.asarray(self.scale)
-        x = V.T @ (np.asarray(self.forces)[:kept] / s)
-        return Solved(x / scale, (V.T / s) / scale[:, None], kept)
-
-    @property
-    def rank(self) -> int:
-        """Number of directions that are more than rounding."""
-        s = np.asarray(self.values)
-        return int(np.count_nonzero(s > NUMERICAL * s.max(initial=0.0)))
+    def solve(self, inverse: Float[AnyArray, " base"]) -> Float[np.ndarray, " base"]:
+        """Parameters, with the inverse of the information along each direction."""
+        along = np.asarray(inverse) * np.asarray(self.values) * np.asarray(self.forces)
+        return np.asarray(self.directions).T @ along / np.asarray(self.scale)
 
 
 class AbstractSolution(eqx.Module):
     """A way to solve a weighted least-squares problem (Eq. 33)."""
 
     @abstractmethod
-    def __call__(self, R: Float[AnyArray, "height base"], z: Float[AnyArray, " height"]) -> Solved:
-        r"""Minimises $|R p - z|^2$ as far as the data decide."""
+    def choose(
+        self, blocks: Blocks, weights: Float[AnyArray, " joints"]
+    ) -> "AbstractSpectralSolution":
+        """The solution for these observations, with everything that it chooses chosen."""
 
 
-class Complete(AbstractSolution):
+class AbstractSpectralSolution(AbstractSolution):
+    r"""A solution that treats each direction by its singular value.
+
+    The parameters are $B \Theta^T W^2 Q$ where $B$ takes the place of the inverse of the information.
+    """
+
+    @abstractmethod
+    def inverse(self, values: Float[AnyArray, " base"]) -> Float[np.ndarray, " base"]:
+        """What takes the place of 1 / value² for each singular value."""
+
+    def choose(self, blocks, weights):
+        """Has nothing to choose."""
+        return self
+
+
+class Complete(AbstractSpectralSolution):
     """Every direction that is more than rounding: least squares as they are meant (Eq. 33)."""
 
-    def __call__(self, R, z):
+    def inverse(self, values):
         """Leaves out only what is nothing but rounding."""
-        decomposition = Decomposition.of(R, z)
-        return decomposition.solve(decomposition.rank)
+        return _above(values, NUMERICAL)
 
 
-class Truncated(AbstractSolution):
-    """Only directions that the data decide well; the others stay zero.
+class Truncated(AbstractSpectralSolution):
+    """Only directions that the data decide well; along the others the parameters stay zero.
 
     Attributes:
         share: Directions whose singular value, with scaled columns, is below this share of the
@@ -102,9 +97,74 @@ class Truncated(AbstractSolution):
 
     share: float = eqx.field(static=True, default=1e-2)
 
-    def __call__(self, R, z):
+    def inverse(self, values):
         """Leaves out weak directions."""
-        decomposition = Decomposition.of(R, z)
-        s = np.asarray(decomposition.values)
-        kept = int(np.count_nonzero(s > max(self.share, NUMERICAL) * s[0]))
-        return decomposition.solve(kept)
+        return _above(values, max(self.share, NUMERICAL))
+
+
+class Ridge(AbstractSpectralSolution):
+    """Least squares that pull weak directions towards zero (Tikhonov).
+
+    Attributes:
+        share: Directions whose singular value, with scaled columns, is this share of the largest
+            are halved.
+    """
+
+    share: float = eqx.field(static=True, default=1e-2)
+
+    def inverse(self, values):
+        """Bounds the inverse."""
+        s = np.asarray(values)
+        return 1.0 / (s**2 + (max(self.share, NUMERICAL) * s.max(initial=0.0)) ** 2)
+
+
+class CrossValidated(AbstractSolution):
+    """The strongest of several solutions that predicts left-out time as well as the best one does.
+
+    The observations are divided into contiguous blocks of time. Each solution is found without one
+    block and judged on it. Of those whose error lies within one standard error of the smallest, the
+    strongest is taken: neighbouring blocks are alike, and other motions are not.
+
+    Attributes:
+        candidates: From the weakest to the strongest.
+    """
+
+    candidates: tuple[AbstractSpectralSolution, ...] = tuple(
+        Ridge(float(share)) for share in np.geomspace(1e-4, 0.5, 25)
+    )
+
+    def choose(self, blocks, weights):
+        """Judges every candidate on every block."""
+        errors = np.array(self.errors(blocks, weights))
+        total = errors.sum(axis=1)
+        best = int(np.argmin(total))
+        margin = errors[best].std(ddof=1) * np.sqrt(errors.shape[1])
+        within = np.flatnonzero(total <= total[best] + margin)
+        return self.candidates[int(within.max())]
+
+    def errors(
+        self, blocks: Blocks, weights: Float[AnyArray, " joints"]
+    ) -> Float[np.ndarray, "candidates blocks"]:
+        """Sums of the squared weighted residuals of each block left out.
+
+        Raises:
+            ValueError: If there are fewer than two blocks.
+        """
+        if len(blocks.parts) < 2:
+            raise ValueError(
+                "cross-validation needs at least two blocks of rows, but there is one."
+            )
+        squares = np.asarray(weights) ** 2
+        errors = np.empty((len(self.candidates), len(blocks.parts)))
+        for k, left_out in enumerate(blocks.parts):
+            decomposition = Decomposition.of(*blocks.without(k).weighted(weights))
+            for i, candidate in enumerate(self.candidates):
+                p = decomposition.solve(candidate.inverse(decomposition.values))
+                errors[i, k] = squares @ left_out.residual_squares(p)
+        return errors
+
+
+def _above(values: Float[AnyArray, " base"], share: float) -> Float[np.ndarray, " base"]:
+    s = np.asarray(values)
+    kept = s > share * s.max(initial=0.0)
+    return np.where(kept, 1.0 / np.where(kept, s, 1.0) ** 2, 0.0)

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.identification.factors import Factors
-from jaxid.identification.solutions import AbstractSolution
+from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
 
@@ -15,22 +15,14 @@ class AbstractWeights(eqx.Module):
     """A choice of one weight for each joint."""
 
     @abstractmethod
-    def __call__(
-        self, robot: Robot, factors: Factors, solution: AbstractSolution
-    ) -> Float[np.ndarray, " joints"]:
-        """The weights [1/(N m) or 1/N].
-
-        Args:
-            robot: Whose joints are weighted.
-            factors: Of the observations.
-            solution: How a weighted system is solved, for weights that depend on residuals.
-        """
+    def __call__(self, robot: Robot, factors: Factors) -> Float[np.ndarray, " joints"]:
+        """The weights [1/(N m) or 1/N] for some observations of a robot."""
 
 
 class Unweighted(AbstractWeights):
     r"""Every row counts the same, whatever its unit (Eq. 28)."""
 
-    def __call__(self, robot, factors, solution):
+    def __call__(self, robot, factors):
         """Ones."""
         return np.ones(robot.joints)
 
@@ -38,13 +30,21 @@ class Unweighted(AbstractWeights):
 class MaximumForces(AbstractWeights):
     r"""The reciprocals of the largest forces, $1 / (i_{Gj} M_{j,max})$ (Eq. 30)."""
 
-    def __call__(self, robot, factors, solution):
+    def __call__(self, robot, factors):
         """The reciprocals.
 
         Raises:
             ValueError: If the largest force of some joint is not known.
         """
         return 1.0 / np.asarray(robot.max_forces)
+
+
+class MeasuredForces(AbstractWeights):
+    """The reciprocals of the forces' RMS values: where the largest forces are not known."""
+
+    def __call__(self, robot, factors):
+        """The reciprocals."""
+        return _reciprocal(np.sqrt(factors.force_squares / np.maximum(factors.rows, 1)))
 
 
 class ResidualVariances(AbstractWeights):
@@ -56,12 +56,18 @@ class ResidualVariances(AbstractWeights):
 
     iterations: int = eqx.field(static=True, default=5)
 
-    def __call__(self, robot, factors, solution):
+    def __call__(self, robot, factors):
         """Starts from the size of the forces."""
-        deviations = np.sqrt(factors.force_squares / np.maximum(factors.rows, 1))
-        floor = 1e-9 * max(float(deviations.max()), np.finfo(float).tiny)
+        weights = MeasuredForces()(robot, factors)
         for _ in range(self.iterations):
-            weights = 1.0 / np.maximum(deviations, floor)
-            p = solution(*factors.weighted(weights)).parameters
-            deviations = np.sqrt(factors.residual_squares(p) / np.maximum(factors.rows, 1))
-        return 1.0 / np.maximum(deviations, floor)
+            decomposition = Decomposition.of(*factors.weighted(weights))
+            p = decomposition.solve(Complete().inverse(decomposition.values))
+            squares = factors.residual_squares(p)
+            weights = _reciprocal(np.sqrt(squares / np.maximum(factors.rows, 1)))
+        return weights
+
+
+def _reciprocal(deviations: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
+    """Reciprocals that a joint without any force or residual does not make infinite."""
+    floor = max(1e-9 * float(deviations.max()), np.finfo(float).tiny)
+    return 1.0 / np.maximum(deviations, floor)
