@@ -1,25 +1,26 @@
-"""Base parameters: the combinations of standard parameters that forces can tell apart (Eqs. 20-24)."""
+"""Base parameters: what forces can tell apart of the standard parameters (Eqs. 20-24)."""
 
 import enum
-import math
+import functools
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.observation import observation_matrix
 from jaxid.dynamics.rank import (
     AbstractRankMethod,
+    Dependence,
     GramSchmidt,
     SingularValues,
     regrouping,
 )
 from jaxid.types import AnyArray, Float
 
-SAMPLES = 25
 CLEAR_GAP = 1e3
-LENGTH_POWERS = {"kg": 0, "kg m": 1, "kg m²": 2}
 
 
 class Identifiability(enum.Enum):
@@ -67,6 +68,21 @@ class BaseParameters(eqx.Module):
         """Units of the base parameters."""
         units = self.model.parameter_units
         return tuple(units[k] for k in self.indices)
+
+    @functools.cached_property
+    def closed_forms(self) -> ClosedForms:
+        """The base parameters in letters, found when they are first asked for (Eq. 24)."""
+        return closed_forms(self.model, self.indices, self.dependent, np.asarray(self.kappa))
+
+    @property
+    def expressions(self) -> tuple[str, ...]:
+        """Each base parameter as a readable combination, like `mx2 + l2x*m3` (Eq. 24)."""
+        return tuple(str(e) for e in self.closed_forms.expressions)
+
+    @property
+    def lengths(self) -> dict[str, float]:
+        """Values of the letters in the expressions: lengths [m], and `g` [m/s²]."""
+        return dict(self.closed_forms.lengths)
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
         r"""The base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
@@ -151,36 +167,7 @@ def base_parameters(
     )
 
 
-def observation_matrix(
-    model: Model, seed: int
-) -> tuple[Float[AnyArray, "rows standard"], Float[AnyArray, " standard"]]:
-    r"""The regressor at random motions, stacked and free of units: $\Theta_{QR}$ (Eq. 20).
-
-    Lengths are measured in the robot's own size, so that metres or millimetres make no difference.
-
-    Returns:
-        The matrix, and for each parameter the factor that its column was multiplied with.
-    """
-    robot = model.robot
-    size = characteristic_length(model)
-    samples = max(SAMPLES, math.ceil(3 * model.size / robot.joints))
-    rng = np.random.default_rng(seed)
-    unit = np.where(np.array(robot.revolute), 1.0, size)
-    q, qd, qdd = (rng.uniform(-s, s, (samples, robot.joints)) * unit for s in (3.0, 3.0, 6.0))
-    theta = np.asarray(model.regressor(Motion(q, qd, qdd)), np.float64)
-    theta = theta * unit[:, None]
-    # A body's mass, first moments and inertias are of the sizes 1, length and length squared.
-    scale = np.array([size ** LENGTH_POWERS.get(u, 0) for u in model.parameter_units])
-    return (theta * scale).reshape(samples * robot.joints, model.size), scale
-
-
-def characteristic_length(model: Model) -> float:
-    """The size of the robot: the largest distance between neighbouring joints [m], or 1."""
-    distances = np.linalg.norm(np.asarray(model.robot.offset), axis=-1)
-    return float(distances.max()) if distances.any() else 1.0
-
-
-def _doubts(found, other, left) -> tuple[str, ...]:
+def _doubts(found: Dependence, other: Dependence, left: float) -> tuple[str, ...]:
     notes = []
     if len(found.independent) != len(other.independent):
         notes.append(

@@ -110,7 +110,8 @@ class SingularValues(AbstractRankMethod):
         norms = np.linalg.norm(W, axis=0)
         live = norms > ROUNDING * norms.max(initial=0.0)
         scaled = np.where(live, W / np.where(live, norms, 1.0), 0.0)
-        _, s, Vt = np.linalg.svd(scaled, full_matrices=True)
+        # The triangular factor has the same singular values and null space, and few rows.
+        _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=True)
         s = np.concatenate([s, np.zeros(columns - len(s))]) / max(s[0], np.finfo(float).tiny)
         floored = np.maximum(s, self.rounding)
         certain = int(np.count_nonzero(s > self.tolerance))
@@ -119,6 +120,8 @@ class SingularValues(AbstractRankMethod):
         rank = certain if not possible.any() else 1 + int(np.argmax(np.where(possible, drops, 0.0)))
         if columns and s[-1] > self.tolerance:
             rank = columns
+        if not live.any():
+            rank = 0
         null = Vt[rank:]
         dependent: list[int] = []
         # Eliminate from the last column backwards: a pivot found there is where a vector ends.
@@ -129,7 +132,6 @@ class SingularValues(AbstractRankMethod):
             if np.linalg.norm(pivot) < 1e-8:
                 continue
             dependent.append(k)
-            _, R = np.linalg.qr(np.column_stack([pivot, null]), mode="reduced")
             Q, _ = scipy.linalg.qr(pivot[:, None])
             null = (Q.T @ null)[1:]
         chosen = tuple(sorted(dependent))
