@@ -175,10 +175,9 @@ class Model(eqx.Module):
     ) -> Float[AnyArray, "*batch"]:
         """The potential energy of gravity and springs [J], zero at the ground's origin."""
         self._check(q)
-        p = jnp.asarray(p)
+        parts = list(zip(self.terms, self.split(jnp.asarray(p)), strict=True))
         return over_batch(
-            lambda x: jnp.concatenate([t.potential_columns(self.robot, x) for t in self.terms]) @ p,
-            q,
+            lambda x: sum(t.potential_columns(self.robot, x) @ s for t, s in parts), q
         )
 
     def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
