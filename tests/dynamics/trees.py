@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxid.robot.robot import Robot
 
 # Column of Pinocchio's regressor (m, mx, my, mz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) for each of
-# (m, mx, my, mz, A, B, C, D, E, F); D, E, F are the integrals, Pinocchio's are the tensor's entries.
+# (m, mx, my, mz, A, B, C, D, E, F). D, E, F are integrals, Pinocchio has the tensor's entries.
 FROM_PINOCCHIO = [0, 1, 2, 3, 4, 6, 9, 8, 7, 5]
 SIGNS = np.array([1, 1, 1, 1, 1, 1, 1, -1, -1, -1.0])
 

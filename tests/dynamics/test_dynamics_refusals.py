@@ -1,0 +1,76 @@
+"""What the room does not take, and the sentences that it says then."""
+
+import numpy as np
+import pytest
+import trees
+
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.terms import (
+    CoulombFriction,
+    CoupledDrives,
+    RigidBodies,
+    Tanh,
+    ViscousFriction,
+)
+
+TREE = trees.mixed_tree(51)
+MODEL = Model(TREE.robot())
+
+
+def _refused(sentence):
+    return pytest.raises(ValueError, match="^" + sentence)
+
+
+def test_model_without_terms():
+    with _refused("`terms` must hold at least one term, but is empty"):
+        Model(TREE.robot(), ())
+
+
+def test_the_same_term_twice():
+    with _refused("`terms` must not contribute the same parameter twice, but `fv1` comes twice"):
+        Model(TREE.robot(), (RigidBodies(), ViscousFriction(), ViscousFriction()))
+
+
+@pytest.mark.parametrize("size", [64, 66])
+def test_wrong_number_of_parameters(size):
+    motion = Motion(*np.zeros((3, 2, 5)))
+    sentence = (
+        rf"`p` must hold one number for each standard parameter \(65\), but has shape \({size},\)"
+    )
+    for refused in (
+        lambda p: MODEL.inverse_dynamics(p, motion),
+        lambda p: MODEL.mass_matrix(p, motion.q),
+        lambda p: MODEL.bias_forces(p, motion.q, motion.qd),
+        lambda p: MODEL.kinetic_energy(p, motion.q, motion.qd),
+        lambda p: MODEL.potential_energy(p, motion.q),
+    ):
+        with _refused(sentence):
+            refused(np.zeros(size))
+
+
+@pytest.mark.parametrize("shape", [(4,), (5, 6), (2, 3, 1)])
+def test_motion_of_another_robot(shape):
+    motion, p = Motion(*np.zeros((3, *shape))), np.zeros(65)
+    for refused in (
+        lambda: MODEL.regressor(motion),
+        lambda: MODEL.inverse_dynamics(p, motion),
+        lambda: MODEL.mass_matrix(p, motion.q),
+        lambda: MODEL.bias_forces(p, motion.q, motion.qd),
+        lambda: MODEL.potential_energy(p, motion.q),
+        lambda: MODEL.tool_forces(motion),
+    ):
+        with _refused(r"the motion must have one coordinate for each joint \(5\)") as caught:
+            refused()
+        assert str(shape) in str(caught.value)
+
+
+def test_coupled_drives_of_independent_drives():
+    with _refused("the drives of `tree` are not coupled: leave `CoupledDrives` out"):
+        Model(TREE.robot(), (RigidBodies(), CoupledDrives()))
+
+
+@pytest.mark.parametrize("epsilon", [0.0, -0.01, np.array([0.01, 0.0, 0.01])])
+def test_transition_without_width(epsilon):
+    with _refused("`epsilon` must be a positive speed, but is .*: use `HardSign`"):
+        CoulombFriction(Tanh(epsilon))

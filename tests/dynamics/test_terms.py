@@ -1,0 +1,248 @@
+"""Each term against its formula, and what all terms have in common."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trees
+
+from jaxid.dynamics import terms
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import (
+    AbstractTerm,
+    AsymmetricCoulombFriction,
+    ConstantOffset,
+    CoulombFriction,
+    CoupledDrives,
+    HardSign,
+    LinearSpring,
+    RigidBodies,
+    RotorInertia,
+    Tanh,
+    ViscousFriction,
+)
+from jaxid.robot.drives import Drives
+from jaxid.robot.library import tx40
+
+N = 3
+TREE = trees.Tree(
+    (-1, 0, 0),
+    (True, False, True),
+    *trees.geometry(np.random.default_rng(41), N),
+    np.array([0.0, 0.0, -9.81]),
+)
+Q, QD, QDD = trees.random_motion(np.random.default_rng(42), N)
+REDUCTION = np.array([[10.0, 0.0, 0.0], [0.0, 20.0, 5.0], [4.0, 0.0, -8.0]])
+
+ALL = [
+    RigidBodies(),
+    RigidBodies(principal_axes=True),
+    ViscousFriction(),
+    CoulombFriction(),
+    CoulombFriction(HardSign(dead_zone=0.1)),
+    CoulombFriction(Tanh(np.array([0.01, 0.001, 0.02]), dead_zone=0.05)),
+    AsymmetricCoulombFriction(),
+    ConstantOffset(),
+    RotorInertia(),
+    LinearSpring(),
+    LinearSpring(np.array([0.1, 0.2, 0.3])),
+    CoupledDrives(),
+]
+FORCE = ("N m", "N", "N m")
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return TREE.robot(drives=Drives.of(N, reduction=REDUCTION))
+
+
+def _columns(term, robot, q=Q, qd=QD, qdd=QDD):
+    return np.asarray(term.columns(robot, *(jnp.asarray(x) for x in (q, qd, qdd))))
+
+
+@pytest.mark.parametrize("term", ALL, ids=lambda t: type(t).__name__)
+class TestContract:
+    """What a colleague's new term must do; add it to the list above."""
+
+    def test_parameters_are_named_once_and_have_units(self, term, robot):
+        parameters = term.parameters(robot)
+        names = [name for name, _ in parameters]
+        assert len(set(names)) == len(names) > 0
+        assert all(name.isidentifier() and unit for name, unit in parameters)
+
+    def test_everything_fits_and_is_linear(self, term, robot):
+        """Shapes, forces = columns p, mass matrix = slope, potential's slope = forces at rest."""
+        size = len(term.parameters(robot))
+        p = np.random.default_rng(43).normal(size=size)
+
+        @trees.compiled
+        def parts(q, qd, qdd):
+            rest = jnp.zeros_like(q)
+            return (
+                term.columns(robot, q, qd, qdd),
+                term.forces(robot, p, q, qd, qdd),
+                term.mass_matrix(robot, p, q),
+                term.columns(robot, q, qd, rest),
+                jax.jacfwd(lambda x: term.potential_columns(robot, x))(q),
+                term.columns(robot, q, rest, rest),
+            )
+
+        columns, forces, mass, bias, lift, still = (np.asarray(x) for x in parts(Q, QD, QDD))
+        assert columns.shape == bias.shape == (N, size)
+        assert lift.shape == (size, N)
+        np.testing.assert_allclose(forces, columns @ p, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(mass @ QDD + bias @ p, forces, rtol=1e-12, atol=1e-12)
+        if np.any(lift):
+            np.testing.assert_allclose(lift.T, still, rtol=1e-12, atol=1e-12)
+
+    def test_derivatives_and_batches_are_finite(self, term, robot):
+        """Also at standstill, where transitions are steepest."""
+        p = np.ones(len(term.parameters(robot)))
+
+        def work(q, qd, qdd, p):
+            return (term.forces(robot, p, q, qd, qdd) ** 2).sum()
+
+        batch = [np.stack([x, 0.0 * x]) for x in (Q, QD, QDD)]
+        slopes = trees.compiled(jax.vmap(jax.grad(work, argnums=(0, 1, 2, 3)), (0, 0, 0, None)))
+        for slope in slopes(*batch, p):
+            assert np.isfinite(np.asarray(slope)).all()
+
+
+def test_the_contract_covers_every_term():
+    members = {
+        c
+        for _, c in inspect.getmembers(terms, inspect.isclass)
+        if issubclass(c, AbstractTerm) and not inspect.isabstract(c)
+    }
+    assert members == {type(t) for t in ALL}, "add the new term to the list `ALL` of this file"
+
+
+@pytest.mark.parametrize(
+    ("term", "diagonal", "name", "units"),
+    [
+        (ViscousFriction(), QD, "fv", ("N m s", "N s/m", "N m s")),
+        (CoulombFriction(), np.tanh(QD / 0.01), "fc", FORCE),
+        (CoulombFriction(Tanh(0.3)), np.tanh(QD / 0.3), "fc", FORCE),
+        (CoulombFriction(HardSign()), np.sign(QD), "fc", FORCE),
+        (ConstantOffset(), np.ones(N), "fo", FORCE),
+        (RotorInertia(), QDD, "Ia", ("kg m²", "kg", "kg m²")),
+        (LinearSpring(), Q, "ks", ("N m/rad", "N/m", "N m/rad")),
+        (LinearSpring(0.25), Q - 0.25, "ks", ("N m/rad", "N/m", "N m/rad")),
+    ],
+)
+def test_diagonal_terms(robot, term, diagonal, name, units):
+    """Eqs. 13, 14, 17: one column for each joint, and only on that joint."""
+    np.testing.assert_allclose(_columns(term, robot), np.diag(diagonal), rtol=1e-15)
+    assert term.parameters(robot) == tuple((f"{name}{i + 1}", u) for i, u in enumerate(units))
+
+
+def test_friction_opposes_motion(robot):
+    """The print's minus stands on the other side: motors must overcome positive friction."""
+    for term in (ViscousFriction(), CoulombFriction()):
+        assert (np.diag(_columns(term, robot)) * QD > 0).all()
+
+
+def test_asymmetric_friction_is_its_level_in_each_direction(robot):
+    term = AsymmetricCoulombFriction(HardSign())
+    levels = np.array([1.0, 2.0, 3.0, 10.0, 20.0, 30.0])
+    forward = _columns(term, robot, qd=np.array([0.3, 0.2, 0.1])) @ levels
+    backward = _columns(term, robot, qd=np.array([-0.3, -0.2, -0.1])) @ levels
+    np.testing.assert_allclose(forward, [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(backward, [-10.0, -20.0, -30.0])
+    names = ("fcp1", "fcp2", "fcp3", "fcn1", "fcn2", "fcn3")
+    assert term.parameters(robot) == tuple(zip(names, FORCE * 2, strict=True))
+
+
+def test_asymmetric_friction_is_symmetric_friction_with_an_offset(robot):
+    """The docstring's claim: it spans the columns of the two terms whose place it takes."""
+    fcp, fcn = np.random.default_rng(44).uniform(1, 5, (2, N))
+    found = _columns(AsymmetricCoulombFriction(), robot) @ np.concatenate([fcp, fcn])
+    dry = _columns(CoulombFriction(), robot) @ (0.5 * (fcp + fcn))
+    offset = _columns(ConstantOffset(), robot) @ (0.5 * (fcp - fcn))
+    np.testing.assert_allclose(found, dry + offset, rtol=1e-14)
+
+
+def test_transition_has_a_width_for_each_joint():
+    """0.01 is in rad/s on an arm's joint and in m/s on a rail: one number does not fit both."""
+    qd = np.array([0.004, 0.004, -0.004])
+    width = np.array([0.01, 0.001, 0.1])
+    np.testing.assert_allclose(Tanh(width)(jnp.asarray(qd)), np.tanh(qd / width), rtol=1e-15)
+    assert np.asarray(Tanh()(jnp.asarray([0.01]))) == pytest.approx(np.tanh(1.0))
+
+
+@pytest.mark.parametrize("transition", [Tanh, HardSign])
+def test_dead_zone_says_nothing_about_standstill(transition):
+    qd = jnp.asarray([-0.3, -0.05, 0.0, 0.05, 0.1, 0.1001])
+    found = np.asarray(transition(dead_zone=0.1)(qd))
+    open_ended = np.asarray(transition()(qd))
+    np.testing.assert_array_equal(found, np.where(np.abs(qd) > 0.1, open_ended, 0.0))
+    np.testing.assert_array_equal(found[1:5], 0.0)
+    assert found[0] < -0.99
+    assert found[5] > 0.99
+    each = np.asarray(transition(dead_zone=np.array([0.2, 0.4]))(jnp.asarray([0.3, 0.3])))
+    assert each[0] > 0.99
+    assert each[1] == 0.0
+
+
+def _motor_level(A, J, fv, fc, epsilon, qd, qdd):
+    """A^T (J A qdd + fv A qd + fc s(A qd / a_ii)): every motor with its own rotor and friction."""
+    own = np.diag(A)
+    motors = J * (A @ qdd) + fv * (A @ qd) + np.sign(own) * fc * np.tanh(A @ qd / own / epsilon)
+    return A.T @ motors
+
+
+@pytest.mark.parametrize("which", ["tx40", "two coupled motors"])
+def test_coupled_drives_are_the_motors_own_equations(which, robot):
+    """Rotor inertia and friction of all motors, seen from the joints (TX40: wrist)."""
+    robot = tx40() if which == "tx40" else robot
+    A, n = np.asarray(robot.drives.reduction), robot.joints
+    coupled = [5] if which == "tx40" else [1, 2]
+    rng = np.random.default_rng(45)
+    J, fv, fc = rng.uniform(1e-4, 1e-3, (3, n))
+    q, qd, qdd = rng.normal(size=(3, n)) * 0.02
+    own = np.diag(A)
+    model = Model(
+        robot, (RotorInertia(), ViscousFriction(), CoulombFriction(Tanh(0.01)), CoupledDrives())
+    )
+    single = np.where(np.isin(np.arange(n), coupled), 0.0, fc * np.abs(own))
+    p = np.concatenate(
+        [
+            (A**2).T @ J,
+            (A**2).T @ fv,
+            single,
+            (own**2 * J)[coupled],
+            (own**2 * fv)[coupled],
+            (np.abs(own) * fc)[coupled],
+        ]
+    )
+    assert model.parameter_names[3 * n :] == tuple(
+        f"{name}{i + 1}" for name in ("Iam", "fvm", "fcm") for i in coupled
+    )
+    found = np.asarray(model.columns(*(jnp.asarray(x) for x in (q, qd, qdd)))) @ p
+    np.testing.assert_allclose(found, _motor_level(A, J, fv, fc, 0.01, qd, qdd), rtol=1e-12)
+
+
+def test_coupled_drives_of_the_tx40_are_the_published_columns():
+    """Row 5: (qdd6, qd6, s(qd5 + qd6)), row 6: (qdd5, qd5, s(qd5 + qd6))."""
+    q, qd, qdd = np.random.default_rng(46).normal(size=(3, 6)) * 0.01
+    found = _columns(CoupledDrives(), tx40(), q, qd, qdd)
+    s = np.tanh((qd[4] + qd[5]) / 0.01)
+    expected = np.zeros((6, 3))
+    expected[4], expected[5] = (qdd[5], qd[5], s), (qdd[4], qd[4], s)
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    units = tuple(unit for _, unit in CoupledDrives().parameters(tx40()))
+    assert units == ("kg m²", "N m s", "N m")
+
+
+def test_a_coupled_motor_of_a_slide_has_a_slides_units(robot):
+    found = dict(CoupledDrives().parameters(robot))
+    assert found == {
+        "Iam2": "kg",
+        "Iam3": "kg m²",
+        "fvm2": "N s/m",
+        "fvm3": "N m s",
+        "fcm2": "N",
+        "fcm3": "N m",
+    }
