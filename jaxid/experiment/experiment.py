@@ -1,0 +1,158 @@
+"""An experiment: the objects that the user's file describes."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters, base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.experiment.method_tables import (
+    build_columns,
+    build_decimation,
+    build_estimator,
+    build_filter,
+    build_slow,
+    build_terms,
+)
+from jaxid.experiment.reading import read_tables
+from jaxid.experiment.robot_tables import build_robot, within
+from jaxid.experiment.tables import RecordingTable
+from jaxid.identification.estimators import AbstractEstimator
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.decimation import AbstractDecimation
+from jaxid.measurement.filters import AbstractFilter
+from jaxid.measurement.observations import Observations, observe
+from jaxid.measurement.read import read_recording
+from jaxid.measurement.recording import Recording
+from jaxid.robot.robot import Robot
+from jaxid.types import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """What an experiment file describes.
+
+    Attributes:
+        path: Of the file.
+        text: Of the file, as it was read.
+        robot: What is known.
+        model: The effects whose parameters are wanted.
+        recording: The table of the log's columns; None if the file has none.
+        columns: The same as the reader needs them; None if the file has none.
+        filter: For motion, forces and columns.
+        decimation: For forces and columns.
+        slow: Speeds below which rows do not count [rad/s or m/s]; None if all count.
+        estimator: How rows become parameters.
+        notes: What was assumed where the file says nothing, in sentences.
+    """
+
+    path: Path
+    text: str
+    robot: Robot
+    model: Model
+    recording: RecordingTable | None
+    columns: Columns | None
+    filter: AbstractFilter
+    decimation: AbstractDecimation
+    slow: Float[np.ndarray, " joints"] | None
+    estimator: AbstractEstimator
+    notes: tuple[str, ...]
+
+    @functools.cached_property
+    def base(self) -> BaseParameters:
+        """The base parameters of the model, found when they are first asked for."""
+        return base_parameters(self.model)
+
+    def read(self, log: str | Path) -> Recording:
+        """Reads a log as the file's table `[recording]` says.
+
+        Args:
+            log: Path of the log; the files of forces and velocities lie beside it.
+
+        Raises:
+            ValueError: If the file has no table `[recording]`, or the log is not as it says.
+        """
+        log, table = Path(log), self.recording
+        if table is None or self.columns is None:
+            raise ValueError(
+                f"{self.path.name}: the table `[recording]` is missing: it says which columns of "
+                f"`{log.name}` hold angles and forces."
+            )
+        recording = read_recording(
+            log,
+            self.columns,
+            forces_path=_beside(log, table.forces_file),
+            velocities_path=_beside(log, table.velocities_file),
+            largest_gap=table.largest_gap,
+        )
+        if recording.joints != self.robot.joints:
+            raise ValueError(
+                f"{self.path.name}: `recording.angles` names {recording.joints} columns of "
+                f"`{log.name}`, but the robot `{self.robot.name}` has {self.robot.joints} joints: "
+                "name one column for each joint, or choose another robot (`robot.tip`)."
+            )
+        if table.start is None and table.stop is None:
+            return recording
+        with within(self.path.name, "recording"):
+            return recording.crop(
+                -np.inf if table.start is None else table.start,
+                np.inf if table.stop is None else table.stop,
+            )
+
+    def observe(self, recording: Recording) -> Observations:
+        """Filters a recording and makes rows of it, as the tables `[filter]` and `[rows]` say.
+
+        Raises:
+            ValueError: If filter and recording do not go together.
+        """
+        with within(self.path.name, "filter` and `rows"):
+            return observe(recording, self.robot, self.filter, self.decimation, self.slow)
+
+
+def _beside(log: Path, name: str | None) -> Path | None:
+    return None if name is None else log.parent / name.replace("{}", log.stem)
+
+
+def load_experiment(path: str | Path) -> Experiment:
+    """Loads an experiment file.
+
+    Args:
+        path: Of a TOML file; paths in it are relative to its folder.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If the file or something in it is not what it should be: one sentence with the
+            names of file and key.
+    """
+    path = Path(path)
+    tables, text = read_tables(path)
+    robot = build_robot(tables, path)
+    notes = []
+    with within(path.name, "model"):
+        model = Model(robot, build_terms(tables.model, robot))
+    with within(path.name, "recording"):
+        columns = build_columns(tables.recording, robot)
+    with within(path.name, "filter"):
+        filtering, said = build_filter(tables.filter)
+        notes += said
+    with within(path.name, "rows"):
+        decimation = build_decimation(tables.rows)
+        slow = build_slow(tables.rows, robot)
+    with within(path.name, "estimator"):
+        estimator, said = build_estimator(tables.estimator, robot)
+        notes += said
+    return Experiment(
+        path=path,
+        text=text,
+        robot=robot,
+        model=model,
+        recording=tables.recording,
+        columns=columns,
+        filter=filtering,
+        decimation=decimation,
+        slow=slow,
+        estimator=estimator,
+        notes=tuple(notes),
+    )

@@ -1,0 +1,220 @@
+"""The tables `[model]`, `[recording]`, `[filter]`, `[rows]` and `[estimator]` become objects."""
+
+import numpy as np
+
+from jaxid.dynamics.terms import (
+    AbstractTerm,
+    AbstractTransition,
+    AsymmetricCoulombFriction,
+    ConstantOffset,
+    CoulombFriction,
+    CoupledDrives,
+    HardSign,
+    LinearSpring,
+    RigidBodies,
+    RotorInertia,
+    Tanh,
+    ViscousFriction,
+)
+from jaxid.experiment.robot_tables import each
+from jaxid.experiment.tables import (
+    ButterworthTable,
+    CoulombTable,
+    EstimatorTable,
+    ModelTable,
+    PaperTable,
+    PeriodicTable,
+    RecordingTable,
+    RowsTable,
+)
+from jaxid.identification.estimators import AbstractEstimator, LeastSquares, WeightedLeastSquares
+from jaxid.identification.solutions import Complete, Truncated
+from jaxid.identification.weights import MaximumForces, ResidualVariances
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
+from jaxid.measurement.filters import (
+    AbstractFilter,
+    PaperFilter,
+    PeriodicFourier,
+    ZeroPhaseButterworth,
+)
+from jaxid.measurement.units import Unit, unit
+from jaxid.robot.robot import Robot
+from jaxid.types import Float
+
+CUTOFF = 10.0
+"""Cut-off of the filter where the file says nothing [Hz]."""
+
+
+def build_terms(table: ModelTable, robot: Robot) -> tuple[AbstractTerm, ...]:
+    """The terms of the model, in the paper's order: bodies, friction, rotors, and the rest.
+
+    Raises:
+        ValueError: If a list does not hold one number for each joint.
+    """
+    coulomb = CoulombTable() if isinstance(table.coulomb, bool) else table.coulomb
+    transition = _transition(coulomb, robot)
+    terms: list[AbstractTerm] = [RigidBodies(principal_axes=table.principal_axes)]
+    if table.viscous:
+        terms.append(ViscousFriction())
+    if table.coulomb is not False:
+        dry = AsymmetricCoulombFriction if coulomb.asymmetric else CoulombFriction
+        terms.append(dry(transition))
+    if table.rotor_inertia:
+        terms.append(RotorInertia())
+    # An offset is half of what two levels of dry friction can say already.
+    if table.offset or (table.offset is None and not coulomb.asymmetric):
+        terms.append(ConstantOffset())
+    if table.coupled_drives or (table.coupled_drives is None and coupled(robot)):
+        terms.append(CoupledDrives(transition))
+    if table.springs:
+        terms.append(LinearSpring())
+    return tuple(terms)
+
+
+def coupled(robot: Robot) -> bool:
+    """Whether some motor turns more than one axis."""
+    return bool(CoupledDrives().couplings(robot))
+
+
+def _transition(table: CoulombTable, robot: Robot) -> AbstractTransition:
+    dead_zone = _number_or_each(robot, "coulomb.dead_zone", table.dead_zone)
+    if table.hard:
+        return HardSign(dead_zone)
+    return Tanh(_number_or_each(robot, "coulomb.epsilon", table.epsilon), dead_zone)
+
+
+def _number_or_each(
+    robot: Robot, name: str, value: float | int | list
+) -> float | Float[np.ndarray, " joints"]:
+    if isinstance(value, list):
+        return np.array(each(robot, name, value), np.float64)
+    return float(value)
+
+
+def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
+    """What the columns of the logs hold.
+
+    Raises:
+        ValueError: If a unit is unknown, a list has a wrong length, or the time is not given.
+    """
+    if table is None:
+        return None
+    if (table.time is None) == (table.sample_time is None):
+        came = "it has neither" if table.time is None else "not both"
+        raise ValueError(
+            "give `time` (the column of the time stamps) or `sample_time` [s] (rows equally far "
+            f"apart): {came}."
+        )
+    for name in ("torque_constants", "angle_signs", "force_signs", "angle_offsets"):
+        each(robot, name, getattr(table, name))
+    forces_side = table.side if table.forces_side is None else table.forces_side
+    return Columns(
+        _selection(robot, "angles", table.angles),
+        _selection(robot, "forces", table.forces),
+        None if table.velocities is None else _selection(robot, "velocities", table.velocities),
+        time=table.time,
+        sample_time=table.sample_time,
+        time_unit=unit(table.time_unit),
+        angle_unit=_units(robot, "angle_unit", table.angle_unit),
+        velocity_unit=(
+            None
+            if table.velocity_unit is None
+            else _units(robot, "velocity_unit", table.velocity_unit)
+        ),
+        force_unit=_units(robot, "force_unit", table.force_unit),
+        torque_constants=table.torque_constants,
+        angle_signs=table.angle_signs,
+        force_signs=table.force_signs,
+        angle_offsets=table.angle_offsets,
+        angles_on_motor_side=table.side == "motor",
+        forces_on_motor_side=forces_side == "motor",
+    )
+
+
+def _selection(robot: Robot, name: str, value: str | int | list):
+    return each(robot, name, value) if isinstance(value, list) else value
+
+
+def _units(robot: Robot, name: str, value: str | list[str]) -> Unit | list[Unit]:
+    if isinstance(value, str):
+        return unit(value)
+    return [unit(one) for one in each(robot, name, value) or []]
+
+
+def build_filter(
+    table: ButterworthTable | PaperTable | PeriodicTable | None,
+) -> tuple[AbstractFilter, list[str]]:
+    """The filter, and what is assumed."""
+    match table:
+        case None:
+            said = (
+                f"no table `[filter]`: a Butterworth low-pass at {CUTOFF:g} Hz is assumed; choose "
+                "about five times the highest frequency of the motion."
+            )
+            return ZeroPhaseButterworth(CUTOFF), [said]
+        case ButterworthTable():
+            return ZeroPhaseButterworth(
+                table.cutoff, table.order, table.force_cutoff, table.margin
+            ), []
+        case PaperTable():
+            return PaperFilter(table.velocity, table.acceleration, table.margin), []
+        case PeriodicTable():
+            return PeriodicFourier(
+                table.period, table.harmonics, table.force_harmonics, table.order, table.margin
+            ), []
+
+
+def build_decimation(table: RowsTable) -> AbstractDecimation:
+    """Which samples become rows.
+
+    Raises:
+        ValueError: If two ways are asked for, or a factor is too large.
+    """
+    if table.every is not None and table.factors is not None:
+        raise ValueError(
+            "give `every` (takes every n-th sample) or `factors` (low-pass filters before every "
+            "stage), but not both."
+        )
+    if table.factors is not None:
+        return Decimation(tuple(table.factors))
+    return Subsample(1 if table.every is None else table.every)
+
+
+def build_slow(table: RowsTable, robot: Robot) -> Float[np.ndarray, " joints"] | None:
+    """Speeds below which rows do not count [rad/s or m/s].
+
+    Raises:
+        ValueError: If there is not one number for each joint.
+    """
+    if table.slow is None:
+        return None
+    return np.broadcast_to(_number_or_each(robot, "slow", table.slow), (robot.joints,)) + 0.0
+
+
+def build_estimator(table: EstimatorTable, robot: Robot) -> tuple[AbstractEstimator, list[str]]:
+    """The estimator, and what is assumed.
+
+    Raises:
+        ValueError: If weights make no sense, or need forces that are not known.
+    """
+    solution = Complete() if table.truncate is None else Truncated(table.truncate)
+    if table.kind == "least_squares":
+        if table.weights is not None:
+            raise ValueError(
+                '`weights` belong to `kind = "weighted"`: leave them out, or change `kind`.'
+            )
+        return LeastSquares(solution), []
+    if table.weights == "residual_variances":
+        return WeightedLeastSquares(ResidualVariances(), solution), []
+    try:
+        _ = robot.max_forces
+    except ValueError as error:
+        if table.weights == "maximum_forces":
+            raise ValueError(f'`weights = "maximum_forces"`: {error}') from error
+        said = (
+            "the largest forces of the joints are not known: joints are weighted by the residuals' "
+            "variances."
+        )
+        return WeightedLeastSquares(ResidualVariances(), solution), [said]
+    return WeightedLeastSquares(MaximumForces(), solution), []

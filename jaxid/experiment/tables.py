@@ -1,0 +1,200 @@
+"""What an experiment file may hold: its tables, their keys and the types of their values."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+Positive = Annotated[float, Meta(gt=0)]
+Magnitude = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=1)]
+Sign = Literal[1, -1]
+Side = Literal["joint", "motor"]
+AngleUnit = Literal["rad", "deg"]
+Vector = tuple[float, float, float]
+PerJoint = list[float]
+Column = str | int
+Group = str | list[Column]
+
+
+class _Table(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table whose misspelt keys are refused."""
+
+
+class DhRow(_Table):
+    """One joint of a Denavit-Hartenberg table: angles in degrees, lengths in metres."""
+
+    alpha: float
+    a: float
+    d: float
+    theta: float = 0.0
+    slides: bool = False
+    name: str | None = None
+
+
+class InertiaTable(_Table):
+    """Inertia tensor about the centre of mass [kg m²], with the signs of a URDF file."""
+
+    xx: Magnitude
+    yy: Magnitude
+    zz: Magnitude
+    xy: float = 0.0
+    xz: float = 0.0
+    yz: float = 0.0
+
+
+class ToolTable(_Table):
+    """A known load: it is subtracted, not identified."""
+
+    mass: Positive
+    centre_of_mass: Vector
+    inertia: InertiaTable | None = None
+    body: str | None = None
+
+
+class RobotTable(_Table):
+    """Where the robot comes from, and how it stands."""
+
+    urdf: str | None = None
+    builtin: str | None = None
+    dh: list[DhRow] | None = None
+    convention: Literal["modified", "standard"] | None = None
+    name: str | None = None
+    tip: str | None = None
+    base: str | None = None
+    gravity: Vector | None = None
+    base_rotation: Vector | None = None
+    base_position: Vector | None = None
+    snap_tolerance: Magnitude | None = None
+    tool: ToolTable | None = None
+
+
+class LimitsTable(_Table):
+    """Limits that replace those of the robot's source."""
+
+    angle_unit: AngleUnit = "rad"
+    position_min: PerJoint | None = None
+    position_max: PerJoint | None = None
+    velocity: PerJoint | None = None
+    acceleration: PerJoint | None = None
+    jerk: PerJoint | None = None
+    force: PerJoint | None = None
+
+
+class DrivesTable(_Table):
+    """Motors and gears that replace those of the robot's source."""
+
+    gear_ratios: PerJoint | None = None
+    matrix: list[PerJoint] | None = None
+    angle_unit: AngleUnit = "rad"
+    zero: PerJoint | None = None
+    max_torques: PerJoint | None = None
+    rotor_inertia: PerJoint | None = None
+
+
+class CoulombTable(_Table):
+    """How dry friction passes from one direction of motion to the other."""
+
+    epsilon: Positive | list[Positive] = 0.01
+    dead_zone: Magnitude | list[Magnitude] = 0.0
+    hard: bool = False
+    asymmetric: bool = False
+
+
+class ModelTable(_Table):
+    """Which effects the model has."""
+
+    principal_axes: bool = False
+    rotor_inertia: bool = True
+    viscous: bool = True
+    coulomb: bool | CoulombTable = True
+    offset: bool | None = None
+    coupled_drives: bool | None = None
+    springs: bool = False
+
+
+class RecordingTable(_Table):
+    """Which columns of a log hold what, and in which units."""
+
+    angles: Group | int
+    forces: Group | int
+    velocities: Group | int | None = None
+    time: Column | None = None
+    sample_time: Positive | None = None
+    time_unit: str = "s"
+    angle_unit: str | list[str] = "rad"
+    velocity_unit: str | list[str] | None = None
+    force_unit: str | list[str] = "N m"
+    torque_constants: PerJoint | None = None
+    angle_signs: list[Sign] | None = None
+    force_signs: list[Sign] | None = None
+    angle_offsets: PerJoint | None = None
+    side: Side = "joint"
+    forces_side: Side | None = None
+    forces_file: str | None = None
+    velocities_file: str | None = None
+    largest_gap: Positive = 1.75
+    start: float | None = None
+    stop: float | None = None
+
+
+class ButterworthTable(_Table, tag="butterworth", tag_field="kind"):
+    """A Butterworth low-pass without phase, then differences."""
+
+    cutoff: Positive
+    order: Count = 4
+    force_cutoff: Positive | None = None
+    margin: Magnitude | None = None
+
+
+class PaperTable(_Table, tag="paper", tag_field="kind"):
+    """The differentiating filter of first order (Eq. 25)."""
+
+    velocity: Positive = 1200.0
+    acceleration: Positive = 100.0
+    margin: Magnitude | None = None
+
+
+class PeriodicTable(_Table, tag="periodic", tag_field="kind"):
+    """A Fourier series for periodic motions."""
+
+    period: Positive
+    harmonics: Count
+    force_harmonics: Positive | None = None
+    order: Count = 4
+    margin: Magnitude | None = None
+
+
+class RowsTable(_Table):
+    """Which samples become rows of the least-squares problem."""
+
+    every: Count | None = None
+    factors: list[Count] | None = None
+    slow: Magnitude | list[Magnitude] | None = None
+
+
+class EstimatorTable(_Table):
+    """How the rows become parameters."""
+
+    kind: Literal["weighted", "least_squares"] = "weighted"
+    weights: Literal["maximum_forces", "residual_variances"] | None = None
+    truncate: Annotated[float, Meta(gt=0, lt=1)] | None = None
+
+
+class Tables(_Table):
+    """The whole file."""
+
+    robot: RobotTable
+    limits: LimitsTable | None = None
+    drives: DrivesTable | None = None
+    model: ModelTable = ModelTable()
+    recording: RecordingTable | None = None
+    filter: ButterworthTable | PaperTable | PeriodicTable | None = None
+    rows: RowsTable = RowsTable()
+    estimator: EstimatorTable = EstimatorTable()
+
+
+FILTERS = {
+    "butterworth": ButterworthTable,
+    "paper": PaperTable,
+    "periodic": PeriodicTable,
+}
