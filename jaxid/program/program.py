@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from .operation import COMPARISONS, FUNCTIONS, LOGIC, Operation
+from .rewrite import live, rewrite
 from .scalar import Operand, Scalar
 
 Reference = int | float
@@ -140,17 +141,6 @@ class Program:
         return np.broadcast_shapes(*batches) if batches else ()
 
 
-def _live(outputs: Sequence[Operand]) -> list[Scalar]:
-    """The scalars that the outputs need, in the order in which they were made."""
-    seen, stack = {}, [x for x in outputs if isinstance(x, Scalar)]
-    while stack:
-        scalar = stack.pop()
-        if scalar.index not in seen:
-            seen[scalar.index] = scalar
-            stack += [x for x in scalar.operands if isinstance(x, Scalar)]
-    return [seen[index] for index in sorted(seen)]
-
-
 def assemble(
     input_shapes: tuple[tuple[int, ...], ...],
     outputs: Sequence[Operand],
@@ -158,7 +148,8 @@ def assemble(
     structure: Any,
 ) -> Program:
     """Writes the live part of a graph as a program; what no output needs is left out."""
-    scalars = _live(outputs)
+    outputs = rewrite(outputs)
+    scalars = live(outputs)
     place = {scalar.index: k for k, scalar in enumerate(scalars)}
 
     def reference(x: Operand) -> Reference:
