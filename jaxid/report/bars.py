@@ -1,0 +1,120 @@
+"""Torque errors joint by joint, for identification beside verification (Fig. 10 of the paper)."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxid.report.numbers import percent, shortened
+from jaxid.report.style import BLUE, INK, ORANGE, WIDTH, heading, house_style, new_figure
+from jaxid.report.torques import require_joints
+from jaxid.robot.robot import Robot
+from jaxid.types import Float
+from jaxid.validation.errors import TorqueErrors
+
+BAR = 0.36
+NUMBERED = 10
+"""Most joints whose bars bear numbers."""
+
+
+class _Pooled(eqx.Module):
+    """Errors of several recordings as if they were one."""
+
+    mean: Float[np.ndarray, " joints"]
+    rms: Float[np.ndarray, " joints"]
+    force_rms: Float[np.ndarray, " joints"]
+
+    @classmethod
+    def of(cls, recordings: Sequence[TorqueErrors]) -> "_Pooled":
+        e = np.concatenate([r.errors for r in recordings])
+        counted = np.concatenate([np.asarray(r.counted) for r in recordings])
+        forces = np.concatenate([np.asarray(r.measured) for r in recordings])
+        rows = np.maximum(counted.sum(axis=0), 1)
+        e, forces = np.where(counted, e, 0.0), np.where(counted, forces, 0.0)
+        return cls(
+            np.abs(e).sum(axis=0) / rows,
+            np.sqrt((e**2).sum(axis=0) / rows),
+            np.sqrt((forces**2).sum(axis=0) / rows),
+        )
+
+
+def error_figure(
+    identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors], robot: Robot
+) -> Figure:
+    """Draws mean absolute errors as bars and RMS errors as marks (Eq. 37, Fig. 10).
+
+    In percent of the largest forces; of the RMS of the measured forces if a largest one is not
+    known. Several recordings count as one.
+
+    Args:
+        identification: On the recordings of the fit.
+        verification: On recordings that the fit has not seen; may be empty.
+        robot: Whose joints they are.
+
+    Raises:
+        ValueError: If there is no recording at all, or the numbers of joints differ.
+    """
+    everything = (*identification, *verification)
+    if not everything:
+        raise ValueError("`identification` or `verification` must hold errors, but both are empty.")
+    for errors in everything:
+        require_joints(errors, robot)
+    largest = np.asarray(everything[0].max_forces)
+    known = bool(np.isfinite(largest).all())
+    n = robot.joints
+    groups = [
+        (label, colour, _Pooled.of(recordings))
+        for label, colour, recordings in (
+            ("identification", BLUE, identification),
+            ("verification", ORANGE, verification),
+        )
+        if recordings
+    ]
+    with house_style():
+        figure = new_figure(max(6.5, min(2.0 + 1.1 * n, 1.4 * WIDTH)), 4.4)
+        axes = figure.add_subplot()
+        for k, (label, colour, pooled) in enumerate(groups):
+            place = np.arange(n) + (k - 0.5 * (len(groups) - 1)) * (BAR + 0.02)
+            scale = 100.0 / (largest if known else np.maximum(pooled.force_rms, 1e-300))
+            mean, rms = pooled.mean * scale, pooled.rms * scale
+            average = percent(float(np.mean(mean)) / 100.0)
+            axes.bar(
+                place, mean, BAR, color=colour, label=f"{label}, mean |e|: {average} % on average"
+            )
+            axes.plot(
+                place,
+                rms,
+                linestyle="none",
+                marker="D",
+                markersize=4.5 if n <= NUMBERED else 3.0,
+                markerfacecolor="white",
+                markeredgecolor=INK,
+                markeredgewidth=0.9,
+                label="RMS" if k == len(groups) - 1 else "_",
+            )
+            if n <= NUMBERED:
+                for x, value in zip(place, mean, strict=True):
+                    axes.annotate(
+                        percent(value / 100.0),
+                        (x, 0.0),
+                        (0, 3),
+                        textcoords="offset points",
+                        ha="center",
+                        fontsize=7.5,
+                        color="white" if colour == BLUE else INK,
+                    )
+        names = [shortened(name, 20) for name in robot.joint_names]
+        tilted = n > NUMBERED or max(map(len, names)) > 12
+        axes.set_xticks(
+            np.arange(n), names, rotation=35 if tilted else 0, ha="right" if tilted else "center"
+        )
+        axes.tick_params(axis="x", length=0)
+        axes.grid(visible=False, axis="x")
+        axes.set_xlim(-0.6, n - 0.4)
+        axes.set_ylabel(f"error [% of {'the largest force' if known else 'RMS force'}]")
+        heading(figure, f"{robot.name}: torque errors")
+        handles, _ = axes.get_legend_handles_labels()
+        bars_first = sorted(handles, key=lambda handle: handle.get_label() == "RMS")
+        figure.legend(handles=bars_first, loc="outside lower left", ncols=3)
+    return figure

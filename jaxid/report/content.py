@@ -1,0 +1,202 @@
+"""What a result file holds: everything that was found, as plain numbers, lists and texts."""
+
+import datetime
+import importlib.metadata
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxid.identification.excited import UndeterminedDirection
+from jaxid.identification.fit import Fit
+from jaxid.robot.robot import Robot
+from jaxid.validation.definiteness import Definiteness
+from jaxid.validation.errors import TorqueErrors
+
+SCHEMA = "jaxid-result/1"
+DISTRIBUTION = "jaxid-robotics"
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON can hold it: arrays become lists, what is no finite number becomes null."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | jax.Array):
+        return plain(np.asarray(value).tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    return str(value)
+
+
+def result(
+    fit: Fit,
+    identification: Sequence[TorqueErrors],
+    verification: Sequence[TorqueErrors],
+    definiteness: Definiteness,
+    settings: Mapping[str, Any],
+    notes: Sequence[str],
+) -> dict[str, Any]:
+    """Everything that was found, ready for JSON."""
+    base, model, robot = fit.base, fit.base.model, fit.base.model.robot
+    return plain(
+        {
+            "schema": SCHEMA,
+            "made": {
+                "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+                "versions": versions(),
+            },
+            "robot": _robot(robot),
+            "base_parameters": parameters(fit),
+            "lengths": base.lengths,
+            "model": {
+                "terms": [str(term) for term in model.terms],
+                "standard_names": model.parameter_names,
+                "standard_units": model.parameter_units,
+                "independent": base.indices,
+                "dependent": base.dependent,
+                "kappa": base.kappa,
+            },
+            "fit": {
+                "estimator": str(fit.estimator),
+                "recordings": fit.recordings,
+                "rows": fit.rows,
+                "weights": fit.weights,
+                "condition_numbers": {
+                    "raw": fit.condition_numbers.raw,
+                    "weighted": fit.condition_numbers.weighted,
+                    "scaled": fit.condition_numbers.scaled,
+                },
+                "residual": fit.residual,
+                "residual_rms": fit.residual_rms,
+                "covariance": fit.covariance,
+                "undetermined": [_direction(fit, d) for d in fit.undetermined],
+            },
+            "errors": {
+                "identification": [_errors(e, robot) for e in identification],
+                "verification": [_errors(e, robot) for e in verification],
+            },
+            "mass_matrix": {
+                "positive_definite": definiteness.positive_definite,
+                "smallest_eigenvalue": definiteness.smallest,
+                "pose": definiteness.pose,
+                "indefinite_share": definiteness.indefinite,
+                "poses": definiteness.poses,
+            },
+            "settings": settings,
+            "notes": (*robot.notes, *base.notes, *fit.notes, *notes),
+        }
+    )
+
+
+def parameters(fit: Fit) -> list[dict[str, Any]]:
+    """The base parameters, one entry for each, in their order."""
+    columns = zip(
+        fit.base.names,
+        fit.base.expressions,
+        fit.base.units,
+        np.asarray(fit.parameters).tolist(),
+        fit.standard_deviations.tolist(),
+        fit.relative_standard_deviations.tolist(),
+        strict=True,
+    )
+    keys = ("name", "expression", "unit", "estimate", "standard_deviation", "relative")
+    return [dict(zip(keys, row, strict=True)) for row in columns]
+
+
+def versions() -> dict[str, str]:
+    """Of what computed the result."""
+    try:
+        own = importlib.metadata.version(DISTRIBUTION)
+    except importlib.metadata.PackageNotFoundError:
+        own = "not installed"
+    return {
+        "jaxid": own,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _robot(robot: Robot) -> dict[str, Any]:
+    limits, drives, tool = robot.limits, robot.drives, robot.tool
+    names = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
+    return {
+        "name": robot.name,
+        "source": robot.source,
+        "joints": [
+            {
+                "name": name,
+                "kind": "revolute" if turns else "prismatic",
+                "unit": robot.joint_unit(j),
+                "force_unit": robot.force_unit(j),
+                "parent": robot.parent[j],
+                "axis": robot.axis[j],
+                "rotation": robot.rotation[j],
+                "offset": robot.offset[j],
+                **{key: getattr(limits, key)[j] for key in names},
+            }
+            for j, (name, turns) in enumerate(zip(robot.joint_names, robot.revolute, strict=True))
+        ],
+        "gravity": robot.gravity,
+        "drives": {
+            "reduction": drives.reduction,
+            "zero": drives.zero,
+            "max_torques": drives.max_torques,
+            "rotor_inertia": drives.rotor_inertia,
+        },
+        "tool": None
+        if tool is None
+        else {
+            "body": tool.body,
+            "mass": tool.mass,
+            "centre_of_mass": tool.centre_of_mass,
+            "inertia": tool.inertia,
+        },
+        "tip": {
+            "body": robot.tip_body,
+            "rotation": robot.tip_rotation,
+            "offset": robot.tip_offset,
+        },
+    }
+
+
+def _direction(fit: Fit, direction: UndeterminedDirection) -> dict[str, Any]:
+    return {
+        "sentence": direction.sentence(fit.base),
+        "parameters": [fit.base.names[k] for k in direction.parts],
+        "shares": direction.shares,
+        "singular_value": direction.singular_value,
+        "uncertainty": direction.uncertainty,
+    }
+
+
+def _errors(errors: TorqueErrors, robot: Robot) -> dict[str, Any]:
+    columns = {
+        "rows": np.asarray(errors.counted).sum(axis=0),
+        "mean": errors.mean,
+        "rms": errors.rms,
+        "mean_percent": errors.mean_percent,
+        "rms_percent": errors.rms_percent,
+        "rms_relative": errors.rms_relative,
+    }
+    return {
+        "recording": errors.name,
+        "relative": errors.relative,
+        "joints": [
+            {
+                "name": name,
+                "unit": robot.force_unit(j),
+                **{key: values[j] for key, values in columns.items()},
+            }
+            for j, name in enumerate(robot.joint_names)
+        ],
+    }

@@ -1,0 +1,138 @@
+"""Tables for the terminal: joints, errors and parameters, with units and aligned numbers."""
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from jaxid.identification.fit import Fit
+from jaxid.report.estimates import DOUBTFUL, TRUSTED
+from jaxid.report.numbers import aligned, percent, significant, with_deviation
+from jaxid.report.torques import require_joints
+from jaxid.robot.robot import Robot
+from jaxid.validation.errors import TorqueErrors
+
+
+def parameter_table(fit: Fit, expressions: bool = True) -> Table:
+    """The base parameters with their estimates and standard deviations, in the paper's order.
+
+    Estimates stand with the digits that their standard deviations leave meaningful.
+
+    Args:
+        fit: The estimates.
+        expressions: Whether combinations are written out in letters; otherwise the name of the
+            parameter that leads each stands alone.
+    """
+    base = fit.base
+    pairs = [
+        with_deviation(float(p), float(s))
+        for p, s in zip(fit.parameters, fit.standard_deviations, strict=True)
+    ]
+    values, deviations = (aligned(column) for column in zip(*pairs, strict=True))
+    relative = np.asarray(fit.relative_standard_deviations)
+    shares = aligned([percent(float(r)) for r in relative])
+    table = _table(f"{base.model.robot.name}: {base.size} base parameters")
+    table.add_column("#", justify="right", style="dim")
+    table.add_column("parameter", overflow="fold")
+    table.add_column("estimate", justify="right", no_wrap=True)
+    table.add_column("±", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("± [%]", justify="right", no_wrap=True)
+    names = base.expressions if expressions else base.names
+    for k, name in enumerate(names):
+        table.add_row(
+            str(k + 1),
+            Text(name),
+            values[k],
+            deviations[k],
+            base.units[k],
+            Text(shares[k], style=_colour(float(relative[k]))),
+        )
+    return table
+
+
+def error_table(errors: TorqueErrors, robot: Robot) -> Table:
+    """Torque errors of one recording, joint by joint (Eq. 37).
+
+    Columns whose largest forces are not known hold dashes.
+
+    Args:
+        errors: Of the recording.
+        robot: Whose joints they are.
+
+    Raises:
+        ValueError: If the numbers of joints differ.
+    """
+    require_joints(errors, robot)
+    n = robot.joints
+    table = _table(f"{errors.name}: relative error {percent(errors.relative)} %")
+    table.add_column("joint")
+    table.add_column("unit", no_wrap=True)
+    columns = [
+        ("mean |e|", [significant(x) for x in errors.mean]),
+        ("RMS", [significant(x) for x in errors.rms]),
+        ("mean\n[% of max]", [significant(x) for x in errors.mean_percent]),
+        ("RMS\n[% of max]", [significant(x) for x in errors.rms_percent]),
+        ("RMS\n[% of RMS force]", [percent(x, 3) for x in errors.rms_relative]),
+    ]
+    for title, _ in columns:
+        table.add_column(Text(title), justify="right", no_wrap=True)
+    cells = [aligned(texts) for _, texts in columns]
+    for j in range(n):
+        row = (column[j] for column in cells)
+        table.add_row(Text(robot.joint_names[j]), robot.force_unit(j), *row)
+    average = float(np.mean(errors.mean_percent))
+    if n > 1 and np.isfinite(average):
+        table.add_section()
+        table.add_row("average", "", "", "", significant(average), "", "")
+    return table
+
+
+def joint_table(robot: Robot) -> Table:
+    """The joints of a robot with what is known of their limits; dashes where it is not.
+
+    Args:
+        robot: The robot.
+    """
+    limits = robot.limits
+    force = np.where(np.isfinite(limits.force), limits.force, robot.drives.max_forces)
+    table = _table(f"{robot.name}: {robot.joints} joints")
+    table.add_column("joint")
+    table.add_column("moves")
+    columns = [
+        ("from", limits.position_min),
+        ("to", limits.position_max),
+        ("speed\n[unit/s]", limits.velocity),
+        ("acceleration\n[unit/s²]", limits.acceleration),
+        ("largest\nforce", force),
+    ]
+    cells = []
+    for title, values in columns:
+        table.add_column(Text(title), justify="right", no_wrap=True)
+        known = np.where(np.isfinite(values), values, np.nan)
+        cells.append(aligned([significant(x) for x in known]))
+    table.add_column("unit", no_wrap=True)
+    table.add_column("force\nunit", no_wrap=True)
+    for j in range(robot.joints):
+        table.add_row(
+            Text(robot.joint_names[j]),
+            "turns" if robot.revolute[j] else "slides",
+            *(column[j] for column in cells),
+            robot.joint_unit(j),
+            robot.force_unit(j),
+        )
+    return table
+
+
+def _table(title: str) -> Table:
+    return Table(
+        title=Text(title, style="bold"),
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+        header_style="bold",
+        padding=(0, 2, 0, 0),
+    )
+
+
+def _colour(share: float) -> str:
+    return "green" if share <= TRUSTED else "yellow" if share <= DOUBTFUL else "red"

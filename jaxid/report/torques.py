@@ -1,0 +1,129 @@
+"""Measured and predicted forces over time, joint by joint (Figs. 6, 7 and 9 of the paper)."""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from jaxid.report.lines import thinned
+from jaxid.report.numbers import percent, shortened, significant
+from jaxid.report.style import (
+    ERROR,
+    GREY,
+    MEASURED,
+    PREDICTED,
+    WIDE,
+    WIDTH,
+    caption,
+    heading,
+    house_style,
+    new_figure,
+)
+from jaxid.robot.robot import Robot
+from jaxid.validation.errors import TorqueErrors
+
+ROW = 2.15
+HEADER = 0.95
+BINS = 700
+"""Bins of a line: about one for each pixel of a panel."""
+
+
+def torque_figure(errors: TorqueErrors, robot: Robot, title: str | None = None) -> Figure:
+    """Draws measured and predicted forces of every joint, and their difference below.
+
+    Rows at both ends that count for no joint are left out; where a row within does not count for
+    a joint, the difference is left blank.
+
+    Args:
+        errors: Of one recording.
+        robot: Whose joints they are.
+        title: Of the figure; the recording's name if None.
+
+    Raises:
+        ValueError: If the numbers of joints differ, or no row counts.
+    """
+    n = robot.joints
+    require_joints(errors, robot)
+    counts = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
+    if not len(counts):
+        raise ValueError(
+            f"no row of `{errors.name}` counts for any joint: there is nothing to draw."
+        )
+    window = slice(counts[0], counts[-1] + 1)
+    columns = 1 if n <= 2 else 2 if n <= 16 else 3
+    rows = math.ceil(n / columns)
+    with house_style():
+        figure = new_figure(WIDTH if columns < 3 else WIDE, HEADER + ROW * rows, gap=0.02)
+        grid = figure.add_gridspec(rows, columns)
+        panels = []
+        for j in range(n):
+            # The third part is empty: it keeps the next joint off.
+            cell = grid[divmod(j, columns)].subgridspec(3, 1, height_ratios=(3, 1, 0.22))
+            upper = figure.add_subplot(cell[0])
+            lower = figure.add_subplot(cell[1], sharex=upper)
+            panels.append((upper, lower))
+            _joint(upper, lower, errors, robot, j, window)
+            if j + columns >= n:
+                lower.set_xlabel("time [s]")
+        for column in range(columns):
+            figure.align_ylabels([axes for pair in panels[column::columns] for axes in pair])
+        name = shortened(errors.name if title is None else title, 40)
+        heading(figure, f"{name}: relative error {percent(errors.relative)} %")
+        figure.legend(
+            handles=[
+                Line2D([], [], color=MEASURED, lw=2.4, label="measured"),
+                Line2D([], [], color=PREDICTED, lw=1.2, label="predicted"),
+                Line2D(
+                    [], [], color=ERROR, lw=1.2, label="predicted - measured, on a scale of its own"
+                ),
+            ],
+            loc="outside lower left",
+            ncols=3,
+        )
+    return figure
+
+
+def _joint(
+    upper: Axes, lower: Axes, errors: TorqueErrors, robot: Robot, j: int, window: slice
+) -> None:
+    unit = robot.force_unit(j)
+    time = np.asarray(errors.time)[window]
+    measured, predicted = (np.asarray(x)[window, j] for x in (errors.measured, errors.predicted))
+    difference = errors.errors[window, j]
+    upper.plot(*thinned(time, measured, BINS), color=MEASURED, lw=1.9, label="measured")
+    upper.plot(*thinned(time, predicted, BINS), color=PREDICTED, lw=0.8, label="predicted")
+    lower.plot(*thinned(time, difference, BINS), color=ERROR, lw=0.6, label="error")
+    caption(upper, shortened(robot.joint_names[j], 26), _mean_error(errors, j, unit))
+    upper.set_ylabel(f"{'torque' if robot.revolute[j] else 'force'} [{unit}]")
+    lower.set_ylabel(f"[{unit}]")
+    upper.tick_params(labelbottom=False)
+    upper.set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1.0)
+    upper.yaxis.set_major_locator(MaxNLocator(5))
+    lower.yaxis.set_major_locator(MaxNLocator(2, symmetric=True, min_n_ticks=3))
+    largest = np.nanmax(np.abs(difference)) if np.isfinite(difference).any() else 0.0
+    lower.set_ylim(*np.array([-1.1, 1.1]) * (largest if largest > 0 else 1.0))
+    lower.axhline(0.0, color=GREY, lw=0.5)
+
+
+def _mean_error(errors: TorqueErrors, j: int, unit: str) -> str:
+    if not np.asarray(errors.counted)[:, j].any():
+        return "no row counts"
+    mean, share = errors.mean[j], errors.mean_percent[j] / 100.0
+    text = f"mean |e| {significant(mean, 2)} {unit}"
+    return f"{text} = {percent(share)} % of max" if np.isfinite(share) else text
+
+
+def require_joints(errors: TorqueErrors, robot: Robot) -> None:
+    """Refuses errors of another robot.
+
+    Raises:
+        ValueError: If the numbers of joints differ.
+    """
+    if errors.measured.shape[1] != robot.joints:
+        raise ValueError(
+            f"`errors` of `{errors.name}` belong to {errors.measured.shape[1]} joints, but the "
+            f"robot `{robot.name}` has {robot.joints}."
+        )

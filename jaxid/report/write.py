@@ -1,0 +1,117 @@
+"""Writes the report of an identification: numbers for programs, figures for people."""
+
+import csv
+import json
+import re
+import unicodedata
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxid.identification.fit import Fit
+from jaxid.report.bars import error_figure
+from jaxid.report.content import parameters, result
+from jaxid.report.estimates import parameter_figure
+from jaxid.report.style import save
+from jaxid.report.torques import torque_figure
+from jaxid.simulation.folder import written_whole
+from jaxid.validation.definiteness import Definiteness
+from jaxid.validation.errors import TorqueErrors
+
+LONGEST_NAME = 80
+
+
+def write_report(
+    folder: Path,
+    fit: Fit,
+    identification: tuple[TorqueErrors, ...],
+    verification: tuple[TorqueErrors, ...],
+    definiteness: Definiteness,
+    settings: Mapping[str, Any],
+    notes: tuple[str, ...] = (),
+) -> list[Path]:
+    """Writes `result.json`, `parameters.csv` and the figures, all of them or nothing.
+
+    A folder that is there already keeps its other files; figures of recordings that an earlier
+    report left in it go.
+
+    Args:
+        folder: Of the report; made with its parents.
+        fit: The estimates.
+        identification: Errors on the recordings of the fit.
+        verification: Errors on recordings that the fit has not seen.
+        definiteness: Of the mass matrix.
+        settings: How the result came about, for the record.
+        notes: What the reader should know, in sentences.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: If there are no errors to show, or `folder` is a file.
+    """
+    robot = fit.base.model.robot
+    named = _file_names(identification, verification)
+    content = result(fit, identification, verification, definiteness, settings, notes)
+    names = ["result.json", "parameters.csv", "errors.png", "parameters.png"]
+    names += [file for file, _, _ in named]
+    content["files"] = names
+    with written_whole(folder) as staging:
+        _write_json(staging / "result.json", content)
+        _write_csv(staging / "parameters.csv", parameters(fit))
+        save(error_figure(identification, verification, robot), staging / "errors.png")
+        save(parameter_figure(fit), staging / "parameters.png")
+        for file, role, errors in named:
+            save(torque_figure(errors, robot, f"{errors.name} ({role})"), staging / file)
+        stale = _earlier(folder) - set(names)
+    for name in stale:
+        (folder / name).unlink(missing_ok=True)
+    return [folder / name for name in names]
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+    # A list of numbers or texts stands on one line. Texts hold no line breaks, so none is touched.
+    text = re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text)
+    path.write_text(f"{text}\n", encoding="utf-8")
+
+
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _file_names(
+    identification: Iterable[TorqueErrors], verification: Iterable[TorqueErrors]
+) -> list[tuple[str, str, TorqueErrors]]:
+    """A file name of its own for every recording, also where file names ignore case."""
+    used: set[str] = set()
+    named = []
+    for role, recordings in (("identification", identification), ("verification", verification)):
+        for errors in recordings:
+            stem = safe_name(errors.name)
+            choices = (stem, f"{stem}_{role}", *(f"{stem}_{role}_{k}" for k in range(2, 10_000)))
+            name = next(c for c in choices if c.lower() not in used)
+            used.add(name.lower())
+            named.append((f"torque_{name}.png", role, errors))
+    return named
+
+
+def safe_name(name: str) -> str:
+    """A name that every file system takes: ASCII letters, digits, `-`, `_` and inner dots."""
+    ascii_only = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    safe = re.sub(r"[^A-Za-z0-9._-]+", "-", ascii_only).strip(".-")[:LONGEST_NAME].strip(".-")
+    return safe or "recording"
+
+
+def _earlier(folder: Path) -> set[str]:
+    """Figures of recordings that an earlier report in this folder says it has written."""
+    try:
+        content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        if not str(content["schema"]).startswith("jaxid-result/"):
+            return set()
+        return {f for f in content["files"] if re.fullmatch(r"torque_[A-Za-z0-9._-]+\.png", f)}
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
