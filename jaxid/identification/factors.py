@@ -6,6 +6,7 @@ free, and recordings are added by stacking factors. The observation matrix is ne
 """
 
 import functools
+import itertools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -152,7 +153,7 @@ def factorise(
         edges = [0, *edges[1:], observations.rows]
         factors = [empty(base) for _ in edges[1:]]
         for rows, columns, forces in reduced_rows(base, observations):
-            for k, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+            for k, (first, last) in enumerate(itertools.pairwise(edges)):
                 low, high = max(first, rows.start), min(last, rows.stop)
                 if low < high:
                     part = slice(low - rows.start, high - rows.start)

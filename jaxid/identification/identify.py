@@ -9,7 +9,7 @@ from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSqua
 from jaxid.identification.excited import undetermined_directions
 from jaxid.identification.factors import Blocks, Factors, factorise
 from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.solutions import Decomposition
+from jaxid.identification.solutions import NUMERICAL, Decomposition
 from jaxid.measurement.observations import Observations
 
 
@@ -122,7 +122,8 @@ def _covariance(
         columns = list(joint.columns)
         felt = w**2 * np.asarray(joint.R)[:, :-1] @ B[columns]
         inner += variance * (felt.T @ felt)
-    unknown = ~np.any(B != 0.0, axis=1)
+    null = np.asarray(decomposition.directions)[s <= NUMERICAL * s.max(initial=0.0)]
+    unknown = np.sum(null**2, axis=0) > 1e-8
     inner[unknown, unknown] = np.inf
     return inner
 

@@ -67,7 +67,8 @@ class AbstractSolution(eqx.Module):
 class AbstractSpectralSolution(AbstractSolution):
     r"""A solution that treats each direction by its singular value.
 
-    The parameters are $B \Theta^T W^2 Q$ where $B$ takes the place of the inverse of the information.
+    The parameters are $B \Theta^T W^2 Q$, where $B$ takes the place of the inverse of the
+    information.
     """
 
     @abstractmethod

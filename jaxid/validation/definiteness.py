@@ -1,4 +1,4 @@
-"""Whether the mass matrix of an identified model is one: positive definite in every pose (Sec. 5)."""
+"""Whether an identified mass matrix is positive definite in every pose (Sec. 5)."""
 
 import equinox as eqx
 import numpy as np
@@ -51,7 +51,7 @@ def definiteness(fit: Fit, *, poses: int = POSES, seed: int = 0) -> Definiteness
 
 
 def position_range(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the joints' ranges [rad or m]; one turn, or a metre to either side, where unlimited."""
+    """Ends of the joints' ranges [rad or m]; a turn, or a metre to either side, where unlimited."""
     half = np.where(np.array(robot.revolute), np.pi, 1.0)
     low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
     return np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)

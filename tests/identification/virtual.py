@@ -1,0 +1,76 @@
+"""Observations of virtual arms whose parameters are known."""
+
+import math
+
+import numpy as np
+
+import jaxid as jid
+from jaxid.dynamics.compiled import evaluate_forces, evaluate_regressor, evaluate_tool_forces
+
+
+def standard_parameters(model: jid.Model, seed: int = 0) -> np.ndarray:
+    """Any parameters do: the equations are linear in them."""
+    return np.random.default_rng(seed).uniform(0.2, 2.0, model.size)
+
+
+def motion(joints: int, samples: int, *, seed: int = 0, still: tuple[int, ...] = ()) -> jid.Motion:
+    """A few sinusoids for each joint; some joints can be kept still."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 10.0, samples)[:, None]
+    q, qd, qdd = (np.zeros((samples, joints)) for _ in range(3))
+    for k in (1, 2, 3):
+        w = 2 * math.pi * 0.1 * k
+        a, phase = rng.uniform(0.3, 1.0, joints), rng.uniform(0, 6, joints)
+        a[list(still)] = 0.0
+        q += a * np.sin(w * t + phase)
+        qd += a * w * np.cos(w * t + phase)
+        qdd -= a * w**2 * np.sin(w * t + phase)
+    return jid.Motion(q, qd, qdd)
+
+
+def observations(
+    model: jid.Model,
+    p: np.ndarray,
+    *,
+    samples: int = 400,
+    noise: np.ndarray | float = 0.0,
+    seed: int = 0,
+    noise_seed: int = 0,
+    still: tuple[int, ...] = (),
+    filter: jid.AbstractFilter | None = None,
+    every: int = 1,
+    mask: np.ndarray | None = None,
+) -> jid.Observations:
+    """Exact motion, forces of the model with white noise; nothing filtered unless asked for."""
+    n = model.robot.joints
+    m = motion(n, samples, seed=seed, still=still)
+    forces = evaluate_forces(model, p, m) + evaluate_tool_forces(model, m)
+    forces = forces + noise * np.random.default_rng(noise_seed).normal(size=forces.shape)
+    dt = 10.0 / (samples - 1)
+    if filter is None:
+        filter = jid.ZeroPhaseButterworth(0.4 / dt, force_cutoff=math.inf, margin=0.0)
+    o = jid.Observations(
+        time=dt * np.arange(samples),
+        motion=m,
+        forces=forces,
+        filter=filter,
+        decimation=jid.Subsample(every),
+        segments=((0, samples),),
+        mask=np.ones((0, n), bool),
+        sample_time=dt,
+    )
+    rows = len(o.instants)
+    full = np.ones((rows, n), bool) if mask is None else mask
+    return jid.Observations(**{**vars(o), "mask": full})
+
+
+def dense(
+    base: jid.BaseParameters, o: jid.Observations
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Observation matrix, forces and joint of every counted row, formed the obvious way."""
+    theta = evaluate_regressor(base.model, o.motion)[:, :, list(base.indices)]
+    rows = o.reduce(theta)
+    forces = o.reduce(np.asarray(o.forces) - evaluate_tool_forces(base.model, o.motion))
+    keep = np.asarray(o.mask)
+    joint = np.broadcast_to(np.arange(keep.shape[1]), keep.shape)
+    return rows[keep], forces[keep], joint[keep]
