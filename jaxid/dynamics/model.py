@@ -88,7 +88,7 @@ class Model(eqx.Module):
         return jnp.concatenate([t.columns(self.robot, q, qd, qdd) for t in self.terms], axis=1)
 
     def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
-        """The generalized forces of one sample, as they are defined (Eq. 11)."""
+        """The generalized forces of one sample, as they are defined (Eqs. 11, 15)."""
         parts = zip(self.terms, self.split(p), strict=True)
         return sum(t.forces(self.robot, x, q, qd, qdd) for t, x in parts)
 
