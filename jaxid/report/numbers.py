@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-MISSING = "–"
+MISSING = "–"  # noqa: RUF001
 MOST_DECIMALS = 8
 
 

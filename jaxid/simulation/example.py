@@ -1,0 +1,208 @@
+"""An example to begin with: the files of an experiment on a virtual robot whose truth is known."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import (
+    ConstantOffset,
+    CoulombFriction,
+    RigidBodies,
+    RotorInertia,
+    ViscousFriction,
+)
+from jaxid.measurement.recording import Recording
+from jaxid.robot import library
+from jaxid.simulation.folder import written_whole
+from jaxid.simulation.virtual import VirtualRobot, random_bodies
+from jaxid.trajectory.fourier import random_fourier_series
+
+SAMPLE_TIME = 0.002
+PERIOD = 8.0
+IDENTIFICATION_PERIODS, VERIFICATION_PERIODS = 2, 1
+MASSES = (3.4, 2.2, 2.6, 2.4, 1.6, 1.3, 0.6)
+"""About what the bodies weigh [kg]."""
+ROTORS = (0.6, 0.6, 0.45, 0.45, 0.2, 0.2, 0.15)
+"""About what the motors add to the joints' inertia [kg m²]."""
+FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")
+
+_EXPERIMENT = """\
+# A virtual robot with the geometry of a Panda (7 joints), and two logs of it:
+#   identification.csv   16 s at 500 Hz, to identify with
+#   verification.csv      8 s of another motion, to verify with
+# The logs were computed, with noise, encoder steps and a little friction that no model below
+# describes. truth.json holds the parameters that were used: compare them with what you find.
+#
+#   jaxid inspect  experiment.toml identification.csv
+#   jaxid identify experiment.toml identification.csv --verify verification.csv -o report/
+#
+# Lines that begin with `#` are comments. Units: rad, s, N m.
+
+[robot]
+builtin = "panda"                     # what is known: geometry, limits, largest torques
+
+[model]                               # which effects have unknown parameters, beside the bodies
+viscous = true                        # friction that grows with speed
+rotor_inertia = true                  # motors' rotors, felt through the gears
+offset = true                         # constant torque at each joint
+[model.coulomb]                       # dry friction
+epsilon = 0.01                        # speed of its smooth transition [rad/s]
+
+[recording]                           # which columns of the logs hold what
+angles = "q{}"                        # q1 … q7
+forces = "tau{}"                      # tau1 … tau7
+time = "time"
+angle_unit = "rad"
+force_unit = "N m"
+
+[filter]                              # from angles to velocities and accelerations
+kind = "butterworth"                  # a low-pass, forward and backward, then differences
+cutoff = 10.0                         # the motion has nothing above 0.625 Hz [Hz]
+
+[rows]                                # which samples become rows of the least-squares problem
+every = 20                            # 25 rows in a second
+
+[estimator]
+kind = "weighted"                     # joints count by their largest torques (Eq. 30)
+"""
+
+
+def virtual_panda(seed: int = 0) -> VirtualRobot:
+    """A robot with the geometry of a Panda and parameters that are drawn.
+
+    Masses, rotors and friction vary by some 20 percent about plausible values; the bodies could
+    exist. Noise is 1 percent of the largest torques.
+
+    Args:
+        seed: Of the parameters.
+    """
+    robot = library.panda()
+    random = np.random.default_rng([seed, 0])
+    n, largest = robot.joints, np.asarray(robot.max_forces)
+
+    def about(values: np.ndarray) -> np.ndarray:
+        return values * random.uniform(0.8, 1.2, n)
+
+    bodies = random_bodies(robot, about(np.array(MASSES)), random)
+    parameters = [
+        bodies.ravel(),
+        about(0.02 * largest),
+        about(0.03 * largest),
+        about(np.array(ROTORS)),
+        0.01 * largest * random.uniform(-1.0, 1.0, n),
+    ]
+    terms = (
+        RigidBodies(),
+        ViscousFriction(),
+        CoulombFriction(),
+        RotorInertia(),
+        ConstantOffset(),
+    )
+    return VirtualRobot(
+        model=Model(robot, terms),
+        parameters=np.concatenate(parameters),
+        stribeck=0.005 * largest,
+        stribeck_speed=0.05,
+        encoder_step=2 * math.pi / 2**19,
+        white_noise=0.009 * largest,
+        coloured_noise=0.004 * largest,
+        memory=0.02,
+    )
+
+
+def virtual_log(robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]) -> Recording:
+    """A log of a random motion within the limits.
+
+    Args:
+        robot: That moves.
+        name: Of the log.
+        periods: How often the motion is repeated.
+        seed: Of motion and noise.
+    """
+    motion_seed, noise_seed = (
+        int(s) for s in np.random.SeedSequence(seed).generate_state(2, np.uint32)
+    )
+    trajectory = random_fourier_series(
+        robot.model.robot, omega=2 * math.pi / PERIOD, reach=0.9, seed=motion_seed
+    )
+    return robot.measure(
+        trajectory,
+        duration=periods * PERIOD,
+        sample_time=SAMPLE_TIME,
+        seed=noise_seed,
+        name=name,
+    )
+
+
+def write_example(folder: Path, seed: int = 0) -> list[Path]:
+    """Writes an experiment to try: its file, two logs and the truth; all of them or nothing.
+
+    Args:
+        folder: Of the files; made with its parents.
+        seed: Of the parameters, the motions and the noise.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: If `folder` is a file, or holds one of the files with another content.
+        RuntimeError: If JAX runs in single precision.
+    """
+    robot = virtual_panda(seed)
+    with written_whole(folder) as staging:
+        (staging / FILES[0]).write_text(_EXPERIMENT, encoding="utf-8")
+        for k, (file, periods) in enumerate(
+            zip(FILES[1:3], (IDENTIFICATION_PERIODS, VERIFICATION_PERIODS), strict=True)
+        ):
+            path = staging / file
+            _write_csv(path, virtual_log(robot, path.stem, periods, (seed, k + 1)))
+        text = json.dumps(_truth(robot, seed), indent=1, ensure_ascii=False, allow_nan=False)
+        (staging / FILES[3]).write_text(f"{text}\n", encoding="utf-8")
+        for file in FILES:
+            _refuse_other(folder / file, staging / file)
+    return [folder / file for file in FILES]
+
+
+def _refuse_other(present: Path, new: Path) -> None:
+    if present.exists() and (not present.is_file() or present.read_bytes() != new.read_bytes()):
+        raise ValueError(
+            f"`{present}` is there already with another content: choose another folder for the "
+            "example, or remove it."
+        )
+
+
+def _write_csv(path: Path, recording: Recording) -> None:
+    n = recording.joints
+    header = ["time", *(f"q{i + 1}" for i in range(n)), *(f"tau{i + 1}" for i in range(n))]
+    columns = np.column_stack([recording.time, recording.angles, recording.forces])
+    formats = ["%.3f", *["%.7f"] * n, *["%.4f"] * n]
+    np.savetxt(path, columns, formats, ",", header=",".join(header), comments="", encoding="utf-8")
+
+
+def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
+    model, p = robot.model, np.asarray(robot.parameters)
+    base = base_parameters(model)
+    first, second = list(base.indices), list(base.dependent)
+    combined = p[first] + np.asarray(base.kappa) @ p[second]
+    keys = ("name", "unit", "value")
+    standard = zip(model.parameter_names, model.parameter_units, p.tolist(), strict=True)
+    regrouped = zip(base.names, base.units, combined.tolist(), strict=True)
+    return {
+        "schema": "jaxid-truth/1",
+        "robot": model.robot.name,
+        "seed": seed,
+        "base_parameters": [dict(zip(keys, row, strict=True)) for row in regrouped],
+        "standard_parameters": [dict(zip(keys, row, strict=True)) for row in standard],
+        "beyond_the_model": {
+            "stribeck_friction": np.asarray(robot.stribeck).tolist(),
+            "stribeck_speed": robot.stribeck_speed,
+            "encoder_step": robot.encoder_step,
+            "white_noise": np.asarray(robot.white_noise).tolist(),
+            "coloured_noise": np.asarray(robot.coloured_noise).tolist(),
+            "noise_memory": robot.memory,
+        },
+    }
