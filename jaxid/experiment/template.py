@@ -234,11 +234,13 @@ def _drives(robot: Robot) -> str:
             "# Motors and gears: needed for logs on the motors' side.",
             f"[drives]                              # ratio of motor to joint speed{rail}",
             f"gear_ratios = {_list([1.0] * n)}",
-            "# matrix = [[…], …]                   # instead: a row for each motor, its ratio to each joint",
+            "# matrix = [[…], …]  # instead: a row for each motor, its ratio to each joint",
             f"# zero = {_list([0.0] * n)}             # joint angles at which the motors' are zero",
             '# angle_unit = "deg"                  # of `zero`',
-            f"# max_torques = {_list([1.0] * n)}      # of the motors, before the gears [N m]",
-            f"# rotor_inertia = {_list([1e-4] * n)}  # of the motors, before the gears [kg m²]",
+            "# largest torques of the motors, before the gears [N m]:",
+            f"# max_torques = {_list([1.0] * n)}",
+            "# inertias of the rotors, before the gears [kg m²]:",
+            f"# rotor_inertia = {_list([1e-4] * n)}",
         )
     )
 

@@ -1,0 +1,290 @@
+"""The command line: `jaxid init`, `inspect`, `identify` and `example`."""
+
+import dataclasses
+import dis
+import importlib.metadata
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
+from typer.core import TyperCommand
+
+from jaxid.experiment import terminal
+from jaxid.experiment.experiment import Experiment, load_experiment
+from jaxid.experiment.folder import refuse_foreign_folder
+from jaxid.experiment.sanity import check_log
+from jaxid.experiment.template import write_template
+from jaxid.identification.identify import identify as estimate
+from jaxid.measurement.observations import Observations
+from jaxid.report.write import write_report
+from jaxid.validation.validate import validate
+
+DISTRIBUTION = "jaxid-robotics"
+WIDTH = 100
+"""Of what is written where there is no terminal."""
+
+app = typer.Typer(
+    name="jaxid",
+    help="Identifies the dynamic parameters of robots: from a log to a model.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+ExperimentFile = Annotated[Path, typer.Argument(help="The experiment file (TOML).")]
+
+
+class SpreadVerify(TyperCommand):
+    """Takes `--verify b.csv c.csv` for `--verify b.csv --verify c.csv`.
+
+    Otherwise the second log would silently be used to identify.
+    """
+
+    def parse_args(self, ctx, args):
+        """Repeats the option before each log that follows it."""
+        spread, verifying = [], False
+        for arg in args:
+            if arg == "--verify":
+                verifying = True
+            elif arg.startswith("-"):
+                verifying = False
+                spread.append(arg)
+            else:
+                spread += ["--verify", arg] if verifying else [arg]
+        return super().parse_args(ctx, spread)
+
+
+def main() -> None:
+    """Runs a command; what a user can mend is one sentence on stderr and exit code 2."""
+    jax.config.update("jax_enable_x64", True)
+    try:
+        app()
+    except (ValueError, OSError, RuntimeError) as error:
+        if not _is_for_the_user(error):
+            raise
+        _console(stderr=True).print(Text(f"jaxid: {_sentence(error)}"), soft_wrap=True)
+        raise SystemExit(2) from None
+
+
+def _is_for_the_user(error: Exception) -> bool:
+    """Whether it comes from a file, or was raised by name in this package: not from a bug."""
+    if isinstance(error, OSError):
+        return True
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None or not trace.tb_frame.f_globals.get("__name__", "").startswith("jaxid."):
+        return False
+    # NumPy's own errors have no frame below ours: only a `raise` statement is a sentence.
+    return trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        where = f"`{error.filename}`: " if error.filename else ""
+        return f"{where}{error.strerror}."
+    return str(error)
+
+
+def _console(stderr: bool = False) -> Console:
+    console = Console(stderr=stderr, highlight=False)
+    if not console.is_terminal and "COLUMNS" not in console._environ:
+        console.width = WIDTH
+    return console
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        try:
+            shown = importlib.metadata.version(DISTRIBUTION)
+        except importlib.metadata.PackageNotFoundError:
+            shown = "(not installed)"
+        _console().print(Text(f"jaxid {shown}"))
+        raise typer.Exit
+
+
+@app.command()
+def init(
+    urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.")],
+) -> None:
+    """Write a commented experiment file for a robot: jaxid init arm.urdf > experiment.toml."""
+    typer.echo(write_template(urdf), nl=False)
+
+
+@app.command()
+def example(
+    folder: Annotated[Path, typer.Argument(help="Where the files shall lie.")],
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+) -> None:
+    """Write an experiment file and two logs of a virtual robot to try things on."""
+    from jaxid.simulation.example import write_example
+
+    console = _console()
+    with _stages(1) as stage:
+        stage("simulating")
+        files = write_example(folder, seed=seed)
+    for file in files:
+        console.print(Text(f"wrote {file}"), soft_wrap=True)
+    console.print(
+        Text(
+            f"now: jaxid identify {folder}/experiment.toml {folder}/identification.csv "
+            f"--verify {folder}/verification.csv -o {folder}/report"
+        ),
+        soft_wrap=True,
+    )
+
+
+@app.command()
+def inspect(
+    experiment: ExperimentFile,
+    logs: Annotated[list[Path] | None, typer.Argument(help="Logs to look at.")] = None,
+) -> None:
+    """Show the joints, what can be identified, and whether a log is sane."""
+    console = _console()
+    loaded = load_experiment(experiment)
+    paths = logs or []
+    terminal.show_robot(console, loaded)
+    with _stages(1 + 3 * len(paths)) as stage:
+        stage("finding base parameters")
+        _ = loaded.base.expressions
+        seen = [_look(loaded, path, stage) for path in paths]
+    terminal.show_base(console, loaded.base)
+    terminal.sentences(console, loaded.notes)
+    for recording, observations, fit in seen:
+        terminal.show_recording(console, recording)
+        check = check_log(loaded.robot, recording, observations)
+        terminal.show_check(console, loaded.robot, check)
+        console.print()
+        terminal.show_rows(console, (observations,), fit)
+        terminal.show_undetermined(console, fit)
+
+
+def _look(experiment: Experiment, path: Path, stage):
+    stage(f"reading {path.name}")
+    recording = experiment.read(path)
+    stage(f"filtering {path.name}")
+    observations = experiment.observe(recording)
+    stage(f"factorising {path.name}")
+    return recording, observations, estimate(experiment.base, observations, experiment.estimator)
+
+
+@app.command(cls=SpreadVerify)
+def identify(
+    experiment: ExperimentFile,
+    logs: Annotated[list[Path], typer.Argument(help="Logs to identify with, fitted together.")],
+    verify: Annotated[
+        list[Path] | None,
+        typer.Option("--verify", help="Logs to verify with, which the fit does not see."),
+    ] = None,
+    split: Annotated[
+        float | None,
+        typer.Option(
+            "--split",
+            metavar="F",
+            help="Identify with the first part F of every log, of 1; verify with the rest.",
+        ),
+    ] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")] = Path(
+        "report"
+    ),
+    force: Annotated[
+        bool, typer.Option("--force", help="Write into a folder that holds other files too.")
+    ] = False,
+) -> None:
+    """Estimate the parameters from logs, with uncertainty and torque errors; write a report."""
+    console = _console()
+    if split is not None and not 0 < split < 1:
+        raise ValueError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
+    refuse_foreign_folder(output, force)
+    loaded = load_experiment(experiment)
+    others = verify or []
+    with _stages(4 + 2 * (len(logs) + len(others))) as stage:
+        fitted, checked = _observe_all(loaded, logs, others, stage)
+        if split is not None:
+            parts = [o.split(split) for o in fitted]
+            percent = f"{100 * split:g}"
+            fitted = [_named(a, f"{a.name}, first {percent} %") for a, _ in parts]
+            checked = [*(_named(b, f"{b.name}, rest") for _, b in parts), *checked]
+        stage("finding base parameters")
+        base = loaded.base
+        stage("factorising the rows")
+        fit = estimate(base, fitted, loaded.estimator)
+        stage("predicting torques")
+        found = validate(fit, [*fitted, *checked])
+        stage("writing the report")
+        logs_said = [n for o in (*fitted, *checked) for n in o.notes]
+        files = write_report(
+            output,
+            fit,
+            found.errors[: len(fitted)],
+            found.errors[len(fitted) :],
+            found.definiteness,
+            {
+                "experiment": str(experiment),
+                "experiment_text": loaded.text,
+                "identification": [str(p) for p in logs],
+                "verification": [str(p) for p in others],
+                "split": split,
+                "filter": str(loaded.filter),
+                "decimation": str(loaded.decimation),
+                "slow": loaded.slow,
+            },
+            (*loaded.notes, *dict.fromkeys(logs_said)),
+        )
+    terminal.show_robot(console, loaded)
+    console.print()
+    terminal.sentences(console, [*loaded.notes, *logs_said, *fit.notes])
+    terminal.show_fit(console, fit)
+    console.print()
+    terminal.show_rows(console, fitted, fit)
+    terminal.show_undetermined(console, fit)
+    terminal.show_validation(console, loaded.robot, found, len(fitted))
+    terminal.show_files(console, output, [p.name for p in files])
+
+
+def _observe_all(experiment: Experiment, logs: list[Path], others: list[Path], stage):
+    """Reads and filters all logs; those of equal names take their folders' in front."""
+    paths = [*logs, *others]
+    stems = [p.stem for p in paths]
+    observed = []
+    for path in paths:
+        stage(f"reading {path.name}")
+        recording = experiment.read(path)
+        if stems.count(path.stem) > 1:
+            recording = dataclasses.replace(
+                recording, name=f"{path.resolve().parent.name}/{path.stem}"
+            )
+        stage(f"filtering {path.name}")
+        observed.append(experiment.observe(recording))
+    return observed[: len(logs)], observed[len(logs) :]
+
+
+def _named(observations: Observations, name: str) -> Observations:
+    return dataclasses.replace(observations, name=name)
+
+
+@contextmanager
+def _stages(total: int) -> Iterator:
+    """A progress bar on stderr; call what it gives with the name of each stage as it begins."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=_console(stderr=True), transient=True) as progress:
+        task = progress.add_task("starting", total=total + 1)
+
+        def stage(name: str) -> None:
+            progress.update(task, description=name, advance=1)
+
+        yield stage
+
+
+if __name__ == "__main__":
+    main()

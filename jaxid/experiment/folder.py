@@ -1,0 +1,34 @@
+"""Whether a folder may take a report."""
+
+import json
+from pathlib import Path
+
+from jaxid.report.content import SCHEMA
+
+
+def refuse_foreign_folder(target: Path, force: bool) -> None:
+    """Refuses to put a report into a folder that holds other things; an earlier report may go.
+
+    Args:
+        target: Folder of the report.
+        force: Whether the report may stand beside other files.
+
+    Raises:
+        ValueError: If there is something else in its place.
+    """
+    if target.exists() and not target.is_dir():
+        raise ValueError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
+    if force or not target.is_dir() or not any(target.iterdir()) or _is_report(target):
+        return
+    raise ValueError(
+        f"`{target}` holds files but no report: choose another folder with -o, or add --force to "
+        "put the report beside them."
+    )
+
+
+def _is_report(folder: Path) -> bool:
+    try:
+        content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        return str(content["schema"]).startswith(SCHEMA.split("/")[0])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
