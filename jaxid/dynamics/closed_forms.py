@@ -188,16 +188,14 @@ def _number(value: float) -> Coefficient | None:
 
 def _fit(x: np.ndarray, y: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Factors of products of powers, without those that are not needed."""
-    for _ in range(3):
+    factors, needed = np.zeros(0), np.zeros(1, bool)
+    while not needed.all():
         factors = np.linalg.lstsq(_products(x, powers), y, rcond=None)[0]
         needed = np.abs(factors) > _SMALL * np.abs(factors).max()
-        if needed.all():
-            break
         powers = powers[needed]
     if len(powers) > MOST_TERMS:
         return None
-    simple = np.array([float(_simple(f)) for f in factors])
-    return simple, powers
+    return np.array([float(_simple(f)) for f in factors]), powers
 
 
 def _products(x: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -206,4 +204,4 @@ def _products(x: np.ndarray, powers: np.ndarray) -> np.ndarray:
 
 def _simple(number: float) -> Fraction | float:
     nearest = Fraction(number).limit_denominator(LARGEST_DENOMINATOR)
-    return nearest if nearest and abs(number - float(nearest)) < 1e-8 else number
+    return nearest if nearest and abs(number - float(nearest)) < _FITS else number

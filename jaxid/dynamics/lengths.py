@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from jaxid.dynamics.dimensions import Dimension
 from jaxid.dynamics.model import Model
@@ -21,6 +20,7 @@ from jaxid.dynamics.observation import (
     random_motion,
     row_units,
 )
+from jaxid.dynamics.rank import solve_from_earlier
 from jaxid.program import FREE, Program, evaluate, trace
 from jaxid.robot.robot import AXES, Robot
 from jaxid.types import Float
@@ -118,33 +118,27 @@ class Regrouping:
         scale = np.where(live, norms, 1.0)
         W = np.where(live[:, None], W / scale[:, None], 0.0)
         W1, W2 = W[..., self.independent], W[..., self.dependent]
-        Q, R = np.linalg.qr(W1)
-        diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
-        if diagonal.min(initial=1.0) < EXPLAINED:
+        diagonal = np.diagonal(np.linalg.qr(W1, mode="r"), axis1=1, axis2=2)
+        if np.abs(diagonal).min(initial=1.0) < EXPLAINED:
             return np.zeros((len(W), len(self.independent), len(self.dependent))), False
-        kappa = np.array([self._regroup(*x) for x in zip(Q, R, W1, W2, strict=True)])
+        columns = (self.independent, self.dependent)
+        kappa = np.array([solve_from_earlier(*x, *columns) for x in zip(W1, W2, strict=True)])
         left = np.linalg.norm(W2 - W1 @ kappa, axis=1).max(initial=0.0)
-        later = self.independent[:, None] > self.dependent
-        early = np.abs(np.where(later, kappa, 0.0)).max(initial=0.0)
         kappa = np.where(np.abs(kappa) > EXPLAINED, kappa, 0.0)
         kappa = kappa * scale[:, None, self.dependent] / scale[:, self.independent, None]
-        return kappa, bool(max(left, early) < EXPLAINED)
-
-    @staticmethod
-    def _regroup(Q, R, W1, W2):
-        kappa = scipy.linalg.solve_triangular(R, Q.T @ W2)
-        return kappa + scipy.linalg.solve_triangular(R, Q.T @ (W2 - W1 @ kappa))
+        return kappa, bool(left < EXPLAINED)
 
 
 def _program_of_geometry(model: Model, geometry: np.ndarray) -> Program:
     n = model.robot.joints
-    zero = np.zeros_like(geometry)
+    varying = np.zeros(len(geometry), object)
+    varying[geometry != 0.0] = FREE
 
     def columns(q, qd, qdd, x):
         robot = model.robot.replace(offset=x[: 3 * n].reshape(n, 3), gravity=x[3 * n :])
         return Model(robot, model.terms).columns(q, qd, qdd)
 
-    return trace(columns, (n,), (n,), (n,), np.where(geometry != 0.0, FREE, zero))
+    return trace(columns, (n,), (n,), (n,), varying)
 
 
 def draws(

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 import scipy.linalg
 
-from jaxid.types import AnyArray, Float
+from jaxid.types import AnyArray, Float, Int
 
 ROUNDING = 1e-12
 """A column below this share of the largest one is nothing but rounding."""
@@ -70,9 +70,9 @@ class GramSchmidt(AbstractRankMethod):
         dependent: list[int] = []
         new, old = [np.inf], [0.0]
         for k in range(columns):
-            share = 0.0
+            w, share = W[:, k], 0.0
             if norms[k] > ROUNDING * largest and len(independent) < rows:
-                w = W[:, k] / norms[k]
+                w = w / norms[k]
                 basis = Q[:, : len(independent)]
                 # Twice is enough unless almost nothing is left; the third pass costs little.
                 for _ in range(3):
@@ -132,7 +132,7 @@ class SingularValues(AbstractRankMethod):
             if np.linalg.norm(pivot) < 1e-8:
                 continue
             dependent.append(k)
-            Q, _ = scipy.linalg.qr(pivot[:, None])
+            Q = np.linalg.qr(pivot[:, None], mode="complete").Q
             null = (Q.T @ null)[1:]
         chosen = tuple(sorted(dependent))
         independent = tuple(k for k in range(columns) if k not in set(chosen))
@@ -155,10 +155,31 @@ def regrouping(
     first, second = list(dependence.independent), list(dependence.dependent)
     W1, W2 = W[:, first] / scale[first], W[:, second] / scale[second]
     W2 = np.where(norms[second] > floor, W2, 0.0)
-    Q, R = np.linalg.qr(W1)
-    kappa = scipy.linalg.solve_triangular(R, Q.T @ W2) if first else np.zeros((0, len(second)))
-    # One step of refinement takes out most of the rounding that poor conditioning amplifies.
-    kappa = kappa + scipy.linalg.solve_triangular(R, Q.T @ (W2 - W1 @ kappa)) if first else kappa
+    kappa = solve_from_earlier(W1, W2, np.array(first, int), np.array(second, int))
     left = float(np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0))
     kappa = np.where(np.abs(kappa) > 1e-9, kappa, 0.0)
     return kappa * scale[second] / scale[first][:, None], left
+
+
+def solve_from_earlier(
+    W1: Float[np.ndarray, "rows base"],
+    W2: Float[np.ndarray, "rows dependent"],
+    first: Int[np.ndarray, " base"],
+    second: Int[np.ndarray, " dependent"],
+) -> Float[np.ndarray, "base dependent"]:
+    """The combinations of independent columns closest to dependent ones, of earlier ones only.
+
+    Args:
+        W1: Independent columns.
+        W2: Dependent columns.
+        first: Where the independent columns stand, in ascending order.
+        second: Where the dependent columns stand.
+    """
+    if not first.size:
+        return np.zeros((0, len(second)))
+    Q, R = np.linalg.qr(W1)
+    earlier = first[:, None] < second
+    kappa = scipy.linalg.solve_triangular(R, np.where(earlier, Q.T @ W2, 0.0))
+    # One step of refinement takes out most of the rounding that poor conditioning amplifies.
+    left = np.where(earlier, Q.T @ (W2 - W1 @ kappa), 0.0)
+    return kappa + scipy.linalg.solve_triangular(R, left)
