@@ -62,7 +62,8 @@ def write_report(
         save(error_figure(identification, verification, robot), staging / "errors.png")
         save(parameter_figure(fit), staging / "parameters.png")
         for file, role, errors in named:
-            save(torque_figure(errors, robot, f"{errors.name} ({role})"), staging / file)
+            title = errors.name if errors.name == role else f"{errors.name} ({role})"
+            save(torque_figure(errors, robot, title), staging / file)
         stale = _earlier(folder) - set(names)
     for name in stale:
         (folder / name).unlink(missing_ok=True)

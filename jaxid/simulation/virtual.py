@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from scipy import signal
 
-from jaxid.dynamics.compiled import evaluate_forces
+from jaxid.dynamics.machine import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.recording import Recording
@@ -14,6 +14,8 @@ from jaxid.types import AnyArray, Float, require_float64
 
 GRAINS = 12
 """Point masses of a random body: enough to fill all directions."""
+PIECE = 4000
+"""Samples that are evaluated at once: so few need no compiling."""
 
 
 def random_bodies(
@@ -75,7 +77,14 @@ class VirtualRobot(eqx.Module):
         fading = np.exp(-((qd / self.stribeck_speed) ** 2)) * np.tanh(
             4.0 * qd / self.stribeck_speed
         )
-        modelled = evaluate_forces(self.model, self.parameters, motion)
+        modelled = in_numpy(
+            self.model,
+            self.model.forces,
+            motion.q,
+            motion.qd,
+            motion.qdd,
+            shared=(self.parameters,),
+        )
         return modelled + fading * np.asarray(self.stribeck)
 
     def measure(
