@@ -18,7 +18,7 @@ from typer.core import TyperCommand
 from jaxid.experiment import terminal
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
-from jaxid.experiment.sanity import check_log
+from jaxid.experiment.sanity import check_log, negative_friction
 from jaxid.experiment.template import write_template
 from jaxid.identification.identify import identify as estimate
 from jaxid.measurement.observations import Observations
@@ -163,10 +163,10 @@ def inspect(
     for recording, observations, fit in seen:
         terminal.show_recording(console, recording)
         check = check_log(loaded.robot, recording, observations)
-        terminal.show_check(console, loaded.robot, check)
+        terminal.show_check(console, loaded.robot, check, negative_friction(fit))
         console.print()
         terminal.show_rows(console, (observations,), fit)
-        terminal.show_undetermined(console, fit)
+        terminal.show_undetermined(console, fit, loaded.regularised)
 
 
 def _look(experiment: Experiment, path: Path, stage):
@@ -247,7 +247,8 @@ def identify(
     terminal.show_fit(console, fit)
     console.print()
     terminal.show_rows(console, fitted, fit)
-    terminal.show_undetermined(console, fit)
+    terminal.show_undetermined(console, fit, loaded.regularised)
+    terminal.sentences(console, negative_friction(fit), terminal.DOUBTFUL, "!")
     terminal.show_validation(console, loaded.robot, found, len(fitted))
     terminal.show_files(console, output, [p.name for p in files])
 
@@ -277,7 +278,9 @@ def _named(observations: Observations, name: str) -> Observations:
 def _stages(total: int) -> Iterator:
     """A progress bar on stderr; call what it gives with the name of each stage as it begins."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=_console(stderr=True), transient=True) as progress:
+    console = _console(stderr=True)
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
         task = progress.add_task("starting", total=total + 1)
 
         def stage(name: str) -> None:

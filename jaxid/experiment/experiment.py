@@ -45,6 +45,7 @@ class Experiment:
         decimation: For forces and columns.
         slow: Speeds below which rows do not count [rad/s or m/s]; None if all count.
         estimator: How rows become parameters.
+        regularised: Whether the estimator keeps small what the logs do not decide.
         notes: What was assumed where the file says nothing, in sentences.
     """
 
@@ -58,6 +59,7 @@ class Experiment:
     decimation: AbstractDecimation
     slow: Float[np.ndarray, " joints"] | None
     estimator: AbstractEstimator
+    regularised: bool
     notes: tuple[str, ...]
 
     @functools.cached_property
@@ -154,5 +156,6 @@ def load_experiment(path: str | Path) -> Experiment:
         decimation=decimation,
         slow=slow,
         estimator=estimator,
+        regularised=tables.estimator.ridge is not None or tables.estimator.truncate is not None,
         notes=tuple(notes),
     )

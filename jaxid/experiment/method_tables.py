@@ -28,7 +28,13 @@ from jaxid.experiment.tables import (
     RowsTable,
 )
 from jaxid.identification.estimators import AbstractEstimator, LeastSquares, WeightedLeastSquares
-from jaxid.identification.solutions import Complete, Truncated
+from jaxid.identification.solutions import (
+    AbstractSolution,
+    Complete,
+    CrossValidated,
+    Ridge,
+    Truncated,
+)
 from jaxid.identification.weights import MaximumForces, ResidualVariances
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
@@ -198,7 +204,7 @@ def build_estimator(table: EstimatorTable, robot: Robot) -> tuple[AbstractEstima
     Raises:
         ValueError: If weights make no sense, or need forces that are not known.
     """
-    solution = Complete() if table.truncate is None else Truncated(table.truncate)
+    solution = _solution(table)
     if table.kind == "least_squares":
         if table.weights is not None:
             raise ValueError(
@@ -218,3 +224,13 @@ def build_estimator(table: EstimatorTable, robot: Robot) -> tuple[AbstractEstima
         )
         return WeightedLeastSquares(ResidualVariances(), solution), [said]
     return WeightedLeastSquares(MaximumForces(), solution), []
+
+
+def _solution(table: EstimatorTable) -> AbstractSolution:
+    if table.truncate is not None and table.ridge is not None:
+        raise ValueError("give `truncate` or `ridge`, but not both.")
+    if table.truncate is not None:
+        return Truncated(table.truncate)
+    if table.ridge is None:
+        return Complete()
+    return CrossValidated() if isinstance(table.ridge, str) else Ridge(table.ridge)

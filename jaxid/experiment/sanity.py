@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxid.identification.fit import Fit
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
@@ -15,6 +16,10 @@ FAST, STRONG = 1.1, 1.2
 """Parts of the limits above which speeds and forces are doubtful."""
 STANDING = 0.01
 """Part of a joint's largest speed below which it stands."""
+FRICTION = ("fv", "fc")
+"""Parameters that are negative on no robot."""
+SURE = 3.0
+"""Standard deviations beyond which a sign is certain."""
 HARDLY = 0.02
 """A motion in [rad] or [m] that is too small to tell anything."""
 
@@ -74,7 +79,7 @@ def check_log(robot: Robot, recording: Recording, observations: Observations) ->
         warnings=(),
     )
     warnings = [w for j in range(robot.joints) for w in _joint(robot, j, check)]
-    warnings += _signs(robot, qd, forces)
+    warnings += _signs(qd, forces)
     warnings += _velocities(robot, recording, observations)
     if check.all_standing > 0.5:
         warnings.append(
@@ -117,15 +122,29 @@ def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
     return said
 
 
-def _signs(robot: Robot, qd: np.ndarray, forces: np.ndarray) -> list[str]:
-    """Over a whole log, friction makes every joint consume energy."""
-    power = np.mean(forces * qd, axis=0)
-    size = np.sqrt(np.mean(forces**2, axis=0) * np.mean(qd**2, axis=0))
+def _signs(qd: np.ndarray, forces: np.ndarray) -> list[str]:
+    """Over a whole log, friction makes a robot consume energy."""
+    power = float(np.mean(np.sum(forces * qd, axis=1)))
+    size = float(np.sqrt(np.mean(np.sum(forces**2, axis=1)) * np.mean(np.sum(qd**2, axis=1))))
+    if power >= -0.05 * size:
+        return []
     return [
-        f"joint `{robot.joint_names[j]}` gives off energy over the whole log: check the signs of "
-        "its angles and forces."
-        for j in np.flatnonzero(power < -0.1 * size)
+        "the robot gives off energy over the whole log: check the signs of its angles and forces "
+        "(`recording.angle_signs`, `force_signs`)."
     ]
+
+
+def negative_friction(fit: Fit) -> tuple[str, ...]:
+    """Joints whose friction comes out negative beyond doubt: a sign is wrong, or the model is."""
+    robot, names = fit.base.model.robot, fit.base.names
+    certain = np.asarray(fit.parameters) < -SURE * np.asarray(fit.standard_deviations)
+    wrong = {name for name, negative in zip(names, certain, strict=True) if negative}
+    return tuple(
+        f"friction of joint `{label}` comes out negative ({' and '.join(found)}): check the signs "
+        "of its angles and forces (`recording.angle_signs`, `force_signs`)."
+        for j, label in enumerate(robot.joint_names)
+        if (found := [f"{kind}{j + 1}" for kind in FRICTION if f"{kind}{j + 1}" in wrong])
+    )
 
 
 def _velocities(robot: Robot, recording: Recording, observations: Observations) -> list[str]:

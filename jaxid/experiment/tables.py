@@ -7,6 +7,7 @@ from msgspec import Meta, Struct
 Positive = Annotated[float, Meta(gt=0)]
 Magnitude = Annotated[float, Meta(ge=0)]
 Count = Annotated[int, Meta(ge=1)]
+Share = Annotated[float, Meta(gt=0, lt=1)]
 Sign = Literal[1, -1]
 Side = Literal["joint", "motor"]
 AngleUnit = Literal["rad", "deg"]
@@ -177,7 +178,8 @@ class EstimatorTable(_Table):
 
     kind: Literal["weighted", "least_squares"] = "weighted"
     weights: Literal["maximum_forces", "residual_variances"] | None = None
-    truncate: Annotated[float, Meta(gt=0, lt=1)] | None = None
+    truncate: Share | None = None
+    ridge: Share | Literal["cross_validated"] | None = None
 
 
 class Tables(_Table):

@@ -127,6 +127,8 @@ every = 1                             # every n-th sample, of signals below half
 kind = "weighted"                     # or "least_squares": every newton metre counts the same
 # weights = "maximum_forces"          # joints count by their largest forces (Eq. 30); or
 #                                     # "residual_variances": by what the model leaves unexplained
+# ridge = "cross_validated"           # pulls what the logs hardly decide towards zero, as much as
+#                                     # serves left-out parts of the logs best; or a share like 0.01
 # truncate = 0.01                     # leave out directions below this share of the best one
 """
 

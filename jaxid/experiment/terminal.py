@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+from rich.cells import cell_len
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
@@ -15,12 +16,18 @@ from jaxid.experiment.sanity import LogCheck, known_forces
 from jaxid.identification.fit import Fit
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
-from jaxid.report.numbers import MISSING, percent, significant
+from jaxid.report.estimates import DOUBTFUL as DOUBTFUL_SHARE
+from jaxid.report.estimates import TRUSTED
+from jaxid.report.numbers import MISSING, aligned, percent, significant
 from jaxid.report.tables import error_table, joint_table, parameter_table
 from jaxid.robot.robot import Robot
 from jaxid.validation.validate import Validation
 
 GOOD, DOUBTFUL, BAD = "green", "yellow", "red"
+GAP = 2
+"""Blanks between two columns."""
+SHORTEST = 12
+"""Letters of a combination that are shown at least."""
 LARGE_CONDITION = 1e3
 """Condition number, with scaled columns, above which parameters are hard to tell apart."""
 
@@ -75,26 +82,29 @@ def show_robot(console: Console, experiment: Experiment) -> None:
 
 
 def _motor_table(robot: Robot) -> Table:
-    drives = robot.drives
+    drives, n = robot.drives, robot.joints
+    A = np.asarray(drives.reduction)
+    turns = [
+        " + ".join(f"{A[i, j]:.6g} {robot.joint_names[j]}" for j in np.flatnonzero(A[i]))
+        for i in range(n)
+    ]
+    columns = [
+        ("joint at motor zero [rad or m]", np.asarray(drives.zero)),
+        ("largest torque [N m]", np.asarray(drives.max_torques)),
+        ("rotor inertia [kg m²]", np.asarray(drives.rotor_inertia)),
+    ]
     table = plain_table("motors")
-    for name in ("motor", "turns", "joint at motor zero [rad or m]", "largest torque [N m]"):
-        table.add_column(name, justify="left" if name in ("motor", "turns") else "right")
-    table.add_column("rotor inertia [kg m²]", justify="right")
-    for i in range(robot.joints):
-        row = np.asarray(drives.reduction)[i]
-        ratios = [f"{float(x):.6g} {robot.joint_names[j]}" for j, x in enumerate(row) if x]
-        table.add_row(
-            str(i + 1),
-            " + ".join(ratios),
-            significant(float(drives.zero[i])),
-            significant(_known(drives.max_torques[i])),
-            significant(float(drives.rotor_inertia[i])),
-        )
+    table.add_column("motor")
+    table.add_column("turns", no_wrap=True)
+    cells = []
+    for title, values in columns:
+        known = np.isfinite(values)
+        if known.any() and values.any():
+            table.add_column(title, justify="right")
+            cells.append(aligned([significant(x) for x in np.where(known, values, np.nan)]))
+    for i in range(n):
+        table.add_row(str(i + 1), turns[i], *(column[i] for column in cells))
     return table
-
-
-def _known(value: float) -> float:
-    return float(value) if np.isfinite(value) else np.nan
 
 
 def plain_table(title: str) -> Table:
@@ -156,11 +166,19 @@ def show_recording(console: Console, recording: Recording) -> None:
     sentences(console, recording.notes)
 
 
-def show_check(console: Console, robot: Robot, check: LogCheck) -> None:
+def show_check(console: Console, robot: Robot, check: LogCheck, doubts: Iterable[str]) -> None:
     """What a log holds beside the robot's limits, and what is strange about it."""
+    alike = len(set(robot.revolute)) == 1
+    u, f = robot.joint_unit(0), robot.force_unit(0)
+    units = f" [{u}]", f" [{u}]", f" [{u}/s]", f" [{f}]"
+    titles = zip(("from", "to", "speed", "force"), units if alike else ("",) * 4, strict=True)
     table = plain_table("motion and forces, with the robot's limits in brackets")
-    for name in ("joint", "from", "to", "speed [1/s]", "force", "stands", "units"):
-        table.add_column(name, justify="left" if name in ("joint", "units") else "right")
+    table.add_column("joint")
+    for name, unit in titles:
+        table.add_column(name + unit, justify="right")
+    table.add_column("stands", justify="right")
+    if not alike:
+        table.add_column("units")
     limits, forces = robot.limits, known_forces(robot)
     for j, name in enumerate(robot.joint_names):
         table.add_row(
@@ -170,12 +188,13 @@ def show_check(console: Console, robot: Robot, check: LogCheck) -> None:
             _beside(check.speed[j], limits.velocity[j]),
             _beside(check.force[j], forces[j]),
             f"{100 * check.standing[j]:.0f} %",
-            f"{robot.joint_unit(j)}, {robot.force_unit(j)}",
+            *(() if alike else (f"{robot.joint_unit(j)}, {robot.force_unit(j)}",)),
         )
     show_table(console, table)
-    if check.warnings:
+    warnings = [*check.warnings, *doubts]
+    if warnings:
         console.print()
-        sentences(console, check.warnings, DOUBTFUL, "!")
+        sentences(console, warnings, DOUBTFUL, "!")
 
 
 def _beside(value: float, limit: float) -> Text:
@@ -190,6 +209,9 @@ def show_rows(console: Console, observations: Iterable[Observations], fit: Fit) 
     count = str(rows[0]) if len(set(rows)) == 1 else f"{min(rows)} to {max(rows)}"
     every = next(iter(observations))
     good = numbers.scaled < LARGE_CONDITION
+    share = fit.relative_standard_deviations
+    steps = np.searchsorted([TRUSTED, DOUBTFUL_SHARE], share)
+    known = np.bincount(steps, minlength=3)
     facts(
         console,
         [
@@ -204,11 +226,16 @@ def show_rows(console: Console, observations: Iterable[Observations], fit: Fit) 
                 ),
             ),
             ("residual", f"{percent(fit.residual, 3)} % of the forces (norms of all rows)"),
+            (
+                "estimates",
+                f"{known[0]} of {fit.base.size} known to {100 * TRUSTED:g} %, {known[1]} to "
+                f"{100 * DOUBTFUL_SHARE:g} %, {known[2]} worse (standard deviations)",
+            ),
         ],
     )
 
 
-def show_undetermined(console: Console, fit: Fit) -> None:
+def show_undetermined(console: Console, fit: Fit, regularised: bool) -> None:
     """Which combinations the logs do not determine, and what to do about it."""
     if not fit.undetermined:
         text = f"these logs determine all {fit.base.size} base parameters."
@@ -223,30 +250,38 @@ def show_undetermined(console: Console, fit: Fit) -> None:
     sentences(
         console,
         (
-            f"{d.sentence(fit.base)[:-1]} (singular value {d.singular_value:.1e} of the largest)."
+            f"{d.sentence(fit.base)} (singular value {d.singular_value:.1e} of the largest)."
             for d in fit.undetermined
         ),
         BAD,
         "✗",
     )
-    console.print(
-        Padding(
-            Text(
-                "Estimates of these parameters mean nothing one by one, and the model may fail on "
-                "other motions. Record a motion that moves these joints in more poses, faster and "
-                "in both directions; or leave effects out in `[model]`; or add `truncate = 0.01` "
-                "to `[estimator]`, which leaves out what the logs do not decide.",
-            ),
-            (0, 0, 0, 2),
-        )
+    advice = (
+        "Estimates of these parameters mean nothing one by one, and the model may fail on other "
+        "motions. Record a motion that moves these joints in more poses, faster and in both "
+        "directions, or leave effects out in `[model]`"
     )
+    if regularised:
+        advice += "; until then `[estimator]` keeps small what these logs do not decide."
+    else:
+        advice += (
+            '; or add `ridge = "cross_validated"` to `[estimator]`, which keeps small what these '
+            "logs do not decide."
+        )
+    console.print(Padding(Text(advice), (0, 0, 0, 2)))
 
 
 def show_fit(console: Console, fit: Fit) -> None:
     """The estimates; a combination that is too long for its line ends in dots."""
     table = parameter_table(fit)
-    names = next(c for c in table.columns if c.header == "parameter")
+    names = next(c for c in table.columns if str(c.header) == "parameter")
+    others = sum(
+        GAP + max(cell_len(str(cell)) for cell in (c.header, *c.cells))
+        for c in table.columns
+        if c is not names
+    )
     names.overflow, names.no_wrap = "ellipsis", True
+    names.max_width = max(SHORTEST, console.width - others - GAP)
     show_table(console, table)
 
 
@@ -255,9 +290,9 @@ def show_validation(console: Console, robot: Robot, found: Validation, identific
     for i, errors in enumerate(found.errors):
         table = error_table(errors, robot)
         role = "identification" if i < identification else "verification"
-        title = Text(f"torque errors, {role}: ", style="bold")
-        table.title = title.append(Text(str(table.title), style="bold"))
-        show_table(console, table)
+        heading(console, f"torque errors, {role}: {table.title}")
+        table.title = None
+        console.print(table)
     console.print()
     d = found.definiteness
     if d.positive_definite:
