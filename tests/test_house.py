@@ -1,0 +1,204 @@
+"""Laws of the house: what a machine can check of the rules in CONTRIBUTING.md."""
+
+import ast
+import inspect
+import os
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import jaxid
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = sorted((ROOT / "jaxid").rglob("*.py"))
+README = ROOT / "README.md"
+LONGEST = 400
+FORBIDDEN_CALLS = {"print", "exit", "quit", "breakpoint", "sys.exit", "os._exit"}
+HOMELESS = {"utils", "util", "helpers", "helper", "common", "misc"}
+
+BARE_IMPORT = """
+import sys
+import jax
+def settings():
+    return {name: jax.config._read(name) for name in jax.config.values}
+before = settings()
+import jaxid
+after = settings()
+assert after == before, {k: v for k, v in after.items() if before.get(k, v) != v}
+loaded = sorted({"matplotlib", "typer", "rich", "msgspec"} & set(sys.modules))
+assert not loaded, f"import jaxid has loaded {loaded}"
+from jax._src import xla_bridge
+assert not xla_bridge._backends, "import jaxid has started a backend"
+"""
+
+
+def _name(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+@cache
+def _public() -> dict[str, str]:
+    """Public names, as they are written in `__init__`, and where each one comes from."""
+    return {
+        alias.asname or alias.name: f"{node.module}.{alias.name}"
+        for node in _tree(ROOT / "jaxid" / "__init__.py").body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
+def _commands() -> list[str]:
+    """The lines of the README's shell blocks."""
+    blocks = re.findall(r"```(?:bash|sh)\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+    return [line.strip() for block in blocks for line in block.splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=_name)
+def test_a_file_is_short_documented_and_behaves(path):
+    tree, lines = _tree(path), path.read_text(encoding="utf-8").splitlines()
+    wrong = []
+    if not ast.get_docstring(tree):
+        wrong.append("has no docstring")
+    if len(lines) > LONGEST:
+        wrong.append(f"has {len(lines)} lines, more than {LONGEST}")
+    if HOMELESS & set(path.relative_to(ROOT).with_suffix("").parts):
+        wrong.append("has a name that says nothing: move what is in it where it belongs")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assert):
+            wrong.append(f"line {node.lineno}: an `assert`")
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in FORBIDDEN_CALLS:
+            wrong.append(f"line {node.lineno}: a call of `{ast.unparse(node.func)}`")
+        if isinstance(node, ast.ImportFrom) and node.module == "__future__":
+            wrong.append(f"line {node.lineno}: annotations must be real ones")
+    wrong += [
+        f"line {number}: a `{found[0]}`"
+        for number, line in enumerate(lines, 1)
+        if (found := re.search(r"TODO|FIXME|XXX", line))
+    ]
+    assert not wrong, f"{_name(path)}: " + "; ".join(wrong)
+
+
+def test_every_abstract_class_has_at_most_three_abstract_methods():
+    for path in SOURCES:
+        for node in ast.walk(_tree(path)):
+            if not isinstance(node, ast.ClassDef):
+                continue
+            abstract = [
+                f.name
+                for f in node.body
+                if isinstance(f, ast.FunctionDef)
+                and any(ast.unparse(d).endswith("abstractmethod") for d in f.decorator_list)
+            ]
+            assert len(abstract) <= 3, f"{_name(path)}: `{node.name}` has {abstract}"
+            assert not abstract or node.name.startswith("Abstract"), f"{_name(path)}: {node.name}"
+
+
+def test_importing_changes_nothing_and_loads_nothing_heavy():
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    done = subprocess.run(
+        [sys.executable, "-c", BARE_IMPORT],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_public_names_are_exported_under_themselves():
+    body = _tree(ROOT / "jaxid" / "__init__.py").body[1:]
+    assert all(isinstance(node, ast.ImportFrom) for node in body), "only `from … import X as X`"
+    for node in body:
+        for alias in node.names:
+            renamed = (alias.name, alias.asname) == ("library", "robots")
+            assert renamed or alias.name == alias.asname, f"`{alias.name}` is not `X as X`"
+    names = [alias.asname for node in body for alias in node.names]
+    assert len(set(names)) == len(names)
+    missing = [name for name in names if not hasattr(jaxid, name)]
+    assert not missing
+
+
+@pytest.mark.parametrize("name", sorted(_public()))
+def test_a_public_name_is_documented_with_units(name):
+    thing = getattr(jaxid, name)
+    docstring = inspect.getdoc(thing)
+    assert docstring, f"`{name}` has no docstring"
+    if inspect.isfunction(thing):
+        annotations = inspect.get_annotations(thing)
+        floats = [k for k, v in annotations.items() if v is float and k != "return"]
+        for argument in floats:
+            described = re.search(rf"^\s*{argument}: (.+(?:\n {{8,}}.+)*)", docstring, re.M)
+            assert described, f"`{name}` does not document `{argument}`"
+            assert re.search(r"\[[^\]]+\]|of 1\b", described[1]), (
+                f"`{name}`: the unit of `{argument}` is missing"
+            )
+
+
+def test_the_example_in_the_readme_runs(tmp_path):
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+    assert len(blocks) == 1, "the README has one example in Python"
+    script = tmp_path / "example.py"
+    script.write_text(blocks[0], encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", str(script)],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip(), "the example prints what it found"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["example.py"]
+
+
+def test_ci_runs_what_the_readme_promises():
+    steps = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    commands = [c for c in _commands() if c.startswith("python3 -m venv")]
+    assert len(commands) == 2, "the README has two commands: the job and the tests"
+    for command in commands:
+        assert command in steps, f".ci/run does not run `{command}`"
+    assert steps.rstrip().endswith(commands[1])
+
+
+def test_commands_in_the_readme_exist():
+    cli = pytest.importorskip("jaxid.cli", reason="the command line is not there yet")
+    import typer.main
+
+    group = typer.main.get_command(cli.app)
+    named = re.findall(r"\bjaxid (?!_)([a-z]+)\b", "\n".join(_commands()))
+    assert named
+    assert set(named) <= set(group.commands), sorted(set(named) - set(group.commands))
+
+
+def test_links_between_the_documents_lead_somewhere():
+    documents = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *ROOT.glob("docs/*.md")]
+    dead = []
+    for document in documents:
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", document.read_text(encoding="utf-8")):
+            if not target.startswith("http") and not (document.parent / target).exists():
+                dead.append(f"{_name(document)}: {target}")
+    assert not dead
+
+
+def test_names_in_the_documents_exist():
+    unknown = []
+    for document in [README, ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]:
+        text = document.read_text(encoding="utf-8")
+        for name in re.findall(r"\bjid\.([A-Za-z_]\w*(?:\.\w+)*)", text):
+            thing = jaxid
+            for part in name.split("."):
+                thing = getattr(thing, part, None)
+            if thing is None:
+                unknown.append(f"{_name(document)}: jid.{name}")
+    assert not unknown
