@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
+from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.observation import observation_matrix
@@ -21,6 +22,7 @@ from jaxid.dynamics.rank import (
 from jaxid.types import AnyArray, Float
 
 CLEAR_GAP = 1e3
+BARELY = 1e-4
 
 
 class Identifiability(enum.Enum):
@@ -84,9 +86,22 @@ class BaseParameters(eqx.Module):
         """Values of the letters in the expressions: lengths [m], and `g` [m/s²]."""
         return dict(self.closed_forms.lengths)
 
+    def columns(self, q, qd, qdd) -> Float[AnyArray, "joints base"]:
+        """The base regressor of one sample, as it is defined (Eq. 23)."""
+        return self.model.columns(q, qd, qdd)[:, np.array(self.indices)]
+
+    def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
+        """The generalized forces of one sample, as they are defined (Eq. 39)."""
+        return self.model.forces(self.to_standard(p), q, qd, qdd)
+
+    def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
+        """The mass matrix of one sample, as it is defined (Eq. 38)."""
+        return self.model.inertia(self.to_standard(p), q)
+
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
         r"""The base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
-        return self.model.regressor(motion)[..., np.array(self.indices)]
+        self.model.check(motion.q)
+        return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
 
     def from_standard(
         self, p: Float[AnyArray, "*batch standard"]
@@ -109,13 +124,15 @@ class BaseParameters(eqx.Module):
         self, p: Float[AnyArray, " base"], motion: Motion
     ) -> Float[AnyArray, "*batch joints"]:
         r"""The generalized forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
-        return self.model.inverse_dynamics(self.to_standard(p), motion)
+        self.model.check(motion.q)
+        return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
 
     def mass_matrix(
         self, p: Float[AnyArray, " base"], q: Float[AnyArray, "*batch joints"]
     ) -> Float[AnyArray, "*batch joints joints"]:
         """The mass matrix, which base parameters determine completely (Eq. 38)."""
-        return self.model.mass_matrix(self.to_standard(p), q)
+        self.model.check(q)
+        return on_samples(self, self.inertia, q, shared=(p,))
 
     @property
     def identifiability(self) -> tuple[Identifiability, ...]:
@@ -155,7 +172,7 @@ def base_parameters(
     kappa, left = regrouping(W, found)
     first, second = np.array(found.independent, int), np.array(found.dependent, int)
     kappa = kappa * scale[first][:, None] / scale[second]
-    notes = _doubts(found, other, left)
+    notes = _doubts(found, other, left, _least_independent(W, model, found))
     return BaseParameters(
         model,
         found.independent,
@@ -167,7 +184,18 @@ def base_parameters(
     )
 
 
-def _doubts(found: Dependence, other: Dependence, left: float) -> tuple[str, ...]:
+def _least_independent(
+    W: Float[np.ndarray, "rows standard"], model: Model, found: Dependence
+) -> str:
+    """Name of the parameter whose column earlier independent ones replace best."""
+    if not found.independent:
+        return ""
+    chosen = W[:, found.independent]
+    R = np.linalg.qr(chosen / np.linalg.norm(chosen, axis=0), mode="r")
+    return model.parameter_names[found.independent[int(np.argmin(np.abs(np.diag(R))))]]
+
+
+def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> tuple[str, ...]:
     notes = []
     if len(found.independent) != len(other.independent):
         notes.append(
@@ -178,6 +206,12 @@ def _doubts(found: Dependence, other: Dependence, left: float) -> tuple[str, ...
         notes.append(
             "the two ways to count base parameters agree on their number but not on which columns "
             "lead them; the geometry is nearly degenerate."
+        )
+    if found.smallest_independent < BARELY:
+        notes.append(
+            f"`{weakest}` is barely a base parameter of its own: only "
+            f"{found.smallest_independent:.1e} of its column is new. Lengths that are almost zero, "
+            "or rounded angles such as 1.5708, do that; forces cannot determine it well."
         )
     if found.dependent and found.gap < CLEAR_GAP:
         notes.append(

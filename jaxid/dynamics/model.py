@@ -1,14 +1,11 @@
 """A model: a robot and the terms of its equations of motion, linear in the parameters."""
 
-import math
-from collections.abc import Callable
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxid.dynamics import projection
+from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import (
     AbstractTerm,
@@ -28,7 +25,9 @@ class Model(eqx.Module):
 
     The columns stand in the order of the terms, the paper's order by default: bodies, viscous,
     Coulomb, rotors. Every method takes any leading batch axes and works under `jit`, `vmap` and
-    `grad`, also with respect to the robot's geometry.
+    `grad`, also with respect to the robot's geometry. For few samples it runs in NumPy at once; for
+    many it is compiled for the robot, whose numbers are then constants: let `jit` close over the
+    model, as in `jax.jit(lambda motion: model.regressor(motion))`, rather than pass it.
 
     Attributes:
         robot: What is known.
@@ -97,6 +96,15 @@ class Model(eqx.Module):
         parts = zip(self.terms, self.split(p), strict=True)
         return sum(t.mass_matrix(self.robot, x, q) for t, x in parts)
 
+    def bias(self, p, q, qd) -> Float[AnyArray, " joints"]:
+        """The bias forces of one sample, as they are defined (Eq. 38)."""
+        return self.forces(p, q, qd, jnp.zeros_like(q))
+
+    def potential(self, p, q) -> Float[AnyArray, ""]:
+        """The potential energy of one sample, as it is defined."""
+        parts = zip(self.terms, self.split(p), strict=True)
+        return sum(t.potential_columns(self.robot, q) @ x for t, x in parts)
+
     def known_forces(self, q, qd, qdd) -> Float[AnyArray, " joints"]:
         """The generalized forces of the known tool at one sample [N m or N]."""
         tool = self.robot.tool
@@ -112,8 +120,8 @@ class Model(eqx.Module):
         Args:
             motion: Joint motion at any number of instants.
         """
-        self._check(motion.q)
-        return over_batch(self.columns, motion.q, motion.qd, motion.qdd)
+        self.check(motion.q)
+        return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
 
     def inverse_dynamics(
         self, p: Float[AnyArray, " standard"], motion: Motion
@@ -124,11 +132,8 @@ class Model(eqx.Module):
             p: Standard parameters.
             motion: Joint motion at any number of instants.
         """
-        self._check(motion.q)
-        p = jnp.asarray(p)
-        return over_batch(
-            lambda q, qd, qdd: self.forces(p, q, qd, qdd), motion.q, motion.qd, motion.qdd
-        )
+        self.check(motion.q)
+        return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
 
     def mass_matrix(
         self, p: Float[AnyArray, " standard"], q: Float[AnyArray, "*batch joints"]
@@ -139,9 +144,8 @@ class Model(eqx.Module):
             p: Standard parameters.
             q: Joint coordinates [rad or m].
         """
-        self._check(q)
-        p = jnp.asarray(p)
-        return over_batch(lambda x: self.inertia(p, x), q)
+        self.check(q)
+        return on_samples(self, self.inertia, q, shared=(p,))
 
     def bias_forces(
         self,
@@ -156,9 +160,8 @@ class Model(eqx.Module):
             q: Joint coordinates [rad or m].
             qd: Joint velocities [rad/s or m/s].
         """
-        self._check(q)
-        p = jnp.asarray(p)
-        return over_batch(lambda x, v: self.forces(p, x, v, jnp.zeros_like(x)), q, qd)
+        self.check(q)
+        return on_samples(self, self.bias, q, qd, shared=(p,))
 
     def kinetic_energy(
         self,
@@ -174,28 +177,22 @@ class Model(eqx.Module):
         self, p: Float[AnyArray, " standard"], q: Float[AnyArray, "*batch joints"]
     ) -> Float[AnyArray, "*batch"]:
         """The potential energy of gravity and springs [J], zero at the ground's origin."""
-        self._check(q)
-        parts = list(zip(self.terms, self.split(jnp.asarray(p)), strict=True))
-        return over_batch(
-            lambda x: sum(t.potential_columns(self.robot, x) @ s for t, s in parts), q
-        )
+        self.check(q)
+        return on_samples(self, self.potential, q, shared=(p,))
 
     def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         """What the known tool adds to the measured forces [N m or N]; zero without a tool."""
-        self._check(motion.q)
-        return over_batch(self.known_forces, motion.q, motion.qd, motion.qdd)
+        self.check(motion.q)
+        return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
 
-    def _check(self, q: Float[AnyArray, "*batch joints"]) -> None:
+    def check(self, q: Float[AnyArray, "*batch joints"]) -> None:
+        """Refuses coordinates that are not those of the robot's joints.
+
+        Raises:
+            ValueError: If the last axis is not one for each joint.
+        """
         if q.shape[-1:] != (self.robot.joints,):
             raise ValueError(
                 f"the motion must have one coordinate for each joint ({self.robot.joints}) along "
                 f"its last axis, but has shape {q.shape}."
             )
-
-
-def over_batch(function: Callable, *arrays: Float[AnyArray, "*batch joints"]):
-    """Applies a function of single samples to arrays with any leading batch axes."""
-    batch = arrays[0].shape[:-1]
-    flat = [jnp.reshape(x, (math.prod(batch), x.shape[-1])) for x in arrays]
-    out = jax.vmap(function)(*flat)
-    return jnp.reshape(out, (*batch, *out.shape[1:]))

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from jaxid.dynamics.compiled import evaluate_regressor
 from jaxid.dynamics.dimensions import length_power
+from jaxid.dynamics.machine import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.types import Float
@@ -27,7 +27,7 @@ def observation_matrix(
     """
     samples = max(SAMPLES, math.ceil(ROWS_PER_COLUMN * model.size / model.robot.joints))
     motion = random_motion(model, samples, seed)
-    theta = evaluate_regressor(model, motion)
+    theta = in_numpy(model, model.columns, motion.q, motion.qd, motion.qdd)
     rows, columns = row_units(model), column_units(model)
     return (theta * rows[:, None] * columns).reshape(-1, model.size), columns
 

@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import evaluate_rows, evaluate_tool_forces, structure
+from jaxid.dynamics.compiled import acting_columns, regressor_rows, tool_forces
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Float
 
@@ -127,7 +127,7 @@ def empty(base: BaseParameters) -> Factors:
     return Factors(
         tuple(
             JointFactor(columns, np.zeros((0, len(columns) + 1)), 0)
-            for columns in _base_columns(base)
+            for columns in acting_columns(base)
         ),
         base.size,
     )
@@ -186,20 +186,11 @@ def reduced_rows(base: BaseParameters, observations: Observations, samples: int 
         Slice of the rows; for each joint its columns [rows, columns of the joint]; forces
         [rows, joints] in [N m] or [N].
     """
-    place = {k: i for i, k in enumerate(base.indices)}
     for chunk in observations.chunks(samples):
         part = slice(*chunk.samples)
         motion = observations.motion[part]
         forces = np.asarray(observations.forces)[part]
         if base.model.robot.tool is not None:
-            forces = forces - evaluate_tool_forces(base.model, motion)
-        columns = []
-        for acting, theta in evaluate_rows(base.model, motion):
-            kept = [i for i, k in enumerate(acting) if k in place]
-            columns.append(chunk.reduce(theta[:, kept]))
+            forces = forces - tool_forces(base, motion)
+        columns = [chunk.reduce(theta) for theta in regressor_rows(base, motion)]
         yield slice(*chunk.rows), columns, chunk.reduce(forces)
-
-
-def _base_columns(base: BaseParameters) -> list[tuple[int, ...]]:
-    acting = structure(base.model)[:, list(base.indices)]
-    return [tuple(int(k) for k in np.flatnonzero(row)) for row in acting]

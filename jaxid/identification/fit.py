@@ -3,8 +3,8 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import evaluate_forces
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.estimators import AbstractEstimator
 from jaxid.identification.excited import UndeterminedDirection
@@ -86,4 +86,4 @@ class Fit(eqx.Module):
 
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39)."""
-        return evaluate_forces(self.base.model, self.standard_parameters, motion)
+        return compiled.forces(self.base, self.parameters, motion)

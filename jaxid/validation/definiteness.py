@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 
-from jaxid.dynamics.compiled import evaluate_mass_matrix
+from jaxid.dynamics.compiled import mass_matrices
 from jaxid.identification.fit import Fit
 from jaxid.robot.robot import Robot
 from jaxid.types import AnyArray, Float
@@ -44,7 +44,7 @@ def definiteness(fit: Fit, *, poses: int = POSES, seed: int = 0) -> Definiteness
     robot = fit.base.model.robot
     low, high = position_range(robot)
     q = np.random.default_rng(seed).uniform(low, high, (poses, robot.joints))
-    M = evaluate_mass_matrix(fit.base.model, fit.standard_parameters, q)
+    M = mass_matrices(fit.base, fit.parameters, q)
     smallest = np.linalg.eigvalsh(M)[:, 0]
     worst = int(np.argmin(smallest))
     return Definiteness(float(smallest[worst]), q[worst], float(np.mean(smallest <= 0.0)), poses)

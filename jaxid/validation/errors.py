@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 
-from jaxid.dynamics.compiled import evaluate_tool_forces
+from jaxid.dynamics.compiled import tool_forces
 from jaxid.identification.fit import Fit
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Bool, Float
@@ -89,9 +89,7 @@ def torque_errors(fit: Fit, observations: Observations) -> TorqueErrors:
         observations: Of any recording of the same robot.
     """
     robot = fit.base.model.robot
-    predicted = fit.predict(observations.motion) + evaluate_tool_forces(
-        fit.base.model, observations.motion
-    )
+    predicted = fit.predict(observations.motion) + tool_forces(fit.base, observations.motion)
     known = np.where(np.isfinite(robot.limits.force), robot.limits.force, robot.drives.max_forces)
     return TorqueErrors(
         name=observations.name,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 import jaxid as jid
-from jaxid.dynamics.compiled import evaluate_forces, evaluate_regressor, evaluate_tool_forces
+from jaxid.dynamics.machine import in_numpy
 
 
 def standard_parameters(model: jid.Model, seed: int = 0) -> np.ndarray:
@@ -44,7 +44,8 @@ def observations(
     """Exact motion, forces of the model with white noise; nothing filtered unless asked for."""
     n = model.robot.joints
     m = motion(n, samples, seed=seed, still=still)
-    forces = evaluate_forces(model, p, m) + evaluate_tool_forces(model, m)
+    forces = in_numpy(model, model.forces, m.q, m.qd, m.qdd, shared=(p,))
+    forces = forces + in_numpy(model, model.known_forces, m.q, m.qd, m.qdd)
     forces = forces + noise * np.random.default_rng(noise_seed).normal(size=forces.shape)
     dt = 10.0 / (samples - 1)
     if filter is None:
@@ -68,9 +69,10 @@ def dense(
     base: jid.BaseParameters, o: jid.Observations
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Observation matrix, forces and joint of every counted row, formed the obvious way."""
-    theta = evaluate_regressor(base.model, o.motion)[:, :, list(base.indices)]
+    m, model = o.motion, base.model
+    theta = in_numpy(model, model.columns, m.q, m.qd, m.qdd)[:, :, list(base.indices)]
     rows = o.reduce(theta)
-    forces = o.reduce(np.asarray(o.forces) - evaluate_tool_forces(base.model, o.motion))
+    forces = o.reduce(np.asarray(o.forces) - in_numpy(model, model.known_forces, m.q, m.qd, m.qdd))
     keep = np.asarray(o.mask)
     joint = np.broadcast_to(np.arange(keep.shape[1]), keep.shape)
     return rows[keep], forces[keep], joint[keep]

@@ -1,0 +1,123 @@
+"""Which machine runs a definition: NumPy for few samples, fused XLA for many, JAX as it stands.
+
+A definition is a method of a model for one sample. For a robot whose geometry is known it is traced
+once into a scalar program; programs are kept for the models that were used last. A model whose
+geometry JAX is tracing has no program: its definition runs as it is written.
+"""
+
+import math
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.program import Program, evaluate, lower, trace
+from jaxid.types import AnyArray, Array
+
+FEW = 4096
+"""Samples up to which NumPy is faster than what compiling costs."""
+_KEPT = 64
+
+
+class Machines:
+    """A program and its compiled form."""
+
+    def __init__(self, program: Program):
+        self.program = program
+        lowered = lower(program)
+        self.compiled = jax.jit(lambda *arrays: lowered.dense(*arrays))
+
+
+_machines: OrderedDict[tuple, Machines] = OrderedDict()
+_lock = threading.Lock()
+
+
+def machines(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Machines:
+    """The program of a method of a model, traced the first time it is needed.
+
+    Args:
+        owner: The model, whose numbers become constants of the program.
+        definition: Its method for one sample.
+        shapes: Of the method's arguments.
+    """
+    key = (definition.__name__, shapes, *_content(owner))
+    with _lock:
+        if key in _machines:
+            _machines.move_to_end(key)
+            return _machines[key]
+    made = Machines(trace(definition, *shapes))
+    with _lock:
+        _machines[key] = made
+        while len(_machines) > _KEPT:
+            _machines.popitem(last=False)
+    return made
+
+
+def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:
+    """The scalar program of a method of a model."""
+    return machines(owner, definition, *shapes).program
+
+
+def on_samples(
+    owner: eqx.Module,
+    definition: Callable,
+    *samples: AnyArray,
+    shared: tuple[AnyArray, ...] = (),
+) -> Array:
+    """Applies a method for one sample to arrays with any leading batch axes.
+
+    Args:
+        owner: The model.
+        definition: Its method of first the shared arguments, then those of one sample.
+        samples: Arguments with batch axes before their last axis.
+        shared: Arguments that all samples have in common.
+    """
+    batch = samples[0].shape[:-1]
+    count = math.prod(batch)
+    flat = [x.reshape((count, x.shape[-1])) for x in samples]
+    if _is_traced(owner):
+        out = jax.vmap(lambda *x: definition(*shared, *x))(*map(jnp.asarray, flat))
+        return jnp.reshape(out, (*batch, *out.shape[1:]))
+    shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in flat))
+    machine = machines(owner, definition, *shapes)
+    arguments = (*shared, *(x.T for x in flat))
+    if count <= FEW and not any(isinstance(x, jax.core.Tracer) for x in arguments):
+        out = jnp.asarray(evaluate(machine.program, *arguments), _precision(arguments))
+    else:
+        out = machine.compiled(*arguments)
+    out = jnp.moveaxis(jnp.broadcast_to(out, (*out.shape[:-1], count)), -1, 0)
+    return jnp.reshape(out, (*batch, *out.shape[1:]))
+
+
+def in_numpy(
+    owner: eqx.Module,
+    definition: Callable,
+    *samples: AnyArray,
+    shared: tuple[AnyArray, ...] = (),
+) -> np.ndarray:
+    """Applies a method for one sample to rows of samples in NumPy: float64, never compiled."""
+    arguments = [np.asarray(x, np.float64) for x in shared]
+    arguments += [np.asarray(x, np.float64).T for x in samples]
+    shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in samples))
+    out = evaluate(program_of(owner, definition, *shapes), *arguments)
+    return np.moveaxis(np.broadcast_to(out, (*out.shape[:-1], len(samples[0]))), -1, 0)
+
+
+def _is_traced(owner: eqx.Module) -> bool:
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(owner))
+
+
+def _precision(arguments: tuple[AnyArray, ...]) -> Any:
+    return jnp.result_type(*(x.dtype for x in arguments), float)
+
+
+def _content(owner: eqx.Module) -> tuple:
+    """What a model is, by value: two equal models share their programs."""
+    leaves, structure = jax.tree.flatten(owner)
+    arrays = [np.asarray(x) for x in leaves]
+    return structure, tuple((x.shape, x.dtype.str, x.tobytes()) for x in arrays)
