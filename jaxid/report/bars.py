@@ -72,7 +72,7 @@ def error_figure(
         if recordings
     ]
     with house_style():
-        figure = new_figure(max(6.5, min(2.0 + 1.1 * n, 1.4 * WIDTH)), 4.4)
+        figure = new_figure(max(7.6, min(2.0 + 1.1 * n, 1.4 * WIDTH)), 4.4)
         axes = figure.add_subplot()
         for k, (label, colour, pooled) in enumerate(groups):
             place = np.arange(n) + (k - 0.5 * (len(groups) - 1)) * (BAR + 0.02)

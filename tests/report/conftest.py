@@ -1,0 +1,75 @@
+"""A small robot with a rail and a pendulum, fitted to a noisy virtual log."""
+
+import numpy as np
+import pytest
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction
+from jaxid.identification.estimators import LeastSquares
+from jaxid.identification.identify import identify
+from jaxid.measurement.filters import ZeroPhaseButterworth
+from jaxid.measurement.observations import observe
+from jaxid.robot.limits import Limits
+from jaxid.robot.robot import Robot
+from jaxid.simulation.virtual import VirtualRobot, random_bodies
+from jaxid.trajectory.fourier import random_fourier_series
+from jaxid.validation.validate import Validation, validate
+
+
+def cart() -> Robot:
+    return Robot.of(
+        "cart",
+        revolute=(False, True),
+        axis=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)],
+        rotation=np.tile(np.eye(3), (2, 1, 1)),
+        offset=np.zeros((2, 3)),
+        joint_names=("rail", "swing_$1_$"),
+        limits=Limits.of(2, velocity=[1.0, 3.0], force=[200.0, 30.0]),
+        tip_offset=(0.0, 0.0, 0.4),
+    )
+
+
+@pytest.fixture(scope="session")
+def validated():
+    """A fit of the cart with its validation on two recordings."""
+    robot = cart()
+    model = Model(robot, (RigidBodies(), ViscousFriction(), CoulombFriction()))
+    random = np.random.default_rng(0)
+    bodies = random_bodies(robot, np.array([8.0, 2.0]), random)
+    virtual = VirtualRobot(
+        model=model,
+        parameters=np.concatenate([bodies.ravel(), [3.0, 0.2, 5.0, 0.4]]),
+        stribeck=np.zeros(2),
+        stribeck_speed=0.1,
+        encoder_step=1e-6,
+        white_noise=np.array([0.5, 0.05]),
+        coloured_noise=np.zeros(2),
+        memory=0.1,
+    )
+    observations = [
+        observe(
+            virtual.measure(
+                random_fourier_series(robot, omega=1.5, seed=s),
+                duration=4.0,
+                sample_time=0.005,
+                seed=s,
+                name=name,
+            ),
+            robot,
+            ZeroPhaseButterworth(10.0),
+        )
+        for s, name in ((1, "first/run"), (2, "second"))
+    ]
+    fit = identify(base_parameters(model), observations[0], LeastSquares())
+    return fit, validate(fit, observations)
+
+
+@pytest.fixture
+def fit(validated):
+    return validated[0]
+
+
+@pytest.fixture
+def validation(validated) -> Validation:
+    return validated[1]

@@ -1,0 +1,91 @@
+"""The example: the same for a seed, possible bodies, and a truth that can be found again."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jaxid.experiment.experiment import load_experiment
+from jaxid.identification.identify import identify
+from jaxid.robot import library
+from jaxid.simulation.example import FILES, virtual_log, virtual_panda, write_example
+from jaxid.simulation.virtual import random_bodies
+from jaxid.validation.validate import validate
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("example")
+    write_example(folder)
+    return folder
+
+
+@pytest.mark.parametrize("robot", [library.panda(), library.tx90l_on_rail()], ids=lambda r: r.name)
+def test_random_bodies_could_exist(robot):
+    masses = np.linspace(1.0, 5.0, robot.joints)
+    bodies = random_bodies(robot, masses, np.random.default_rng(0))
+    np.testing.assert_allclose(bodies[:, 0], masses)
+    for m, mx, my, mz, a, b, c, d, e, f in bodies:
+        J = np.array([[a, -f, -e], [-f, b, -d], [-e, -d, c]])
+        first = np.array([mx, my, mz])
+        second = 0.5 * np.trace(J) * np.eye(3) - J
+        pseudo = np.block([[second, first[:, None]], [first[None], np.array([[m]])]])
+        assert np.linalg.eigvalsh(pseudo)[0] > 0
+
+
+def test_files_are_small_and_named(example):
+    assert sorted(p.name for p in example.iterdir()) == sorted(FILES)
+    assert sum(p.stat().st_size for p in example.iterdir()) < 3e6
+
+
+def test_seed_decides(example, tmp_path):
+    write_example(tmp_path)
+    for file in FILES:
+        assert (tmp_path / file).read_bytes() == (example / file).read_bytes()
+    first, other = (virtual_log(virtual_panda(s), "log", 1, (s, 1)) for s in (0, 1))
+    assert not np.array_equal(first.angles, other.angles)
+    assert not np.array_equal(virtual_panda(0).parameters, virtual_panda(1).parameters)
+
+
+def test_logs_keep_the_robots_limits(example):
+    robot = virtual_panda().model.robot
+    for s in range(3):
+        virtual = virtual_panda(s)
+        for k in (1, 2):
+            log = virtual_log(virtual, "log", 1, (s, k))
+            assert (log.angles >= robot.limits.position_min).all()
+            assert (log.angles <= robot.limits.position_max).all()
+            assert (np.abs(log.forces).max(axis=0) < robot.max_forces).all()
+
+
+def test_the_truth_is_found_again(example):
+    virtual, experiment = virtual_panda(), load_experiment(example / "experiment.toml")
+    base = experiment.base
+    assert base.model.parameter_names == virtual.model.parameter_names
+    observations = [
+        experiment.observe(experiment.read(example / f"{name}.csv"))
+        for name in ("identification", "verification")
+    ]
+    fit = identify(base, observations[0], experiment.estimator)
+    truth = json.loads((example / "truth.json").read_text("utf-8"))
+    rows = truth["base_parameters"]
+    assert [r["name"] for r in rows] == list(base.names)
+    values = np.array([r["value"] for r in rows])
+    np.testing.assert_allclose(values, base.from_standard(virtual.parameters), rtol=1e-12)
+    # Noise with memory and friction beyond the model make deviations larger than they are said.
+    z = (np.asarray(fit.parameters) - values) / fit.standard_deviations
+    assert np.abs(z).max() < 8
+    assert np.sqrt(np.mean(z**2)) < 2.5
+    assert not fit.undetermined
+    found = validate(fit, observations)
+    assert found.definiteness.positive_definite
+    assert max(np.max(e.mean_percent) for e in found.errors) < 0.5
+
+
+def test_files_that_are_there_are_not_lost(example, tmp_path):
+    write_example(example)
+    (tmp_path / "experiment.toml").write_text("mine")
+    with pytest.raises(ValueError, match="is there already with another content"):
+        write_example(tmp_path)
+    assert (tmp_path / "experiment.toml").read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 1
