@@ -1,0 +1,264 @@
+"""Base parameters in letters: Eq. 24 as printed, and right on robots of other lengths."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from trees import mixed_tree, random_tree
+
+from jaxid.dynamics.base import BaseParameters, base_parameters
+from jaxid.dynamics.dimensions import Dimension, dimension, length_power
+from jaxid.dynamics.expressions import Coefficient, Expression, Monomial
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import (
+    AsymmetricCoulombFriction,
+    ConstantOffset,
+    CoulombFriction,
+    CoupledDrives,
+    RigidBodies,
+    RotorInertia,
+    ViscousFriction,
+)
+from jaxid.robot import library
+from jaxid.robot.robot import Robot
+
+DRIVES = (ViscousFriction(), CoulombFriction(), RotorInertia())
+SEVEN, TEN = RigidBodies(principal_axes=True), RigidBodies()
+X, Y, Z = UPRIGHT = np.eye(3)
+
+
+@pytest.fixture(scope="module")
+def paper() -> BaseParameters:
+    return base_parameters(Model(library.tx90l_on_rail(), (SEVEN, *DRIVES)))
+
+
+def combinations(base: BaseParameters) -> np.ndarray:
+    """The same numbers as `expressions`, from kappa: one row per base parameter."""
+    full = np.zeros((base.size, base.model.size))
+    full[:, base.indices] = np.eye(base.size)
+    full[:, base.dependent] = base.kappa
+    return full
+
+
+def evaluated(base: BaseParameters, lengths: dict[str, float]) -> np.ndarray:
+    place = {name: k for k, name in enumerate(base.model.parameter_names)}
+    full = np.zeros((base.size, base.model.size))
+    for row, expression in enumerate(base.closed_forms.expressions):
+        for name, value in expression.evaluate(lengths).items():
+            full[row, place[name]] = value
+    return full
+
+
+def test_equation_24_as_printed(paper):
+    assert paper.expressions[0] == "m1 + m2 + m3 - mz4/l3z + Ia1"
+    assert paper.expressions[1] == "mx2 + l2x*m3 - l2x*mz4/l3z"
+    assert paper.expressions[26] == "fv1"
+    assert paper.expressions[33] == "fc1"
+    assert paper.expressions[40:] == ("Ia4", "Ia5", "Ia6", "Ia7")
+    assert (paper.lengths["l2x"], paper.lengths["l3z"]) == (0.05, 0.05)
+
+
+def test_equation_24_as_latex(paper):
+    first, second = (e.latex() for e in paper.closed_forms.expressions[:2])
+    assert first == r"m_{1} + m_{2} + m_{3} - \frac{1}{l_{3z}}\, m_{4} r_{c,4z} + I_{a1}"
+    assert second == (r"m_{2} r_{c,2x} + l_{2x}\, m_{3} - \frac{l_{2x}}{l_{3z}}\, m_{4} r_{c,4z}")
+
+
+def test_expressions_are_found_once_and_always_the_same(paper):
+    assert paper.closed_forms is paper.closed_forms
+    again = base_parameters(paper.model, seed=11)
+    assert again.expressions == paper.expressions
+    assert again.lengths == paper.lengths
+
+
+def test_moments_move_down_a_planar_arm():
+    base = base_parameters(Model(library.planar_arm(3, [0.5, 0.4, 0.3]), (TEN,)))
+    assert [e for e in base.expressions if " " in e] == [
+        "mx1 + l1x*(m2 + m3)",
+        "C1 + l1x^2*(m2 + m3)",
+        "mx2 + l2x*m3",
+        "C2 + l2x^2*m3",
+    ]
+    assert base.lengths == {"l1x": 0.5, "l2x": 0.4}
+
+
+def test_gravity_is_a_symbol_on_a_lift():
+    lift = Robot.of(
+        "lift",
+        revolute=(False, True, True),
+        axis=[Z, Z, Y],
+        rotation=[UPRIGHT] * 3,
+        offset=[(0.0, 0.0, 0.0), (0.1, 0.0, 0.2), (0.2, 0.0, 0.1)],
+        gravity=(0.0, 0.0, -9.80665),
+    )
+    base = base_parameters(Model(lift, (TEN, *DRIVES, ConstantOffset())))
+    assert base.expressions[0] == "m1 + m2 + m3 + fo1/g"
+    assert base.lengths["g"] == pytest.approx(9.80665)
+
+
+def test_bodies_with_several_children_name_both_ends():
+    tree = Robot.of(
+        "tree",
+        parent=(-1, 0, 0),
+        revolute=(True, True, True),
+        axis=[Z, Y, Y],
+        rotation=[UPRIGHT] * 3,
+        offset=[(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (-0.3, 0.0, 0.2)],
+    )
+    base = base_parameters(Model(tree, (TEN,)))
+    assert base.expressions[0] == "C1 + l1_2x^2*m2 + C2 + l1_3x^2*m3 + C3"
+    assert base.lengths == {"l1_2x": 0.1, "l1_3x": -0.3}
+
+
+def test_lengths_that_must_stay_equal_change_together():
+    # Joint 4 turns about the same line as joint 1 only because two offsets cancel each other.
+    arm = Robot.of(
+        "arm",
+        revolute=(True, False, True, True),
+        axis=[Z, Z, Z, Y],
+        rotation=[UPRIGHT] * 4,
+        offset=[(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (-0.3, 0.0, 0.0), (0.2, 0.0, 0.1)],
+    )
+    base = base_parameters(Model(arm, (TEN, *DRIVES)))
+    assert "C1 + 2*l1x*mx2 + C2 - l1x^2*(m3 + m4) + Ia1" in base.expressions
+    assert base.lengths == {"l1x": 0.3, "l3x": 0.2}
+    np.testing.assert_allclose(evaluated(base, base.lengths), combinations(base), atol=1e-12)
+
+
+def test_what_has_no_short_form_is_a_number():
+    base = base_parameters(Model(mixed_tree().robot(), (SEVEN, *DRIVES)))
+    numbers = [
+        coefficient.monomials[0].number
+        for e in base.closed_forms.expressions
+        for _, coefficient in e.terms
+        if len(coefficient.monomials) == 1 and not coefficient.symbols
+    ]
+    assert any(isinstance(x, float) for x in numbers)
+
+
+MODELS = {
+    "paper": lambda: Model(library.tx90l_on_rail(), (SEVEN, *DRIVES)),
+    "ten": lambda: Model(library.tx90l_on_rail(), (TEN, *DRIVES)),
+    "ur10": lambda: Model(library.ur10(), (TEN, *DRIVES, ConstantOffset())),
+    "coupled": lambda: Model(library.tx40(), (TEN, *DRIVES, CoupledDrives())),
+    "kr300": lambda: Model(library.kr300(), (TEN, *DRIVES)),
+    "panda": lambda: Model(library.panda(), (TEN, AsymmetricCoulombFriction(), ConstantOffset())),
+    "iiwa": lambda: Model(library.iiwa14(), (SEVEN, *DRIVES)),
+    "tree": lambda: Model(mixed_tree().robot(), (TEN, *DRIVES, ConstantOffset())),
+    **{f"skew{s}": lambda s=s: Model(random_tree(s, 5).robot(), (TEN, *DRIVES)) for s in range(5)},
+}
+
+
+def stretched(robot: Robot, lengths: dict[str, float], seed: int) -> tuple[Robot, dict[str, float]]:
+    """The robot with all its offsets and gravity changed at random, and the lengths it then has."""
+    rng = np.random.default_rng(seed)
+    offset = np.array(robot.offset) * rng.uniform(0.6, 1.6, (robot.joints, 3))
+    factor = rng.uniform(0.3, 3.0)
+    changed = robot.replace(offset=offset, gravity=factor * np.asarray(robot.gravity))
+    values = {}
+    for name in lengths:
+        if name == "g":
+            values[name] = float(np.linalg.norm(changed.gravity))
+            continue
+        ends, axis = name[1:-1].split("_"), "xyz".index(name[-1])
+        children = [i for i, p in enumerate(robot.parent) if p + 1 == int(ends[0])]
+        body = int(ends[1]) - 1 if len(ends) == 2 else children[0]
+        values[name] = float(offset[body, axis])
+    return changed, values
+
+
+@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
+def test_letters_hold_for_robots_of_other_lengths(make):
+    model = make()
+    base = base_parameters(model)
+    own = combinations(base)
+    np.testing.assert_allclose(
+        evaluated(base, base.lengths), own, rtol=1e-9, atol=1e-10 * np.abs(own).max()
+    )
+    for seed in range(2):
+        robot, lengths = stretched(model.robot, base.lengths, seed)
+        fresh = base_parameters(Model(robot, model.terms))
+        assert fresh.indices == base.indices
+        expected, found = combinations(fresh), evaluated(base, lengths)
+        # A plain number is what has no short form: it need not hold for other lengths.
+        place = {name: k for k, name in enumerate(model.parameter_names)}
+        for row, expression in enumerate(base.closed_forms.expressions):
+            for name, coefficient in expression.terms:
+                if coefficient.symbols:
+                    value = found[row, place[name]]
+                    exact = expected[row, place[name]]
+                    assert value == pytest.approx(exact, rel=1e-8, abs=1e-10), (
+                        str(expression),
+                        name,
+                    )
+
+
+@pytest.mark.parametrize("name", ["paper", "ten", "ur10", "coupled", "kr300", "panda"])
+def test_nothing_stays_a_number_where_axes_stand_square(name):
+    base = base_parameters(MODELS[name]())
+    for expression in base.closed_forms.expressions:
+        for _, coefficient in expression.terms:
+            assert all(isinstance(m.number, Fraction) for m in coefficient.monomials)
+    robot, lengths = stretched(base.model.robot, base.lengths, 9)
+    expected = combinations(base_parameters(Model(robot, base.model.terms)))
+    np.testing.assert_allclose(evaluated(base, lengths), expected, rtol=1e-9, atol=1e-10)
+
+
+def test_a_tiny_length_is_still_seen():
+    robot = library.tx90l_on_rail()
+    offset = np.array(robot.offset)
+    offset[3, 2] = 1e-5
+    base = base_parameters(Model(robot.replace(offset=offset), (SEVEN, *DRIVES)))
+    assert base.expressions[0] == "m1 + m2 + m3 - mz4/l3z + Ia1"
+    assert base.lengths["l3z"] == 1e-5
+
+
+def written(*terms: tuple[str, tuple]) -> Expression:
+    return Expression(
+        tuple((n, Coefficient(tuple(Monomial(x, p) for x, p in c))) for n, c in terms)
+    )
+
+
+def test_signs_fractions_brackets_and_shared_factors():
+    one, half = Fraction(1), Fraction(1, 2)
+    a, b = ("a", 1), ("b", -2)
+    e = written(
+        ("p1", ((one, ()),)),
+        ("p2", ((-half, (a, b)),)),
+        ("p3", ((-one, (("a", 2),)), (-2 * one, (a, ("c", 1))))),
+        ("p4", ((one, (("a", 2),)), (2 * one, (a, ("c", 1))))),
+        ("p5", ((-0.25, (a,)),)),
+        ("p6", ((-one, ()),)),
+        ("p7", ((0.123456789, (a,)), (2.5e-7, (("c", 1),)))),
+    )
+    assert str(e) == (
+        "p1 - a*p2/(2*b^2) - a*(a + 2*c)*(p3 - p4) - 0.25*a*p5 - p6 + (0.123457*a + 2.5e-07*c)*p7"
+    )
+    assert r"\frac{a}{2 b^{2}}\, p_{2}" in e.latex()
+    assert r"2.5 \cdot 10^{-7} c" in e.latex()
+    values = e.evaluate({"a": 3.0, "b": 2.0, "c": 5.0})
+    assert values["p2"] == pytest.approx(-0.375)
+    assert values["p3"] == pytest.approx(-39.0)
+    assert values["p4"] == -values["p3"]
+    assert e.symbols == ("a", "b", "c")
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        ("kg", (1, 0, 0)),
+        ("kg m²", (1, 2, 0)),
+        ("N m", (1, 2, -2)),
+        ("N m s/rad", (1, 2, -1)),
+        ("N s/m", (1, 0, -1)),
+        ("N/(m s)", (1, 0, -3)),
+    ],
+)
+def test_dimensions_of_units(unit, expected):
+    assert dimension(unit) == Dimension(*expected)
+    assert length_power(unit) == expected[1]
+
+
+def test_unknown_units_have_no_dimension():
+    assert dimension("A/furlong") is None
+    assert length_power("A/furlong") == 0
