@@ -68,7 +68,7 @@ def partial_velocities(
 
 
 def momentum_matrix(w: Vector) -> Float[AnyArray, "3 6"]:
-    r"""The matrix $[\Omega\;|\;-\hat\Omega]$ that makes $J^o\omega$ of $(A, B, C, D, E, F)$ (Eq. 9)."""
+    r"""The matrix $[\Omega\;|\;-\hat\Omega]$ that makes $J^o\omega$ of $(A, ..., F)$ (Eq. 9)."""
     x, y, z = w[0], w[1], w[2]
     o = 0.0 * x
     return jnp.array([[x, o, o, o, -z, -y], [o, y, o, -z, o, -x], [o, o, z, -y, -x, o]])
@@ -173,7 +173,7 @@ def inertia_tensor(j: Float[AnyArray, "6"]) -> Float[AnyArray, "3 3"]:
 def potential_energy_columns(
     robot: Robot, q: Float[AnyArray, " joints"]
 ) -> Float[AnyArray, "joints 10"]:
-    r"""Potential energy of unit parameters: $-g^T (m\, r_o + R\, m r_c)$ [J], zero at the ground."""
+    r"""Potential energy of unit parameters: $-g^T (m r_o + R m r_c)$ [J], zero at the ground."""
     rotations, origins = placements(robot, q)
     mass = -origins @ robot.gravity
     moment = -jnp.einsum("bij,i->bj", rotations, jnp.asarray(robot.gravity))

@@ -285,7 +285,7 @@ class CoupledDrives(AbstractTerm):
     transition: AbstractTransition = Tanh()
 
     def couplings(self, robot: Robot) -> tuple[tuple[int, np.ndarray], ...]:
-        """The motors that turn more than one axis, with their ratios relative to their own joint."""
+        """The motors that turn several axes, with their ratios relative to their own joint."""
         A = np.asarray(robot.drives.reduction)
         scale = np.abs(A).max()
         return tuple(
