@@ -153,11 +153,11 @@ def inspect(
     console = _console()
     loaded = load_experiment(experiment)
     paths = logs or []
-    terminal.show_robot(console, loaded)
     with _stages(1 + 3 * len(paths)) as stage:
         stage("finding base parameters")
         _ = loaded.base.expressions
         seen = [_look(loaded, path, stage) for path in paths]
+    terminal.show_robot(console, loaded)
     terminal.show_base(console, loaded.base)
     terminal.sentences(console, loaded.notes)
     for recording, observations, fit in seen:

@@ -151,6 +151,8 @@ def _choices(key: str) -> str:
     else:
         values = _literals(typing.get_type_hints(_STRUCTS[table])[name])
     quoted = [f'"{v}"' if isinstance(v, str) else str(v) for v in values]
+    if (table, name) == ("estimator", "ridge"):
+        quoted.insert(0, "a number")
     return " or ".join(filter(None, [", ".join(quoted[:-1]), quoted[-1]]))
 
 

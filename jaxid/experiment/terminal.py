@@ -100,10 +100,10 @@ def _motor_table(robot: Robot) -> Table:
     for title, values in columns:
         known = np.isfinite(values)
         if known.any() and values.any():
-            table.add_column(title, justify="right")
+            table.add_column(Text(title), justify="right")
             cells.append(aligned([significant(x) for x in np.where(known, values, np.nan)]))
     for i in range(n):
-        table.add_row(str(i + 1), turns[i], *(column[i] for column in cells))
+        table.add_row(str(i + 1), Text(turns[i]), *(column[i] for column in cells))
     return table
 
 
@@ -175,7 +175,7 @@ def show_check(console: Console, robot: Robot, check: LogCheck, doubts: Iterable
     table = plain_table("motion and forces, with the robot's limits in brackets")
     table.add_column("joint")
     for name, unit in titles:
-        table.add_column(name + unit, justify="right")
+        table.add_column(Text(name + unit), justify="right")
     table.add_column("stands", justify="right")
     if not alike:
         table.add_column("units")

@@ -1,0 +1,366 @@
+"""The command line: what it writes, what it refuses, and that it leaves nothing half-written."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jaxid import cli
+from jaxid.experiment.experiment import load_experiment
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+EXPERIMENT = """\
+[robot]
+builtin = "planar_arm"
+[limits]
+force = [80, 20]
+[recording]
+angles = "q{}"
+forces = "tau{}"
+time = "t"
+[filter]
+kind = "butterworth"
+cutoff = 10
+[rows]
+every = 4
+"""
+GRAVITY = 9.81
+
+
+def two_links(q, qd, qdd):
+    """A textbook's arm of two rods in the vertical plane, with friction [N m]."""
+    (m1, m2), (I1, I2), c = (2.0, 1.5), (0.2, 0.15), 0.5
+    q1, q2 = q.T
+    a, b, k = I1 + m1 * c**2 + m2 + I2 + m2 * c**2, m2 * c, I2 + m2 * c**2
+    g2 = m2 * c * GRAVITY * np.cos(q1 + q2)
+    g1 = (m1 * c + m2) * GRAVITY * np.cos(q1) + g2
+    t1 = (a + 2 * b * np.cos(q2)) * qdd[:, 0] + (k + b * np.cos(q2)) * qdd[:, 1]
+    t1 += -b * np.sin(q2) * (2 * qd[:, 0] * qd[:, 1] + qd[:, 1] ** 2) + g1
+    t2 = (k + b * np.cos(q2)) * qdd[:, 0] + k * qdd[:, 1]
+    t2 += b * np.sin(q2) * qd[:, 0] ** 2 + g2
+    return np.stack([t1, t2], 1) + 0.4 * qd + 0.3 * np.tanh(qd / 0.01)
+
+
+def write_log(path, seed, seconds=6.0, still=False, sign=1.0):
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 0.005)
+    w = 1.3 * np.arange(1, 5)[:, None]
+    a, b = rng.uniform(-0.25, 0.25, (2, 4, 2))
+    s, c = np.sin(w * t), np.cos(w * t)
+    q = s.T @ a + c.T @ b
+    qd = (w * c).T @ a - (w * s).T @ b
+    qdd = -(w**2 * s).T @ a - (w**2 * c).T @ b
+    if still:
+        q[:, 1], qd[:, 1], qdd[:, 1] = 0.3, 0.0, 0.0
+    tau = two_links(q, qd, qdd) * np.array([1.0, sign]) + rng.normal(0, 0.02, q.shape)
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "q1", "q2", "tau1", "tau2"])
+        writer.writerows(np.column_stack([t, q, tau]).round(7).tolist())
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with an experiment file and three logs."""
+    (tmp_path / "experiment.toml").write_text(EXPERIMENT)
+    for seed, name in enumerate("abc"):
+        write_log(tmp_path / f"{name}.csv", seed)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    return tmp_path
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Runs a command line in this process: exit code, stdout and stderr."""
+
+    def run(*args):
+        monkeypatch.setattr(sys, "argv", ["jaxid", *map(str, args)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        out, err = capsys.readouterr()
+        return stopped.value.code, out, err
+
+    return run
+
+
+def refused(result, *expected):
+    code, out, err = result
+    assert code == 2
+    assert out == ""
+    assert "Traceback" not in err
+    assert err.count("\n") == 1
+    assert err.startswith("jaxid: ")
+    for text in expected:
+        assert text in err
+    return True
+
+
+def result(folder, name="report"):
+    return json.loads((folder / name / "result.json").read_text(encoding="utf-8"))
+
+
+def listing(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*"))
+
+
+def test_identify_finds_a_textbook_arm(folder, run):
+    code, out, err = run("identify", "experiment.toml", "a.csv", "b.csv", "--verify", "c.csv")
+    assert code == 0, err
+    assert err == ""
+    found = result(folder)
+    by_name = {p["name"]: p for p in found["base_parameters"]}
+    truth = {"fv1": 0.4, "fv2": 0.4, "fc1": 0.3, "fc2": 0.3, "mx2": 0.75, "C2": 0.15 + 0.375}
+    for name, value in truth.items():
+        assert abs(by_name[name]["estimate"] - value) < 0.02, name
+    assert found["errors"]["verification"][0]["relative"] < 0.01
+    assert [e["recording"] for e in found["errors"]["identification"]] == ["a", "b"]
+    assert found["mass_matrix"]["positive_definite"]
+    assert found["settings"]["experiment_text"] == EXPERIMENT
+    assert found["settings"]["verification"] == ["c.csv"]
+    for text in (
+        "planar arm, 2 joints",
+        "condition number",
+        "base parameters",
+        "torque errors, identification: a: relative error",
+        "torque errors, verification: c: relative error",
+        "positive definite in all",
+        "wrote report: result.json, parameters.csv",
+        "N m",
+    ):
+        assert text in out
+    assert max(map(len, out.splitlines())) <= 100
+    assert set(os.listdir("report")) == set(found["files"])
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 140])
+def test_output_keeps_to_the_width_of_the_terminal(folder, run, monkeypatch, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    code, out, _ = run("inspect", "experiment.toml", "a.csv")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= width
+    assert "[rad]" in out
+    code, out, _ = run("identify", "experiment.toml", "a.csv")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= width
+    lines = [line for line in out.splitlines() if " kg m" in line]
+    assert len(lines) >= 3
+    assert not any("…" in line.split("  ", 2)[-1][-30:] for line in lines)
+
+
+def test_every_log_behind_verify_is_one_to_verify_with(folder, run):
+    code, _, _ = run(
+        "identify", "experiment.toml", "a.csv", "--verify", "b.csv", "c.csv", "-o", "r"
+    )
+    assert code == 0
+    found = result(folder, "r")
+    assert found["fit"]["recordings"] == ["a"]
+    assert [e["recording"] for e in found["errors"]["verification"]] == ["b", "c"]
+
+
+def test_a_split_in_time(folder, run):
+    code, out, _ = run("identify", "experiment.toml", "a.csv", "--split", "0.6")
+    assert code == 0
+    found = result(folder)
+    first, rest = (found["errors"][k][0] for k in ("identification", "verification"))
+    assert first["recording"] == "a, first 60 %"
+    assert rest["recording"] == "a, rest"
+    total = len(
+        load_experiment("experiment.toml")
+        .observe(load_experiment("experiment.toml").read("a.csv"))
+        .reduced_time
+    )
+    rows = [e["joints"][0]["rows"] for e in (first, rest)]
+    assert sum(rows) == total
+    assert abs(rows[0] / total - 0.6) < 0.02
+    assert "first 60 %" in out
+
+
+def test_logs_of_one_name_are_told_apart_by_their_folders(folder, run):
+    for name in ("monday", "friday"):
+        (folder / name).mkdir()
+        write_log(folder / name / "run.csv", len(name))
+    assert (
+        run("identify", "experiment.toml", "monday/run.csv", "--verify", "friday/run.csv")[0] == 0
+    )
+    assert result(folder)["fit"]["recordings"] == ["monday/run"]
+
+
+def test_what_is_not_determined_is_said_with_a_cure(folder, run):
+    write_log(folder / "still.csv", 5, still=True)
+    code, out, _ = run("identify", "experiment.toml", "still.csv")
+    assert code == 0
+    assert "NOT DETERMINED by these logs" in out
+    assert "mean nothing one by one" in out
+    assert "Record a motion" in out
+    assert 'add `ridge = "cross_validated"`' in " ".join(out.split())
+    (folder / "ridge.toml").write_text(EXPERIMENT + "[estimator]\nridge = 'cross_validated'\n")
+    code, out, _ = run("identify", "ridge.toml", "still.csv", "-o", "ridge")
+    assert code == 0
+    assert "NOT DETERMINED" in out
+    assert "add `ridge" not in out
+
+
+def test_inspect_without_a_log(folder, run):
+    code, out, _ = run("inspect", "experiment.toml")
+    assert code == 0
+    for text in ("largest", "base parameters of", "only in combination", "not identifiable"):
+        assert text in out
+    assert listing(folder) == ["a.csv", "b.csv", "c.csv", "experiment.toml"]
+
+
+def test_inspect_doubts_wrong_units_and_signs(folder, run):
+    def words(text, log="a.csv"):
+        (folder / "e.toml").write_text(text)
+        code, out, err = run("inspect", "e.toml", log)
+        assert code == 0, err
+        return " ".join(out.split())
+
+    limits = "[limits]\nposition_min = [-2, -2]\nposition_max = [2, 2]\nvelocity = [6, 6]\n"
+    good = EXPERIMENT.replace("[limits]\n", limits)
+    sane = words(good)
+    assert "!" not in sane
+    assert "these logs determine all" in sane
+    wrong = words(good.replace('time = "t"', 'time = "t"\nangle_unit = "rev"'))
+    assert "outside its range from -2 to 2 rad" in wrong
+    assert "but its limit is 6" in wrong
+    small = words(good.replace('time = "t"', 'time = "t"\nangle_unit = "deg"'))
+    assert "is it the right column and unit?" in small
+    forces = words(good.replace("force = [80, 20]", "force = [3, 1]"))
+    assert "check `recording.force_unit` and `forces_side`" in forces
+    write_log(folder / "signs.csv", 3, sign=-1.0)
+    signs = words(good, "signs.csv")
+    assert "friction of joint `joint2` comes out negative" in signs
+
+
+def test_init_writes_a_file_that_loads(tmp_path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="stick"><link name="a"/><link name="b"/><joint name="hinge" '
+        'type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>'
+    )
+    code, out, err = run("init", "arm.urdf")
+    assert (code, err) == (0, "")
+    (tmp_path / "experiment.toml").write_text(out)
+    assert load_experiment("experiment.toml").robot.joint_names == ("hinge",)
+
+
+def test_the_example_runs(tmp_path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("example", "here")
+    assert code == 0, err
+    command = out.strip().splitlines()[-1].removeprefix("now: jaxid ").split()
+    assert run(*command)[0] == 0
+    assert result(tmp_path / "here")["errors"]["verification"][0]["relative"] < 0.05
+
+
+def test_version_and_help(run):
+    code, out, _ = run("--version")
+    assert code == 0
+    assert out.startswith("jaxid ")
+    code, out, _ = run("identify", "--help")
+    assert code == 0
+    for option in ("--verify", "--split", "--output", "--force"):
+        assert option in out
+
+
+def test_double_precision_is_turned_on(folder):
+    """In a process of its own, where nobody else has done it."""
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    environment["PYTHONPATH"] = ROOT
+    command = [sys.executable, "-m", "jaxid.cli", "inspect", "experiment.toml"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "base parameters" in done.stdout
+
+
+def test_refusals(folder, run):
+    assert refused(run("inspect", "none.toml"), "`none.toml` is no file")
+    assert refused(run("identify", "experiment.toml", "none.csv"), "`none.csv` is no file")
+    assert refused(run("init", "none.urdf"), "none.urdf")
+    assert refused(
+        run("identify", "experiment.toml", "a.csv", "--split", "1.5"), "between 0 and 1", "is 1.5"
+    )
+    (folder / "wrong.toml").write_text(EXPERIMENT.replace("cutoff = 10", "cutoff = -3"))
+    assert refused(
+        run("identify", "wrong.toml", "a.csv"),
+        "wrong.toml: `filter.cutoff` must be positive, but is -3.",
+    )
+    (folder / "cut.csv").write_text("t,q1,q2,tau1,tau2\n0,0,0,0,0\n0.1,0,x,0,0\n")
+    assert refused(run("inspect", "experiment.toml", "cut.csv"), "`cut.csv`", "line 3", "`x`")
+    (folder / "other.csv").write_text((folder / "a.csv").read_text().replace("q2", "angle2"))
+    assert refused(run("inspect", "experiment.toml", "other.csv"), "has 1 joints")
+    assert listing(folder) == [
+        "a.csv",
+        "b.csv",
+        "c.csv",
+        "cut.csv",
+        "experiment.toml",
+        "other.csv",
+        "wrong.toml",
+    ]
+
+
+def test_words_that_no_command_knows(folder, run):
+    for args in (("identify", "experiment.toml"), ("idntify",), ("identify", "a", "b", "--splt")):
+        code, _, err = run(*args)
+        assert code == 2
+        assert "Traceback" not in err
+
+
+def test_foreign_folders_are_left_alone(folder, run):
+    (folder / "data").mkdir()
+    (folder / "data" / "precious.txt").write_text("mine")
+    (folder / "file").write_text("mine")
+    assert refused(
+        run("identify", "experiment.toml", "a.csv", "-o", "data"), "`data` holds files but no repor"
+    )
+    assert refused(run("identify", "experiment.toml", "a.csv", "-o", "file"), "`file` is a file")
+    assert listing(folder / "data") == ["precious.txt"]
+    code, _, _ = run("identify", "experiment.toml", "a.csv", "-o", "data", "--force")
+    assert code == 0
+    assert (folder / "data" / "precious.txt").read_text() == "mine"
+    assert (folder / "data" / "result.json").is_file()
+
+
+def test_an_earlier_report_is_replaced_and_notes_beside_it_are_kept(folder, run):
+    assert run("identify", "experiment.toml", "a.csv")[0] == 0
+    (folder / "report" / "notes.txt").write_text("mine")
+    assert run("identify", "experiment.toml", "b.csv")[0] == 0
+    assert result(folder)["fit"]["recordings"] == ["b"]
+    names = os.listdir("report")
+    assert "torque_b.png" in names
+    assert "torque_a.png" not in names
+    assert "notes.txt" in names
+
+
+def test_after_a_failure_nothing_is_half_written(folder, run, monkeypatch):
+    assert run("identify", "experiment.toml", "a.csv")[0] == 0
+    before = {p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()}
+
+    def full_disk(*args, **kwargs):
+        raise OSError(28, "No space left on device", "torque_b.png")
+
+    monkeypatch.setattr("jaxid.report.write.torque_figure", full_disk)
+    for output in ("report", "new"):
+        assert refused(
+            run("identify", "experiment.toml", "b.csv", "-o", output),
+            "`torque_b.png`: No space left on device.",
+        )
+    after = {p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()}
+    assert after == before
+    assert not (folder / "new").exists()
+
+
+def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch):
+    def shapes(*args, **kwargs):
+        return np.zeros(3) + np.zeros(4)
+
+    monkeypatch.setattr(cli, "estimate", shapes)
+    monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
+    with pytest.raises(ValueError, match="broadcast"):
+        cli.main()

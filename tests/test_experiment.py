@@ -1,0 +1,555 @@
+"""Experiment files: what they become, and how each mistake is refused in one sentence."""
+
+import re
+
+import numpy as np
+import pytest
+
+import jaxid as jid
+from jaxid.experiment.experiment import load_experiment
+from jaxid.experiment.template import render, write_template
+from jaxid.measurement import units
+
+ARM = """\
+[robot]
+builtin = "planar_arm"
+"""
+RECORDING = """
+[recording]
+angles = "q{}"
+forces = "tau{}"
+time = "t"
+"""
+URDF = """\
+<robot name="rail and arm">
+  <link name="base"/><link name="cart"/><link name="arm"/><link name="tool"/>
+  <joint name="rail" type="prismatic">
+    <parent link="base"/><child link="cart"/><axis xyz="1 0 0"/>
+    <limit lower="-1.5" upper="1.5" velocity="2" effort="3000"/>
+  </joint>
+  <joint name="shoulder" type="revolute">
+    <parent link="cart"/><child link="arm"/><origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
+    <limit lower="-2.1" upper="2.2" velocity="3.5" effort="120"/>
+  </joint>
+  <joint name="flange" type="fixed">
+    <parent link="arm"/><child link="tool"/><origin xyz="0 0 0.5"/>
+  </joint>
+</robot>
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Loads an experiment file with this text."""
+
+    def load(text):
+        path = tmp_path / "experiment.toml"
+        path.write_text(text, encoding="utf-8")
+        return load_experiment(path)
+
+    return load
+
+
+def test_defaults_are_said(load):
+    experiment = load(ARM)
+    assert [type(t).__name__ for t in experiment.model.terms] == [
+        "RigidBodies",
+        "ViscousFriction",
+        "CoulombFriction",
+        "RotorInertia",
+        "ConstantOffset",
+    ]
+    assert experiment.filter == jid.ZeroPhaseButterworth(10.0)
+    assert experiment.decimation == jid.Subsample(1)
+    assert experiment.slow is None
+    assert experiment.columns is None
+    assert isinstance(experiment.estimator.weights, jid.ResidualVariances)
+    assert "10 Hz is assumed" in experiment.notes[0]
+    assert "largest forces" in experiment.notes[1]
+
+
+def test_weights_are_the_largest_forces_where_they_are_known(load):
+    experiment = load('[robot]\nbuiltin = "ur10"\n')
+    assert isinstance(experiment.estimator.weights, jid.MaximumForces)
+    assert len(experiment.notes) == 1
+
+
+def test_base_parameters_are_found_once_and_only_when_asked_for(load):
+    experiment = load(ARM)
+    assert "base" not in vars(experiment)
+    assert experiment.base is experiment.base
+    assert experiment.base.size == jid.base_parameters(experiment.model).size
+
+
+def test_a_table_of_angles_in_degrees_is_the_builtin_robot(load):
+    rows = [
+        (90, 0.0, 0.1273),
+        (0, -0.612, 0.0),
+        (0, -0.5723, 0.0),
+        (90, 0.0, 0.163941),
+        (-90, 0.0, 0.1157),
+        (0, 0.0, 0.0922),
+    ]
+    table = ",\n".join(f"  {{ alpha = {al}, a = {a}, d = {d} }}" for al, a, d in rows)
+    robot = load(f'[robot]\nconvention = "standard"\nname = "mine"\ndh = [\n{table}\n]\n').robot
+    known = jid.robots.ur10()
+    assert robot.name == "mine"
+    np.testing.assert_array_equal(robot.rotation, known.rotation)
+    np.testing.assert_array_equal(robot.offset, known.offset)
+
+
+def test_rows_of_a_table_may_slide_and_have_names(load):
+    rows = (
+        '{ alpha = 0, a = 0, d = 0.1, slides = true, name = "rail" }, { alpha = 90, a = 0, d = 0 }'
+    )
+    robot = load(f'[robot]\nconvention = "modified"\ndh = [{rows}]\n').robot
+    assert robot.revolute == (False, True)
+    assert robot.joint_names == ("rail", "joint2")
+
+
+def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "arm.urdf").write_text(URDF)
+    (tmp_path / "experiments").mkdir()
+    path = tmp_path / "experiments" / "e.toml"
+    path.write_text('[robot]\nurdf = "../robots/arm.urdf"\ntip = "tool"\n')
+    monkeypatch.chdir("/")
+    assert load_experiment(path).robot.joint_names == ("rail", "shoulder")
+
+
+def test_limits_replace_those_of_the_robot_and_nan_keeps_them(load):
+    known = jid.robots.tx90l_on_rail()
+    text = """
+[robot]
+builtin = "tx90l_on_rail"
+[limits]
+angle_unit = "deg"
+velocity = [2.0, 180, nan, nan, nan, nan, inf]
+force = [1000, nan, nan, nan, nan, nan, nan]
+"""
+    robot = load(text).robot
+    velocity = np.array(known.limits.velocity)
+    velocity[[0, 1, 6]] = 2.0, np.pi, np.inf
+    np.testing.assert_allclose(robot.limits.velocity, velocity, rtol=1e-15)
+    np.testing.assert_array_equal(robot.limits.force[1:], known.limits.force[1:])
+    assert robot.limits.force[0] == 1000.0
+    assert robot.limits.assumed == (
+        "position_min of rail",
+        "position_max of rail",
+        "acceleration",
+    )
+
+
+def test_drives_replace_those_of_the_robot(load):
+    text = """
+[robot]
+builtin = "tx40"
+[drives]
+max_torques = [1, 2, 3, 4, 5, 6]
+angle_unit = "deg"
+zero = [0, -90, 90, 0, 0, 0]
+"""
+    drives, known = load(text).robot.drives, jid.robots.tx40().drives
+    np.testing.assert_array_equal(drives.reduction, known.reduction)
+    np.testing.assert_allclose(drives.zero, known.zero, rtol=1e-15)
+    np.testing.assert_array_equal(drives.max_torques, [1, 2, 3, 4, 5, 6])
+    assert np.isnan(drives.rotor_inertia).all()
+
+
+def test_coupled_motors_bring_their_term_along(load):
+    matrix = "[drives]\nmatrix = [[10, 0], [20, 20]]\n"
+    assert "Iam2" in load(ARM + matrix).model.parameter_names
+    said = matrix + "[model]\ncoupled_drives = false\n"
+    assert "Iam2" not in load(ARM + said).model.parameter_names
+
+
+def test_base_and_gravity(load):
+    text = "gravity = [0, 0, -1.62]\nbase_rotation = [90, 0, 0]\nbase_position = [0, 0, 1]\n"
+    robot = load(ARM + text).robot
+    np.testing.assert_array_equal(robot.gravity, [0, 0, -1.62])
+    np.testing.assert_array_equal(robot.rotation[0], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    np.testing.assert_array_equal(robot.offset[0], [0, 0, 1])
+
+
+def test_a_tool_at_the_end_effector_or_on_a_body(load):
+    inertia = "inertia = { xx = 0.02, yy = 0.03, zz = 0.04, xy = 0.001 }\n"
+    text = ARM + "[robot.tool]\nmass = 2\ncentre_of_mass = [0.1, 0, 0]\n" + inertia
+    tool = load(text).robot.tool
+    assert tool.body == 1
+    np.testing.assert_allclose(tool.centre_of_mass, [1.1, 0, 0])
+    np.testing.assert_allclose(tool.inertia[0], [0.02, 0.001, 0])
+    tool = load(text + 'body = "joint1"\n').robot.tool
+    assert tool.body == 0
+    np.testing.assert_allclose(tool.centre_of_mass, [0.1, 0, 0])
+
+
+def test_the_model(load):
+    text = """
+[model]
+principal_axes = true
+rotor_inertia = false
+viscous = false
+springs = true
+[model.coulomb]
+epsilon = [0.1, 0.2]
+dead_zone = 0.05
+asymmetric = true
+"""
+    model = load(ARM + text).model
+    assert "D1" not in model.parameter_names
+    assert [n for n in model.parameter_names if n.startswith(("f", "I", "k"))] == [
+        "fcp1",
+        "fcp2",
+        "fcn1",
+        "fcn2",
+        "ks1",
+        "ks2",
+    ]
+    dry = model.terms[1]
+    np.testing.assert_array_equal(dry.transition.epsilon, [0.1, 0.2])
+    assert dry.transition.dead_zone == 0.05
+
+
+def test_friction_with_a_hard_sign_or_none(load):
+    hard = load(ARM + "[model.coulomb]\nhard = true\ndead_zone = [0.1, 0.2]\n").model
+    assert isinstance(hard.terms[2].transition, jid.HardSign)
+    none = load(ARM + "[model]\ncoulomb = false\noffset = false\n").model
+    assert not any(n.startswith(("fc", "fo")) for n in none.parameter_names)
+
+
+def test_columns(load):
+    text = """
+[recording]
+angles = ["a", "b"]
+forces = [3, 4]
+velocities = "v{}"
+sample_time = 0.004
+angle_unit = "deg"
+velocity_unit = "rpm"
+force_unit = ["A", "mA"]
+torque_constants = [0.5, 0.6]
+angle_signs = [1, -1]
+force_signs = [-1, 1]
+angle_offsets = [0.1, 0]
+side = "motor"
+forces_side = "joint"
+"""
+    columns = load(ARM + text).columns
+    assert columns.angles == ("a", "b")
+    assert columns.forces == (3, 4)
+    assert columns.sample_time == 0.004
+    np.testing.assert_allclose(columns.angle_scale(2), [np.pi / 180, -np.pi / 180])
+    np.testing.assert_allclose(columns.velocity_scale(2), [np.pi / 30, -np.pi / 30])
+    np.testing.assert_allclose(columns.force_scale(2), [-0.5, 0.6e-3])
+    np.testing.assert_allclose(columns.angle_shift(2), [0.1, 0.0])
+    assert columns.angles_on_motor_side
+    assert not columns.forces_on_motor_side
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            'kind = "butterworth"\ncutoff = 20\norder = 2\nforce_cutoff = inf\nmargin = 0.1',
+            jid.ZeroPhaseButterworth(20.0, 2, np.inf, 0.1),
+        ),
+        ('kind = "paper"\nvelocity = 900', jid.PaperFilter(900.0, 100.0)),
+        (
+            'kind = "periodic"\nperiod = 8\nharmonics = 5',
+            jid.PeriodicFourier(8.0, 5),
+        ),
+    ],
+)
+def test_filters(load, text, expected):
+    experiment = load(f"{ARM}[filter]\n{text}\n")
+    assert experiment.filter == expected
+
+
+def test_rows(load):
+    assert load(ARM + "[rows]\nevery = 50\n").decimation == jid.Subsample(50)
+    experiment = load(ARM + "[rows]\nfactors = [10, 5]\nslow = 0.1\n")
+    assert experiment.decimation == jid.Decimation((10, 5))
+    np.testing.assert_array_equal(experiment.slow, [0.1, 0.1])
+    np.testing.assert_array_equal(load(ARM + "[rows]\nslow = [0.1, 2]\n").slow, [0.1, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "estimator", "solution"),
+    [
+        ('kind = "least_squares"', jid.LeastSquares, jid.Complete),
+        ('kind = "least_squares"\nridge = "cross_validated"', jid.LeastSquares, jid.CrossValidated),
+        ("ridge = 0.02", jid.WeightedLeastSquares, jid.Ridge),
+        ("truncate = 0.02", jid.WeightedLeastSquares, jid.Truncated),
+    ],
+)
+def test_estimators(load, text, estimator, solution):
+    experiment = load(f"{ARM}[estimator]\n{text}\n")
+    assert isinstance(experiment.estimator, estimator)
+    assert isinstance(experiment.estimator.solution, solution)
+    assert experiment.regularised == (solution is not jid.Complete)
+    if solution in (jid.Ridge, jid.Truncated):
+        assert experiment.estimator.solution.share == 0.02
+
+
+def test_logs_are_read_cropped_and_filtered(load, tmp_path):
+    t = 0.01 * np.arange(400)
+    q = np.stack([np.sin(t), np.cos(2 * t)], 1)
+    head = "t,q1,q2\n"
+    rows = "\n".join(f"{x:.9g},{a:.12g},{b:.12g}" for x, (a, b) in zip(t, q, strict=True))
+    (tmp_path / "run.csv").write_text(head + rows)
+    forces = "\n".join(f"{3 * a:.12g},{b:.12g}" for a, b in q)
+    (tmp_path / "run_torque.csv").write_text("tau1,tau2\n" + forces)
+    text = RECORDING + 'forces_file = "{}_torque.csv"\nstart = 0.5\nstop = 3.5\n'
+    experiment = load(ARM + text + "[filter]\nkind = 'butterworth'\ncutoff = 5\n")
+    recording = experiment.read(tmp_path / "run.csv")
+    assert recording.samples == 300
+    np.testing.assert_allclose(recording.forces[:, 0], 3 * recording.angles[:, 0], rtol=1e-10)
+    observations = experiment.observe(recording)
+    np.testing.assert_allclose(
+        observations.motion.qd[50:-50, 0], np.cos(observations.time[50:-50]), atol=2e-3
+    )
+
+
+REFUSALS = [
+    ("robot = 3", "`robot` must be a table, but is 3."),
+    ("[robt]\nurdf = 'a'", "`robt` is no known key: did you mean `robot`?"),
+    ("", "the table `[robot]` is missing: give it `urdf`, `builtin` or `dh`."),
+    ("[robot]", "`robot` needs one of `urdf`, `builtin` and `dh`, but has none of them."),
+    (ARM + 'urdf = "a"', "needs one of `urdf`, `builtin` and `dh`, but has `urdf` and `builtin`."),
+    ('[robot]\nbuiltin = "tx9"', '`robot.builtin`: "tx9" is none of the robots tx90l_on_rail'),
+    ('[robot]\nbuiltin = "panda"\ntip = "x"', "`robot.tip` belongs to `urdf`"),
+    (ARM + "snap_tolerance = 0.01", "leave out `robot.snap_tolerance`"),
+    ('[robot]\nurdf = "no.urdf"', "`robot.urdf`: "),
+    ("[robot]\ndh = [{alpha = 0, a = 0, d = 0}]", "`robot.convention`"),
+    ("[robot]\ndh = []\nconvention = 'standard'", "`robot.dh`: "),
+    (
+        "[robot]\ndh = [{alpha = 0, a = 0}]",
+        "`robot.dh[0].d` is missing: `[robot.dh]` needs it.",
+    ),
+    (
+        "[robot]\ndh = [{alpha = 0, a = 0, d = 0, teta = 0}]",
+        "`robot.dh[0].teta` is no known key: did you mean `theta`?",
+    ),
+    (ARM + "gravity = [0, -9.81]", "`robot.gravity` must hold 3 numbers, but holds 2."),
+    (ARM + "gravity = [0, 0, 'g']", '`robot.gravity[2]` must be a number, but is "g".'),
+    (ARM + "gravty = 1", "`robot.gravty` is no known key: did you mean `gravity`?"),
+    (ARM + "cutoff = 1", "`robot.cutoff` is no known key: `cutoff` belongs into the table `[filt"),
+    (ARM + "xyzzy = 1", "`robot.xyzzy` is no known key: the table `[robot]` has urdf, builtin"),
+    (
+        ARM + "[robot.tool]\nmass = 0\ncentre_of_mass = [0, 0, 0]",
+        "`robot.tool.mass` must be positive, but is 0.",
+    ),
+    (
+        ARM + "[robot.tool]\nmass = 1\ncentre_of_mass = [0, 0, 0]\nbody = 'hand'",
+        "`robot.tool`: `body` must be the name of the joint that moves it (joint1, joint2), b",
+    ),
+    (
+        ARM
+        + "[robot.tool]\nmass = 1\ncentre_of_mass = [0, 0, 0]\ninertia = {xx = 1, yy = 1, zz = 9}",
+        "`robot.tool`: `inertia` of the tool belongs to no body",
+    ),
+    (
+        ARM + "[limits]\nvelocity = [1, 2, 3]",
+        "`limits`: `velocity` must hold one value for each of the 2 joints (joint1, joint2), but "
+        "holds 3.",
+    ),
+    (ARM + "[limits]\nvelocity = 1", "`limits.velocity` must be a list, but is 1."),
+    (ARM + "[limits]\nvelocity = [1, -2]", "`limits`: `velocity` must be positive, but joint 2"),
+    (ARM + "[limits]\nangle_unit = 'grad'", '`limits.angle_unit` must be "rad" or "deg", but is "'),
+    (
+        ARM + "[limits]\nposition_min = [1, 1]\nposition_max = [0, 2]",
+        "`limits`: `position_min` must be below",
+    ),
+    (
+        ARM + "[drives]\ngear_ratios = [1, 1]\nmatrix = [[1, 0], [0, 1]]",
+        "`drives`: give `gear_ratios` or `matrix`, but not both.",
+    ),
+    (ARM + "[drives]\ngear_ratios = [1]", "each of the 2 joints"),
+    (ARM + "[drives]\ngear_ratios = [1, 0]", "is a gear ratio zero?"),
+    (ARM + "[drives]\nmatrix = [[1, 0], [0]]", "`drives`: `matrix` must hold 2 rows of 2 numbers"),
+    (ARM + "[drives]\nzero = [1]", "`drives`: `zero` must hold one value for each of the 2 joints"),
+    (ARM + "[model]\nviscous = 1", "`model.viscous` must be true or false, but is 1."),
+    (ARM + "[model]\ncoulomb = 'hard'", "`model.coulomb` must be true or false or a table, but is"),
+    (ARM + "[model.coulomb]\nepsilon = 0", "`model.coulomb.epsilon` must be positive, but is 0."),
+    (
+        ARM + "[model.coulomb]\nepsilon = [1]",
+        "`model`: `coulomb.epsilon` must hold one value for ea",
+    ),
+    (
+        ARM + "[model]\ncoupled_drives = true",
+        "`model`: the drives of `planar arm, 2 joints` are not",
+    ),
+    (ARM + "[recording]\nangles = 'q{}'", "`recording.forces` is missing: `[recording]` needs it."),
+    (
+        ARM + RECORDING.replace('time = "t"', ""),
+        "`recording`: give `time` (the column of the time stamps) or `sample_time` [s] (rows "
+        "equally far apart): it has neither.",
+    ),
+    (ARM + RECORDING + "sample_time = 1", "apart): not both."),
+    (
+        ARM + RECORDING + "side = 'link'",
+        '`recording.side` must be "joint" or "motor", but is "link"',
+    ),
+    (ARM + RECORDING + "angle_unit = 'degree'", "`recording`: `degree` is no known unit (did you"),
+    (ARM + RECORDING + "angle_unit = ['deg']", "`recording`: `angle_unit` must hold one value for"),
+    (ARM + RECORDING + "force_unit = 's'", "`recording`: `force_unit` must measure"),
+    (ARM + RECORDING + "force_unit = 'A'", "`recording`: `torque_constants` [N m/A] are needed"),
+    (
+        ARM + RECORDING + "angle_signs = [1, 2]",
+        "`recording.angle_signs[1]` must be 1 or -1, but is",
+    ),
+    (
+        ARM + RECORDING + "angle_offsets = [1]",
+        "`recording`: `angle_offsets` must hold one value fo",
+    ),
+    (
+        ARM + RECORDING.replace('"q{}"', '["q1"]'),
+        "`recording`: `angles` must hold one value for eac",
+    ),
+    (ARM + RECORDING + "angels = 1", "`recording.angels` is no known key: did you mean `angles`?"),
+    (
+        ARM + "[filter]\ncutoff = 1",
+        '`filter.kind` is missing: `[filter]` needs it ("butterworth", ',
+    ),
+    (
+        ARM + "[filter]\nkind = 'buterworth'",
+        '`filter.kind` must be "butterworth", "paper" or "periodic", but is "buterworth".',
+    ),
+    (
+        ARM + "[filter]\nkind = 'butterworth'\ncutoff = -3",
+        "`filter.cutoff` must be positive, but is -3.",
+    ),
+    (
+        ARM + "[filter]\nkind = 'butterworth'\ncutoff = nan",
+        "`filter.cutoff` must be positive, but i",
+    ),
+    (
+        ARM + "[filter]\nkind = 'paper'\ncutoff = 3",
+        "`filter.cutoff` is no known key: the table `[filter]` has kind, velocity, acceleration, m",
+    ),
+    (ARM + "[filter]\nkind = 'butterworth'\ncutof = 3", "is no known key: did you mean `cutoff`?"),
+    (
+        ARM + "[filter]\nkind = 'periodic'\nperiod = 1\nharmonics = 1.5",
+        "must be a whole number, but",
+    ),
+    (ARM + "[rows]\nevery = 0", "`rows.every` must be at least 1, but is 0."),
+    (ARM + "[rows]\nevery = 2\nfactors = [2]", "`rows`: give `every`"),
+    (ARM + "[rows]\nfactors = [50]", "`rows`: `factors` must be 13 or less"),
+    (ARM + "[rows]\nslow = [1]", "`rows`: `slow` must hold one value for each of the 2 joints"),
+    (ARM + "[rows]\nslow = -1", "`rows.slow` must be at least 0, but is -1."),
+    (
+        ARM + "[estimator]\nkind = 'wls'",
+        '`estimator.kind` must be "weighted" or "least_squares", b',
+    ),
+    (
+        ARM + "[estimator]\nweights = 'maximum_forces'",
+        '`estimator`: `weights = "maximum_forces"`: the largest force of joint `joint1`',
+    ),
+    (
+        ARM + "[estimator]\nkind = 'least_squares'\nweights = 'residual_variances'",
+        '`estimator`: `weights` belong to `kind = "weighted"`',
+    ),
+    (ARM + "[estimator]\ntruncate = 1", "`estimator.truncate` must be below 1, but is 1."),
+    (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge` must be a number or"),
+    (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`estimator`: give `truncate` or `ridge`"),
+    ("[robot\n", "is no TOML: "),
+    (ARM + ARM, "is no TOML: "),
+]
+
+
+@pytest.mark.parametrize(("text", "expected"), REFUSALS, ids=range(len(REFUSALS)))
+def test_mistakes_are_one_sentence_with_file_and_key(load, text, expected):
+    with pytest.raises(ValueError, match=re.escape(expected)) as caught:
+        load(text)
+    message = str(caught.value)
+    assert message.startswith("experiment.toml: ")
+    assert "\n" not in message
+    assert message.endswith((".", "?"))
+    assert not message.endswith("..")
+    for machinery in ("$", "null", "msgspec", "Object", "`float`", "Expected"):
+        assert machinery not in message
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(ValueError, match="is no file: check its path, or write one with `jaxid in"):
+        load_experiment(tmp_path / "none.toml")
+    with pytest.raises(ValueError, match="is a folder"):
+        load_experiment(tmp_path)
+    path = tmp_path / "latin.toml"
+    path.write_bytes("# Stäubli\n".encode("latin-1"))
+    with pytest.raises(ValueError, match=r"latin.toml: is no text in UTF-8 \(byte 4\)"):
+        load_experiment(path)
+
+
+def test_logs_that_do_not_fit_the_file(load, tmp_path):
+    with pytest.raises(ValueError, match=r"the table `\[recording\]` is missing: .* `run.csv`"):
+        load(ARM).read("run.csv")
+    log = tmp_path / "run.csv"
+    rows = "\n".join(f"{0.01 * i},{i},{i},{i},1,1,1" for i in range(100))
+    log.write_text("t,q1,q2,q3,tau1,tau2,tau3\n" + rows)
+    with pytest.raises(ValueError, match=r"`recording.angles` names 3 columns of `run.csv`, but"):
+        load(ARM + RECORDING).read(log)
+    with pytest.raises(ValueError, match=r"`run.csv` has no column `pos1` for `angles`"):
+        load(ARM + RECORDING.replace("q{}", "pos{}")).read(log)
+    short = RECORDING.replace('"q{}"', '["q1", "q2"]').replace('"tau{}"', '["tau1", "tau2"]')
+    with pytest.raises(ValueError, match=r"`recording`: `run` has 0 samples from 5 s"):
+        load(ARM + short + "start = 5\n").read(log)
+    experiment = load(ARM + short + "[filter]\nkind = 'butterworth'\ncutoff = 60\n")
+    with pytest.raises(ValueError, match=r"experiment.toml: `filter` and `rows`: .*cutoff"):
+        experiment.observe(experiment.read(log))
+
+
+def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    text = write_template(tmp_path / "arm.urdf", folder=tmp_path)
+    path = tmp_path / "experiment.toml"
+    path.write_text(text, encoding="utf-8")
+    experiment = load_experiment(path)
+    robot, known = experiment.robot, jid.load_urdf(tmp_path / "arm.urdf")
+    for name in ("position_min", "position_max", "velocity", "acceleration", "jerk", "force"):
+        np.testing.assert_array_equal(getattr(robot.limits, name), getattr(known.limits, name))
+    assert robot.drives.is_direct
+    assert experiment.notes == ()
+    assert experiment.columns.angle_unit == (units.M, units.RAD)
+    assert experiment.columns.force_unit == (units.N, units.NM)
+    assert "1 rail (slides), 2 shoulder (turns)" in text
+    assert max(len(line) for line in text.splitlines()) <= 100
+
+
+def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    text = write_template(tmp_path / "arm.urdf", folder=tmp_path)
+    tool = r"^# (?=\[robot.tool\]|mass = |centre_of_mass = )"
+    text = re.sub(tool, "", text, flags=re.M)
+    path = tmp_path / "experiment.toml"
+    keys = dict.fromkeys(re.findall(r"^# ?(\w+) = ", text, flags=re.M))
+    assert len(keys) > 25
+    for key in keys:
+        path.write_text(re.sub(rf"^# ?({key} = )", r"\1", text, count=1, flags=re.M))
+        said = _refusal(path)
+        # The keys of other kinds of filter follow their kind, which stands twice then.
+        foreign = re.search(r"`filter.\w+` is no known key", said)
+        assert "no known key" not in said or foreign, said
+
+
+def _refusal(path):
+    try:
+        load_experiment(path)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def test_the_template_documents_every_key():
+    from jaxid.experiment import tables
+    from jaxid.experiment.reading import _STRUCTS
+
+    text = render(jid.robots.tx90l_on_rail(), "arm.urdf")
+    structs = [*_STRUCTS.values(), *tables.FILTERS.values()]
+    for key in {k for s in structs for k in s.__struct_encode_fields__}:
+        assert re.search(rf"(?<![\w]){key}(?![\w])", text), key
+
+
+def test_the_template_of_a_missing_urdf(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        write_template(tmp_path / "none.urdf")
