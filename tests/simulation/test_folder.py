@@ -51,3 +51,39 @@ def test_a_relative_folder_is_meant_from_here(tmp_path, monkeypatch):
     with written_whole(Path("report")) as staging:
         (staging / "a").write_text("a")
     assert (tmp_path / "report" / "a").exists()
+
+
+def test_a_failure_among_the_moves_brings_the_old_files_back(tmp_path, monkeypatch):
+    for name in "ac":
+        (tmp_path / name).write_text("old")
+    real = os.replace
+
+    def fail(source, target):
+        if Path(target) == tmp_path / "c" and Path(source).read_text() == "new":
+            raise OSError("disk full")
+        real(source, target)
+
+    def write():
+        with written_whole(tmp_path) as staging:
+            for name in "abcd":
+                (staging / name).write_text("new")
+            monkeypatch.setattr(os, "replace", fail)
+
+    with pytest.raises(OSError, match="disk full"):
+        write()
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"a": "old", "c": "old"}
+
+
+def test_a_folder_in_a_files_place_is_not_touched(tmp_path):
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "mine").write_text("mine")
+
+    def write():
+        with written_whole(tmp_path) as staging:
+            (staging / "a").write_text("new")
+            (staging / "b").write_text("new")
+
+    with pytest.raises(ValueError, match="must be a file, but is a folder"):
+        write()
+    assert [p.name for p in tmp_path.iterdir()] == ["b"]
+    assert (tmp_path / "b" / "mine").read_text() == "mine"
