@@ -67,6 +67,7 @@ def result(
             },
             "fit": {
                 "estimator": str(fit.estimator),
+                "solution": str(fit.solution),
                 "recordings": fit.recordings,
                 "rows": fit.rows,
                 "weights": fit.weights,

@@ -112,7 +112,7 @@ def _column(
     for place, k in zip(places, order, strict=True):
         value, deviation = with_deviation(float(fit.parameters[k]), float(deviations[k]))
         text = f"{value} ± {deviation} {units[k]}"
-        axes.text(1.03, place, text, transform=beside, va="center", fontsize=7.5, color=GREY)
+        axes.text(1.03, float(place), text, transform=beside, va="center", fontsize=7.5, color=GREY)
     axes.spines["left"].set_color(PALE)
 
 
