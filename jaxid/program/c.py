@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .operation import TRUTH_VALUED, Operation
-from .program import Program, Reference
+from jaxid.program.operation import TRUTH_VALUED, Operation
+from jaxid.program.program import Program, Reference
 
 _INFIX = {
     Operation.ADD: "+",

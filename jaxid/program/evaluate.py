@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ..types import AnyArray
-from .operation import NUMPY, TRUTH_VALUED, Operation
-from .program import Program, Reference
+from jaxid.program.operation import NUMPY, TRUTH_VALUED, Operation
+from jaxid.program.program import Program, Reference
+from jaxid.types import AnyArray
 
 _BLOCK = 1024
 """Samples at a time: the values that are alive at once then stay in the cache."""
@@ -55,7 +55,7 @@ def _plan(program: Program) -> _Plan:
             else:
                 cell[position], cells = cells, cells + 1
         if node.operation is Operation.INPUT:
-            number, entry = node.operands
+            number, entry = node.place
             loads.append((cell[position], number, entry))
             continue
         operands = tuple(cell[x] if isinstance(x, int) else x for x in node.operands)

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .operation import COMPARISONS, FUNCTIONS, LOGIC, Operation
-from .rewrite import live, rewrite
-from .scalar import Operand, Scalar
+from jaxid.program.operation import COMPARISONS, FUNCTIONS, LOGIC, Operation
+from jaxid.program.rewrite import live, rewrite
+from jaxid.program.scalar import Operand, Scalar
 
 Reference = int | float
 """An operand or a result: the position of a node (int) or a constant (float)."""
@@ -28,6 +28,12 @@ class Node(NamedTuple):
         if self.operation is Operation.INPUT:
             return ()
         return tuple(x for x in self.operands if isinstance(x, int))
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The input's number and the entry's position, of an `INPUT`."""
+        number, entry = self.operands
+        return int(number), int(entry)
 
 
 @dataclass(frozen=True)

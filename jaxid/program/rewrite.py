@@ -7,8 +7,8 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from .operation import Operation
-from .scalar import Operand, Scalar, add, multiply, negate
+from jaxid.program.operation import Operation
+from jaxid.program.scalar import Operand, Scalar, add, multiply, negate
 
 _SUMS = (Operation.ADD, Operation.SUBTRACT)
 _Term = tuple[bool, Operand]
@@ -108,7 +108,7 @@ class _Rewriting:
         stack, terms = [(x, negated, True)], []
         while stack:
             x, negated, outermost = stack.pop()
-            if outermost or x in inner:
+            if isinstance(x, Scalar) and (outermost or x in inner):
                 left, right = x.operands
                 stack += [
                     (right, negated != (x.operation is Operation.SUBTRACT), False),
@@ -120,7 +120,11 @@ class _Rewriting:
 
     def _factor(self, terms: list[_Term]) -> list[_Term] | None:
         """Draws common factors out of products that nothing else needs; None if there are none."""
-        products = [(k, x) for k, (_, x) in enumerate(terms) if self._once(x) and _is_product(x)]
+        products = [
+            (k, x)
+            for k, (_, x) in enumerate(terms)
+            if isinstance(x, Scalar) and self._once(x) and _is_product(x)
+        ]
         done: list[_Term] = []
         taken: set[int] = set()
         while True:

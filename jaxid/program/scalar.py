@@ -9,8 +9,9 @@ the result: check inputs before they come here.
 """
 
 import math
+from typing import overload
 
-from .operation import COMMUTATIVE, EVEN, ODD, TRUTH_VALUED, Operation, on_constants
+from jaxid.program.operation import COMMUTATIVE, EVEN, ODD, TRUTH_VALUED, Operation, on_constants
 
 
 class Graph:
@@ -70,10 +71,10 @@ class Scalar:
 Operand = Scalar | float | bool
 
 
-def _constant(x: Operand) -> bool:
-    return not isinstance(x, Scalar)
-
-
+@overload
+def _magnitude(x: Scalar) -> tuple[bool, Scalar]: ...
+@overload
+def _magnitude(x: float | bool) -> tuple[bool, float | bool]: ...
 def _magnitude(x: Operand) -> tuple[bool, Operand]:
     """Splits x into (is negated, rest)."""
     if isinstance(x, Scalar):
@@ -92,11 +93,11 @@ def negate(x: Operand) -> Operand:
 
 def add(x: Operand, y: Operand) -> Operand:
     """Sum, ordered so that x + y, y + x and -(-x - y) share a node, as do x - y and y - x."""
-    if _constant(x):
-        if _constant(y):
+    if not isinstance(x, Scalar):
+        if not isinstance(y, Scalar):
             return float(x + y)
         x, y = y, x
-    if _constant(y):
+    if not isinstance(y, Scalar):
         if y == 0:
             return x
         negated, x = _magnitude(x)
@@ -117,14 +118,14 @@ def add(x: Operand, y: Operand) -> Operand:
 
 def multiply(x: Operand, y: Operand) -> Operand:
     """Product with the sign in front; a constant factor stands first, merged with one in y."""
-    if _constant(y):
+    if not isinstance(y, Scalar):
+        if not isinstance(x, Scalar):
+            return float(x * y)
         x, y = y, x
-    if _constant(y):
-        return float(x * y)
-    if _constant(x) and x == 0:
+    if not isinstance(x, Scalar) and x == 0:
         return 0.0
     (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
-    if _constant(x):
+    if not isinstance(x, Scalar):
         product = _scale(float(x), y)
     else:
         if x.index > y.index:
@@ -136,7 +137,7 @@ def multiply(x: Operand, y: Operand) -> Operand:
 def _scale(factor: float, x: Scalar) -> Scalar:
     if factor == 1:
         return x
-    if x.operation is Operation.MULTIPLY and _constant(x.operands[0]):
+    if x.operation is Operation.MULTIPLY and not isinstance(x.operands[0], Scalar):
         merged = factor * x.operands[0]
         if 1e-300 < merged < 1e300:
             return _scale(merged, x.operands[1])
@@ -145,17 +146,17 @@ def _scale(factor: float, x: Scalar) -> Scalar:
 
 def divide(x: Operand, y: Operand) -> Operand:
     """Quotient; a division by a constant becomes a multiplication by its reciprocal."""
-    if _constant(y):
-        if _constant(x):
+    if not isinstance(y, Scalar):
+        if not isinstance(x, Scalar):
             return on_constants(Operation.DIVIDE, float(x), float(y))
         reciprocal = on_constants(Operation.DIVIDE, 1.0, float(y))
         if 1e-300 < abs(reciprocal) < 1e300:
             return multiply(reciprocal, x)
         return x.graph.node(Operation.DIVIDE, x, float(y))
-    if _constant(x) and x == 0:
+    if not isinstance(x, Scalar) and x == 0:
         return 0.0
     (x_negated, x), (y_negated, y) = _magnitude(x), _magnitude(y)
-    quotient = y.graph.node(Operation.DIVIDE, float(x) if _constant(x) else x, y)
+    quotient = y.graph.node(Operation.DIVIDE, float(x) if not isinstance(x, Scalar) else x, y)
     return quotient if x_negated == y_negated else negate(quotient)
 
 
@@ -175,7 +176,7 @@ def integer_power(x: Operand, exponent: int) -> Operand:
 
 def power(x: Operand, y: Operand) -> Operand:
     """Power x^y, where a small whole or half exponent needs no call of `pow`."""
-    if _constant(y) and not _constant(x):
+    if not isinstance(y, Scalar) and isinstance(x, Scalar):
         if float(y).is_integer() and abs(y) <= 16:
             return integer_power(x, int(y))
         if y == 0.5:
@@ -185,20 +186,22 @@ def power(x: Operand, y: Operand) -> Operand:
 
 def select(condition: Operand, if_true: Operand, if_false: Operand) -> Operand:
     """if_true where the condition holds, else if_false."""
-    if _constant(condition):
+    if not isinstance(condition, Scalar):
         return if_true if condition else if_false
-    if if_true is if_false or (_constant(if_true) and _constant(if_false) and if_true == if_false):
+    if if_true is if_false or (
+        not isinstance(if_true, Scalar) and not isinstance(if_false, Scalar) and if_true == if_false
+    ):
         return if_true
     return condition.graph.node(Operation.SELECT, condition, if_true, if_false)
 
 
 def logic(operation: Operation, *operands: Operand) -> Operand:
     """Truth values combined by `AND`, `OR` or `NOT`."""
-    unknown = [x for x in operands if not _constant(x)]
+    unknown = [x for x in operands if isinstance(x, Scalar)]
     if operation is Operation.NOT:
         return apply(operation, *operands)
     decisive = operation is Operation.OR
-    if any(bool(x) is decisive for x in operands if _constant(x)):
+    if any(bool(x) is decisive for x in operands if not isinstance(x, Scalar)):
         return decisive
     if len(unknown) == 2 and unknown[0] is not unknown[1]:
         return apply(operation, *unknown)
@@ -207,15 +210,18 @@ def logic(operation: Operation, *operands: Operand) -> Operand:
 
 def apply(operation: Operation, *operands: Operand) -> Operand:
     """Any other operation; a sign moves out of an odd function and vanishes in an even one."""
-    graph = next((x.graph for x in operands if not _constant(x)), None)
-    if graph is None:
-        return on_constants(operation, *operands)
+    constants = [x for x in operands if not isinstance(x, Scalar)]
+    if len(constants) == len(operands):
+        return on_constants(operation, *constants)
+    graph = next(x.graph for x in operands if isinstance(x, Scalar))
     if operation in ODD or operation in EVEN:
         negated, x = _magnitude(operands[0])
         result = graph.node(operation, x)
         return negate(result) if negated and operation in ODD else result
     if operation in COMMUTATIVE:
-        operands = tuple(sorted(operands, key=lambda x: -1 if _constant(x) else x.index))
+        operands = tuple(
+            sorted(operands, key=lambda x: -1 if not isinstance(x, Scalar) else x.index)
+        )
         if operation in (Operation.MAXIMUM, Operation.MINIMUM) and operands[0] is operands[1]:
             return operands[0]
     return graph.node(operation, *operands)
@@ -223,23 +229,23 @@ def apply(operation: Operation, *operands: Operand) -> Operand:
 
 def is_truth(x: Operand) -> bool:
     """Whether x is a truth value, not a number."""
-    return isinstance(x, bool) if _constant(x) else x.operation in TRUTH_VALUED
+    return isinstance(x, bool) if not isinstance(x, Scalar) else x.operation in TRUTH_VALUED
 
 
 def as_number(x: Operand) -> Operand:
     """A truth value as 1 or 0; numbers stay."""
-    if _constant(x):
+    if not isinstance(x, Scalar):
         return float(x)
     return select(x, 1.0, 0.0) if x.operation in TRUTH_VALUED else x
 
 
 def as_truth(x: Operand) -> Operand:
     """A number as the truth value `x != 0`; truth values stay."""
-    if _constant(x):
+    if not isinstance(x, Scalar):
         return bool(x)
     return x if x.operation in TRUTH_VALUED else apply(Operation.NOT_EQUAL, x, 0.0)
 
 
 def is_zero(x: Operand) -> bool:
     """Whether x is the constant 0."""
-    return _constant(x) and not math.isnan(x) and x == 0
+    return not isinstance(x, Scalar) and not math.isnan(x) and x == 0

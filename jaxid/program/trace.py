@@ -8,13 +8,21 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
-from . import scalar
-from .moves import INDEXED_MOVES, MOVES, is_symbolic, move_by_index, on_numbers, scatter_add
-from .operation import COMPARISONS, FUNCTIONS, Operation
-from .program import Program, assemble
-from .scalar import Graph, Operand
+from jaxid.program import scalar
+from jaxid.program.moves import (
+    INDEXED_MOVES,
+    MOVES,
+    is_symbolic,
+    move_by_index,
+    on_numbers,
+    scatter_add,
+)
+from jaxid.program.operation import COMPARISONS, FUNCTIONS, Operation
+from jaxid.program.program import Program, assemble
+from jaxid.program.scalar import Graph, Operand
 
 
 class Free:
@@ -44,11 +52,11 @@ _INSTEAD = {
 }
 
 
-def _each(function: Callable, operands: int) -> Callable:
+def _each(function: Callable, operands: int) -> np.ufunc:
     return np.frompyfunc(function, operands, 1)
 
 
-def _operation(operation: Operation, operands: int) -> Callable:
+def _operation(operation: Operation, operands: int) -> np.ufunc:
     return _each(lambda *x: scalar.apply(operation, *x), operands)
 
 
@@ -161,6 +169,11 @@ def _entries(x: np.ndarray) -> np.ndarray:
     return x.astype(np.float64).astype(object)
 
 
+def _dtype(equation: JaxprEqn) -> np.dtype:
+    """The type of what an equation gives, if that is one array."""
+    return np.dtype(equation.outvars[0].aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """One equation on arrays of which at least one is symbolic."""
     name = equation.primitive.name
@@ -169,10 +182,10 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
     if name in ("scatter-add", "scatter_add"):
         return [scatter_add(equation, operands)]
     if name == "select_n":
-        truth = equation.outvars[0].aval.dtype == bool
+        truth = _dtype(equation).kind == "b"
         which, cases = operands[0], [_entries(x) for x in operands[1:]]
         return [(_select_truth if truth else _select_n)(which, *cases)]
-    if name in ("div", "pow") and np.issubdtype(equation.outvars[0].aval.dtype, np.integer):
+    if name in ("div", "pow") and np.issubdtype(_dtype(equation), np.integer):
         raise ValueError(f"`trace` cannot translate `{name}` of integers: use real numbers.")
     if name in _ARITHMETIC:
         parameters = equation.params if name in _WITH_PARAMETERS else {}
@@ -188,7 +201,7 @@ def _entries_of_floats(x: np.ndarray) -> np.ndarray:
 
 
 def _known(constant: object) -> np.ndarray:
-    if isinstance(constant, jax.core.Tracer):
+    if isinstance(constant, Tracer):
         raise ValueError(
             "The function given to `trace` closes over a value that JAX is tracing, which a "
             f"program cannot hold ({constant}): pass it as an input, or trace outside of `jit`."
@@ -232,7 +245,7 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.
 def _double_precision() -> AbstractContextManager:
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(True)
-    from jax.experimental import enable_x64
+    from jax.experimental import enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
     return enable_x64(True)
 

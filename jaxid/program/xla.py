@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..types import AnyArray, Array
-from .fence import AbstractFence, default_fence, fenced_nodes
-from .operation import Operation
-from .program import Program
-from .sincos import sine_cosine as polynomial_sine_cosine
+from jaxid.program.fence import AbstractFence, default_fence, fenced_nodes
+from jaxid.program.operation import Operation
+from jaxid.program.program import Program
+from jaxid.program.sincos import sine_cosine as polynomial_sine_cosine
+from jaxid.types import AnyArray, Array
 
 _JAX: dict[Operation, Callable] = {
     Operation.ADD: lambda x, y: x + y,
@@ -103,16 +103,16 @@ class Lowered(eqx.Module):
         pairs = {}
         angles = _input_angles(self.program)
         if angles:
-            rows = [entries[number][entry] for number, entry in (nodes[k].operands for k in angles)]
+            rows = [entries[number][entry] for number, entry in (nodes[k].place for k in angles)]
             sines, cosines = circular(jnp.stack(rows), anchor)
             pairs = {k: (sines[row], cosines[row]) for row, k in enumerate(angles)}
         values: list[Array] = []
         for position, node in enumerate(nodes):
             if node.operation is Operation.INPUT:
-                number, entry = node.operands
+                number, entry = node.place
                 values.append(entries[number][entry])
             elif node.operation in _CIRCULAR:
-                (angle,) = node.operands
+                (angle,) = node.uses
                 if angle not in pairs:
                     pairs[angle] = circular(values[angle], anchor)
                 values.append(pairs[angle][node.operation is Operation.COSINE])
@@ -166,7 +166,7 @@ def _entries(x: Array, shape: tuple[int, ...], batch: tuple[int, ...]) -> Array:
 
 def _input_angles(program: Program) -> list[int]:
     """Positions of the inputs of which a sine or a cosine is taken."""
-    angles = {n.operands[0]: None for n in program.nodes if n.operation in _CIRCULAR}
+    angles = {n.uses[0]: None for n in program.nodes if n.operation in _CIRCULAR}
     return [k for k in angles if program.nodes[k].operation is Operation.INPUT]
 
 
