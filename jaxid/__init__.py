@@ -50,4 +50,9 @@ from jaxid.robot.limits import Limits as Limits
 from jaxid.robot.robot import Robot as Robot
 from jaxid.robot.robot import Tool as Tool
 from jaxid.robot.urdf import load_urdf as load_urdf
+from jaxid.simulation.example import write_example as write_example
+from jaxid.simulation.virtual import VirtualRobot as VirtualRobot
+from jaxid.trajectory.fourier import FourierSeries as FourierSeries
+from jaxid.trajectory.fourier import random_fourier_series as random_fourier_series
+from jaxid.trajectory.trajectory import AbstractTrajectory as AbstractTrajectory
 from jaxid.validation.validate import validate as validate

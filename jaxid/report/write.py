@@ -8,13 +8,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
 from jaxid.report.bars import error_figure
 from jaxid.report.content import parameters, result
 from jaxid.report.estimates import parameter_figure
 from jaxid.report.style import save
 from jaxid.report.torques import torque_figure
-from jaxid.simulation.folder import written_whole
 from jaxid.validation.definiteness import Definiteness
 from jaxid.validation.errors import TorqueErrors
 

@@ -15,9 +15,9 @@ from jaxid.dynamics.terms import (
     RotorInertia,
     ViscousFriction,
 )
+from jaxid.files import written_whole
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
-from jaxid.simulation.folder import written_whole
 from jaxid.simulation.virtual import VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 

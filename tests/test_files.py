@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxid.simulation.folder import written_whole
+from jaxid.files import written_whole
 
 
 def test_nothing_is_seen_before_the_end(tmp_path):
