@@ -292,8 +292,10 @@ def test_refusals(folder, run):
     )
     (folder / "cut.csv").write_text("t,q1,q2,tau1,tau2\n0,0,0,0,0\n0.1,0,x,0,0\n")
     assert refused(run("inspect", "experiment.toml", "cut.csv"), "`cut.csv`", "line 3", "`x`")
-    (folder / "other.csv").write_text((folder / "a.csv").read_text().replace("q2", "angle2"))
-    assert refused(run("inspect", "experiment.toml", "other.csv"), "has 1 joints")
+    (folder / "other.csv").write_text(
+        (folder / "a.csv").read_text().replace("q2", "q_2").replace("tau2", "tau_2")
+    )
+    assert refused(run("inspect", "experiment.toml", "other.csv"), "`recording.angles` names 1")
     assert listing(folder) == [
         "a.csv",
         "b.csv",

@@ -36,7 +36,7 @@ from jaxid.identification.solutions import (
     Truncated,
 )
 from jaxid.identification.weights import MaximumForces, ResidualVariances
-from jaxid.measurement.columns import Columns
+from jaxid.measurement.columns import Columns, Selection
 from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
 from jaxid.measurement.filters import (
     AbstractFilter,
@@ -138,8 +138,8 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
     )
 
 
-def _selection(robot: Robot, name: str, value: str | int | list):
-    return each(robot, name, value) if isinstance(value, list) else value
+def _selection(robot: Robot, name: str, value: str | int | list) -> Selection:
+    return tuple(each(robot, name, value) or ()) if isinstance(value, list) else value
 
 
 def _units(robot: Robot, name: str, value: str | list[str]) -> Unit | list[Unit]:

@@ -21,7 +21,7 @@ class _Table(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table whose misspelt keys are refused."""
 
 
-class DhRow(_Table):
+class DhRow(_Table, frozen=True):
     """One joint of a Denavit-Hartenberg table: angles in degrees, lengths in metres."""
 
     alpha: float
@@ -32,7 +32,7 @@ class DhRow(_Table):
     name: str | None = None
 
 
-class InertiaTable(_Table):
+class InertiaTable(_Table, frozen=True):
     """Inertia tensor about the centre of mass [kg m²], with the signs of a URDF file."""
 
     xx: Magnitude
@@ -43,7 +43,7 @@ class InertiaTable(_Table):
     yz: float = 0.0
 
 
-class ToolTable(_Table):
+class ToolTable(_Table, frozen=True):
     """A known load: it is subtracted, not identified."""
 
     mass: Positive
@@ -52,7 +52,7 @@ class ToolTable(_Table):
     body: str | None = None
 
 
-class RobotTable(_Table):
+class RobotTable(_Table, frozen=True):
     """Where the robot comes from, and how it stands."""
 
     urdf: str | None = None
@@ -69,7 +69,7 @@ class RobotTable(_Table):
     tool: ToolTable | None = None
 
 
-class LimitsTable(_Table):
+class LimitsTable(_Table, frozen=True):
     """Limits that replace those of the robot's source."""
 
     angle_unit: AngleUnit = "rad"
@@ -81,7 +81,7 @@ class LimitsTable(_Table):
     force: PerJoint | None = None
 
 
-class DrivesTable(_Table):
+class DrivesTable(_Table, frozen=True):
     """Motors and gears that replace those of the robot's source."""
 
     gear_ratios: PerJoint | None = None
@@ -92,7 +92,7 @@ class DrivesTable(_Table):
     rotor_inertia: PerJoint | None = None
 
 
-class CoulombTable(_Table):
+class CoulombTable(_Table, frozen=True):
     """How dry friction passes from one direction of motion to the other."""
 
     epsilon: Positive | list[Positive] = 0.01
@@ -101,7 +101,7 @@ class CoulombTable(_Table):
     asymmetric: bool = False
 
 
-class ModelTable(_Table):
+class ModelTable(_Table, frozen=True):
     """Which effects the model has."""
 
     principal_axes: bool = False
@@ -113,7 +113,7 @@ class ModelTable(_Table):
     springs: bool = False
 
 
-class RecordingTable(_Table):
+class RecordingTable(_Table, frozen=True):
     """Which columns of a log hold what, and in which units."""
 
     angles: Group | int
@@ -138,7 +138,7 @@ class RecordingTable(_Table):
     stop: float | None = None
 
 
-class ButterworthTable(_Table, tag="butterworth", tag_field="kind"):
+class ButterworthTable(_Table, frozen=True, tag="butterworth", tag_field="kind"):
     """A Butterworth low-pass without phase, then differences."""
 
     cutoff: Positive
@@ -147,7 +147,7 @@ class ButterworthTable(_Table, tag="butterworth", tag_field="kind"):
     margin: Magnitude | None = None
 
 
-class PaperTable(_Table, tag="paper", tag_field="kind"):
+class PaperTable(_Table, frozen=True, tag="paper", tag_field="kind"):
     """The differentiating filter of first order (Eq. 25)."""
 
     velocity: Positive = 1200.0
@@ -155,7 +155,7 @@ class PaperTable(_Table, tag="paper", tag_field="kind"):
     margin: Magnitude | None = None
 
 
-class PeriodicTable(_Table, tag="periodic", tag_field="kind"):
+class PeriodicTable(_Table, frozen=True, tag="periodic", tag_field="kind"):
     """A Fourier series for periodic motions."""
 
     period: Positive
@@ -165,7 +165,7 @@ class PeriodicTable(_Table, tag="periodic", tag_field="kind"):
     margin: Magnitude | None = None
 
 
-class RowsTable(_Table):
+class RowsTable(_Table, frozen=True):
     """Which samples become rows of the least-squares problem."""
 
     every: Count | None = None
@@ -173,7 +173,7 @@ class RowsTable(_Table):
     slow: Magnitude | list[Magnitude] | None = None
 
 
-class EstimatorTable(_Table):
+class EstimatorTable(_Table, frozen=True):
     """How the rows become parameters."""
 
     kind: Literal["weighted", "least_squares"] = "weighted"
@@ -182,7 +182,7 @@ class EstimatorTable(_Table):
     ridge: Share | Literal["cross_validated"] | None = None
 
 
-class Tables(_Table):
+class Tables(_Table, frozen=True):
     """The whole file."""
 
     robot: RobotTable

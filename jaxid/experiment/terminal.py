@@ -183,10 +183,10 @@ def show_check(console: Console, robot: Robot, check: LogCheck, doubts: Iterable
     for j, name in enumerate(robot.joint_names):
         table.add_row(
             Text(name),
-            _beside(check.lowest[j], limits.position_min[j]),
-            _beside(check.highest[j], limits.position_max[j]),
-            _beside(check.speed[j], limits.velocity[j]),
-            _beside(check.force[j], forces[j]),
+            _beside(check.lowest[j], float(limits.position_min[j])),
+            _beside(check.highest[j], float(limits.position_max[j])),
+            _beside(check.speed[j], float(limits.velocity[j])),
+            _beside(check.force[j], float(forces[j])),
             f"{100 * check.standing[j]:.0f} %",
             *(() if alike else (f"{robot.joint_unit(j)}, {robot.force_unit(j)}",)),
         )
@@ -198,7 +198,7 @@ def show_check(console: Console, robot: Robot, check: LogCheck, doubts: Iterable
 
 
 def _beside(value: float, limit: float) -> Text:
-    shown = significant(float(limit)) if np.isfinite(limit) else MISSING
+    shown = significant(limit) if np.isfinite(limit) else MISSING
     return Text.assemble(significant(float(value)), (f" ({shown})", "dim"))
 
 
