@@ -38,7 +38,9 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-ExperimentFile = Annotated[Path, typer.Argument(help="The experiment file (TOML).")]
+ExperimentFile = Annotated[
+    Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
+]
 
 
 class SpreadVerify(TyperCommand):
@@ -115,18 +117,34 @@ def _options(
 
 @app.command()
 def init(
-    urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.")],
+    urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.", metavar="ARM.URDF")],
+    tip: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LINK", help="The end-effector: take only the chain that leads to it."
+        ),
+    ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(metavar="LINK", help="What stands on the ground; the root if left."),
+    ] = None,
 ) -> None:
-    """Write a commented experiment file for a robot: jaxid init arm.urdf > experiment.toml."""
-    typer.echo(write_template(urdf), nl=False)
+    """Print a commented experiment file for a robot.
+
+    Like this: jaxid init arm.urdf > experiment.toml
+    """
+    typer.echo(write_template(urdf, tip=tip, base=base), nl=False)
 
 
 @app.command()
 def example(
-    folder: Annotated[Path, typer.Argument(help="Where the files shall lie.")],
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    folder: Annotated[Path, typer.Argument(help="Where the files shall lie.", metavar="DIR")],
+    seed: Annotated[int, typer.Option(metavar="N", help="Of parameters, motion and noise.")] = 0,
 ) -> None:
-    """Write an experiment file and two logs of a virtual robot to try things on."""
+    """Write an experiment to try things on.
+
+    An experiment file and two logs of a virtual robot whose parameters are known.
+    """
     from jaxid.simulation.example import write_example
 
     console = _console()
@@ -147,9 +165,15 @@ def example(
 @app.command()
 def inspect(
     experiment: ExperimentFile,
-    logs: Annotated[list[Path] | None, typer.Argument(help="Logs to look at.")] = None,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(help="Logs to look at.", metavar="LOG")
+    ] = None,
 ) -> None:
-    """Show the joints, what can be identified, and whether a log is sane."""
+    """Show what can be identified, and if logs are sane.
+
+    Joints, motors and limits; base parameters and what becomes of each standard parameter; ranges,
+    speeds and forces of each log beside the limits, and what the log does not determine.
+    """
     console = _console()
     loaded = load_experiment(experiment)
     paths = logs or []
@@ -181,10 +205,15 @@ def _look(experiment: Experiment, path: Path, stage):
 @app.command(cls=SpreadVerify)
 def identify(
     experiment: ExperimentFile,
-    logs: Annotated[list[Path], typer.Argument(help="Logs to identify with, fitted together.")],
+    logs: Annotated[
+        list[Path],
+        typer.Argument(help="Logs to identify with, fitted together.", metavar="LOG"),
+    ],
     verify: Annotated[
         list[Path] | None,
-        typer.Option("--verify", help="Logs to verify with, which the fit does not see."),
+        typer.Option(
+            "--verify", metavar="LOG...", help="Logs to verify with, which the fit does not see."
+        ),
     ] = None,
     split: Annotated[
         float | None,
@@ -194,14 +223,17 @@ def identify(
             help="Identify with the first part F of every log, of 1; verify with the rest.",
         ),
     ] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the report.")] = Path(
-        "report"
-    ),
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the report.")
+    ] = Path("report"),
     force: Annotated[
         bool, typer.Option("--force", help="Write into a folder that holds other files too.")
     ] = False,
 ) -> None:
-    """Estimate the parameters from logs, with uncertainty and torque errors; write a report."""
+    """Estimate the parameters and write a report.
+
+    With their uncertainty, what the logs do not determine, torque errors and figures.
+    """
     console = _console()
     if split is not None and not 0 < split < 1:
         raise ValueError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")

@@ -487,7 +487,9 @@ def test_logs_that_do_not_fit_the_file(load, tmp_path):
     log = tmp_path / "run.csv"
     rows = "\n".join(f"{0.01 * i},{i},{i},{i},1,1,1" for i in range(100))
     log.write_text("t,q1,q2,q3,tau1,tau2,tau3\n" + rows)
-    with pytest.raises(ValueError, match=r"`recording.angles` names 3 columns of `run.csv`, but"):
+    with pytest.raises(
+        ValueError, match=r"`recording.angles` names 3 of the columns of `run.csv`, but"
+    ):
         load(ARM + RECORDING).read(log)
     with pytest.raises(ValueError, match=r"`run.csv` has no column `pos1` for `angles`"):
         load(ARM + RECORDING.replace("q{}", "pos{}")).read(log)
@@ -553,3 +555,27 @@ def test_the_template_documents_every_key():
 def test_the_template_of_a_missing_urdf(tmp_path):
     with pytest.raises(FileNotFoundError):
         write_template(tmp_path / "none.urdf")
+
+
+def test_the_template_keeps_the_chosen_chain(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    path = tmp_path / "experiment.toml"
+    path.write_text(write_template(tmp_path / "arm.urdf", tip="cart", base="base", folder=tmp_path))
+    experiment = load_experiment(path)
+    assert experiment.robot.joint_names == ("rail",)
+    assert experiment.columns.angle_unit == units.M
+
+
+def test_the_template_breaks_long_lists(tmp_path):
+    joints = "".join(
+        f'<link name="l{i}"/><joint name="turning_joint_{i}" type="revolute">'
+        f'<parent link="l{i - 1}"/><child link="l{i}"/><axis xyz="0 0 1"/>'
+        f'<limit lower="{-i - 1 / 3}" upper="{i + 1 / 7}" velocity="1" effort="2"/></joint>'
+        for i in range(1, 31)
+    )
+    (tmp_path / "snake.urdf").write_text(f'<robot name="snake"><link name="l0"/>{joints}</robot>')
+    path = tmp_path / "experiment.toml"
+    path.write_text(write_template(tmp_path / "snake.urdf", folder=tmp_path))
+    assert max(map(len, path.read_text().splitlines())) <= 100
+    low = load_experiment(path).robot.limits.position_min
+    np.testing.assert_array_equal(low, [-i - 1 / 3 for i in range(1, 31)])

@@ -91,8 +91,9 @@ class Experiment:
         )
         if recording.joints != self.robot.joints:
             raise ValueError(
-                f"{self.path.name}: `recording.angles` names {recording.joints} columns of "
-                f"`{log.name}`, but the robot `{self.robot.name}` has {self.robot.joints} joints: "
+                f"{self.path.name}: `recording.angles` names {recording.joints} of the "
+                f"columns of `{log.name}`, but the robot `{self.robot.name}` has "
+                f"{self.robot.joints} joints: "
                 "name one column for each joint, or choose another robot (`robot.tip`)."
             )
         if table.start is None and table.stop is None:

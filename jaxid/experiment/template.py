@@ -26,8 +26,8 @@ _TEMPLATE = """\
 
 [robot]
 urdf = {urdf}
-# tip = {tip}      # link of the end-effector: only the chain from `base` to it
-# base = {base}    # link that stands on the ground
+{tip}      # link of the end-effector: only the chain from `base` to it
+{base}    # link that stands on the ground
 # gravity = [0.0, 0.0, -9.81]         # in the frame of the ground [m/s²]
 # base_rotation = [0.0, 0.0, 0.0]     # of the robot on the ground: roll, pitch, yaw [deg]
 # base_position = [0.0, 0.0, 0.0]     # [m]
@@ -133,28 +133,38 @@ kind = "weighted"                     # or "least_squares": every newton metre c
 """
 
 
-def write_template(urdf: str | Path, *, folder: str | Path = ".") -> str:
+def write_template(
+    urdf: str | Path,
+    *,
+    tip: str | None = None,
+    base: str | None = None,
+    folder: str | Path = ".",
+) -> str:
     """Writes a complete commented experiment file for a robot; it loads again as it is.
 
     Args:
         urdf: The robot's URDF file.
+        tip: Link of the end-effector; the end of the longest chain if None.
+        base: Link that stands on the ground; the root if None.
         folder: Where the experiment file is going to lie: the URDF's path is relative to it.
 
     Raises:
         FileNotFoundError: If the URDF file does not exist.
         ValueError: If it cannot be loaded.
     """
-    robot = load_urdf(urdf)
+    robot = load_urdf(urdf, tip=tip, base=base)
     path = os.path.relpath(Path(urdf).resolve(), Path(folder).resolve())
-    return render(robot, Path(path).as_posix())
+    return render(robot, Path(path).as_posix(), tip, base)
 
 
-def render(robot: Robot, urdf: str) -> str:
+def render(robot: Robot, urdf: str, tip: str | None = None, base: str | None = None) -> str:
     """The file for a robot that a URDF file describes.
 
     Args:
         robot: As it was loaded.
         urdf: Path of the URDF file, as it is written into the file.
+        tip: Link of the end-effector, if it was chosen.
+        base: Link that stands on the ground, if it was chosen.
     """
     n = robot.joints
     slides = not all(robot.revolute)
@@ -170,8 +180,8 @@ def render(robot: Robot, urdf: str) -> str:
             name=robot.name.replace("\n", " "),
             file="experiment.toml",
             urdf=_text(urdf),
-            tip=_text("flange"),
-            base=_text("base_link"),
+            tip=f"tip = {_text(tip)}" if tip else '# tip = "flange"',
+            base=f"base = {_text(base)}" if base else '# base = "base_link"',
             builtin="tx90l_on_rail, tx40, ur10, ur10e, panda,",
             last=_text(robot.joint_names[-1]),
             joints_said=_wrapped(joints),
@@ -199,7 +209,22 @@ def _aligned(text: str) -> str:
             lines.append(f"{found[1]:<{_COMMENT}}# {found[2]}")
         else:
             lines += [f"# {found[2]}:", found[1]]
-    return "\n".join(lines) + "\n"
+    return "\n".join(part for line in lines for part in _broken(line)) + "\n"
+
+
+def _broken(line: str) -> list[str]:
+    """A list that is too long for its line takes several."""
+    found = re.fullmatch(r"(#? ?)(\w+ = \[)(.*)\]", line)
+    if found is None or len(line) <= _WIDTH:
+        return [line]
+    mark, opening, content = found.groups()
+    lines, row = [mark + opening], ""
+    for item in content.split(", "):
+        if len(row) + len(item) > _WIDTH - 8:
+            lines.append(f"{mark}  {row.rstrip()}")
+            row = ""
+        row += f"{item}, "
+    return [*lines, f"{mark}  {row.rstrip()}", f"{mark}]"]
 
 
 def _limits(robot: Robot) -> str:
