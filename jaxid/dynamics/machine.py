@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxid.program import Program, evaluate, lower, trace
 from jaxid.types import AnyArray, Array
@@ -86,7 +87,7 @@ def on_samples(
     shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in flat))
     machine = machines(owner, definition, *shapes)
     arguments = (*shared, *(x.T for x in flat))
-    if count <= FEW and not any(isinstance(x, jax.core.Tracer) for x in arguments):
+    if count <= FEW and not any(isinstance(x, Tracer) for x in arguments):
         out = jnp.asarray(evaluate(machine.program, *arguments), _precision(arguments))
     else:
         out = machine.compiled(*arguments)
@@ -109,7 +110,7 @@ def in_numpy(
 
 
 def _is_traced(owner: eqx.Module) -> bool:
-    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(owner))
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(owner))
 
 
 def _precision(arguments: tuple[AnyArray, ...]) -> Any:

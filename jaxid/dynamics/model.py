@@ -1,5 +1,8 @@
 """A model: a robot and the terms of its equations of motion, linear in the parameters."""
 
+from functools import reduce
+from operator import add
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -89,12 +92,12 @@ class Model(eqx.Module):
     def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
         """The generalized forces of one sample, as they are defined (Eqs. 11, 15)."""
         parts = zip(self.terms, self.split(p), strict=True)
-        return sum(t.forces(self.robot, x, q, qd, qdd) for t, x in parts)
+        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in parts))
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
         """The mass matrix of one sample, as it is defined (Eq. 38)."""
         parts = zip(self.terms, self.split(p), strict=True)
-        return sum(t.mass_matrix(self.robot, x, q) for t, x in parts)
+        return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in parts))
 
     def bias(self, p, q, qd) -> Float[AnyArray, " joints"]:
         """The bias forces of one sample, as they are defined (Eq. 38)."""
@@ -103,7 +106,7 @@ class Model(eqx.Module):
     def potential(self, p, q) -> Float[AnyArray, ""]:
         """The potential energy of one sample, as it is defined."""
         parts = zip(self.terms, self.split(p), strict=True)
-        return sum(t.potential_columns(self.robot, q) @ x for t, x in parts)
+        return reduce(add, (t.potential_columns(self.robot, q) @ x for t, x in parts))
 
     def known_forces(self, q, qd, qdd) -> Float[AnyArray, " joints"]:
         """The generalized forces of the known tool at one sample [N m or N]."""

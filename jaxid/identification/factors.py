@@ -38,7 +38,7 @@ class JointFactor(eqx.Module):
 
     def joined(self, rows: Float[AnyArray, "height width"]) -> "JointFactor":
         """The factor after more rows `[columns, forces]`."""
-        R = np.linalg.qr(np.vstack([self.R, rows]), mode="r")
+        R = np.asarray(np.linalg.qr(np.vstack([self.R, rows]), mode="r"))
         return JointFactor(self.columns, R, self.rows + len(rows))
 
     def residual_square(self, p: Float[AnyArray, " base"]) -> float:
@@ -89,7 +89,8 @@ class Factors(eqx.Module):
             block[:, list(joint.columns)] = R[:, :-1]
             blocks.append(block)
             forces.append(R[:, -1])
-        R = np.linalg.qr(np.column_stack([np.vstack(blocks), np.concatenate(forces)]), mode="r")
+        stacked = np.column_stack([np.vstack(blocks), np.concatenate(forces)])
+        R = np.asarray(np.linalg.qr(stacked, mode="r"))
         return R[:, :-1], R[:, -1]
 
     def residual_squares(self, p: Float[AnyArray, " base"]) -> Float[np.ndarray, " joints"]:

@@ -23,7 +23,7 @@ def turn(axis: Float[AnyArray, "3"], q: Float[AnyArray, ""]) -> Float[AnyArray, 
     The part of a vector along the axis stays and the rest turns: in this wording a constant axis
     leaves the fewest operations.
     """
-    along = jnp.outer(axis, axis)
+    along = axis[:, None] * axis[None, :]
     return along + jnp.cos(q) * (np.eye(3) - along) + jnp.sin(q) * skew(axis)
 
 
