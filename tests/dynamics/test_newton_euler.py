@@ -23,8 +23,8 @@ def _expected(tree, parameters, motion):
 
 @pytest.fixture(scope="module")
 def forces():
-    """The package's forces of rigid bodies, compiled once."""
-    return trees.compiled(Model(TREE.robot(), BODIES).inverse_dynamics)
+    """The package's forces of rigid bodies."""
+    return Model(TREE.robot(), BODIES).inverse_dynamics
 
 
 @pytest.mark.parametrize("tree", [TREE, trees.random_tree(5, 6)])
@@ -32,7 +32,7 @@ def test_regressor_times_parameters_is_newton_euler(tree):
     rng = np.random.default_rng(1)
     p = trees.standard_parameters(trees.random_bodies(rng, tree.joints))
     motion = trees.random_motion(rng, 6, tree.joints)
-    theta = trees.compiled(Model(tree.robot(), BODIES).regressor)(Motion(*motion))
+    theta = Model(tree.robot(), BODIES).regressor(Motion(*motion))
     assert trees.relative(theta @ p.ravel(), _expected(tree, p, motion)) < 1e-13
 
 
@@ -76,7 +76,7 @@ def test_tool_forces_are_newton_euler_of_the_tool(point_mass):
     alone[2] = np.array([m, *(m * c), *np.diag(J), -J[1, 2], -J[0, 2], -J[0, 1]])
     expected = _expected(TREE, alone, motion)
 
-    found = trees.compiled(Model(TREE.robot(tool=tool)).tool_forces)(Motion(*motion))
+    found = Model(TREE.robot(tool=tool)).tool_forces(Motion(*motion))
     assert trees.relative(found, expected) < 1e-13
     assert np.abs(expected[:, :3]).min() > 0
     np.testing.assert_array_equal(found[:, 3:], 0.0)
@@ -96,7 +96,7 @@ def test_known_tool_is_apart_from_the_models_own_forces(forces):
     p = rng.normal(size=(TREE.joints, 10))
     heavier = p.copy()
     heavier[4] += load.parameters
-    own = trees.compiled(carrying.inverse_dynamics)(p.ravel(), motion)
+    own = carrying.inverse_dynamics(p.ravel(), motion)
     np.testing.assert_array_equal(own, forces(p.ravel(), motion))
-    total = own + trees.compiled(carrying.tool_forces)(motion)
+    total = own + carrying.tool_forces(motion)
     assert trees.relative(total, forces(heavier.ravel(), motion)) < 1e-13
