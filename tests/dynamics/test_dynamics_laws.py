@@ -23,7 +23,7 @@ from jaxid.robot.drives import Drives
 N, SAMPLES, EPSILON = 4, 6, 0.05
 TREE = trees.Tree(
     (-1, 0, 1, 1),
-    (True, False, True, True),
+    (True, True, False, True),
     *trees.geometry(np.random.default_rng(31), N),
     np.array([2.0, -4.0, -8.0]),
 )
