@@ -20,8 +20,11 @@ from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
 from jaxid.experiment.sanity import check_log, negative_friction
 from jaxid.experiment.template import write_template
+from jaxid.identification.factors import factorise
+from jaxid.identification.identify import fit_blocks
 from jaxid.identification.identify import identify as estimate
 from jaxid.measurement.observations import Observations
+from jaxid.report.content import Beside
 from jaxid.report.write import write_report
 from jaxid.validation.validate import validate
 
@@ -250,9 +253,14 @@ def identify(
         stage("finding base parameters")
         base = loaded.base
         stage("factorising the rows")
-        fit = estimate(base, fitted, loaded.estimator)
+        blocks = factorise(base, fitted)
+        fit = fit_blocks(base, blocks, loaded.estimator, tuple(o.name for o in fitted))
         stage("predicting torques")
         found = validate(fit, [*fitted, *checked])
+        beside = None
+        if loaded.regularised or fit.undetermined:
+            other = loaded.other_estimator
+            beside = Beside.of(fit_blocks(base, blocks, other, fit.recordings), [*fitted, *checked])
         stage("writing the report")
         logs_said = [n for o in (*fitted, *checked) for n in o.notes]
         files = write_report(
@@ -272,6 +280,7 @@ def identify(
                 "slow": loaded.slow,
             },
             (*loaded.notes, *dict.fromkeys(logs_said)),
+            beside,
         )
     terminal.show_robot(console, loaded)
     console.print()
@@ -282,6 +291,8 @@ def identify(
     terminal.show_undetermined(console, fit, loaded.regularised)
     terminal.sentences(console, negative_friction(fit), terminal.DOUBTFUL, "!")
     terminal.show_validation(console, loaded.robot, found, len(fitted))
+    if beside is not None:
+        terminal.show_beside(console, fit, found.errors, beside)
     terminal.show_files(console, output, [p.name for p in files])
 
 

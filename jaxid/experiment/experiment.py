@@ -19,7 +19,8 @@ from jaxid.experiment.method_tables import (
 from jaxid.experiment.reading import read_tables
 from jaxid.experiment.robot_tables import build_robot, within
 from jaxid.experiment.tables import RecordingTable
-from jaxid.identification.estimators import AbstractEstimator
+from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
+from jaxid.identification.solutions import Complete, CrossValidated
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
 from jaxid.measurement.filters import AbstractFilter
@@ -58,7 +59,7 @@ class Experiment:
     filter: AbstractFilter
     decimation: AbstractDecimation
     slow: Float[np.ndarray, " joints"] | None
-    estimator: AbstractEstimator
+    estimator: LeastSquares | WeightedLeastSquares
     regularised: bool
     notes: tuple[str, ...]
 
@@ -66,6 +67,16 @@ class Experiment:
     def base(self) -> BaseParameters:
         """The base parameters of the model, found when they are first asked for."""
         return base_parameters(self.model)
+
+    @property
+    def other_estimator(self) -> LeastSquares | WeightedLeastSquares:
+        """What the estimator is compared with where logs do not determine everything.
+
+        Plain least squares beside an estimator that keeps undecided parameters small, and the
+        other way round.
+        """
+        other = Complete() if self.regularised else CrossValidated()
+        return dataclasses.replace(self.estimator, solution=other)
 
     def read(self, log: str | Path) -> Recording:
         """Reads a log as the file's table `[recording]` says.

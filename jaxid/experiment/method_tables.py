@@ -27,7 +27,7 @@ from jaxid.experiment.tables import (
     RecordingTable,
     RowsTable,
 )
-from jaxid.identification.estimators import AbstractEstimator, LeastSquares, WeightedLeastSquares
+from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.solutions import (
     AbstractSolution,
     Complete,
@@ -198,7 +198,9 @@ def build_slow(table: RowsTable, robot: Robot) -> Float[np.ndarray, " joints"] |
     return np.broadcast_to(_number_or_each(robot, "slow", table.slow), (robot.joints,)) + 0.0
 
 
-def build_estimator(table: EstimatorTable, robot: Robot) -> tuple[AbstractEstimator, list[str]]:
+def build_estimator(
+    table: EstimatorTable, robot: Robot
+) -> tuple[LeastSquares | WeightedLeastSquares, list[str]]:
     """The estimator, and what is assumed.
 
     Raises:

@@ -1,6 +1,6 @@
 """What the commands show in the terminal: tables with units, and sentences."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,16 @@ from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.sanity import LogCheck, known_forces
 from jaxid.identification.fit import Fit
+from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
+from jaxid.report.content import Beside
 from jaxid.report.estimates import DOUBTFUL as DOUBTFUL_SHARE
 from jaxid.report.estimates import TRUSTED
 from jaxid.report.numbers import MISSING, aligned, percent, significant
 from jaxid.report.tables import error_table, joint_table, parameter_table
 from jaxid.robot.robot import Robot
+from jaxid.validation.errors import TorqueErrors
 from jaxid.validation.validate import Validation
 
 GOOD, DOUBTFUL, BAD = "green", "yellow", "red"
@@ -308,6 +311,27 @@ def show_validation(console: Console, robot: Robot, found: Validation, identific
             "simulate or control with this model where the joints were not moved."
         )
         sentences(console, [text], BAD, "✗")
+
+
+def show_beside(console: Console, fit: Fit, errors: Sequence[TorqueErrors], beside: Beside) -> None:
+    """What another way to solve the same equations leaves on each recording."""
+    heading(console, "solved otherwise: RMS error in percent of the RMS force, mean of the joints")
+    table = plain_table("")
+    table.title = None
+    table.add_column("recording")
+    table.add_column(f"this fit ({solution_name(fit.solution)})", justify="right")
+    table.add_column(solution_name(beside.solution), justify="right")
+    for own, other in zip(errors, beside.errors, strict=True):
+        shares = (float(np.mean(e.rms_relative)) for e in (own, other))
+        table.add_row(own.name, *(percent(share) for share in shares))
+    show_table(console, table)
+
+
+def solution_name(solution: AbstractSpectralSolution) -> str:
+    """A solution in words."""
+    share = getattr(solution, "share", None)
+    name = "plain least squares" if share is None else type(solution).__name__.lower()
+    return name if share is None else f"{name} {share:.2g}"
 
 
 def show_files(console: Console, folder: Path, names: Iterable[str]) -> None:

@@ -5,6 +5,7 @@ import importlib.metadata
 import math
 import platform
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -12,12 +13,32 @@ import numpy as np
 
 from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.fit import Fit
+from jaxid.identification.solutions import AbstractSpectralSolution
+from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 from jaxid.validation.definiteness import Definiteness
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation.errors import TorqueErrors, torque_errors
 
 SCHEMA = "jaxid-result/1"
 DISTRIBUTION = "jaxid-robotics"
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Another way to solve the same equations, to be shown beside a fit.
+
+    Attributes:
+        solution: The way.
+        errors: What it leaves on the same recordings.
+    """
+
+    solution: AbstractSpectralSolution
+    errors: tuple[TorqueErrors, ...]
+
+    @classmethod
+    def of(cls, fit: Fit, observations: Sequence[Observations]) -> "Beside":
+        """Judges another fit on some recordings."""
+        return cls(fit.solution, tuple(torque_errors(fit, o) for o in observations))
 
 
 def plain(value: Any) -> Any:
@@ -44,6 +65,7 @@ def result(
     definiteness: Definiteness,
     settings: Mapping[str, Any],
     notes: Sequence[str],
+    beside: Beside | None = None,
 ) -> dict[str, Any]:
     """Everything that was found, ready for JSON."""
     base, model, robot = fit.base, fit.base.model, fit.base.model.robot
@@ -92,8 +114,13 @@ def result(
                 "indefinite_share": definiteness.indefinite,
                 "poses": definiteness.poses,
             },
+            "beside": beside
+            and {
+                "solution": str(beside.solution),
+                "errors": [_errors(e, robot) for e in beside.errors],
+            },
             "settings": settings,
-            "notes": (*robot.notes, *base.notes, *fit.notes, *notes),
+            "notes": tuple(dict.fromkeys((*robot.notes, *fit.notes, *notes))),
         }
     )
 

@@ -11,7 +11,7 @@ from typing import Any
 from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
 from jaxid.report.bars import error_figure
-from jaxid.report.content import parameters, result
+from jaxid.report.content import Beside, parameters, result
 from jaxid.report.estimates import parameter_figure
 from jaxid.report.style import save
 from jaxid.report.torques import torque_figure
@@ -29,6 +29,7 @@ def write_report(
     definiteness: Definiteness,
     settings: Mapping[str, Any],
     notes: tuple[str, ...] = (),
+    beside: Beside | None = None,
 ) -> list[Path]:
     """Writes `result.json`, `parameters.csv` and the figures, all of them or nothing.
 
@@ -43,6 +44,7 @@ def write_report(
         definiteness: Of the mass matrix.
         settings: How the result came about, for the record.
         notes: What the reader should know, in sentences.
+        beside: Another way to solve the same equations.
 
     Returns:
         The files.
@@ -52,7 +54,7 @@ def write_report(
     """
     robot = fit.base.model.robot
     named = _file_names(identification, verification)
-    content = result(fit, identification, verification, definiteness, settings, notes)
+    content = result(fit, identification, verification, definiteness, settings, notes, beside)
     names = ["result.json", "parameters.csv", "errors.png", "parameters.png"]
     names += [file for file, _, _ in named]
     content["files"] = names
