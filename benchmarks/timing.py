@@ -1,0 +1,199 @@
+"""How the benchmarks measure: interleaved medians, facts of the machine, physical floors.
+
+    python benchmarks/timing.py [--quick]     # prints the machine and its floors
+
+It is read before JAX is imported, since threads and devices are chosen then.
+"""
+
+import datetime
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+REPOSITORY = HERE.parent
+sys.path.insert(0, str(REPOSITORY))
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+SHORTEST = 5e-3
+"""One turn of a case lasts at least this long [s]: shorter cases are called several times."""
+PEERS = ("pin", "figaroh", "frax")
+
+
+def pin_to(cores: int) -> None:
+    """Gives this process so many cores, and its libraries as many threads. Before importing JAX."""
+    for name in THREADS:
+        os.environ[name] = str(cores)
+    if hasattr(os, "sched_setaffinity"):
+        allowed = sorted(os.sched_getaffinity(0))
+        # Interrupts and other people's work gather on the first core.
+        os.sched_setaffinity(0, allowed[-cores:])
+    if cores == 1:
+        flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
+    os.environ["JAX_ENABLE_X64"] = "1"
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds for one call, of all turns."""
+
+    turns: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.turns)
+
+    @property
+    def best(self) -> float:
+        return min(self.turns)
+
+    def __truediv__(self, other: "Times") -> float:
+        """How many times longer: the median of the ratios turn by turn, so that load cancels."""
+        return statistics.median(a / b for a, b in zip(self.turns, other.turns, strict=True))
+
+
+def interleaved(cases: dict[str, Callable[[], object]], turns: int) -> dict[str, Times]:
+    """Times all cases in turn, again and again, after warming each of them up.
+
+    A case must block until its result is there.
+    """
+    calls = {}
+    for name, case in cases.items():
+        case()
+        case()
+        start = time.perf_counter()
+        case()
+        calls[name] = max(1, round(SHORTEST / (time.perf_counter() - start + 1e-9)))
+    seconds = {name: [] for name in cases}
+    for _ in range(turns):
+        for name, case in cases.items():
+            start = time.perf_counter()
+            for _ in range(calls[name]):
+                case()
+            seconds[name].append((time.perf_counter() - start) / calls[name])
+    return {name: Times(tuple(values)) for name, values in seconds.items()}
+
+
+def elapsed(work: Callable[[], object]) -> tuple[object, float]:
+    """What some work returns, and how long it took once [s]."""
+    start = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - start
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: what was asked and what was measured, in words and one number."""
+
+    number: str
+    what: str
+    recipe: str
+    asked: str
+    measured: str
+    holds: bool | None = None
+
+
+def hand_over(rows: list[Row], path: str | None) -> None:
+    """Prints rows, and writes them where `run.py` reads them."""
+    for row in rows:
+        print(f"[{row.number}] {row.what}: {row.measured}; asked {row.asked}\n    {row.recipe}")
+    if path is not None:
+        Path(path).write_text(json.dumps([asdict(row) for row in rows]))
+
+
+def at_least(ratio: float, target: float) -> bool:
+    return ratio >= target
+
+
+def version(package: str) -> str | None:
+    """Version of an installed package, or None."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def missing(module: str) -> str | None:
+    """A sentence if a peer cannot be imported, else None: peers are skipped by name."""
+    if importlib.util.find_spec(module) is None:
+        return f"`{module}` is not installed: skipped"
+    return None
+
+
+def machine() -> dict[str, str]:
+    """What the figures depend on."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    features = ""
+    if info.exists():
+        lines = dict(
+            map(str.strip, line.split(":", 1))
+            for line in info.read_text().split("\n\n")[0].splitlines()
+            if ":" in line
+        )
+        model = lines.get("model name", model)
+        features = " with AVX-512" if "avx512f" in lines.get("flags", "") else ""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    packages = [f"{p} {version(p)}" for p in ("jax", "numpy", *PEERS) if version(p)]
+    load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+    return {
+        "date": datetime.date.today().isoformat(),
+        "machine": f"{model}{features}, {cores} cores",
+        "load when the run began": load,
+        "system": f"{platform.system()} {platform.machine()}",
+        "versions": f"Python {platform.python_version()}, " + ", ".join(packages),
+        "compiler": compiler(),
+    }
+
+
+def compiler() -> str:
+    try:
+        return subprocess.run(
+            ["g++", "--version"], capture_output=True, text=True, check=True
+        ).stdout.splitlines()[0]
+    except (OSError, subprocess.CalledProcessError):
+        return "none"
+
+
+def fill(doubles: int, samples: int) -> Callable[[], object]:
+    """The floor of every result: writing as many doubles to memory that is already mapped."""
+    import numpy as np
+
+    memory = np.ones((doubles, samples))
+    return lambda: memory.fill(0.5)
+
+
+def flop_rate(turns: int = 5) -> float:
+    """Multiplications and additions per second in a product of two matrices."""
+    import numpy as np
+
+    size = 768
+    a = np.random.default_rng(0).random((size, size))
+    out = np.empty_like(a)
+    times = interleaved({"product": lambda: np.matmul(a, a, out=out)}, turns)["product"]
+    return 2 * size**3 / times.median
+
+
+def main():
+    quick = "--quick" in sys.argv
+    pin_to(1)
+    samples = 1024 if quick else 2048
+    for name, value in machine().items():
+        print(f"{name}: {value}")
+    times = interleaved({"fill": fill(255, samples)}, 5 if quick else 21)["fill"]
+    print(f"warm fill of 255 doubles: {times.median / samples * 1e9:.0f} ns, one core")
+    print(f"product of matrices: {flop_rate() / 1e9:.0f} Gflop/s, one core")
+
+
+if __name__ == "__main__":
+    main()
