@@ -13,7 +13,10 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import acting_columns, regressor_rows, tool_forces
+from jaxid.dynamics.compiled import acting_columns
+from jaxid.identification.kernel import CHUNK as SAMPLES
+from jaxid.identification.reduction import reduced
+from jaxid.identification.streaming import Stream, suits
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Float
 
@@ -139,7 +142,8 @@ def factorise(
 ) -> Blocks:
     """Reduces observations to the factors of their joints, by blocks of time (Eq. 26).
 
-    Columns are evaluated at the full rate and filtered like the forces, chunk by chunk.
+    Columns are evaluated at the full rate and filtered like the forces, chunk by chunk: in NumPy,
+    or for long logs by a compiled loop, with the same result up to rounding.
 
     Args:
         base: The base parameters.
@@ -152,6 +156,9 @@ def factorise(
         counted = np.flatnonzero(mask.any(axis=1))
         edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
         edges = [0, *edges[1:], observations.rows]
+        if suits(observations):
+            parts += streamed(base, observations, edges)
+            continue
         factors = [empty(base) for _ in edges[1:]]
         for rows, columns, forces in reduced_rows(base, observations):
             for k, (first, last) in enumerate(itertools.pairwise(edges)):
@@ -161,6 +168,28 @@ def factorise(
                     factors[k] = _joined(factors[k], columns, forces, mask[rows], part)
         parts += factors
     return Blocks(tuple(parts))
+
+
+def streamed(
+    base: BaseParameters, observations: Observations, edges: Sequence[int], chunk: int = SAMPLES
+) -> list[Factors]:
+    """The factors of blocks of time by the compiled loop, for logs of any length.
+
+    Args:
+        base: The base parameters.
+        observations: What was measured.
+        edges: Rows at which the blocks begin, and the last one ends.
+        chunk: Samples of an iteration of the loop.
+    """
+    mask = np.asarray(observations.mask)
+    acting = acting_columns(base)
+    triangles = Stream(base, observations, edges, chunk).triangles()
+    found = []
+    for R, (first, last) in zip(triangles, itertools.pairwise(edges), strict=True):
+        rows = mask[first:last].sum(axis=0)
+        joints = zip(acting, R, rows, strict=True)
+        found.append(Factors(tuple(JointFactor(c, r, int(n)) for c, r, n in joints), base.size))
+    return found
 
 
 def _joined(
@@ -188,10 +217,4 @@ def reduced_rows(base: BaseParameters, observations: Observations, samples: int 
         [rows, joints] in [N m] or [N].
     """
     for chunk in observations.chunks(samples):
-        part = slice(*chunk.samples)
-        motion = observations.motion[part]
-        forces = np.asarray(observations.forces)[part]
-        if base.model.robot.tool is not None:
-            forces = forces - tool_forces(base, motion)
-        columns = [chunk.reduce(theta) for theta in regressor_rows(base, motion)]
-        yield slice(*chunk.rows), columns, chunk.reduce(forces)
+        yield slice(*chunk.rows), *reduced(base, observations, chunk)

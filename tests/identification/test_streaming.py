@@ -1,0 +1,180 @@
+"""The compiled pass over long logs gives what NumPy's QR gives, and chunks change only rounding."""
+
+import itertools
+import math
+
+import equinox as eqx
+import numpy as np
+import pytest
+from virtual import dense, motion, observations, standard_parameters
+
+import jaxid as jid
+from jaxid.identification import streaming
+from jaxid.identification.factors import Blocks, factorise, streamed
+from jaxid.identification.identify import fit_blocks
+from jaxid.identification.response import response
+from jaxid.robot.robot import Robot
+
+WEIGHTS = np.array([0.3, 2.0])
+SMOOTH = jid.ZeroPhaseButterworth(100.0, margin=0.01)
+
+
+def planar(**known) -> Robot:
+    return jid.robots.planar_arm(2, 0.4).replace(**known)
+
+
+def based(robot: Robot) -> jid.BaseParameters:
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
+    return jid.base_parameters(jid.Model(robot, terms))
+
+
+@pytest.fixture(scope="module")
+def base():
+    return based(planar())
+
+
+def observed(base, samples=6000, noise=0.3, **options) -> jid.Observations:
+    return observations(
+        base.model, standard_parameters(base.model), samples=samples, noise=noise, **options
+    )
+
+
+def changed(o: jid.Observations, **fields) -> jid.Observations:
+    """Other observations of the same samples, of which four fifths of the rows count."""
+    o = jid.Observations(**{**vars(o), **fields})
+    mask = np.random.default_rng(1).random((len(o.instants), o.joints)) < 0.8
+    return eqx.tree_at(lambda x: x.mask, o, mask)
+
+
+def fast(base, o, blocks=4, chunk=2048) -> Blocks:
+    counted = np.flatnonzero(np.asarray(o.mask).any(axis=1))
+    edges = [int(part[0]) for part in np.array_split(counted, blocks)]
+    return Blocks(tuple(streamed(base, o, [0, *edges[1:], o.rows], chunk)))
+
+
+def scaled_gram(factors, weights) -> tuple[np.ndarray, np.ndarray]:
+    R = np.column_stack(factors.weighted(weights))
+    norms = np.linalg.norm(R, axis=0)
+    return R.T @ R, np.where(norms > 0, norms, 1.0)
+
+
+def distance(a, b, weights=WEIGHTS) -> float:
+    """Largest difference of the information, with columns of length one."""
+    (A, _), (B, norms) = scaled_gram(a, weights), scaled_gram(b, weights)
+    return float(np.abs((A - B) / norms / norms[:, None]).max())
+
+
+def agree(base, o, **options) -> None:
+    got, expected = fast(base, o, **options), factorise(base, [o], options.get("blocks", 4))
+    np.testing.assert_array_equal(got.total.rows, expected.total.rows)
+    assert distance(got.total, expected.total) < 1e-12
+    for a, b in zip(got.parts, expected.parts, strict=True):
+        assert distance(a, b) < 1e-12
+    p, q = (fit_blocks(base, x, jid.LeastSquares()).parameters for x in (got, expected))
+    norms = np.linalg.norm(expected.total.weighted(np.ones(2))[0], axis=0)
+    assert np.linalg.norm(norms * (p - q)) <= 1e-12 * np.linalg.norm(norms * q)
+
+
+def test_every_sample_a_row(base):
+    agree(base, observed(base))
+
+
+def test_masked_rows_do_not_count(base):
+    mask = np.random.default_rng(3).random((6000, 2)) < 0.7
+    agree(base, observed(base, mask=mask))
+
+
+def test_subsampled(base):
+    agree(base, observed(base, every=7))
+
+
+@pytest.mark.parametrize("still", [0, 1])
+def test_a_joint_that_never_moves(base, still):
+    agree(base, observed(base, still=(still,)))
+
+
+def test_a_joint_that_moves_late(base):
+    o = observed(base)
+    late = (np.arange(6000) > 5000)[:, None]
+    m = motion(2, 6000)
+    q = np.where(late, m.q, m.q[5001])
+    agree(base, changed(o, motion=jid.Motion(q, late * m.qd, late * m.qdd)), blocks=1)
+
+
+def test_a_known_tool():
+    robot = planar()
+    tool = jid.Tool.of(1, mass=2.5, centre_of_mass=(0.1, 0.0, 0.05))
+    base = based(robot.replace(tool=tool))
+    o = observed(base)
+    agree(base, o)
+    assert distance(fast(base, o).total, fast(based(robot), o).total) > 1e-3
+
+
+def test_forces_without_noise_are_explained_to_rounding(base):
+    o = observed(base, noise=0.0)
+    fit = fit_blocks(base, fast(base, o), jid.LeastSquares())
+    assert fit.residual < 1e-13
+
+
+def test_filtered_and_decimated_in_several_segments(base):
+    o = observed(base, samples=60000, filter=SMOOTH, every=7)
+    segments = ((0, 900), (900, 25000), (25000, 26500), (26500, 60000))
+    agree(base, changed(o, segments=segments))
+
+
+def test_stages_of_decimation(base):
+    o = observed(base, samples=60000, filter=SMOOTH, every=7)
+    agree(base, changed(o, decimation=jid.Decimation((5, 4))))
+
+
+def test_nothing_depends_on_the_length_of_chunks(base):
+    o = observed(base, samples=30000, filter=SMOOTH, every=7)
+    a, b = (fast(base, o, chunk=chunk).total for chunk in (500, 3000))
+    assert distance(a, b) < 1e-13
+
+
+def test_a_response_is_what_filtering_an_impulse_gives():
+    low_pass = jid.ZeroPhaseButterworth(30.0).low_pass(1e-3)
+    h = response(low_pass)
+    half = len(h) // 2
+    impulse = np.zeros(6 * half + 1)
+    impulse[3 * half] = 1.0
+    expected = low_pass(impulse)
+    np.testing.assert_allclose(h, expected[2 * half : 4 * half + 1], atol=1e-15)
+    assert math.isclose(h.sum(), 1.0, rel_tol=1e-12)
+    assert np.abs(expected[: 2 * half]).max() < 1e-14 * h.max()
+
+
+def test_seven_joints_against_a_dense_matrix():
+    base = jid.base_parameters(jid.Model(jid.robots.tx90l_on_rail()))
+    p = standard_parameters(base.model)
+    o = observations(base.model, p, samples=5000, noise=1.0)
+    theta, forces, joint = dense(base, o)
+    weights = np.linspace(0.5, 2.0, 7)
+    W = weights[joint]
+    R, z = fast(base, o).total.weighted(weights)
+    norms = np.linalg.norm(R, axis=0)
+    expected = np.linalg.lstsq(W[:, None] * theta / norms, W * forces)[0]
+    got = np.linalg.lstsq(R / norms, z)[0]
+    assert np.linalg.norm(got - expected) < 1e-12 * np.linalg.norm(expected)
+
+
+def test_long_logs_take_the_compiled_pass_by_themselves(base, monkeypatch):
+    o = observed(base, mask=np.random.default_rng(3).random((6000, 2)) < 0.7)
+    slow = factorise(base, [o, o], 5)
+    monkeypatch.setattr(streaming, "LONG", 5000)
+    quick = factorise(base, [o, o], 5)
+    assert len(quick.parts) == 10
+    assert distance(slow.total, quick.total) < 1e-12
+    assert [len(j.columns) for j in quick.total.joints] == [
+        len(j.columns) for j in slow.total.joints
+    ]
+    firsts = [p.joints[0].R for p in quick.parts]
+    assert not any(np.array_equal(a, b) for a, b in itertools.pairwise(firsts))
+
+
+def test_filters_with_a_long_memory_stay_in_numpy(base):
+    o = observed(base, samples=streaming.LONG, filter=SMOOTH)
+    assert not streaming.suits(o)
+    assert streaming.suits(observed(base, samples=streaming.LONG, filter=SMOOTH, every=20))
+    assert not streaming.suits(observed(base))
