@@ -84,7 +84,8 @@ def build():
         RuntimeError: If it cannot be built, with the reason.
     """
     places = [p / "include/eigen3" for p in prefixes()]
-    places = [Path(os.environ["EIGEN3_INCLUDE"])] * ("EIGEN3_INCLUDE" in os.environ) + places
+    if "EIGEN3_INCLUDE" in os.environ:
+        places.insert(0, Path(os.environ["EIGEN3_INCLUDE"]))
     eigen = next((p for p in places if (p / "Eigen/Core").exists()), None)
     if eigen is None:
         raise RuntimeError("no headers of Eigen (pip install cmeel-eigen, or set EIGEN3_INCLUDE)")
@@ -131,10 +132,12 @@ class Loop:
         self.forces = np.zeros((len(q), joints))
 
     def regressors(self):
+        """The regressors of all samples [samples, joints, columns], in Pinocchio's columns."""
         self._run(self.library.arm_regressors, self.columns)
         return self.columns.swapaxes(1, 2)
 
     def torques(self):
+        """The generalized forces of all samples [samples, joints]."""
         self._run(self.library.arm_torques, self.forces)
         return self.forces
 

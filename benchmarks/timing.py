@@ -41,6 +41,7 @@ def pin_to(cores: int) -> None:
         flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
     os.environ["JAX_ENABLE_X64"] = "1"
+    os.environ["JAX_PLATFORMS"] = "cpu"
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,12 @@ class Times:
 
     @property
     def median(self) -> float:
+        """The middle one of all turns."""
         return statistics.median(self.turns)
 
     @property
     def best(self) -> float:
+        """The shortest one."""
         return min(self.turns)
 
     def __truediv__(self, other: "Times") -> float:
@@ -109,10 +112,6 @@ def hand_over(rows: list[Row], path: str | None) -> None:
         print(f"[{row.number}] {row.what}: {row.measured}; asked {row.asked}\n    {row.recipe}")
     if path is not None:
         Path(path).write_text(json.dumps([asdict(row) for row in rows]))
-
-
-def at_least(ratio: float, target: float) -> bool:
-    return ratio >= target
 
 
 def version(package: str) -> str | None:

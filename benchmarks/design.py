@@ -1,0 +1,67 @@
+"""The cost of an excitation design, as the compile and run benchmarks need it.
+
+Log det of the information matrix of a Fourier motion, in the base regressor's columns, and its
+gradient with respect to all coefficients.
+"""
+
+import numpy as np
+
+HARMONICS, SAMPLES, OMEGA = 5, 800, 2 * np.pi / 10
+
+
+def packed_rows(base):
+    """A function of a motion: for each joint its rows [columns that act on it, samples]."""
+    import jax.numpy as jnp
+
+    from jaxid.dynamics.compiled import acting_columns
+    from jaxid.dynamics.machine import program_of
+    from jaxid.program import lower
+
+    n = (base.model.robot.joints,)
+    lowered = lower(program_of(base, base.columns, n, n, n))
+    columns = acting_columns(base)
+
+    def rows(motion):
+        entries = lowered(motion.q.T, motion.qd.T, motion.qdd.T)
+        samples = motion.q.shape[0]
+        return [
+            jnp.stack([jnp.broadcast_to(entries[j * base.size + k], (samples,)) for k in acting])
+            for j, acting in enumerate(columns)
+        ]
+
+    return rows, columns
+
+
+def design_cost(base, series):
+    """Value of (a, b) -> log det, joint by joint, so that zeros cost nothing."""
+    import jax.numpy as jnp
+
+    import jaxid as jid
+    from jaxid.trajectory.fourier import FourierSeries
+
+    rows, columns = packed_rows(base)
+    # float64 angles: t is fixed, so sines and cosines of the base motion are constants.
+    t = np.linspace(0.0, 2 * np.pi / OMEGA, SAMPLES, endpoint=False)
+
+    def cost(coefficients):
+        a, b = coefficients
+        motion = FourierSeries(series.offset, a, b, OMEGA).motion(t)
+        information = jnp.zeros((base.size, base.size))
+        for block, acting in zip(
+            rows(jid.Motion(motion.q, motion.qd, motion.qdd)), columns, strict=True
+        ):
+            place = np.ix_(acting, acting)
+            information = information.at[place].add(block @ block.T)
+        return jnp.linalg.slogdet(information / SAMPLES)[1]
+
+    return cost
+
+
+def arm_and_series():
+    """The base parameters of the Panda, bodies with friction and rotors, and a motion of it."""
+    import jaxid as jid
+    from jaxid.trajectory.fourier import random_fourier_series
+
+    robot = jid.robots.panda()
+    base = jid.base_parameters(jid.Model(robot))
+    return base, random_fourier_series(robot, omega=OMEGA, harmonics=HARMONICS, seed=1)
