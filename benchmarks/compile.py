@@ -146,8 +146,8 @@ def main():
         )
         if "median" in cold:
             said = (
-                f"{cold['median'] * 1e3:.2f} ms (best {cold['best'] * 1e3:.2f} ms; gradient against "
-                f"central differences {cold['gradient_error']:.0e})"
+                f"{cold['median'] * 1e3:.2f} ms (best {cold['best'] * 1e3:.2f} ms; gradient "
+                f"against central differences {cold['gradient_error']:.0e})"
             )
             title = f"{what[name]}, warm run"
             rows.append(Row("6e", title, recipe, "<= 2.5 ms", said, cold["median"] <= 2.5e-3))

@@ -68,7 +68,7 @@ def measure(file, samples, few, turns):
         note = f"; C++ skipped: {problem}"
     times = interleaved(cases, turns)
 
-    each = {name: samples for name in cases} | {"Python": few}
+    each = dict.fromkeys(cases, samples) | {"Python": few}
     said = [f"ours {per_sample(times['ours'], samples)}"]
     for name in cases:
         if name != "ours":

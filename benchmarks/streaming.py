@@ -1,0 +1,232 @@
+"""How fast, how small and how accurate is the identification from long logs?
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/streaming.py [--quick]
+
+A seven-axis arm at 1 kHz in float64: every sample a row; forces and columns filtered (zero phase,
+20 Hz) and every 25th a row; and the first against a loop over Pinocchio's regressor in NumPy,
+interleaved with it. Medians of warm runs; compiling is told apart. Memory is the growth of the
+process's resident set during a warm run. Ratios count; absolute times depend on the machine.
+"""
+
+import argparse
+import math
+import os
+import statistics
+import sys
+import threading
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import jaxid as jid
+from jaxid.dynamics.machine import in_numpy
+from jaxid.identification.factors import Blocks, streamed
+
+PAGE = os.sysconf("SC_PAGE_SIZE")
+RATE = 1000.0
+
+
+class Peak:
+    """The largest growth of the resident set inside of a `with` block [MB]."""
+
+    def __enter__(self):
+        self._start, self.megabytes, self._done = self._resident(), 0.0, threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._done.set()
+        self._thread.join()
+
+    def _watch(self):
+        while not self._done.wait(0.002):
+            self.megabytes = max(self.megabytes, (self._resident() - self._start) / 1e6)
+
+    @staticmethod
+    def _resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+
+
+def excited(samples, joints, seed=0):
+    """Five harmonics of 0.1 Hz for each joint, phases at random."""
+    random = np.random.default_rng(seed)
+    q, qd, qdd = (np.zeros((samples, joints)) for _ in range(3))
+    for start in range(0, samples, 50_000):
+        part = slice(start, min(start + 50_000, samples))
+        t = np.arange(part.start, part.stop)[:, None] / RATE
+        random = np.random.default_rng(seed)
+        for k in range(1, 6):
+            w = 2 * math.pi * 0.1 * k
+            a, phase = random.uniform(0.1, 0.5, joints), random.uniform(0, 6, joints)
+            q[part] += a * np.sin(w * t + phase)
+            qd[part] += a * w * np.cos(w * t + phase)
+            qdd[part] -= a * w**2 * np.sin(w * t + phase)
+    return jid.Motion(q, qd, qdd)
+
+
+def virtual_log(base, samples):
+    """A motion, and the model's forces with noise."""
+    model, random = base.model, np.random.default_rng(1)
+    p = random.uniform(0.2, 2.0, model.size)
+    motion = excited(samples, model.robot.joints)
+    forces = np.empty(motion.q.shape)
+    for start in range(0, samples, 50_000):
+        part = slice(start, start + 50_000)
+        m = motion[part]
+        forces[part] = in_numpy(model, model.forces, m.q, m.qd, m.qdd, shared=(p,))
+    return motion, forces + random.normal(size=forces.shape)
+
+
+def observations(motion, forces, filter, decimation):
+    samples, joints = forces.shape
+    fields = {
+        "time": np.arange(samples) / RATE,
+        "motion": motion,
+        "forces": forces,
+        "filter": filter,
+        "decimation": decimation,
+        "segments": ((0, samples),),
+        "sample_time": 1 / RATE,
+    }
+    rows = len(jid.Observations(**fields, mask=np.ones((0, joints), bool)).instants)
+    return jid.Observations(**fields, mask=np.ones((rows, joints), bool))
+
+
+def unfiltered(motion, forces):
+    nothing = jid.ZeroPhaseButterworth(0.4 * RATE, force_cutoff=math.inf, margin=0.0)
+    return observations(motion, forces, nothing, jid.Subsample(1))
+
+
+def filtered(motion, forces):
+    return observations(motion, forces, jid.ZeroPhaseButterworth(20.0), jid.Subsample(25))
+
+
+def timed(run, *arguments):
+    start = time.perf_counter()
+    result = run(*arguments)
+    return time.perf_counter() - start, result
+
+
+def identification(base, o):
+    return jid.identify(base, o, jid.LeastSquares())
+
+
+def whole(base, o):
+    """The factors by the compiled loop, whatever the length of the log."""
+    edges = [int(k) for k in np.linspace(0, o.rows, 11)]
+    return Blocks(tuple(streamed(base, o, edges)))
+
+
+def distance(base, o, matrix, forces):
+    """Of the estimates from those of a dense QR, with columns of length one."""
+    R, z = whole(base, o).total.weighted(np.ones(o.joints))
+    norms = np.linalg.norm(matrix, axis=0)
+    Q, triangle = np.linalg.qr(matrix / norms)
+    expected = np.linalg.solve(triangle, Q.T @ forces)
+    got = np.linalg.lstsq(R / norms, z)[0]
+    condition = np.linalg.cond(triangle)
+    return np.linalg.norm(got - expected) / np.linalg.norm(expected), condition
+
+
+def dense(base, o):
+    model, m = base.model, o.motion
+    theta = in_numpy(model, model.columns, m.q, m.qd, m.qdd)[:, :, list(base.indices)]
+    return o.reduce(theta).reshape(-1, base.size), o.reduced_forces.ravel()
+
+
+def in_pinocchio(robot):
+    import pinocchio as pin
+
+    model, joint = pin.Model(), 0
+    model.gravity.linear = np.asarray(robot.gravity)
+    for k in range(robot.joints):
+        kind = pin.JointModelRevoluteUnaligned
+        kind = kind if robot.revolute[k] else pin.JointModelPrismaticUnaligned
+        place = pin.SE3(np.asarray(robot.rotation[k]), np.asarray(robot.offset[k]))
+        joint = model.addJoint(joint, kind(np.asarray(robot.axis[k])), place, f"joint{k}")
+    return model
+
+
+def peer(model, base, o):
+    """What one writes without this package: a loop over samples, then a QR."""
+    import pinocchio as pin
+
+    data, n = model.createData(), model.nv
+    bodies = 10 * np.arange(n)[:, None] + np.array([0, 1, 2, 3, 4, 6, 9, 8, 7, 5])
+    signs = np.tile([1.0] * 7 + [-1.0] * 3, n)
+    theta = np.empty((len(o.time), n, base.model.size))
+    friction = np.arange(n)
+    q, qd, qdd = o.motion.q, o.motion.qd, o.motion.qdd
+    for i in range(len(theta)):
+        pin_columns = pin.computeJointTorqueRegressor(model, data, q[i], qd[i], qdd[i])
+        theta[i, :, : 10 * n] = pin_columns[:, bodies.ravel()] * signs
+    theta[:, :, 10 * n :] = 0.0
+    for place, column in enumerate((qd, np.tanh(qd / 0.01), qdd)):
+        theta[:, friction, 10 * n + place * n + friction] = column
+    matrix = theta.reshape(-1, base.model.size)[:, list(base.indices)]
+    Q, R = np.linalg.qr(matrix)
+    return np.linalg.solve(R, Q.T @ np.asarray(o.forces).ravel())
+
+
+def case(name, base, o, repetitions):
+    first, _ = timed(whole, base, o)
+    times = [timed(identification, base, o)[0] for _ in range(repetitions)]
+    with Peak() as peak:
+        fit = identification(base, o)
+    median = statistics.median(times)
+    print(
+        f"{name}: median {median:.2f} s, best {min(times):.2f} s, first {first:.1f} s (it compiles)"
+        f"\n    memory beyond the inputs {peak.megabytes:.0f} MB, rows {fit.rows[0]}, residual "
+        f"{100 * fit.residual:.3f} %"
+    )
+
+
+def against_pinocchio(base, motion, forces, samples, repetitions):
+    o = unfiltered(motion[:samples], forces[:samples])
+    model = in_pinocchio(base.model.robot)
+    own, other = [], []
+    whole(base, o)
+    for _ in range(repetitions):
+        seconds, blocks = timed(whole, base, o)
+        own.append(seconds)
+        seconds, p = timed(peer, model, base, o)
+        other.append(seconds)
+    R, z = blocks.total.weighted(np.ones(7))
+    norms = np.linalg.norm(R, axis=0)
+    away = np.linalg.norm(norms * (np.linalg.lstsq(R, z)[0] - p)) / np.linalg.norm(norms * p)
+    a, b = statistics.median(own), statistics.median(other)
+    print(
+        f"{samples} samples: {a:.3f} s, NumPy and Pinocchio {b:.2f} s, {b / a:.0f} times as long; "
+        f"estimates differ by {away:.1e}"
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer samples and repetitions")
+    jax.config.update("jax_enable_x64", True)
+    quick = parser.parse_args().quick
+    samples, checked, looped, repetitions = (
+        (120_000, 10_000, 5_000, 3) if quick else (1_000_000, 100_000, 200_000, 5)
+    )
+    base = jid.base_parameters(jid.Model(jid.robots.tx90l_on_rail()))
+    motion, forces = virtual_log(base, samples)
+    print(f"jax {jax.__version__}, {os.cpu_count()} cores, {samples} samples, {base.size} columns")
+    case("every sample a row", base, unfiltered(motion, forces), repetitions)
+    case("20 Hz, every 25th a row", base, filtered(motion, forces), repetitions)
+    for name, prepare in (("every sample", unfiltered), ("filtered", filtered)):
+        o = prepare(motion[:checked], forces[:checked])
+        away, condition = distance(base, o, *dense(base, o))
+        print(f"{name}: {away:.1e} from a dense QR (condition number {condition:.0f})")
+    against_pinocchio(base, motion, forces, looped, 1 if not quick else repetitions)
+
+
+if __name__ == "__main__":
+    main()
