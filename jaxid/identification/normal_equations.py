@@ -1,0 +1,261 @@
+"""Least squares of a few data sets by the products of their rows, as one compiled computation.
+
+Columns are evaluated for a group of data sets together; the products of the rows with each other
+and with the forces (Gram matrices), the solution and one refinement with the residuals themselves
+follow for each.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.dynamics.motion import Motion
+from jaxid.identification.joint_rows import JointRows
+from jaxid.types import AnyArray, Array, Bool, Float
+
+AT_ONCE = 4096
+"""Samples whose columns are held at once."""
+WELL_CONDITIONED = 1e4
+"""Condition number, with columns of length one, up to which products of rows are accurate enough;
+beyond it a data set is solved again by orthogonal factors."""
+RIDGE = 64 * np.finfo(float).eps
+
+
+class BatchFit(eqx.Module):
+    """Identified base parameters of many data sets.
+
+    Attributes:
+        parameters: The estimates; zero along what a data set does not determine.
+        standard_deviations: Of the estimates, for independent rows and a variance of each joint's
+            own; infinite where nothing is known.
+        residual_rms: Of each joint's rows [N m or N].
+        condition_numbers: Of each weighted observation matrix with columns of length one; an upper
+            bound, at most the number of parameters too large, where it is well conditioned.
+        determined: Whether a data set determines all parameters. Where it is False while JAX
+            traces, the estimates are not to be used.
+    """
+
+    parameters: Float[AnyArray, "*results base"]
+    standard_deviations: Float[AnyArray, "*results base"]
+    residual_rms: Float[AnyArray, "*results joints"]
+    condition_numbers: Float[AnyArray, "*datasets"]
+    determined: Bool[AnyArray, "*datasets"]
+
+
+class DataSets(eqx.Module):
+    """What is known of some data sets: leading axes datasets, then samples (forces: draws)."""
+
+    motion: Motion
+    forces: Float[AnyArray, "datasets draws samples joints"]
+    weights: Float[AnyArray, "datasets joints"]
+    mask: Float[AnyArray, "datasets samples joints"] | None
+    numbers: Float[AnyArray, "datasets numbers"] | None
+
+
+@eqx.filter_jit
+def solve(rows: JointRows, batch: DataSets) -> BatchFit:
+    """Solves all data sets, a group at a time."""
+    batch = jax.tree.map(jnp.asarray, batch)
+    datasets, samples, _ = batch.motion.q.shape
+    group = max(1, min(AT_ONCE // samples, datasets))
+    chunks = -(-samples // AT_ONCE)
+    batch = _filled(batch, chunks * -(-samples // chunks) - samples)
+    whole = -(-datasets // group) * group
+    groups = jax.tree.map(
+        lambda x: x[np.arange(whole) % datasets].reshape((-1, group, *x.shape[1:])), batch
+    )
+    fits = jax.lax.map(lambda one: _solve_group(rows, one, chunks), groups)
+    return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
+
+
+def _filled(batch: DataSets, missing: int) -> DataSets:
+    """Appends samples that do not count."""
+    if not missing:
+        return batch
+
+    def pad(x):
+        return jnp.pad(x, (*((0, 0),) * (x.ndim - 2), (0, missing), (0, 0)))
+
+    mask = jnp.ones_like(batch.motion.q) if batch.mask is None else batch.mask
+    return DataSets(
+        jax.tree.map(pad, batch.motion), pad(batch.forces), batch.weights, pad(mask), batch.numbers
+    )
+
+
+def _solve_group(rows: JointRows, batch: DataSets, chunks: int) -> BatchFit:
+    """Solves a few data sets; those that fit evaluate their columns together, once."""
+    if chunks == 1:
+        columns = _columns(rows, batch)
+
+        def one(x):
+            return _solve_one(rows, x[0], lambda f: f(*x))
+
+        # A CPU multiplies the matrices of one data set faster than those of several together.
+        together = jax.default_backend() != "cpu"
+        return jax.vmap(one)((batch, columns)) if together else jax.lax.map(one, (batch, columns))
+
+    def total(one, f):
+        parts = _in_chunks(one, chunks)
+
+        def part(k):
+            chunk = jax.tree.map(lambda x: x[k], parts)
+            return f(chunk, [A[0] for A in _columns(rows, jax.tree.map(lambda x: x[None], chunk))])
+
+        def add(sums, k):
+            return jax.tree.map(jnp.add, sums, part(k)), None
+
+        return jax.lax.scan(add, part(0), np.arange(1, chunks))[0]
+
+    return jax.lax.map(lambda one: _solve_one(rows, one, lambda f: total(one, f)), batch)
+
+
+def _in_chunks(one: DataSets, chunks: int) -> DataSets:
+    """The samples of a data set divided; weights and the geometry's numbers are repeated."""
+
+    def divide(x):
+        length = x.shape[-2] // chunks
+        return jnp.moveaxis(x.reshape((*x.shape[:-2], chunks, length, x.shape[-1])), -3, 0)
+
+    def repeat(x):
+        return None if x is None else jnp.broadcast_to(x, (chunks, *x.shape))
+
+    return DataSets(
+        jax.tree.map(divide, one.motion),
+        divide(one.forces),
+        repeat(one.weights),
+        None if one.mask is None else divide(one.mask),
+        repeat(one.numbers),
+    )
+
+
+def _columns(rows: JointRows, batch: DataSets) -> list[Array]:
+    """For each joint the columns of some data sets, [datasets, columns, samples]."""
+    arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(batch.motion)]
+    if batch.numbers is not None:
+        numbers = batch.numbers.T[:, :, None]
+        arrays.append(jnp.broadcast_to(numbers, (*numbers.shape[:2], arrays[0].shape[-1])))
+    return rows(*arrays)
+
+
+def _solve_one(rows: JointRows, one: DataSets, total: Callable) -> BatchFit:
+    """Solves one data set by the products of its rows.
+
+    Args:
+        rows: How columns are divided among joints.
+        one: The data set.
+        total: Sums a function of data and columns over the data set's chunks.
+    """
+    weights = one.weights
+    grams, products = total(lambda x, A: _products(*_counted(x, A)))
+    inverse, condition = inverse_information(_added(rows, grams, weights))
+    p = _added_products(rows, products, weights) @ inverse
+    products, squares = total(lambda x, A: _residuals(rows, *_counted(x, A), p))
+    step = _added_products(rows, products, weights) @ inverse
+    # The squares at the refined parameters: what is of second order in the step is rounding.
+    squares -= 2 * jnp.stack(
+        [
+            jnp.sum(step[:, np.array(own, int)] * y, axis=-1)
+            for own, y in zip(rows.columns, products, strict=True)
+        ],
+        axis=-1,
+    )
+    squares = jnp.maximum(squares, 0.0)
+    if one.mask is None:
+        count = jnp.full(weights.shape, float(one.motion.q.shape[0]))
+    else:
+        count = one.mask.sum(axis=0)
+    return BatchFit(
+        p + step,
+        _deviations(rows, inverse, grams, weights, squares, count),
+        jnp.sqrt(squares / jnp.maximum(count, 1.0)[None]),
+        condition,
+        (condition < WELL_CONDITIONED) & (count.sum() > rows.size),
+    )
+
+
+def _counted(
+    one: DataSets, columns: list[Array]
+) -> tuple[list[Array], list[Array]]:
+    """For each joint its columns [columns, samples] and forces [draws, samples] that count."""
+    forces = list(jnp.moveaxis(one.forces, -1, 0))
+    if one.mask is None:
+        return columns, forces
+    masks = one.mask.T[:, None]
+    return (
+        [jnp.where(m > 0, x, 0.0) for m, x in zip(masks, columns, strict=True)],
+        [jnp.where(m > 0, x, 0.0) for m, x in zip(masks, forces, strict=True)],
+    )
+
+
+def _products(columns: list[Array], forces: list[Array]) -> tuple[list[Array], list[Array]]:
+    pairs = list(zip(columns, forces, strict=True))
+    return [A @ A.T for A, _ in pairs], [Q @ A.T for A, Q in pairs]
+
+
+def _residuals(
+    rows: JointRows, columns: list[Array], forces: list[Array], p: Array
+) -> tuple[list[Array], Array]:
+    """Products of the columns with the residuals, and the residuals' squares by joint."""
+    products, squares = [], []
+    for A, Q, own in zip(columns, forces, rows.columns, strict=True):
+        r = Q - p[:, np.array(own, int)] @ A
+        products.append(r @ A.T)
+        squares.append(jnp.sum(r**2, axis=-1))
+    return products, jnp.stack(squares, axis=-1)
+
+
+def _added(rows: JointRows, grams: list[Array], weights: Array) -> Array:
+    """The weighted information of all joints."""
+    whole = jnp.zeros((rows.size, rows.size), weights.dtype)
+    for own, gram, w in zip(rows.columns, grams, weights, strict=True):
+        k = np.array(own, int)
+        whole = whole.at[k[:, None], k].add(w**2 * gram)
+    return whole
+
+
+def _added_products(rows: JointRows, products: list[Array], weights: Array) -> Array:
+    """The weighted products of columns and forces [draws, base]."""
+    sums = jnp.zeros((products[0].shape[0], rows.size), weights.dtype)
+    for own, y, w in zip(rows.columns, products, weights, strict=True):
+        sums = sums.at[:, np.array(own, int)].add(w**2 * y)
+    return sums
+
+
+def _deviations(
+    rows: JointRows,
+    inverse: Array,
+    grams: list[Array],
+    weights: Array,
+    squares: Array,
+    count: Array,
+) -> Array:
+    """Standard deviations [draws, base]; see `Fit.covariance`."""
+    total = count.sum()
+    freedom = jnp.maximum(1.0 - rows.size / jnp.maximum(total, 1.0), 0.0)
+    variances = squares / jnp.maximum(count * freedom, 1.0)[None]
+    felt = []
+    for own, gram, w in zip(rows.columns, grams, weights, strict=True):
+        B = inverse[:, np.array(own, int)] * w**2
+        felt.append(jnp.sum((B @ gram) * B, axis=-1))
+    return jnp.sqrt(jnp.maximum(variances @ jnp.stack(felt), 0.0))
+
+
+def inverse_information(
+    whole: Float[Array, "base base"],
+) -> tuple[Float[Array, "base base"], Float[Array, ""]]:
+    """Inverse of an information, and a bound of its square root's condition number.
+
+    Columns are scaled to length one, and a ridge of rounding's size keeps the factor from failing.
+    """
+    size = whole.shape[-1]
+    square = jnp.diagonal(whole)
+    scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    scaled = scale[:, None] * whole * scale[None] + RIDGE * np.eye(size)
+    L = jnp.linalg.cholesky(scaled)
+    Li = jax.lax.linalg.triangular_solve(L, jnp.eye(size), left_side=True, lower=True)
+    bound = jnp.sqrt(size * jnp.sum(Li**2))
+    Li = Li * scale[None]
+    return Li.T @ Li, jnp.where(jnp.isfinite(bound), bound, jnp.inf)

@@ -1,0 +1,216 @@
+"""Batches give what one identification after the other gives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from virtual import motion, observations, standard_parameters
+
+import jaxid as jid
+from jaxid.dynamics.machine import in_numpy
+from jaxid.identification import batches, normal_equations
+from jaxid.identification.batches import identify_batch
+from jaxid.identification.bootstrap import bootstrap
+from jaxid.identification.factors import factorise
+from jaxid.identification.identify import fit_blocks
+
+SAMPLES = 150
+WEIGHTS = np.array([0.3, 2.0])
+
+
+@pytest.fixture(scope="module")
+def base():
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
+    robot = jid.robots.planar_arm(2, 0.4)
+    limits = jid.Limits(**{**vars(robot.limits), "force": np.array([50.0, 8.0])})
+    return jid.base_parameters(jid.Model(robot.replace(limits=limits), terms))
+
+
+def stacked(sets):
+    fields = [np.stack([getattr(o.motion, x) for o in sets]) for x in ("q", "qd", "qdd")]
+    return jid.Motion(*fields), np.stack([o.forces for o in sets])
+
+
+def some_sets(base, count, **options):
+    p = standard_parameters(base.model)
+    return [
+        observations(base.model, p, samples=SAMPLES, noise=0.3, seed=k, noise_seed=k, **options)
+        for k in range(count)
+    ]
+
+
+def assert_same(base, fit, k, one):
+    """Equal in units in which each parameter alone makes forces of length one."""
+    size = 1.0 / np.asarray(one.standard_deviations)
+    error = (np.asarray(fit.parameters[k]) - one.parameters) * size
+    assert np.linalg.norm(error) < 1e-10 * np.linalg.norm(one.parameters * size)
+    np.testing.assert_allclose(fit.standard_deviations[k], one.standard_deviations, rtol=1e-9)
+    np.testing.assert_allclose(fit.residual_rms[k], one.residual_rms, rtol=1e-9)
+
+
+def test_every_data_set_as_if_identified_alone(base):
+    sets = some_sets(base, 40)
+    fit = identify_batch(base, *stacked(sets))
+    assert np.asarray(fit.determined).all()
+    for k in (0, 7, 31, 32, 39):
+        one = jid.identify(base, sets[k])
+        assert_same(base, fit, k, one)
+        scaled = one.condition_numbers.scaled
+        assert scaled <= fit.condition_numbers[k] <= 1.001 * base.size * scaled
+
+
+def test_masked_rows_and_weights_of_each_data_set(base):
+    mask = np.random.default_rng(1).random((3, SAMPLES, 2)) < 0.7
+    weights = np.random.default_rng(2).uniform(0.1, 2.0, (3, 2))
+    sets = some_sets(base, 3)
+    m, forces = stacked(sets)
+    forces = np.where(mask, forces, np.nan)
+    fit = identify_batch(base, m, forces, weights, mask=mask)
+    for k, o in enumerate(sets):
+        masked = jid.Observations(**{**vars(o), "mask": mask[k]})
+        estimator = jid.WeightedLeastSquares(batches._Given(weights[k]))
+        assert_same(base, fit, k, jid.identify(base, masked, estimator))
+
+
+def test_long_data_sets_go_by_chunks(base, monkeypatch):
+    sets = some_sets(base, 3)
+    whole = identify_batch(base, *stacked(sets), WEIGHTS)
+    monkeypatch.setattr(normal_equations, "AT_ONCE", 64)
+    jax.clear_caches()
+    parts = identify_batch(base, *stacked(sets), WEIGHTS)
+    jax.clear_caches()
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
+def test_draws_over_one_motion(base):
+    m, forces = stacked(some_sets(base, 2))
+    noise = np.random.default_rng(0).normal(size=(2, 5, SAMPLES, 2))
+    fit = identify_batch(base, m, forces[:, None] + noise, WEIGHTS)
+    assert fit.parameters.shape == (2, 5, base.size)
+    for k in range(5):
+        one = identify_batch(base, m, forces + noise[:, k], WEIGHTS)
+        np.testing.assert_allclose(fit.parameters[:, k], one.parameters, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(fit.standard_deviations[:, k], one.standard_deviations)
+
+
+def test_draws_scatter_as_the_standard_deviations_say(base):
+    m, forces = stacked(some_sets(base, 1))
+    rng = np.random.default_rng(0)
+    fit = identify_batch(base, m, forces[:, None] + 5 * rng.normal(size=(1, 3000, SAMPLES, 2)))
+    scatter = np.std(fit.parameters[0], axis=0, ddof=1)
+    expected = np.sqrt(np.mean(np.asarray(fit.standard_deviations[0]) ** 2, axis=0))
+    np.testing.assert_allclose(scatter, expected, rtol=4 / np.sqrt(2 * 3000))
+
+
+def test_data_sets_that_determine_too_little_are_marked_and_solved_like_alone(base):
+    sets = some_sets(base, 3)
+    sets[1] = some_sets(base, 1, still=(1,))[0]
+    fit = identify_batch(base, *stacked(sets))
+    assert list(fit.determined) == [True, False, True]
+    one = jid.identify(base, sets[1])
+    np.testing.assert_allclose(fit.parameters[1], one.parameters, rtol=1e-9, atol=1e-12)
+    known = np.isfinite(one.standard_deviations)
+    assert 0 < known.sum() < base.size
+    np.testing.assert_array_equal(np.isfinite(fit.standard_deviations[1]), known)
+    assert np.isinf(fit.condition_numbers[1])
+    few = np.zeros((3, SAMPLES, 2), bool)
+    few[1:] = True
+    few[0, :2] = True
+    fit = identify_batch(base, *stacked(some_sets(base, 3)), mask=few)
+    assert list(fit.determined) == [False, True, True]
+    assert np.isfinite(fit.parameters).all()
+    assert np.isinf(fit.standard_deviations[0]).all()
+
+
+def test_nearly_dependent_columns_are_as_accurate_as_alone(base):
+    sets = some_sets(base, 2)
+    for o in sets:
+        o.motion.q[:] *= 1e-6
+        o.motion.qd[:] *= 1e-6
+        o.motion.qdd[:] *= 1e-6
+    fit = identify_batch(base, *stacked(sets))
+    one = jid.identify(base, sets[0])
+    assert one.condition_numbers.scaled > normal_equations.WELL_CONDITIONED
+    np.testing.assert_allclose(fit.standard_deviations[0], one.standard_deviations, rtol=1e-5)
+    error = np.abs(np.asarray(fit.parameters[0]) - one.parameters)
+    known = np.isfinite(one.standard_deviations)
+    assert (error[known] < 1e-3 * one.standard_deviations[known]).all()
+
+
+def test_under_transformations(base):
+    m, forces = stacked(some_sets(base, 3))
+    expected = identify_batch(base, m, forces, WEIGHTS)
+
+    def parameters(f):
+        return identify_batch(base, m, f, WEIGHTS).parameters
+
+    np.testing.assert_allclose(jax.jit(parameters)(jnp.asarray(forces)), expected.parameters)
+    both = jax.vmap(parameters)(jnp.stack([forces, 2 * forces]))
+    np.testing.assert_allclose(both[1], 2 * expected.parameters, rtol=1e-9)
+    direction = np.random.default_rng(0).normal(size=forces.shape)
+    gradient = jax.grad(lambda f: parameters(f)[1].sum())(jnp.asarray(forces))
+    step = parameters(jnp.asarray(forces + direction)) - expected.parameters
+    np.testing.assert_allclose(jnp.vdot(gradient, direction), step[1].sum(), rtol=1e-8)
+
+
+def test_robots_of_one_topology(base):
+    own, rng = base.model.robot, np.random.default_rng(5)
+    robots, forces = [], []
+    m = jid.Motion(*(np.stack([x] * 3) for x in vars(motion(2, SAMPLES)).values()))
+    for length in (0.4, 0.5, 0.7):
+        robots.append(own.replace(offset=np.asarray(own.offset) * length / 0.4))
+        model = jid.Model(robots[-1], base.model.terms)
+        p = standard_parameters(model)
+        exact = in_numpy(model, model.forces, m.q[0], m.qd[0], m.qdd[0], shared=(p,))
+        forces.append(exact + 0.1 * rng.normal(size=exact.shape))
+    fit = identify_batch(base, m, np.stack(forces), WEIGHTS, robots=robots)
+    for k, robot in enumerate(robots):
+        alone = jid.base_parameters(jid.Model(robot, base.model.terms))
+        assert alone.indices == base.indices
+        one = identify_batch(alone, m[k : k + 1], forces[k][None], WEIGHTS)
+        np.testing.assert_allclose(fit.parameters[k], one.parameters[0], rtol=1e-9)
+    with pytest.raises(ValueError, match="topology of"):
+        identify_batch(base, m, np.stack(forces), WEIGHTS, robots=[jid.robots.planar_arm(3)] * 3)
+
+
+def test_refusals(base):
+    m, forces = stacked(some_sets(base, 2))
+    with pytest.raises(ValueError, match="joints of"):
+        identify_batch(base, m, forces[..., :1])
+    with pytest.raises(ValueError, match=r"must have the shape \[datasets"):
+        identify_batch(base, m, forces[:, 1:], WEIGHTS)
+    with pytest.raises(ValueError, match="there are 4 rows for"):
+        identify_batch(base, jid.Motion(*(x[:, :2] for x in vars(m).values())), forces[:, :2])
+    with pytest.raises(ValueError, match="`mask` must have the shape"):
+        identify_batch(base, m, forces, WEIGHTS, mask=np.ones((2, 3, 2), bool))
+
+
+def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
+    o = observations(base.model, standard_parameters(base.model), samples=12000, noise=2.0)
+    order = np.random.default_rng(0).permutation(12000)
+    o = jid.Observations(**{**vars(o), "motion": o.motion[order], "forces": o.forces[order]})
+    blocks = factorise(base, [o], blocks=60)
+    fit = fit_blocks(base, blocks, jid.LeastSquares())
+    draws = bootstrap(blocks, fit.weights, 4000, jax.random.key(0))
+    np.testing.assert_allclose(
+        np.mean(draws, axis=0), fit.parameters, atol=0.2 * fit.standard_deviations.max()
+    )
+    left_out = np.array(
+        [
+            np.linalg.lstsq(*blocks.without(k).weighted(fit.weights), rcond=None)[0]
+            for k in range(60)
+        ]
+    )
+    jackknife = np.std(left_out, axis=0) * np.sqrt(59)
+    np.testing.assert_allclose(np.std(draws, axis=0), jackknife, rtol=0.1)
+
+
+def test_bootstrap_refuses_what_it_cannot_answer(base):
+    p = standard_parameters(base.model)
+    blocks = factorise(base, [observations(base.model, p, noise=1.0)], blocks=1)
+    with pytest.raises(ValueError, match="at least two blocks"):
+        bootstrap(blocks, WEIGHTS, 3, jax.random.key(0))
+    still = [observations(base.model, p, still=(1,), noise=1.0), observations(base.model, p)]
+    with pytest.raises(ValueError, match="do not determine all parameters"):
+        bootstrap(factorise(base, still, blocks=1), WEIGHTS, 50, jax.random.key(0))
