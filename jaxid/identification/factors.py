@@ -16,7 +16,8 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
 from jaxid.identification.kernel import CHUNK as SAMPLES
 from jaxid.identification.reduction import reduced
-from jaxid.identification.streaming import Stream, suits
+from jaxid.identification.streaming import Progress, Read, Stream, held, suits
+from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Float
 
@@ -138,7 +139,10 @@ def empty(base: BaseParameters) -> Factors:
 
 
 def factorise(
-    base: BaseParameters, recordings: Sequence[Observations], blocks: int = BLOCKS
+    base: BaseParameters,
+    recordings: Sequence[Observations | LongLog],
+    blocks: int = BLOCKS,
+    progress: Progress | None = None,
 ) -> Blocks:
     """Reduces observations to the factors of their joints, by blocks of time (Eq. 26).
 
@@ -149,29 +153,44 @@ def factorise(
         base: The base parameters.
         recordings: Observations of the same robot.
         blocks: Number of blocks into which the counted rows of each recording are divided.
+        progress: Is told now and then which share of a long log is done, of 1.
     """
     parts = []
-    for observations in recordings:
-        mask = np.asarray(observations.mask)
-        counted = np.flatnonzero(mask.any(axis=1))
+    for recording in recordings:
+        observations, read = source(recording)
+        counted = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
         edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
+        del counted
         edges = [0, *edges[1:], observations.rows]
         if suits(observations):
-            parts += streamed(base, observations, edges)
-            continue
-        factors = [empty(base) for _ in edges[1:]]
-        for rows, columns, forces in reduced_rows(base, observations):
-            for k, (first, last) in enumerate(itertools.pairwise(edges)):
-                low, high = max(first, rows.start), min(last, rows.stop)
-                if low < high:
-                    part = slice(low - rows.start, high - rows.start)
-                    factors[k] = _joined(factors[k], columns, forces, mask[rows], part)
-        parts += factors
+            parts += streamed(base, observations, edges, read=read, progress=progress)
+        else:
+            parts += _in_numpy(base, observations, edges, read)
     return Blocks(tuple(parts))
 
 
+def _in_numpy(
+    base: BaseParameters, observations: Observations, edges: Sequence[int], read: Read
+) -> list[Factors]:
+    """The factors of blocks of time, without compiling."""
+    mask = np.asarray(observations.mask)
+    factors = [empty(base) for _ in edges[1:]]
+    for rows, columns, forces in reduced_rows(base, observations, read=read):
+        for k, (first, last) in enumerate(itertools.pairwise(edges)):
+            low, high = max(first, rows.start), min(last, rows.stop)
+            if low < high:
+                part = slice(low - rows.start, high - rows.start)
+                factors[k] = _joined(factors[k], columns, forces, mask[rows], part)
+    return factors
+
+
 def streamed(
-    base: BaseParameters, observations: Observations, edges: Sequence[int], chunk: int = SAMPLES
+    base: BaseParameters,
+    observations: Observations,
+    edges: Sequence[int],
+    chunk: int = SAMPLES,
+    read: Read | None = None,
+    progress: Progress | None = None,
 ) -> list[Factors]:
     """The factors of blocks of time by the compiled loop, for logs of any length.
 
@@ -180,10 +199,12 @@ def streamed(
         observations: What was measured.
         edges: Rows at which the blocks begin, and the last one ends.
         chunk: Samples of an iteration of the loop.
+        read: Gives motion and forces of some samples; those of the observations if None.
+        progress: Is told now and then which share of the log is done, of 1.
     """
     mask = np.asarray(observations.mask)
     acting = acting_columns(base)
-    triangles = Stream(base, observations, edges, chunk).triangles()
+    triangles = Stream(base, observations, edges, chunk, read, progress).triangles()
     found = []
     for R, (first, last) in zip(triangles, itertools.pairwise(edges), strict=True):
         rows = mask[first:last].sum(axis=0)
@@ -202,7 +223,12 @@ def _joined(
     return Factors(tuple(joints), factors.size)
 
 
-def reduced_rows(base: BaseParameters, observations: Observations, samples: int = CHUNK):
+def reduced_rows(
+    base: BaseParameters,
+    observations: Observations,
+    samples: int = CHUNK,
+    read: Read | None = None,
+):
     """Goes through observations by chunks: row range, columns of each joint, and forces.
 
     A known tool's forces are taken off the measured ones.
@@ -211,10 +237,12 @@ def reduced_rows(base: BaseParameters, observations: Observations, samples: int 
         base: The base parameters.
         observations: What was measured.
         samples: Size of a chunk.
+        read: Gives motion and forces of some samples; those of the observations if None.
 
     Yields:
         Slice of the rows; for each joint its columns [rows, columns of the joint]; forces
         [rows, joints] in [N m] or [N].
     """
+    read = held(observations) if read is None else read
     for chunk in observations.chunks(samples):
-        yield slice(*chunk.rows), *reduced(base, observations, chunk)
+        yield slice(*chunk.rows), *reduced(base, *read(slice(*chunk.samples)), chunk)

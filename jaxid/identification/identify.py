@@ -10,20 +10,25 @@ from jaxid.identification.excited import undetermined_directions
 from jaxid.identification.factors import Blocks, Factors, factorise
 from jaxid.identification.fit import ConditionNumbers, Fit
 from jaxid.identification.solutions import NUMERICAL, Decomposition
+from jaxid.identification.streaming import Progress
+from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 
 
 def identify(
     base: BaseParameters,
-    observations: Observations | Sequence[Observations],
+    observations: Observations | LongLog | Sequence[Observations | LongLog],
     estimator: AbstractEstimator | None = None,
+    progress: Progress | None = None,
 ) -> Fit:
     """Estimates the base parameters from one or several recordings (Eqs. 26-33).
 
     Args:
         base: What can be identified on this robot.
-        observations: Of one recording, or of several that are fitted together.
+        observations: Of one recording, or of several that are fitted together; logs larger than
+            memory come from `open_log`.
         estimator: Weighted least squares with the largest forces if None.
+        progress: Is told now and then which share of a long log is done, of 1.
 
     Returns:
         The estimates; `undetermined` names what these recordings do not determine.
@@ -32,10 +37,11 @@ def identify(
         ValueError: If the observations belong to another number of joints, have fewer rows than
             there are parameters, or weights are not known.
     """
-    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    single = isinstance(observations, Observations | LongLog)
+    recordings = (observations,) if single else tuple(observations)
     estimator = WeightedLeastSquares() if estimator is None else estimator
     _check(base, recordings)
-    blocks = factorise(base, recordings)
+    blocks = factorise(base, recordings, progress=progress)
     return fit_blocks(base, blocks, estimator, tuple(o.name for o in recordings))
 
 
@@ -87,7 +93,7 @@ def fit_blocks(
     )
 
 
-def _check(base: BaseParameters, recordings: Sequence[Observations]) -> None:
+def _check(base: BaseParameters, recordings: Sequence[Observations | LongLog]) -> None:
     if not recordings:
         raise ValueError("`observations` must hold at least one recording, but is empty.")
     n = base.model.robot.joints

@@ -4,17 +4,23 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import regressor_rows, tool_forces
-from jaxid.measurement.observations import Chunk, Observations
-from jaxid.types import Float
+from jaxid.dynamics.motion import Motion
+from jaxid.measurement.observations import Chunk
+from jaxid.types import AnyArray, Float
 
 
 def reduced(
-    base: BaseParameters, observations: Observations, chunk: Chunk
+    base: BaseParameters, motion: Motion, forces: Float[AnyArray, "samples joints"], chunk: Chunk
 ) -> tuple[list[Float[np.ndarray, "rows columns"]], Float[np.ndarray, "rows joints"]]:
-    """The rows of one chunk: the columns of each joint, and forces without a known tool's."""
-    part = slice(*chunk.samples)
-    motion = observations.motion[part]
-    forces = np.asarray(observations.forces)[part]
+    """The rows of one chunk: the columns of each joint, and forces without a known tool's.
+
+    Args:
+        base: The base parameters.
+        motion: At the chunk's samples.
+        forces: Measured at the chunk's samples [N m or N].
+        chunk: How samples become rows.
+    """
+    forces = np.asarray(forces)
     if base.model.robot.tool is not None:
         forces = forces - tool_forces(base, motion)
     columns = [chunk.reduce(theta) for theta in regressor_rows(base, motion)]

@@ -7,13 +7,15 @@ triangle of all rows follows from both.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
+from jaxid.dynamics.motion import Motion
 from jaxid.identification.kernel import CHUNK, Grams, Kernel
 from jaxid.identification.reduction import reduced
 from jaxid.identification.response import Stage, centre, stages
@@ -31,6 +33,12 @@ REGULAR = 1e-13
 """Share of a column's square by which a triangle is kept from being singular."""
 ALIKE = 1e4
 """Ratio of squares that the first triangle may be wrong by."""
+
+
+Read = Callable[[slice], tuple[Motion, np.ndarray]]
+"""Gives motion and forces of some samples."""
+Progress = Callable[[float], None]
+"""Is told which share is done, of 1."""
 
 
 class Ends(NamedTuple):
@@ -62,6 +70,12 @@ def _chain(observations: Observations) -> tuple[Stage, ...]:
     return stages(observations.filter, observations.decimation, observations.sample_time)
 
 
+def held(observations: Observations) -> Read:
+    """Motion and forces from memory."""
+    forces = np.asarray(observations.forces)
+    return lambda samples: (observations.motion[samples], forces[samples])
+
+
 class Stream:
     """A log on its way through the compiled loop.
 
@@ -70,6 +84,8 @@ class Stream:
         observations: A long log.
         edges: Rows at which blocks of time begin, and the last one ends.
         chunk: Samples of an iteration.
+        read: Gives motion and forces of some samples; those of the observations if None.
+        progress: Is told now and then which share of the log is done, of 1.
     """
 
     def __init__(
@@ -78,7 +94,11 @@ class Stream:
         observations: Observations,
         edges: Sequence[int],
         chunk: int = CHUNK,
+        read: Read | None = None,
+        progress: Progress | None = None,
     ):
+        self._read = held(observations) if read is None else read
+        self._progress = progress
         chain = _chain(observations)
         self._stride = 1
         if all(len(stage.response) == 1 for stage in chain):
@@ -100,7 +120,8 @@ class Stream:
         for chunk_of_rows in observations.chunks(max(4096, 2 * reach)) if reach else ():
             outer = ~covered[slice(*chunk_of_rows.rows)]
             if outer.any():
-                columns, forces = reduced(base, observations, chunk_of_rows)
+                motion, measured = self._read(slice(*chunk_of_rows.samples))
+                columns, forces = reduced(base, motion, measured, chunk_of_rows)
                 self._append(slice(*chunk_of_rows.rows), outer, columns, forces)
 
     def _append(
@@ -150,16 +171,34 @@ class Stream:
                 samples = slice(begin, min(begin + length, b), self._stride)
                 yield Piece(block, (r, end), samples)
 
-    def _piece(self, piece: Piece, mixing: Grams, most: int | None = None) -> Grams:
-        """One call of the loop, of a piece's first rows only if `most` is given."""
-        o, delay = self._observations, self._kernel.shape.delay
-        a, b = piece.rows
-        b = b if most is None else min(b, a + most)
-        weights = np.zeros((delay + b - a, self._mask.shape[1]), bool)
-        weights[delay:] = self._mask[a:b]
-        motion = [np.asarray(x)[piece.samples] for x in (o.motion.q, o.motion.qd, o.motion.qdd)]
-        forces = np.asarray(o.forces)[piece.samples]
-        return self._kernel([_float(x) for x in motion], _float(forces), weights, mixing)
+    def _runs(
+        self, pieces: Sequence[Piece], mixing: Grams, most: int | None = None
+    ) -> Iterator[tuple[Piece, Grams]]:
+        """Calls the loop for some pieces, and reads the next one meanwhile.
+
+        With `most`, only so many rows of each piece are read.
+        """
+        if most is not None:
+            pieces = [self._first(piece, most) for piece in pieces]
+        with ThreadPoolExecutor(1) as reader:
+            coming = [reader.submit(self._read, p.samples) for p in pieces[:1]]
+            for piece, following in zip(pieces, [*pieces[1:], None], strict=True):
+                motion, forces = coming.pop().result()
+                if following is not None:
+                    coming.append(reader.submit(self._read, following.samples))
+                delay, (a, b) = self._kernel.shape.delay, piece.rows
+                weights = np.zeros((delay + b - a, self._mask.shape[1]), bool)
+                weights[delay:] = self._mask[a:b]
+                parts = [_float(x) for x in (motion.q, motion.qd, motion.qdd)]
+                yield piece, self._kernel(parts, _float(forces), weights, mixing)
+
+    def _first(self, piece: Piece, most: int) -> Piece:
+        """The first rows of a piece."""
+        (a, b), samples, shape = piece.rows, piece.samples, self._kernel.shape
+        b = min(b, a + most)
+        iterations = -(-(b - a + shape.delay) // shape.rows)
+        stop = min(samples.stop, samples.start + iterations * shape.samples * self._stride)
+        return Piece(piece.block, (a, b), slice(samples.start, stop, samples.step))
 
     def _glance(self) -> Grams:
         """Gram matrices of a few parts of the log as they are."""
@@ -167,16 +206,18 @@ class Stream:
         step = max(1, len(self._pieces) // GLANCES)
         rows = 2 * self._kernel.shape.rows
         total = [np.zeros((width, width)) for width in self._widths]
-        for piece in self._pieces[step // 2 :: step]:
-            _add(total, self._piece(piece, plain, rows))
+        for _, grams in self._runs(self._pieces[step // 2 :: step], plain, rows):
+            _add(total, grams)
         self._add_ends([total] * (len(self._edges) - 1), plain)
         return total
 
     def _grams(self, mixing: Grams) -> list[Grams]:
         """Gram matrices of every block."""
         blocks = [[np.zeros((w, w)) for w in self._widths] for _ in self._edges[1:]]
-        for piece in self._pieces:
-            _add(blocks[piece.block], self._piece(piece, mixing))
+        for done, (piece, grams) in enumerate(self._runs(self._pieces, mixing), 1):
+            _add(blocks[piece.block], grams)
+            if self._progress is not None:
+                self._progress(done / len(self._pieces))
         self._add_ends(blocks, mixing)
         return blocks
 
