@@ -26,7 +26,7 @@ from jaxid.identification.weights import AbstractWeights
 from jaxid.robot.robot import Robot
 from jaxid.types import AnyArray, Array, Bool, Float, require_float64
 
-IN_A_CALL = 32
+IN_A_CALL = 16
 """Data sets of one call of the compiled computation."""
 
 

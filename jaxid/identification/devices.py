@@ -6,6 +6,7 @@ tens of kilobytes for each block of time. Factors are joined in a fixed order, s
 holds the same answer.
 """
 
+import functools
 import itertools
 import zlib
 from collections.abc import Callable, Sequence
@@ -98,6 +99,7 @@ def _divided(x: np.ndarray, filled: int, devices: int, chunks: int) -> np.ndarra
     return whole.reshape((devices, chunks, -1, x.shape[1]))
 
 
+@functools.lru_cache(maxsize=8)
 def _reduced(program: JointRows, mesh: Mesh) -> Callable:
     """The compiled computation: every device reduces its own chunks one after the other."""
     spec = PartitionSpec(mesh.axis_names[0])

@@ -176,9 +176,7 @@ def _solve_one(rows: JointRows, one: DataSets, total: Callable) -> BatchFit:
     )
 
 
-def _counted(
-    one: DataSets, columns: list[Array]
-) -> tuple[list[Array], list[Array]]:
+def _counted(one: DataSets, columns: list[Array]) -> tuple[list[Array], list[Array]]:
     """For each joint its columns [columns, samples] and forces [draws, samples] that count."""
     forces = list(jnp.moveaxis(one.forces, -1, 0))
     if one.mask is None:

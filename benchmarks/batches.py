@@ -1,0 +1,200 @@
+"""Many data sets in one call against a loop in NumPy; one log on several devices.
+
+    python benchmarks/batches.py [--quick] [--json FILE]
+
+The loop does for each data set what a careful user of NumPy does: regressor rows of the base
+parameters, weights, `numpy.linalg.lstsq`. Its rows come once from Pinocchio, called for each sample
+from Python, and once from this package's evaluation in NumPy. One turn takes the whole batch and a
+few data sets of each loop; what is compared is the time for one data set. BLAS has one thread.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+
+import timing
+from timing import Row, hand_over, interleaved
+
+ASKED = 20.0
+EPSILON = 0.01
+"""Of the smooth sign of Coulomb friction [rad/s]."""
+
+
+def motions(datasets, samples, joints):
+    """Fourier series of five harmonics, other coefficients for each data set."""
+    import numpy as np
+
+    import jaxid as jid
+
+    random = np.random.default_rng(0)
+    t = np.linspace(0, 10, samples)
+    w = 0.2 * np.pi * np.arange(1, 6)
+    a, b = random.normal(scale=0.3, size=(2, datasets, joints, 5))
+    c, s = np.cos(np.outer(w, t)), np.sin(np.outer(w, t))
+    series = (a @ c + b @ s, (b * w) @ c - (a * w) @ s, -(a * w**2) @ c - (b * w**2) @ s)
+    return jid.Motion(*(np.ascontiguousarray(x.swapaxes(1, 2)) for x in series))
+
+
+def seven_axes():
+    import jaxid as jid
+
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
+    return jid.base_parameters(jid.Model(jid.robots.panda(), terms))
+
+
+def by_evaluation(base):
+    """Rows by this package's evaluation in NumPy, [samples, joints, base]."""
+    import numpy as np
+
+    from jaxid.dynamics.machine import in_numpy
+
+    return lambda m: np.ascontiguousarray(in_numpy(base, base.columns, m.q, m.qd, m.qdd))
+
+
+def by_pinocchio(base):
+    """Rows by Pinocchio, sample by sample, with friction columns beside them."""
+    import numpy as np
+    import pinocchio as pin
+    from pinocchio_loop import Bodies, in_our_order, pinocchio_model
+
+    n = base.model.robot.joints
+    model = pinocchio_model(base.model.robot, Bodies(n))
+    data = model.createData()
+    chosen = np.array(base.indices)
+    bodies, friction = chosen[chosen < 10 * n], chosen[chosen >= 10 * n] - 10 * n
+
+    def rows(m):
+        found = np.empty((len(m.q), n, 10 * n))
+        for k in range(len(m.q)):
+            found[k] = pin.computeJointTorqueRegressor(model, data, m.q[k], m.qd[k], m.qdd[k])
+        rubbed = np.zeros((len(m.q), n, 2 * n))
+        at = np.arange(n)
+        rubbed[:, at, at], rubbed[:, at, n + at] = m.qd, np.tanh(m.qd / EPSILON)
+        return np.concatenate([in_our_order(found, n)[..., bodies], rubbed[..., friction]], axis=-1)
+
+    return rows
+
+
+def solved(rows, motion, forces, weights):
+    """Weighted least squares of one data set, columns scaled to length one."""
+    import numpy as np
+
+    theta = (rows(motion) * weights[:, None]).reshape(forces.size, -1)
+    scale = np.linalg.norm(theta, axis=0)
+    return np.linalg.lstsq(theta / scale, (forces * weights).ravel(), rcond=None)[0] / scale
+
+
+def against_loops(datasets, samples, turns):
+    import jax
+    import numpy as np
+
+    from jaxid.identification.batches import identify_batch
+
+    base = seven_axes()
+    n = base.model.robot.joints
+    motion = motions(datasets, samples, n)
+    random = np.random.default_rng(1)
+    forces = np.asarray(base.inverse_dynamics(random.normal(size=base.size), motion))
+    forces = forces + 0.1 * random.normal(size=forces.shape)
+    weights = 1.0 / np.asarray(base.model.robot.max_forces)
+    some = range(min(4, datasets))
+
+    def batch():
+        return jax.block_until_ready(identify_batch(base, motion, forces).parameters)
+
+    ours, first = timing.elapsed(batch)
+    ways = {"NumPy + this package's rows": by_evaluation(base)}
+    if timing.missing("pinocchio") is None:
+        ways["NumPy + Pinocchio's rows"] = by_pinocchio(base)
+    else:
+        print(timing.missing("pinocchio"))
+    cases = {"batch": batch}
+    for name, rows in ways.items():
+        p = solved(rows, motion[0], forces[0], weights)
+        np.testing.assert_allclose(ours[0], p, rtol=1e-8, atol=1e-8 * np.abs(p).max())
+        cases[name] = lambda rows=rows: [solved(rows, motion[k], forces[k], weights) for k in some]
+    times = interleaved(cases, turns)
+    mine = times["batch"].median / datasets
+    found = []
+    for name in ways:
+        ratio = times[name] / times["batch"] * datasets / len(some)
+        loop = times[name].median / len(some)
+        found.append(
+            Row(
+                "15",
+                f"{datasets} data sets x {samples} samples in one call, against {name} + lstsq",
+                f"Panda, {base.size} base parameters with friction, float64, two cores, median of "
+                f"{turns} turns; the loop on {len(some)} data sets a turn; compile "
+                f"{first - times['batch'].median:.1f} s apart",
+                f"{ASKED:.0f}x",
+                f"{ratio:.1f}x ({1e3 * mine:.2f} ms against {1e3 * loop:.1f} ms for a data set)",
+                ratio >= ASKED,
+            )
+        )
+    return found
+
+
+def on_devices(samples, turns):
+    """Seconds for one log on this process's devices, printed for the process that asked."""
+    import jax
+
+    from jaxid.identification.devices import factorise_on_devices
+
+    base = seven_axes()
+    n = base.model.robot.joints
+    whole = motions(1, samples, n)[0]
+    forces = whole.q
+    _, first = timing.elapsed(lambda: factorise_on_devices(base, whole, forces))
+    seconds = []
+    for _ in range(turns):
+        start = time.perf_counter()
+        factorise_on_devices(base, whole, forces)
+        seconds.append(time.perf_counter() - start)
+    seconds.sort()
+    print(json.dumps([len(jax.devices()), seconds[len(seconds) // 2], first]))
+
+
+def scaling(samples, turns, quick):
+    """The same log on one and on two devices, each with a core of its own."""
+    found = {}
+    for devices in (1, 2):
+        command = [sys.executable, __file__, "--devices", str(devices), *["--quick"] * quick]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        count, median, first = json.loads(done.stdout.splitlines()[-1])
+        found[count] = median
+        print(f"{count} device(s): {median:.3f} s for {samples} samples, first call {first:.1f} s")
+    return Row(
+        "16",
+        "one log on two devices of a core each, against one",
+        f"Panda with friction, {samples} samples, triangular factors, median of {turns} calls, one "
+        "process after the other: a busy machine shows here",
+        "",
+        f"{found[1] / found[2]:.2f}x ({found[1]:.2f} s against {found[2]:.2f} s)",
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="fewer data sets and samples")
+    parser.add_argument("--json", help="where to write the rows")
+    parser.add_argument("--devices", type=int, help="only one log on so many devices")
+    options = parser.parse_args()
+    datasets, log = (128, 20_000) if options.quick else (1000, 100_000)
+    timing.pin_to(options.devices or 2)
+    for name in timing.THREADS:
+        os.environ[name] = "1"
+    if options.devices:
+        count = f"--xla_force_host_platform_device_count={options.devices}"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}".strip()
+        on_devices(log, 5)
+        return
+    rows = against_loops(datasets, 800, 5)
+    rows.append(scaling(log, 5, options.quick))
+    hand_over(rows, options.json)
+
+
+if __name__ == "__main__":
+    main()
