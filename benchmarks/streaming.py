@@ -1,11 +1,12 @@
 """How fast, how small and how accurate is the identification from long logs?
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/streaming.py [--quick]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/streaming.py [--quick] [--disk SAMPLES]
 
 A seven-axis arm at 1 kHz in float64: every sample a row; forces and columns filtered (zero phase,
-20 Hz) and every 25th a row; and the first against a loop over Pinocchio's regressor in NumPy,
-interleaved with it. Medians of warm runs; compiling is told apart. Memory is the growth of the
-process's resident set during a warm run. Ratios count; absolute times depend on the machine.
+20 Hz) and every 25th a row; the first against a loop over Pinocchio's regressor in NumPy,
+interleaved with it; the second from a Parquet file, whose reading overlaps with the computing.
+Medians of warm runs; compiling is told apart. Memory is the growth of the process's resident set
+during a warm run. Ratios count; absolute times depend on the machine.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import math
 import os
 import statistics
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -21,12 +23,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import numpy as np
+import polars as pl
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
 from jaxid.identification.factors import Blocks, streamed
+from jaxid.identification.streaming_log import open_log
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
 RATE = 1000.0
@@ -188,6 +192,49 @@ def case(name, base, o, repetitions):
     )
 
 
+def written(base, samples, folder):
+    """A Parquet file of one motion after the other, never held as a whole."""
+    step, parts = min(samples, 500_000), []
+    for k, start in enumerate(range(0, samples, step)):
+        motion, forces = virtual_log(base, min(step, samples - start))
+        arrays = {"q": motion.q, "tau": forces}
+        columns = {f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(x.shape[1])}
+        parts.append(folder / f"part{k}.parquet")
+        pl.DataFrame(columns).write_parquet(parts[-1], row_group_size=65536)
+    path = folder / "log.parquet"
+    pl.scan_parquet(parts).sink_parquet(path, row_group_size=65536)
+    for part in parts:
+        part.unlink()
+    return path
+
+
+def from_disk(base, samples, repetitions):
+    columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1 / RATE)
+    smooth, every = jid.ZeroPhaseButterworth(20.0), jid.Subsample(25)
+    with tempfile.TemporaryDirectory() as name:
+        path = written(base, samples, Path(name))
+        log = open_log(path, columns, base.model.robot, smooth, every)
+        part = slice(100_000 // 2, 100_000 // 2 + 65536)
+        timed(identification, base, log)
+        reading = [timed(log.read, part)[0] * samples / 65536 for _ in range(5)]
+        motion, forces = log.read(slice(0, min(samples, 200_000)))
+        held = filtered(motion, forces)
+        computing = [
+            timed(identification, base, held)[0] * samples / len(forces) for _ in range(repetitions)
+        ]
+        times = [timed(identification, base, log)[0] for _ in range(repetitions)]
+        with Peak() as peak:
+            identification(base, log)
+        larger = max(statistics.median(reading), statistics.median(computing))
+        print(
+            f"{samples} samples from Parquet ({path.stat().st_size / 1e6:.0f} MB): median "
+            f"{statistics.median(times):.2f} s; reading and filtering alone "
+            f"{statistics.median(reading):.2f} s, computing alone "
+            f"{statistics.median(computing):.2f} s: {statistics.median(times) / larger:.2f} of the "
+            f"larger\n    memory {peak.megabytes:.0f} MB"
+        )
+
+
 def against_pinocchio(base, motion, forces, samples, repetitions):
     o = unfiltered(motion[:samples], forces[:samples])
     model = in_pinocchio(base.model.robot)
@@ -212,7 +259,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer samples and repetitions")
     jax.config.update("jax_enable_x64", True)
-    quick = parser.parse_args().quick
+    parser.add_argument("--disk", type=int, help="samples of the Parquet file")
+    given = parser.parse_args()
+    quick = given.quick
     samples, checked, looped, repetitions = (
         (120_000, 10_000, 5_000, 3) if quick else (1_000_000, 100_000, 200_000, 5)
     )
@@ -225,7 +274,9 @@ def main():
         o = prepare(motion[:checked], forces[:checked])
         away, condition = distance(base, o, *dense(base, o))
         print(f"{name}: {away:.1e} from a dense QR (condition number {condition:.0f})")
-    against_pinocchio(base, motion, forces, looped, 1 if not quick else repetitions)
+    against_pinocchio(base, motion, forces, looped, repetitions)
+    del motion, forces
+    from_disk(base, given.disk or (200_000 if quick else 10_000_000), 1 if not quick else 3)
 
 
 if __name__ == "__main__":
