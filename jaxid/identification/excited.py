@@ -73,7 +73,8 @@ def undetermined_directions(
     count = len(blocks.parts)
     deviations = np.sqrt(sums * count / max(count - 1, 1)) * inverse
     floor = np.finfo(float).eps * size
-    uncertainty = np.where(live, np.maximum(deviations, floor) / max(size, floor), np.inf)
+    whole = max(size, np.finfo(float).tiny)
+    uncertainty = np.where(live, np.maximum(deviations, floor) / whole, np.inf)
     return tuple(
         _direction(V[k], float(s[k] / s[0]), float(uncertainty[k]))
         for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]

@@ -89,7 +89,7 @@ def fit_blocks(
         estimator=estimator,
         solution=solution,
         recordings=recordings,
-        notes=base.notes,
+        notes=(*base.notes, *_pulled(decomposition, inverse)),
     )
 
 
@@ -132,6 +132,20 @@ def _covariance(
     unknown = np.sum(null**2, axis=0) > 1e-8
     inner[unknown, unknown] = np.inf
     return inner
+
+
+def _pulled(decomposition: Decomposition, inverse: np.ndarray) -> tuple[str, ...]:
+    """Says what standard deviations leave out where a solution keeps weak directions small."""
+    s = np.asarray(decomposition.values)
+    live = s > NUMERICAL * s.max(initial=0.0)
+    pulled = int(np.count_nonzero(live & (inverse * s**2 <= 0.5)))
+    if not pulled:
+        return ()
+    return (
+        f"the solution pulls {pulled} of {len(s)} directions of the parameters to less than half "
+        "of what the data say: standard deviations tell how estimates scatter, not how far this "
+        "pull takes them from the truth, and look too good where logs leave parameters open.",
+    )
 
 
 def _condition_numbers(factors: Factors, weighted: np.ndarray) -> ConditionNumbers:

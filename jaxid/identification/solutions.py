@@ -9,13 +9,14 @@ from jaxid.identification.factors import Blocks
 from jaxid.types import AnyArray, Float
 
 NUMERICAL = 1e-11
-"""Singular values below this share of the largest are rounding."""
+"""Singular values, and columns, below this share of the largest are rounding."""
 
 
 class Decomposition(eqx.Module):
     """Singular values of the weighted observation matrix with its columns scaled to length one.
 
-    Scaled columns make the answer independent of units. A column of zeros stays zero.
+    Scaled columns make the answer independent of units. A column of zeros stays zero, and so does
+    one of nothing but rounding.
 
     Attributes:
         scale: Lengths of the columns.
@@ -42,8 +43,9 @@ class Decomposition(eqx.Module):
             R = np.vstack([R, np.zeros((size - len(R), size))])
             z = np.append(z, np.zeros(size - len(z)))
         norms = np.linalg.norm(R, axis=0)
-        scale = np.where(norms > 0, norms, 1.0)
-        U, s, Vt = np.linalg.svd(R / scale, full_matrices=False)
+        felt = norms > NUMERICAL * norms.max(initial=0.0)
+        scale = np.where(felt, norms, 1.0)
+        U, s, Vt = np.linalg.svd(np.where(felt, R / scale, 0.0), full_matrices=False)
         forces = U.T @ z
         rest = float(np.sqrt(max(z @ z - forces @ forces, 0.0)))
         return cls(scale, s, Vt, forces, rest)

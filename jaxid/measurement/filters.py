@@ -105,11 +105,14 @@ class ZeroPhaseButterworth(AbstractFilter):
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         smooth = butterworth(self.cutoff, self.order, sample_time)
-        q = smooth(angles)
+        # From the first sample on: what stands still does so exactly, and no rounding moves it.
+        way = smooth(angles - angles[0])
+        q = angles[0] + way
         if velocities is None:
-            return Motion(q, first_difference(q, sample_time), second_difference(q, sample_time))
-        qd = smooth(velocities)
-        return Motion(q, qd, first_difference(qd, sample_time))
+            qd = first_difference(way, sample_time)
+            return Motion(q, qd, second_difference(way, sample_time))
+        change = smooth(velocities - velocities[0])
+        return Motion(q, velocities[0] + change, first_difference(change, sample_time))
 
     def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
         cutoff = self.cutoff if self.force_cutoff is None else self.force_cutoff
@@ -150,12 +153,12 @@ class PaperFilter(AbstractFilter):
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         self._refuse_slow_logs(sample_time)
+        way = angles - angles[0]
         b, a = differentiator(self.velocity, sample_time)
-        start = signal.lfilter_zi(b, a)[:, None] * angles[0]
-        qd, _ = signal.lfilter(b, a, angles, axis=0, zi=start)
+        qd = signal.lfilter(b, a, way, axis=0)
         b, a = differentiator(self.acceleration, sample_time)
         padding = min(len(angles) - 1, self.low_pass(sample_time).memory(SETTLED))
-        minus = signal.filtfilt(b, a, angles, axis=0, padtype="odd", padlen=padding)
+        minus = signal.filtfilt(b, a, way, axis=0, padtype="odd", padlen=padding)
         return Motion(angles, qd, -minus)
 
     def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
@@ -217,11 +220,12 @@ class PeriodicFourier(AbstractFilter):
         w = 2 * math.pi / self.period * np.arange(1, self.harmonics + 1)
         s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
         basis = np.hstack([np.ones((samples, 1)), s, c])
-        series = np.linalg.lstsq(basis, angles, rcond=None)[0]
-        self._refuse_misfit(angles, basis @ series)
+        series = np.linalg.lstsq(basis, angles - angles[0], rcond=None)[0]
+        q = angles[0] + basis @ series
+        self._refuse_misfit(angles, q)
         a, b = series[1 : self.harmonics + 1], series[self.harmonics + 1 :]
         W = w[:, None]
-        return Motion(basis @ series, c @ (W * a) - s @ (W * b), -s @ (W**2 * a) - c @ (W**2 * b))
+        return Motion(q, c @ (W * a) - s @ (W * b), -s @ (W**2 * a) - c @ (W**2 * b))
 
     def _refuse_misfit(self, angles: np.ndarray, fitted: np.ndarray) -> None:
         moved = angles.std(axis=0)

@@ -63,20 +63,26 @@ class TorqueErrors(eqx.Module):
 
     @property
     def rms_relative(self) -> Float[np.ndarray, " joints"]:
-        """RMS errors relative to the RMS of the measured forces, of 1."""
-        return self.rms / self.force_rms
+        """RMS errors relative to the RMS of the measured forces, of 1; NaN without any force."""
+        return _share(self.rms, self.force_rms)
 
     @property
     def relative(self) -> float:
         r"""Norm of all errors relative to the norm of all forces, $|Wp - Q| / |Q|$, of 1."""
         measured = np.where(self.counted, np.asarray(self.measured), np.nan)
-        return float(np.sqrt(np.nansum(self.errors**2) / np.nansum(measured**2)))
+        return float(np.sqrt(_share(np.nansum(self.errors**2), np.nansum(measured**2))))
 
     @property
     def explained(self) -> Float[np.ndarray, " joints"]:
         """Share of each joint's variance that the model explains ($R^2$), of 1."""
         measured = np.where(self.counted, np.asarray(self.measured), np.nan)
-        return 1.0 - np.nanmean(self.errors**2, axis=0) / np.nanvar(measured, axis=0)
+        return 1.0 - _share(np.nanmean(self.errors**2, axis=0), np.nanvar(measured, axis=0))
+
+
+def _share(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray | float:
+    """A part of a whole, of 1; NaN where there is no whole."""
+    whole = np.asarray(whole, np.float64)
+    return np.asarray(part) / np.where(whole > 0, whole, np.nan)
 
 
 def torque_errors(fit: Fit, observations: Observations) -> TorqueErrors:

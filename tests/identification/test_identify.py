@@ -6,6 +6,7 @@ from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.factors import factorise
+from jaxid.identification.solutions import Decomposition
 
 WEIGHTED = jid.WeightedLeastSquares(jid.MeasuredForces())
 
@@ -135,6 +136,45 @@ def test_a_joint_that_never_moves_is_named_and_the_rest_is_right(base):
     assert "fv2" in " ".join(d.sentence(base) for d in fit.undetermined)
 
 
+@pytest.mark.parametrize("solution", [jid.Complete(), jid.Truncated(), jid.Ridge()])
+def test_a_log_of_a_joint_that_stands_gives_no_absurd_estimates(base, solution):
+    """From the recorded angles on, whose differences must not make columns out of rounding."""
+    robot, p = base.model.robot, standard_parameters(base.model)
+    o = observations(base.model, p, still=(1,), samples=2000, noise=0.1)
+    log = jid.Recording.of(np.asarray(o.motion.q) + 0.3, o.forces, sample_time=0.005)
+    fit = jid.identify(
+        base, jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0)), jid.LeastSquares(solution)
+    )
+    assert np.abs(fit.parameters).max() < 1e3
+    open_ = [base.names.index(name) for name in ("fv2", "fc2")]
+    np.testing.assert_allclose(fit.parameters[open_], 0.0, atol=1e-9)
+    assert np.isinf(fit.standard_deviations[open_]).all()
+
+
+def test_columns_of_nothing_but_rounding_count_as_zero():
+    rng = np.random.default_rng(0)
+    R = rng.normal(size=(20, 3)) * [1.0, 1e-13, 1.0]
+    d = Decomposition.of(R, rng.normal(size=20))
+    p = d.solve(jid.Complete().inverse(d.values))
+    assert p[1] == 0.0
+    assert np.abs(p).max() < 10.0
+
+
+def test_what_a_solution_pulls_is_said(base, noisy):
+    assert jid.identify(base, noisy).notes == ()
+    for solution in (jid.Ridge(0.3), jid.Truncated(0.3)):
+        (note,) = jid.identify(base, noisy, jid.LeastSquares(solution)).notes
+        assert f"of {base.size} directions" in note
+        assert "not how far this pull takes them from the truth" in note
+
+
+def test_forces_that_are_all_zero_are_no_crash(base):
+    o = observations(base.model, np.zeros(base.model.size))
+    fit = jid.identify(base, o)
+    np.testing.assert_allclose(fit.parameters, 0.0, atol=1e-12)
+    assert np.isnan(jid.validate(fit, o).errors[0].relative)
+
+
 def test_well_excited_data_leave_nothing_open(base, noisy):
     assert jid.identify(base, noisy).undetermined == ()
 
@@ -142,8 +182,6 @@ def test_well_excited_data_leave_nothing_open(base, noisy):
 def test_truncated_solution_leaves_weak_directions_at_zero(base, noisy):
     weights = np.ones(2)
     blocks = factorise(base, [noisy])
-    from jaxid.identification.solutions import Decomposition
-
     d = Decomposition.of(*blocks.total.weighted(weights))
     share = float(d.values[4] / d.values[0]) * 0.999
     fit = jid.identify(base, noisy, jid.LeastSquares(jid.Truncated(share)))

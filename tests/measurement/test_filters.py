@@ -126,6 +126,20 @@ def test_motions_follow_the_desired_ones(filter):
         assert np.polyfit(qdd[inner, j], motion.qdd[inner, j], 1)[0] == pytest.approx(1, abs=5e-3)
 
 
+@every
+@pytest.mark.parametrize("angle", [0.3, 123.456])
+def test_a_joint_that_stands_has_no_speed_at_all(filter, angle):
+    """Rounding would be a column of its own to least squares, and parameters of 1e15 the answer."""
+    q = fourier(DT * np.arange(round(PERIOD / DT) + 1))[0]
+    q[:, 1] = angle
+    speed = np.zeros_like(q)
+    for velocities in (None, speed):
+        motion = filter.motion(q, velocities, DT)
+        assert (motion.q[:, 1] == angle).all()
+        assert not motion.qd[:, 1].any()
+        assert not motion.qdd[:, 1].any()
+
+
 def test_butterworth_derivatives_are_of_fourth_order():
     """Difference stencils of second order would lose 6e-3 of a velocity here."""
     dt, k = 0.008, 2 * np.pi * 4

@@ -44,6 +44,15 @@ def test_rows_that_do_not_count_change_nothing():
     np.testing.assert_allclose(e.mean[0], np.abs(e.errors[counted[:, 0], 0]).mean())
 
 
+def test_a_joint_without_any_force_has_no_relative_error():
+    e = errors()
+    measured = np.asarray(e.measured) * [1.0, 0.0]
+    silent = TorqueErrors(e.name, e.time, measured, e.predicted, e.counted, e.max_forces)
+    for found in (silent.rms_relative, silent.explained):
+        np.testing.assert_array_equal(np.isnan(found), [False, True])
+    assert np.isfinite(silent.relative)
+
+
 def test_a_perfect_prediction_explains_everything():
     e = errors()
     perfect = TorqueErrors(e.name, e.time, e.measured, e.measured, e.counted, e.max_forces)
