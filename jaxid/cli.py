@@ -47,7 +47,7 @@ ExperimentFile = Annotated[
 
 
 class SpreadVerify(TyperCommand):
-    """Takes `--verify b.csv c.csv` for `--verify b.csv --verify c.csv`.
+    """Takes `--verify b.csv c.csv` for `--verify b.csv --verify c.csv`; `--verify=b.csv` alike.
 
     Otherwise the second log would silently be used to identify.
     """
@@ -59,7 +59,7 @@ class SpreadVerify(TyperCommand):
             if arg == "--verify":
                 verifying = True
             elif arg.startswith("-"):
-                verifying = False
+                verifying = arg.startswith("--verify=")
                 spread.append(arg)
             else:
                 spread += ["--verify", arg] if verifying else [arg]
@@ -85,7 +85,9 @@ def _is_for_the_user(error: Exception) -> bool:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    if trace is None or not trace.tb_frame.f_globals.get("__name__", "").startswith("jaxid."):
+    # The package, not the module: that is called `__main__` where it is run with `python -m`.
+    package = "" if trace is None else trace.tb_frame.f_globals.get("__package__") or ""
+    if trace is None or package.partition(".")[0] != "jaxid":
         return False
     # NumPy's own errors have no frame below ours: only a `raise` statement is a sentence.
     return trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
@@ -244,7 +246,7 @@ def identify(
     loaded = load_experiment(experiment)
     others = verify or []
     with _stages(4 + 2 * (len(logs) + len(others))) as stage:
-        fitted, checked = _observe_all(loaded, logs, others, stage)
+        fitted, checked, doubts = _observe_all(loaded, logs, others, stage)
         if split is not None:
             parts = [o.split(split) for o in fitted]
             percent = f"{100 * split:g}"
@@ -279,12 +281,13 @@ def identify(
                 "decimation": str(loaded.decimation),
                 "slow": loaded.slow,
             },
-            (*loaded.notes, *dict.fromkeys(logs_said)),
+            (*loaded.notes, *dict.fromkeys(logs_said), *doubts),
             beside,
         )
     terminal.show_robot(console, loaded)
     console.print()
     terminal.sentences(console, [*loaded.notes, *logs_said, *fit.notes])
+    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
     terminal.show_fit(console, fit)
     console.print()
     terminal.show_rows(console, fitted, fit)
@@ -297,10 +300,10 @@ def identify(
 
 
 def _observe_all(experiment: Experiment, logs: list[Path], others: list[Path], stage):
-    """Reads and filters all logs; those of equal names take their folders' in front."""
+    """Reads and filters all logs, and doubts them; equal names take their folders' in front."""
     paths = [*logs, *others]
     stems = [p.stem for p in paths]
-    observed = []
+    observed, doubts = [], []
     for path in paths:
         stage(f"reading {path.name}")
         recording = experiment.read(path)
@@ -310,7 +313,9 @@ def _observe_all(experiment: Experiment, logs: list[Path], others: list[Path], s
             )
         stage(f"filtering {path.name}")
         observed.append(experiment.observe(recording))
-    return observed[: len(logs)], observed[len(logs) :]
+        check = check_log(experiment.robot, recording, observed[-1])
+        doubts += [f"{recording.name}: {warning}" for warning in check.warnings]
+    return observed[: len(logs)], observed[len(logs) :], doubts
 
 
 def _named(observations: Observations, name: str) -> Observations:

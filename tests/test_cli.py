@@ -152,10 +152,9 @@ def test_output_keeps_to_the_width_of_the_terminal(folder, run, monkeypatch, wid
     assert not any("…" in line.split("  ", 2)[-1][-30:] for line in lines)
 
 
-def test_every_log_behind_verify_is_one_to_verify_with(folder, run):
-    code, _, _ = run(
-        "identify", "experiment.toml", "a.csv", "--verify", "b.csv", "c.csv", "-o", "r"
-    )
+@pytest.mark.parametrize("verify", [("--verify", "b.csv"), ("--verify=b.csv",)])
+def test_every_log_behind_verify_is_one_to_verify_with(folder, run, verify):
+    code, _, _ = run("identify", "experiment.toml", "a.csv", *verify, "c.csv", "-o", "r")
     assert code == 0
     found = result(folder, "r")
     assert found["fit"]["recordings"] == ["a"]
@@ -235,6 +234,32 @@ def test_inspect_doubts_wrong_units_and_signs(folder, run):
     write_log(folder / "signs.csv", 3, sign=-1.0)
     signs = words(good, "signs.csv")
     assert "friction of joint `joint2` comes out negative" in signs
+
+
+def test_wrapped_angles_are_doubted_by_both_commands(folder, run):
+    lines = (folder / "a.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    for row in rows[600:]:
+        row[1] = f"{float(row[1]) - 6.283185:.7f}"
+    (folder / "wrapped.csv").write_text("\n".join(",".join(row) for row in rows))
+    sentence = "the angle of joint `joint1` jumps by 6.2"
+    for command in ("inspect", "identify"):
+        code, out, err = run(command, "experiment.toml", "wrapped.csv")
+        assert code == 0, err
+        assert sentence in " ".join(out.split())
+    assert any(sentence in note for note in result(folder)["notes"])
+    out = " ".join(run("identify", "experiment.toml", "a.csv")[1].split())
+    assert "jumps" not in out
+
+
+def test_run_as_a_module_mistakes_are_sentences_too(folder):
+    command = [sys.executable, "-m", "jaxid.cli", "identify", "experiment.toml", "a.csv"]
+    environment = {**os.environ, "PYTHONPATH": ROOT}
+    done = subprocess.run(
+        [*command, "--split", "2"], capture_output=True, text=True, env=environment
+    )
+    assert done.returncode == 2
+    assert done.stderr == "jaxid: `--split` must lie between 0 and 1, like 0.6, but is 2.\n"
 
 
 def test_init_writes_a_file_that_loads(tmp_path, run, monkeypatch):

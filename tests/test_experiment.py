@@ -579,3 +579,24 @@ def test_the_template_breaks_long_lists(tmp_path):
     assert max(map(len, path.read_text().splitlines())) <= 100
     low = load_experiment(path).robot.limits.position_min
     np.testing.assert_array_equal(low, [-i - 1 / 3 for i in range(1, 31)])
+
+
+@pytest.mark.parametrize(
+    ("units", "sentence"),
+    [
+        ("angle_unit = 'deg'", '`angle_unit` of joint `rail` is "deg", but the joint slides'),
+        (
+            "angle_unit = ['m', 'mm']",
+            '`angle_unit` of joint `shoulder` is "mm", but the joint turns',
+        ),
+        ("velocity_unit = 'rpm'", '`velocity_unit` of joint `rail` is "rpm", but the joint slides'),
+    ],
+)
+def test_degrees_for_a_rail_are_refused(tmp_path, load, units, sentence):
+    """A rail in metres would silently be taken for degrees and shrink by a factor of 57."""
+    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
+    text = '[robot]\nurdf = "arm.urdf"\n' + RECORDING + units
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        load(text)
+    motors = load(text + '\nside = "motor"\n')
+    assert motors.columns.angles_on_motor_side

@@ -48,6 +48,8 @@ from jaxid.measurement.units import Unit, unit
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
 
+TURNS = ("deg", "rev", "deg/s", "rpm")
+LENGTHS = ("mm", "mm/s")
 CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
 
@@ -102,7 +104,8 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
     """What the columns of the logs hold.
 
     Raises:
-        ValueError: If a unit is unknown, a list has a wrong length, or the time is not given.
+        ValueError: If a unit is unknown or does not fit its joint, a list has a wrong length, or
+            the time is not given.
     """
     if table is None:
         return None
@@ -115,6 +118,9 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
     for name in ("torque_constants", "angle_signs", "force_signs", "angle_offsets"):
         each(robot, name, getattr(table, name))
     forces_side = table.side if table.forces_side is None else table.forces_side
+    if table.side == "joint":
+        _refuse_mixed(robot, "angle_unit", table.angle_unit)
+        _refuse_mixed(robot, "velocity_unit", table.velocity_unit)
     return Columns(
         _selection(robot, "angles", table.angles),
         _selection(robot, "forces", table.forces),
@@ -146,6 +152,25 @@ def _units(robot: Robot, name: str, value: str | list[str]) -> Unit | list[Unit]
     if isinstance(value, str):
         return unit(value)
     return [unit(one) for one in each(robot, name, value) or []]
+
+
+def _refuse_mixed(robot: Robot, name: str, value: str | list[str] | None) -> None:
+    """Refuses degrees for a joint that slides and millimetres for one that turns.
+
+    Raises:
+        ValueError: If there is such a joint.
+    """
+    if value is None:
+        return
+    symbols = [value] * robot.joints if isinstance(value, str) else each(robot, name, value) or []
+    for label, turns, symbol in zip(robot.joint_names, robot.revolute, symbols, strict=True):
+        if symbol in (LENGTHS if turns else TURNS):
+            others = "an angle" if turns else "a length"
+            raise ValueError(
+                f'`{name}` of joint `{label}` is "{symbol}", but the joint '
+                f"{'turns' if turns else 'slides'}: give a list with one unit for each joint, of "
+                f"{others} for this one."
+            )
 
 
 def build_filter(

@@ -80,6 +80,7 @@ def check_log(robot: Robot, recording: Recording, observations: Observations) ->
     )
     warnings = [w for j in range(robot.joints) for w in _joint(robot, j, check)]
     warnings += _signs(qd, forces)
+    warnings += _jumps(robot, recording)
     warnings += _velocities(robot, recording, observations)
     if check.all_standing > 0.5:
         warnings.append(
@@ -131,6 +132,21 @@ def _signs(qd: np.ndarray, forces: np.ndarray) -> list[str]:
     return [
         "the robot gives off energy over the whole log: check the signs of its angles and forces "
         "(`recording.angle_signs`, `force_signs`)."
+    ]
+
+
+def _jumps(robot: Robot, recording: Recording) -> list[str]:
+    """A joint does not turn by half a turn or more from one sample to the next."""
+    if recording.angles_on_motor_side:
+        return []
+    angles = np.asarray(recording.angles)
+    steps = [np.abs(np.diff(angles[a:b], axis=0)) for a, b in recording.segments if b > a + 1]
+    largest = np.max([s.max(axis=0) for s in steps], axis=0)
+    return [
+        f"the angle of joint `{name}` jumps by {largest[j]:.3g} rad from one sample to the next: "
+        "undo the wrapping at a full turn before the log is filtered."
+        for j, (name, turns) in enumerate(zip(robot.joint_names, robot.revolute, strict=True))
+        if turns and largest[j] > np.pi
     ]
 
 
