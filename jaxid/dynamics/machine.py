@@ -77,7 +77,15 @@ def on_samples(
         definition: Its method of first the shared arguments, then those of one sample.
         samples: Arguments with batch axes before their last axis.
         shared: Arguments that all samples have in common.
+
+    Raises:
+        ValueError: If the arguments do not have the same shape.
     """
+    if any(x.shape != samples[0].shape for x in samples):
+        came = ", ".join(str(x.shape) for x in samples)
+        raise ValueError(
+            f"coordinates, velocities and accelerations must have one shape, but have {came}."
+        )
     batch = samples[0].shape[:-1]
     count = math.prod(batch)
     flat = [x.reshape((count, x.shape[-1])) for x in samples]

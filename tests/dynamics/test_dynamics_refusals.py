@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trees
 
+from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import (
@@ -74,3 +75,10 @@ def test_coupled_drives_of_independent_drives():
 def test_transition_without_width(epsilon):
     with _refused("`epsilon` must be a positive speed, but is .*: use `HardSign`"):
         CoulombFriction(Tanh(epsilon))
+
+
+def test_velocities_of_other_instants():
+    q = np.zeros((3, 5))
+    sentence = r"coordinates, velocities and accelerations must have one shape, but have \(3, 5\)"
+    with _refused(sentence + r", \(2, 5\), \(3, 5\)"):
+        on_samples(MODEL, MODEL.columns, q, q[:2], q)
