@@ -79,10 +79,10 @@ class TorqueErrors(eqx.Module):
         return 1.0 - _share(np.nanmean(self.errors**2, axis=0), np.nanvar(measured, axis=0))
 
 
-def _share(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray | float:
+def _share(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray:
     """A part of a whole, of 1; NaN where there is no whole."""
     whole = np.asarray(whole, np.float64)
-    return np.asarray(part) / np.where(whole > 0, whole, np.nan)
+    return np.asarray(part / np.where(whole > 0, whole, np.nan))
 
 
 def torque_errors(fit: Fit, observations: Observations) -> TorqueErrors:
