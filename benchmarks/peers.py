@@ -224,8 +224,8 @@ def main():
     turns = 5 if options.quick else 15
     if options.cores is not None:
         timing.pin_to(options.cores)
-        large, small = (1024, 512) if options.quick else (16384, 4096)
-        rows = with_friction(large, turns) if options.cores == 2 else one_core(small, turns)
+        samples = 1024 if options.quick else 16384
+        rows = with_friction(samples, turns) if options.cores == 2 else one_core(samples, turns)
         hand_over(rows, options.json)
         return
     rows = []
