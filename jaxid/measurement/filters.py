@@ -155,7 +155,7 @@ class PaperFilter(AbstractFilter):
         self._refuse_slow_logs(sample_time)
         way = angles - angles[0]
         b, a = differentiator(self.velocity, sample_time)
-        qd = signal.lfilter(b, a, way, axis=0)
+        qd = np.asarray(signal.lfilter(b, a, way, axis=0))
         b, a = differentiator(self.acceleration, sample_time)
         padding = min(len(angles) - 1, self.low_pass(sample_time).memory(SETTLED))
         minus = signal.filtfilt(b, a, way, axis=0, padtype="odd", padlen=padding)
