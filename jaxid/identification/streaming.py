@@ -204,7 +204,7 @@ class Stream:
         """Gram matrices of a few parts of the log as they are."""
         plain = [np.eye(width) for width in self._widths]
         step = max(1, len(self._pieces) // GLANCES)
-        rows = 2 * self._kernel.shape.rows
+        rows = self._kernel.shape.rows
         total = [np.zeros((width, width)) for width in self._widths]
         for _, grams in self._runs(self._pieces[step // 2 :: step], plain, rows):
             _add(total, grams)
