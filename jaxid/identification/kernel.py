@@ -23,7 +23,7 @@ from jaxid.types import AnyArray, Array
 
 CHUNK = 2048
 """Samples of an iteration: their columns stay in the cache."""
-PIECE = 65536
+PIECE = 32768
 """Samples that are handed to the compiled loop at once."""
 TILE = 16
 """Rows of a banded matrix product: more multiply more zeros, fewer use the processor less."""
