@@ -2,8 +2,8 @@
 
 Data sets go through one compiled computation in groups, so that memory does not grow with their
 number. For each data set the rows of a joint are reduced to their products with each other and with
-the forces (Gram matrices), weighted, added, and solved with columns scaled to length one; one step
-of refinement with the residuals themselves brings back what squaring the condition number took.
+the forces (Gram matrices), weighted, added, and solved with columns scaled to length one. Where
+that loses digits, a refinement with the residuals, or orthogonal factors, bring them back.
 """
 
 import os
@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
@@ -81,7 +82,7 @@ def identify_batch(
         None if mask is None else jnp.asarray(mask, float),
         numbers,
     )
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(batch)):
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(batch)):
         fit = solve(rows, batch)
     else:
         fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch))
@@ -125,7 +126,9 @@ def _without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Arr
     if base.model.robot.tool is None:
         return jnp.asarray(forces)
     known = base.model.tool_forces(motion)
-    return forces - known.reshape(len(forces), *(1,) * (forces.ndim - 3), *known.shape[-2:])
+    return jnp.asarray(forces) - known.reshape(
+        len(forces), *(1,) * (forces.ndim - 3), *known.shape[-2:]
+    )
 
 
 def _solve_in_parts(rows: JointRows, batch: DataSets) -> BatchFit:

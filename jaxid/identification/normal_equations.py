@@ -1,8 +1,8 @@
 """Least squares of a few data sets by the products of their rows, as one compiled computation.
 
 Columns are evaluated for a group of data sets together; the products of the rows with each other
-and with the forces (Gram matrices), the solution and one refinement with the residuals themselves
-follow for each.
+and with the forces (Gram matrices) and the solution follow for each, with one refinement by the
+residuals themselves where products alone would lose digits.
 """
 
 from collections.abc import Callable
@@ -21,6 +21,10 @@ AT_ONCE = 4096
 WELL_CONDITIONED = 1e4
 """Condition number, with columns of length one, up to which products of rows are accurate enough;
 beyond it a data set is solved again by orthogonal factors."""
+ACCURATE = 1e3
+"""Bound of the condition number up to which the products' solution needs no refinement."""
+SMALL = 1e-6
+"""Share of the forces' squares below which the residuals' are summed themselves."""
 RIDGE = 64 * np.finfo(float).eps
 
 
@@ -60,12 +64,14 @@ def solve(rows: JointRows, batch: DataSets) -> BatchFit:
     """Solves all data sets, a group at a time."""
     batch = jax.tree.map(jnp.asarray, batch)
     datasets, samples, _ = batch.motion.q.shape
-    group = max(1, min(AT_ONCE // samples, datasets))
+    calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
+    group = -(-datasets // calls)
     chunks = -(-samples // AT_ONCE)
     batch = _filled(batch, chunks * -(-samples // chunks) - samples)
-    whole = -(-datasets // group) * group
+    whole = calls * group
+    more = jax.tree.map(lambda x: x[np.arange(whole - datasets)], batch)
     groups = jax.tree.map(
-        lambda x: x[np.arange(whole) % datasets].reshape((-1, group, *x.shape[1:])), batch
+        lambda x, y: jnp.concatenate([x, y]).reshape((-1, group, *x.shape[1:])), batch, more
     )
     fits = jax.lax.map(lambda one: _solve_group(rows, one, chunks), groups)
     return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
@@ -120,14 +126,14 @@ def _in_chunks(one: DataSets, chunks: int) -> DataSets:
         return jnp.moveaxis(x.reshape((*x.shape[:-2], chunks, length, x.shape[-1])), -3, 0)
 
     def repeat(x):
-        return None if x is None else jnp.broadcast_to(x, (chunks, *x.shape))
+        return jnp.broadcast_to(x, (chunks, *x.shape))
 
     return DataSets(
         jax.tree.map(divide, one.motion),
         divide(one.forces),
         repeat(one.weights),
         None if one.mask is None else divide(one.mask),
-        repeat(one.numbers),
+        None if one.numbers is None else repeat(one.numbers),
     )
 
 
@@ -148,27 +154,28 @@ def _solve_one(rows: JointRows, one: DataSets, total: Callable) -> BatchFit:
         one: The data set.
         total: Sums a function of data and columns over the data set's chunks.
     """
-    weights = one.weights
-    grams, products = total(lambda x, A: _products(*_counted(x, A)))
+    weights = jnp.asarray(one.weights)
+    grams, products, forces = total(lambda x, A: _products(*_counted(x, A)))
     inverse, condition = inverse_information(_added(rows, grams, weights))
     p = _added_products(rows, products, weights) @ inverse
-    products, squares = total(lambda x, A: _residuals(rows, *_counted(x, A), p))
-    step = _added_products(rows, products, weights) @ inverse
-    # The squares at the refined parameters: what is of second order in the step is rounding.
-    squares -= 2 * jnp.stack(
-        [
-            jnp.sum(step[:, np.array(own, int)] * y, axis=-1)
-            for own, y in zip(rows.columns, products, strict=True)
-        ],
-        axis=-1,
-    )
+    squares = _squares(rows, grams, products, forces, p)
+
+    def refine() -> tuple[Array, Array]:
+        products, squares = total(lambda x, A: _residuals(rows, *_counted(x, A), p))
+        step = _added_products(rows, products, weights) @ inverse
+        # The squares at the refined parameters: what is of second order in the step is rounding.
+        return p + step, squares - 2 * _along(rows, step, products)
+
+    # Residuals themselves are only needed where differences of large numbers would lose digits.
+    lost = (condition > ACCURATE) | jnp.any(squares < SMALL * forces)
+    p, squares = jax.lax.cond(lost, refine, lambda: (p, squares))
     squares = jnp.maximum(squares, 0.0)
     if one.mask is None:
         count = jnp.full(weights.shape, float(one.motion.q.shape[0]))
     else:
         count = one.mask.sum(axis=0)
     return BatchFit(
-        p + step,
+        p,
         _deviations(rows, inverse, grams, weights, squares, count),
         jnp.sqrt(squares / jnp.maximum(count, 1.0)[None]),
         condition,
@@ -188,9 +195,28 @@ def _counted(one: DataSets, columns: list[Array]) -> tuple[list[Array], list[Arr
     )
 
 
-def _products(columns: list[Array], forces: list[Array]) -> tuple[list[Array], list[Array]]:
+def _products(columns: list[Array], forces: list[Array]) -> tuple[list[Array], list[Array], Array]:
+    """Products of columns, of forces with columns, and the forces' squares by joint."""
     pairs = list(zip(columns, forces, strict=True))
-    return [A @ A.T for A, _ in pairs], [Q @ A.T for A, Q in pairs]
+    squares = jnp.stack([jnp.sum(Q**2, axis=-1) for Q in forces], axis=-1)
+    return [A @ A.T for A, _ in pairs], [Q @ A.T for A, Q in pairs], squares
+
+
+def _squares(
+    rows: JointRows, grams: list[Array], products: list[Array], forces: Array, p: Array
+) -> Array:
+    """The residuals' squares by joint [draws, joints], from products alone."""
+    felt = []
+    for own, gram in zip(rows.columns, grams, strict=True):
+        x = p[:, np.array(own, int)]
+        felt.append(jnp.sum((x @ gram) * x, axis=-1))
+    return forces - 2 * _along(rows, p, products) + jnp.stack(felt, axis=-1)
+
+
+def _along(rows: JointRows, p: Array, products: list[Array]) -> Array:
+    """Parameters times products, by joint [draws, joints]."""
+    pairs = zip(rows.columns, products, strict=True)
+    return jnp.stack([jnp.sum(p[:, np.array(k, int)] * y, axis=-1) for k, y in pairs], axis=-1)
 
 
 def _residuals(
