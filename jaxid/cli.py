@@ -242,6 +242,12 @@ def identify(
     console = _console()
     if split is not None and not 0 < split < 1:
         raise ValueError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
+    twice = {p.resolve() for p in logs} & {p.resolve() for p in verify or []}
+    if twice:
+        raise ValueError(
+            f"`{sorted(twice)[0].name}` is given both to identify and to verify with: a model that "
+            "has seen a log is not verified by it; use `--split` to divide one log."
+        )
     refuse_foreign_folder(output, force)
     loaded = load_experiment(experiment)
     others = verify or []

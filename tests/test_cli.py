@@ -391,3 +391,12 @@ def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch)
     monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
     with pytest.raises(ValueError, match="broadcast"):
         cli.main()
+
+
+def test_a_log_does_not_verify_what_has_seen_it(run, folder):
+    code, _, err = run(
+        "identify", "experiment.toml", "a.csv", "--verify", "../" + folder.name + "/a.csv"
+    )
+    assert code == 2
+    assert "`a.csv` is given both to identify and to verify with" in err
+    assert not (folder / "report").exists()

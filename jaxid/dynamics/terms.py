@@ -160,6 +160,11 @@ class HardSign(AbstractTransition):
         return _outside(self.dead_zone, qd, jnp.sign(qd))
 
 
+def _has_dead_zone(transition: AbstractTransition) -> bool:
+    dead_zone = getattr(transition, "dead_zone", 0.0)
+    return isinstance(dead_zone, jax.Array) or bool(np.any(dead_zone))
+
+
 def _outside(dead_zone, qd, value):
     if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
         return value
@@ -220,7 +225,11 @@ class AsymmetricCoulombFriction(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """The shares of the two directions."""
         s = self.transition(qd)
-        return jnp.concatenate([jnp.diag(0.5 * (1.0 + s)), jnp.diag(0.5 * (s - 1.0))], axis=1)
+        # Within a dead zone both shares vanish, as the force does.
+        moving = (
+            jnp.where(s == 0.0, s, jnp.ones_like(s)) if _has_dead_zone(self.transition) else 1.0
+        )
+        return jnp.concatenate([jnp.diag(0.5 * (moving + s)), jnp.diag(0.5 * (s - moving))], axis=1)
 
 
 class ConstantOffset(AbstractTerm):
@@ -288,6 +297,12 @@ class CoupledDrives(AbstractTerm):
         """The motors that turn several axes, with their ratios relative to their own joint."""
         A = np.asarray(robot.drives.reduction)
         scale = np.abs(A).max()
+        if not np.diag(A).all():
+            motor = int(np.flatnonzero(np.diag(A) == 0)[0]) + 1
+            raise ValueError(
+                f"`drives.reduction` of `{robot.name}` must name the motors in the order of their "
+                f"joints, but motor {motor} does not turn joint {motor}: reorder its rows."
+            )
         return tuple(
             (i, A[i] / A[i, i])
             for i in range(robot.joints)

@@ -13,13 +13,12 @@ from rich.text import Text
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.sanity import LogCheck, known_forces
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit import DOUBTFUL as DOUBTFUL_SHARE
+from jaxid.identification.fit import TRUSTED, Fit, Trust
 from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.report.content import Beside
-from jaxid.report.estimates import DOUBTFUL as DOUBTFUL_SHARE
-from jaxid.report.estimates import TRUSTED
 from jaxid.report.numbers import MISSING, aligned, percent, significant
 from jaxid.report.tables import error_table, joint_table, parameter_table
 from jaxid.robot.robot import Robot
@@ -212,9 +211,7 @@ def show_rows(console: Console, observations: Iterable[Observations], fit: Fit) 
     count = str(rows[0]) if len(set(rows)) == 1 else f"{min(rows)} to {max(rows)}"
     every = next(iter(observations))
     good = numbers.scaled < LARGE_CONDITION
-    share = fit.relative_standard_deviations
-    steps = np.searchsorted([TRUSTED, DOUBTFUL_SHARE], share)
-    known = np.bincount(steps, minlength=3)
+    known = [fit.trust.count(level) for level in (Trust.GOOD, Trust.DOUBTFUL, Trust.NONE)]
     facts(
         console,
         [
@@ -232,7 +229,7 @@ def show_rows(console: Console, observations: Iterable[Observations], fit: Fit) 
             (
                 "estimates",
                 f"{known[0]} of {fit.base.size} known to {100 * TRUSTED:g} %, {known[1]} to "
-                f"{100 * DOUBTFUL_SHARE:g} %, {known[2]} worse (standard deviations)",
+                f"{100 * DOUBTFUL_SHARE:g} %, {known[2]} worse or undetermined (standard deviations)",
             ),
         ],
     )

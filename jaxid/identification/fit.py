@@ -1,5 +1,7 @@
 """What comes out of an identification."""
 
+import enum
+
 import equinox as eqx
 import numpy as np
 
@@ -10,6 +12,17 @@ from jaxid.identification.estimators import AbstractEstimator
 from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.types import AnyArray, Float
+
+TRUSTED, DOUBTFUL = 0.1, 0.5
+"""Relative standard deviations up to which an estimate is trusted, or doubtful, of 1."""
+
+
+class Trust(enum.Enum):
+    """How far an estimate can be trusted."""
+
+    GOOD = "trusted"
+    DOUBTFUL = "doubtful"
+    NONE = "small, or not excited"
 
 
 class ConditionNumbers(eqx.Module):
@@ -71,6 +84,19 @@ class Fit(eqx.Module):
         size = np.abs(np.asarray(self.parameters))
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(size > 0, self.standard_deviations / size, np.inf)
+
+    @property
+    def trust(self) -> tuple[Trust, ...]:
+        """How far each estimate can be trusted; not if it is part of what is undetermined."""
+        undecided = {k for direction in self.undetermined for k in direction.parts}
+        return tuple(
+            Trust.NONE
+            if k in undecided or not share <= DOUBTFUL
+            else Trust.GOOD
+            if share <= TRUSTED
+            else Trust.DOUBTFUL
+            for k, share in enumerate(self.relative_standard_deviations)
+        )
 
     @property
     def condition_number(self) -> float:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
 from jaxid.report.numbers import significant, with_deviation
 from jaxid.report.style import (
     BLUE,
@@ -22,8 +22,7 @@ from jaxid.report.style import (
     new_figure,
 )
 
-TRUSTED, DOUBTFUL = 0.1, 0.5
-"""Relative standard deviations up to which an estimate is trusted, and above which it is not."""
+COLOURS = {Trust.GOOD: BLUE, Trust.DOUBTFUL: ORANGE, Trust.NONE: VERMILION}
 LINE = 0.19
 LONGEST_COLUMN = 40
 FLOOR, CEILING = 1e-5, 10.0
@@ -68,13 +67,9 @@ def parameter_figure(fit: Fit) -> Figure:
 
 
 def _summary(fit: Fit, relative: np.ndarray) -> str:
-    good = int(np.count_nonzero(relative <= TRUSTED))
+    good = fit.trust.count(Trust.GOOD)
     robot = fit.base.model.robot
     return f"{robot.name}: {good} of {len(relative)} base parameters are known to 10 %"
-
-
-def _colour(share: float) -> str:
-    return BLUE if share <= TRUSTED else ORANGE if share <= DOUBTFUL else VERMILION
 
 
 def _column(
@@ -84,7 +79,7 @@ def _column(
     places = np.arange(len(order))
     shares = np.clip(np.nan_to_num(relative[order], nan=np.inf, posinf=CEILING), low, CEILING)
     beyond = ~(relative[order] <= CEILING)
-    colours = [_colour(r) for r in relative[order]]
+    colours = [COLOURS[fit.trust[k]] for k in order]
     axes.hlines(places, low, shares, color=colours, lw=1.6)
     for marker, where in (("o", ~beyond), (">", beyond)):
         axes.scatter(

@@ -4,12 +4,13 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from jaxid.identification.fit import Fit
-from jaxid.report.estimates import DOUBTFUL, TRUSTED
+from jaxid.identification.fit import Fit, Trust
 from jaxid.report.numbers import aligned, percent, significant, with_deviation
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
 from jaxid.validation.errors import TorqueErrors
+
+STYLES = {Trust.GOOD: "green", Trust.DOUBTFUL: "yellow", Trust.NONE: "red"}
 
 
 def parameter_table(fit: Fit, expressions: bool = True) -> Table:
@@ -37,6 +38,7 @@ def parameter_table(fit: Fit, expressions: bool = True) -> Table:
     table.add_column("±", justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     table.add_column("± [%]", justify="right", no_wrap=True)
+    trust = fit.trust
     names = base.expressions if expressions else base.names
     for k, name in enumerate(names):
         table.add_row(
@@ -45,7 +47,7 @@ def parameter_table(fit: Fit, expressions: bool = True) -> Table:
             values[k],
             deviations[k],
             base.units[k],
-            Text(shares[k], style=_colour(float(relative[k]))),
+            Text(shares[k], style=STYLES[trust[k]]),
         )
     return table
 
@@ -132,7 +134,3 @@ def _table(title: str) -> Table:
         header_style="bold",
         padding=(0, 2, 0, 0),
     )
-
-
-def _colour(share: float) -> str:
-    return "green" if share <= TRUSTED else "yellow" if share <= DOUBTFUL else "red"

@@ -14,6 +14,8 @@ from jaxid.dynamics.terms import (
     Tanh,
     ViscousFriction,
 )
+from jaxid.robot import library as robots
+from jaxid.robot.drives import Drives
 
 TREE = trees.mixed_tree(51)
 MODEL = Model(TREE.robot())
@@ -82,3 +84,9 @@ def test_velocities_of_other_instants():
     sentence = r"coordinates, velocities and accelerations must have one shape, but have \(3, 5\)"
     with _refused(sentence + r", \(2, 5\), \(3, 5\)"):
         on_samples(MODEL, MODEL.columns, q, q[:2], q)
+
+
+def test_motors_in_another_order_than_their_joints():
+    robot = robots.planar_arm(2).replace(drives=Drives.of(2, reduction=[[0, 50], [40, 10]]))
+    with _refused("`drives.reduction` of `planar arm, 2 joints` must name the motors in the order"):
+        Model(robot, (CoupledDrives(),))

@@ -246,3 +246,13 @@ def test_a_coupled_motor_of_a_slide_has_a_slides_units(robot):
         "fcm2": "N",
         "fcm3": "N m",
     }
+
+
+def test_asymmetric_friction_vanishes_in_its_dead_zone():
+    robot = TREE.robot() if hasattr(TREE, "robot") else TREE
+    term = AsymmetricCoulombFriction(Tanh(0.01, dead_zone=0.1))
+    qd = np.full(robot.joints, 0.05)
+    columns = term.columns(robot, qd, qd, qd)
+    np.testing.assert_array_equal(columns, 0.0)
+    fast = np.asarray(term.columns(robot, qd, qd + 1.0, qd))
+    np.testing.assert_allclose(fast[:, : robot.joints], np.eye(robot.joints), atol=1e-12)

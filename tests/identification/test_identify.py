@@ -6,6 +6,7 @@ from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.factors import factorise
+from jaxid.identification.fit import Trust
 from jaxid.identification.solutions import Decomposition
 
 WEIGHTED = jid.WeightedLeastSquares(jid.MeasuredForces())
@@ -231,3 +232,13 @@ def test_refusals(base, noisy):
     unknown = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), base.model.terms))
     with pytest.raises(ValueError, match=r"largest force of joint `joint1` .* is not known"):
         jid.identify(unknown, noisy)
+
+
+def test_what_is_undetermined_is_not_trusted_however_small_its_deviation(base):
+    p = standard_parameters(base.model)
+    fit = jid.identify(base, observations(base.model, p, still=(1,)), jid.LeastSquares())
+    parts = {k for d in fit.undetermined for k in d.parts}
+    assert parts
+    assert all(fit.trust[k] is Trust.NONE for k in parts)
+    good = jid.identify(base, observations(base.model, p), jid.LeastSquares())
+    assert set(good.trust) == {Trust.GOOD}
