@@ -13,6 +13,11 @@ install_import_hook("jaxid", "beartype.beartype")
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The same examples in every run, and no clock: a busy machine is no bug.
+settings.register_profile("jaxid", deadline=None, derandomize=True)
+settings.load_profile("jaxid")
 
 ROOT = Path(__file__).resolve().parent.parent
 
