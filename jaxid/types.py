@@ -4,6 +4,8 @@ Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (c
 regressor), `samples` (rows of a log), `rows` (what is left of them after filtering), `batch`.
 """
 
+from contextlib import AbstractContextManager
+
 import jax
 import numpy as np
 from jaxtyping import Array as Array
@@ -31,3 +33,12 @@ def require_float64(what: str) -> None:
             '`jax.config.update("jax_enable_x64", True)` at the start of the program, '
             "or set the environment variable JAX_ENABLE_X64=1."
         )
+
+
+def double_precision() -> AbstractContextManager:
+    """Lets JAX compute in float64 within a `with`, whatever its setting is outside."""
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(True)
+    from jax.experimental import enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+    return enable_x64(True)

@@ -229,7 +229,7 @@ def show_rows(console: Console, observations: Iterable[Observations], fit: Fit) 
             (
                 "estimates",
                 f"{known[0]} of {fit.base.size} known to {100 * TRUSTED:g} %, {known[1]} to "
-                f"{100 * DOUBTFUL_SHARE:g} %, {known[2]} worse or undetermined (standard deviations)",
+                f"{100 * DOUBTFUL_SHARE:g} %, {known[2]} worse or undetermined",
             ),
         ],
     )

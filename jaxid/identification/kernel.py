@@ -19,7 +19,7 @@ from jaxid.dynamics.compiled import acting_columns
 from jaxid.dynamics.machine import program_of
 from jaxid.identification.response import Stage
 from jaxid.program import Program, default_fence, lower
-from jaxid.types import AnyArray, Array
+from jaxid.types import AnyArray, Array, double_precision
 
 CHUNK = 2048
 """Samples of an iteration: their columns stay in the cache."""
@@ -134,16 +134,8 @@ def _padded(x: np.ndarray, length: int) -> np.ndarray:
 @contextlib.contextmanager
 def on_cpu():
     """Computes in float64 on the CPU, whatever the process does otherwise."""
-    with _double_precision(), jax.default_device(jax.devices("cpu")[0]):
+    with double_precision(), jax.default_device(jax.devices("cpu")[0]):
         yield
-
-
-def _double_precision() -> contextlib.AbstractContextManager:
-    if hasattr(jax, "enable_x64"):
-        return jax.enable_x64(True)
-    from jax.experimental import enable_x64
-
-    return enable_x64(True)
 
 
 @functools.lru_cache(maxsize=16)
@@ -220,7 +212,7 @@ def _compiled(
     return jax.jit(run)
 
 
-def _part(x: Array, k: Array, length: int) -> Array:
+def _part(x: AnyArray, k: Array, length: int) -> Array:
     """The samples of one iteration, last."""
     start = (k * length, jnp.zeros_like(k))
     return jax.lax.dynamic_slice(x, start, (length, x.shape[1])).T

@@ -20,6 +20,7 @@ from jaxid.identification.kernel import CHUNK, Grams, Kernel
 from jaxid.identification.reduction import reduced
 from jaxid.identification.response import Stage, centre, stages
 from jaxid.measurement.observations import Observations
+from jaxid.types import AnyArray
 
 LONG = 100_000
 """Samples from which compiling pays."""
@@ -252,7 +253,7 @@ class Stream:
         return R, blocks, all(_alike(*x) for x in zip(total, glance, mixing, strict=True))
 
 
-def _float(x: np.ndarray) -> np.ndarray:
+def _float(x: AnyArray) -> np.ndarray:
     return np.asarray(x, np.float64)
 
 

@@ -303,6 +303,8 @@ def _sample_time(table: Table, columns: Columns) -> float:
 
 
 def _stamps(table: Table, columns: Columns) -> np.ndarray:
+    if columns.time is None:
+        raise ValueError("`columns` must name the column of the time stamps, or a `sample_time`.")
     stamps, dates = table.stamps(columns.time)
     return stamps if dates else stamps * columns.time_unit.factor
 

@@ -3,7 +3,6 @@
 import functools
 import math
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
@@ -23,6 +22,7 @@ from jaxid.program.moves import (
 from jaxid.program.operation import COMPARISONS, FUNCTIONS, Operation
 from jaxid.program.program import Program, assemble
 from jaxid.program.scalar import Graph, Operand
+from jaxid.types import double_precision
 
 
 class Free:
@@ -242,14 +242,6 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.
     return [read(name) for name in jaxpr.outvars]
 
 
-def _double_precision() -> AbstractContextManager:
-    if hasattr(jax, "enable_x64"):
-        return jax.enable_x64(True)
-    from jax.experimental import enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-
-    return enable_x64(True)
-
-
 def _argument(graph: Graph, number: int, given: tuple[int, ...] | np.ndarray) -> np.ndarray:
     template = np.full(given, FREE, object) if isinstance(given, tuple) else np.asarray(given)
     entries = np.empty(template.shape, object)
@@ -283,7 +275,7 @@ def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
     graph = Graph()
     arguments = [_argument(graph, k, given) for k, given in enumerate(inputs)]
     shapes = tuple(x.shape for x in arguments)
-    with _double_precision():
+    with double_precision():
         avals = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
         jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)
         arrays = _run(jaxpr.jaxpr, jaxpr.consts, arguments)
