@@ -147,7 +147,7 @@ def factorise_across_processes(
         base: The base parameters, the same in all processes.
         recordings: Of this process alone; none is allowed.
         blocks: Number of blocks of time of each recording.
-        patience: Seconds to wait for the other processes.
+        patience: Time to wait for the other processes [s].
 
     Raises:
         RuntimeError: If another process is lost during the exchange.

@@ -111,7 +111,7 @@ def urdf_parameters(
         path: The file.
         tip: As in `load_urdf`.
         base: As in `load_urdf`.
-        snap_tolerance: As in `load_urdf`.
+        snap_tolerance: As in `load_urdf` [rad].
 
     Raises:
         FileNotFoundError: If the file does not exist.
