@@ -266,7 +266,7 @@ def _drives(robot: Robot) -> str:
             '# angle_unit = "deg"                  # of `zero`',
             "# largest torques of the motors, before the gears [N m]:",
             f"# max_torques = {_list([1.0] * n)}",
-            "# inertias of the rotors, before the gears [kg m²]: shown beside the estimates, not used",
+            "# inertias of the rotors, before the gears [kg m²]; shown, not used",
             f"# rotor_inertia = {_list([1e-4] * n)}",
         )
     )

@@ -17,8 +17,8 @@ class Drives(eqx.Module):
         reduction: $A$, motor angle for joint angle; [1] for a revolute joint, [rad/m] for a rail.
         zero: Joint angle $q_0$ at which the motor angles are zero [rad or m].
         max_torques: Largest torque of each motor, on the motor's side [N m]; infinite if unknown.
-        rotor_inertia: Inertia of each motor, on the motor's side [kg m²]; NaN if unknown. It is shown,
-            and not used: what the joints feel of it is identified (Eq. 17).
+        rotor_inertia: Inertia of each motor, on the motor's side [kg m²]; NaN if unknown.
+            It is shown, not used: what the joints feel of it is identified.
     """
 
     reduction: Float[AnyArray, "joints joints"]
