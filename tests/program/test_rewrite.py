@@ -53,8 +53,9 @@ def test_sums_of_products_keep_their_value(terms, split):
     np.testing.assert_allclose(got.T, want, rtol=1e-13, atol=1e-14)
 
 
-def test_operations_of_a_seven_joint_regressor():
+def test_operations_of_a_seven_joint_regressor(monkeypatch):
     """Exact numbers: a careless change of the compiler, or of JAX, shows here at once."""
+    monkeypatch.syspath_prepend(FENCES.parent)
     specification = importlib.util.spec_from_file_location("fences", FENCES)
     benchmark = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(benchmark)
