@@ -1,0 +1,1 @@
+"""Motions that tell parameters apart: criteria, constraints, solvers, design (Eq. 36)."""

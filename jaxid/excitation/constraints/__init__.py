@@ -1,0 +1,1 @@
+"""What a motion must keep beside the limits of its joints."""
