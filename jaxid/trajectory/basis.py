@@ -82,21 +82,19 @@ class FourierBasis(AbstractBasis):
     Attributes:
         harmonics: Number of harmonics.
         omega: Ground frequency [rad/s].
+        duration: The period [s].
     """
 
     harmonics: int = eqx.field(static=True)
     omega: float = eqx.field(static=True)
+    duration: float = eqx.field(static=True, init=False)
 
-    def __check_init__(self):
+    def __post_init__(self):
         if self.harmonics < 1:
             raise ValueError(f"`harmonics` must be at least 1, but is {self.harmonics}.")
         if not 0 < self.omega < math.inf:
             raise ValueError(f"`omega` must be a positive frequency [rad/s], not {self.omega:g}.")
-
-    @property
-    def duration(self) -> float:
-        """The period [s]."""
-        return 2 * math.pi / self.omega
+        self.duration = 2 * math.pi / self.omega
 
     def rows(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "4 samples variables"]:
         """Sines and cosines and their derivatives."""
