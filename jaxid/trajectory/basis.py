@@ -87,14 +87,15 @@ class FourierBasis(AbstractBasis):
 
     harmonics: int = eqx.field(static=True)
     omega: float = eqx.field(static=True)
-    duration: float = eqx.field(static=True, init=False)
+    duration: float = eqx.field(static=True)
 
-    def __post_init__(self):
-        if self.harmonics < 1:
-            raise ValueError(f"`harmonics` must be at least 1, but is {self.harmonics}.")
-        if not 0 < self.omega < math.inf:
-            raise ValueError(f"`omega` must be a positive frequency [rad/s], not {self.omega:g}.")
-        self.duration = 2 * math.pi / self.omega
+    def __init__(self, harmonics: int, omega: float):
+        if harmonics < 1:
+            raise ValueError(f"`harmonics` must be at least 1, but is {harmonics}.")
+        if not 0 < omega < math.inf:
+            raise ValueError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
+        self.harmonics, self.omega = harmonics, float(omega)
+        self.duration = 2 * math.pi / omega
 
     def rows(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "4 samples variables"]:
         """Sines and cosines and their derivatives."""
