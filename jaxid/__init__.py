@@ -24,13 +24,16 @@ from jaxid.identification.bootstrap import bootstrap as bootstrap
 from jaxid.identification.devices import factorise_across_processes as factorise_across_processes
 from jaxid.identification.devices import factorise_on_devices as factorise_on_devices
 from jaxid.identification.estimators import AbstractEstimator as AbstractEstimator
+from jaxid.identification.estimators import Estimate as Estimate
 from jaxid.identification.estimators import LeastSquares as LeastSquares
 from jaxid.identification.estimators import WeightedLeastSquares as WeightedLeastSquares
 from jaxid.identification.factors import factorise as factorise
 from jaxid.identification.fit import Fit as Fit
 from jaxid.identification.fit import Trust as Trust
 from jaxid.identification.identify import fit_blocks as fit_blocks
+from jaxid.identification.identify import fit_rows as fit_rows
 from jaxid.identification.identify import identify as identify
+from jaxid.identification.rows import Rows as Rows
 from jaxid.identification.solutions import Complete as Complete
 from jaxid.identification.solutions import CrossValidated as CrossValidated
 from jaxid.identification.solutions import Ridge as Ridge

@@ -20,9 +20,9 @@ from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
 from jaxid.experiment.sanity import check_log, negative_friction
 from jaxid.experiment.template import write_template
-from jaxid.identification.factors import factorise
-from jaxid.identification.identify import fit_blocks
+from jaxid.identification.identify import fit_rows
 from jaxid.identification.identify import identify as estimate
+from jaxid.identification.rows import Rows
 from jaxid.measurement.observations import Observations
 from jaxid.report.content import Beside
 from jaxid.report.write import write_report
@@ -261,14 +261,13 @@ def identify(
         stage("finding base parameters")
         base = loaded.base
         stage("factorising the rows")
-        blocks = factorise(base, fitted)
-        fit = fit_blocks(base, blocks, loaded.estimator, tuple(o.name for o in fitted))
+        rows = Rows.of(base, fitted)
+        fit = fit_rows(rows, loaded.estimator)
         stage("predicting torques")
         found = validate(fit, [*fitted, *checked])
         beside = None
         if loaded.regularised or fit.undetermined:
-            other = loaded.other_estimator
-            beside = Beside.of(fit_blocks(base, blocks, other, fit.recordings), [*fitted, *checked])
+            beside = Beside.of(fit_rows(rows, loaded.other_estimator), [*fitted, *checked])
         stage("writing the report")
         logs_said = [n for o in (*fitted, *checked) for n in o.notes]
         files = write_report(

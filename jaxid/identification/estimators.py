@@ -1,25 +1,103 @@
-"""Estimators: how parameters follow from observations."""
+"""Estimators: how parameters follow from rows."""
 
 from abc import abstractmethod
 
 import equinox as eqx
 import numpy as np
 
+from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.factors import Blocks
-from jaxid.identification.solutions import AbstractSolution, AbstractSpectralSolution, Complete
+from jaxid.identification.influence import AbstractInfluence, ByJoint
+from jaxid.identification.rows import Rows
+from jaxid.identification.solutions import (
+    AbstractSolution,
+    AbstractSpectralSolution,
+    Complete,
+    Decomposition,
+)
 from jaxid.identification.weights import AbstractWeights, MaximumForces, Unweighted
-from jaxid.robot.robot import Robot
-from jaxid.types import Float
+from jaxid.types import AnyArray, Float
+
+
+class Estimate(eqx.Module):
+    r"""What an estimator has found, and what others need to judge it.
+
+    Near the estimate, a disturbance $e_t$ of the rows moves it by $B \sum_t Z_t^T u(e_t)$:
+    `inverse` is $B$, and `influence` knows $Z$ and $u$. Uncertainties follow from that alone, so an
+    estimator never computes them.
+
+    Attributes:
+        base: Which combinations of standard parameters they are. Those of the rows, unless the
+            estimator has chosen constants of the model's terms.
+        parameters: The base parameters.
+        weights: Of the joints' rows [1/(N m) or 1/N].
+        blocks: The factors of the rows as they counted in the end.
+        inverse: What takes the place of the inverse of the information; rows and columns of zeros
+            for parameters that the estimator holds fixed.
+        influence: How a row moves the estimate.
+        solution: How the weighted system was solved.
+        standard: Standard parameters, of an estimator that finds a complete set of them.
+        notes: What the user should know, in sentences.
+    """
+
+    base: BaseParameters
+    parameters: Float[AnyArray, " base"]
+    weights: Float[AnyArray, " joints"]
+    blocks: Blocks
+    inverse: Float[AnyArray, "base base"]
+    influence: AbstractInfluence
+    solution: AbstractSpectralSolution = Complete()
+    standard: Float[AnyArray, " standard"] | None = None
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @classmethod
+    def solved(
+        cls, rows: Rows, weights: Float[AnyArray, " joints"], solution: AbstractSpectralSolution
+    ) -> "Estimate":
+        """Least squares of rows that are weighted by joint (Eqs. 28, 33)."""
+        decomposition = Decomposition.of(*rows.factors.weighted(weights))
+        inverse = solution.inverse(decomposition.values)
+        return cls(
+            base=rows.base,
+            parameters=decomposition.solve(inverse),
+            weights=np.asarray(weights),
+            blocks=rows.blocks,
+            inverse=decomposition.inverse_information(inverse),
+            influence=ByJoint(weights),
+            solution=solution,
+        )
 
 
 class AbstractEstimator(eqx.Module):
-    """A way to estimate base parameters from the factors of observations."""
+    """A way to estimate parameters from rows.
+
+    An estimator gets `Rows` and returns an `Estimate`. What it can ask the rows for:
+
+    * `rows.base`, `rows.robot`: the base parameters, with the model and the robot behind them;
+    * `rows.factors`: for each joint the R factor of its columns and forces, all that least squares
+      with weights of the joints need, however long the logs are; `rows.blocks`: the same by
+      contiguous blocks of time, for cross-validation;
+    * `rows.chunks()`, `rows.residuals(p)`: passes over the rows themselves, bounded in memory, as
+      often as needed; `rows.reweighted(...)`: new factors with a weight for every row;
+    * `rows.with_base(base)`: the same recordings with other columns, where constants of the model's
+      terms are looked for; `rows.recordings`: motions and filters.
+
+    Rows of factors only (`rows.seen` is False: from other processes, by `fit_blocks`) serve
+    estimators that need no pass; the others refuse them in one sentence.
+
+    What it returns: `Estimate.solved` makes the estimate of weighted least squares; start from it
+    with `dataclasses.replace` where parts differ. A complete set of standard parameters goes to
+    `standard`, other base parameters (of another model) to `base`. Uncertainties, condition
+    numbers, and what is not determined are found from it by `identify`, alike for all estimators.
+    """
 
     @abstractmethod
-    def __call__(
-        self, robot: Robot, blocks: Blocks
-    ) -> tuple[Float[np.ndarray, " joints"], AbstractSpectralSolution]:
-        """The weights of the joints, and how the weighted system is solved."""
+    def __call__(self, rows: Rows) -> Estimate:
+        """The estimate from some rows.
+
+        Raises:
+            ValueError: If weights are not known, or it needs more than factors and has them only.
+        """
 
 
 class LeastSquares(AbstractEstimator):
@@ -31,10 +109,10 @@ class LeastSquares(AbstractEstimator):
 
     solution: AbstractSolution = Complete()
 
-    def __call__(self, robot, blocks):
+    def __call__(self, rows):
         """Every newton metre counts the same, on the shoulder and on the wrist."""
-        weights = Unweighted()(robot, blocks.total)
-        return weights, self.solution.choose(blocks, weights)
+        weights = Unweighted()(rows.robot, rows.factors)
+        return Estimate.solved(rows, weights, self.solution.choose(rows.blocks, weights))
 
 
 class WeightedLeastSquares(AbstractEstimator):
@@ -48,7 +126,7 @@ class WeightedLeastSquares(AbstractEstimator):
     weights: AbstractWeights = MaximumForces()
     solution: AbstractSolution = Complete()
 
-    def __call__(self, robot, blocks):
+    def __call__(self, rows):
         """Finds the weights, then the solution."""
-        weights = self.weights(robot, blocks.total)
-        return weights, self.solution.choose(blocks, weights)
+        weights = self.weights(rows.robot, rows.factors)
+        return Estimate.solved(rows, weights, self.solution.choose(rows.blocks, weights))

@@ -158,15 +158,19 @@ def factorise(
     parts = []
     for recording in recordings:
         observations, read = source(recording)
-        counted = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
-        edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
-        del counted
-        edges = [0, *edges[1:], observations.rows]
+        edges = block_edges(observations, blocks)
         if suits(observations):
             parts += streamed(base, observations, edges, read=read, progress=progress)
         else:
             parts += _in_numpy(base, observations, edges, read)
     return Blocks(tuple(parts))
+
+
+def block_edges(observations: Observations, blocks: int = BLOCKS) -> list[int]:
+    """Rows at which blocks of time with equally many counted rows begin, and the last one ends."""
+    counted = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
+    edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
+    return [0, *edges[1:], observations.rows]
 
 
 def _in_numpy(

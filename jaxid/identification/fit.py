@@ -57,6 +57,7 @@ class Fit(eqx.Module):
         solution: How the system was solved in the end, with everything chosen that it chose.
         recordings: Names of the observations.
         notes: What the user should know, in sentences.
+        full_parameters: Standard parameters, of an estimator that finds a complete set of them.
     """
 
     base: BaseParameters
@@ -72,6 +73,7 @@ class Fit(eqx.Module):
     solution: AbstractSpectralSolution
     recordings: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
+    full_parameters: Float[AnyArray, " standard"] | None = None
 
     @property
     def standard_deviations(self) -> Float[np.ndarray, " base"]:
@@ -105,7 +107,12 @@ class Fit(eqx.Module):
 
     @property
     def standard_parameters(self) -> Float[np.ndarray, " standard"]:
-        """Standard parameters with the same forces; no physical masses and inertias."""
+        """Standard parameters with the same forces.
+
+        Physical masses and inertias only if the estimator finds such (`full_parameters`).
+        """
+        if self.full_parameters is not None:
+            return np.asarray(self.full_parameters)
         full = np.zeros(self.base.model.size)
         full[list(self.base.indices)] = np.asarray(self.parameters)
         return full

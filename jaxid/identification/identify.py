@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
-from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
+from jaxid.identification.estimators import AbstractEstimator, Estimate, WeightedLeastSquares
 from jaxid.identification.excited import undetermined_directions
-from jaxid.identification.factors import Blocks, Factors, factorise
+from jaxid.identification.factors import Blocks, Factors
 from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.solutions import NUMERICAL, Decomposition
+from jaxid.identification.rows import Rows
+from jaxid.identification.solutions import NUMERICAL, AbstractSpectralSolution, Decomposition
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
@@ -41,8 +42,7 @@ def identify(
     recordings = (observations,) if single else tuple(observations)
     estimator = WeightedLeastSquares() if estimator is None else estimator
     _check(base, recordings)
-    blocks = factorise(base, recordings, progress=progress)
-    return fit_blocks(base, blocks, estimator, tuple(o.name for o in recordings))
+    return fit_rows(Rows.of(base, recordings, progress), estimator)
 
 
 def fit_blocks(
@@ -62,34 +62,53 @@ def fit_blocks(
     Raises:
         ValueError: If there are fewer rows than parameters, or weights are not known.
     """
-    factors = blocks.total
-    rows = int(factors.rows.sum())
-    if rows <= base.size:
+    return fit_rows(Rows(base, blocks), estimator, recordings)
+
+
+def fit_rows(
+    rows: Rows, estimator: AbstractEstimator, recordings: tuple[str, ...] | None = None
+) -> Fit:
+    """Estimates the base parameters from rows that were factorised before.
+
+    Args:
+        rows: Of one or several recordings.
+        estimator: How.
+        recordings: Their names; the rows' own if None.
+
+    Raises:
+        ValueError: If there are fewer rows than parameters, weights are not known, or the estimator
+            needs more than factors and has them only.
+    """
+    count = int(rows.factors.rows.sum())
+    if count <= rows.base.size:
         raise ValueError(
-            f"there are {rows} rows for {base.size} base parameters: record longer, decimate less, "
-            "or leave out fewer slow rows."
+            f"there are {count} rows for {rows.base.size} base parameters: record longer, decimate "
+            "less, or leave out fewer slow rows."
         )
-    weights, solution = estimator(base.model.robot, blocks)
-    R, z = factors.weighted(weights)
+    estimate = estimator(rows)
+    blocks, base = estimate.blocks, estimate.base
+    # Residuals are those of all rows alike, however they counted.
+    plain = rows if base is rows.base else rows.with_base(base)
+    p, weights = np.asarray(estimate.parameters), np.asarray(estimate.weights)
+    squares = plain.factors.residual_squares(p)
+    forces = float(np.sqrt(plain.factors.force_squares.sum()))
+    R, z = blocks.total.weighted(weights)
     decomposition = Decomposition.of(R, z)
-    inverse = solution.inverse(decomposition.values)
-    p = decomposition.solve(inverse)
-    squares = factors.residual_squares(p)
-    forces = float(np.sqrt(factors.force_squares.sum()))
     return Fit(
         base=base,
         parameters=p,
-        covariance=_covariance(factors, weights, decomposition, inverse, squares),
+        covariance=_covariance(blocks.total, weights, decomposition, estimate),
         weights=weights,
-        condition_numbers=_condition_numbers(factors, R),
-        rows=tuple(int(n) for n in factors.rows),
-        residual_rms=np.sqrt(squares / np.maximum(factors.rows, 1)),
+        condition_numbers=_condition_numbers(blocks.total, R),
+        rows=tuple(int(n) for n in plain.factors.rows),
+        residual_rms=np.sqrt(squares / np.maximum(plain.factors.rows, 1)),
         residual=float(np.sqrt(squares.sum()) / forces) if forces > 0 else np.inf,
         undetermined=undetermined_directions(blocks, weights, decomposition),
         estimator=estimator,
-        solution=solution,
-        recordings=recordings,
-        notes=(*base.notes, *_pulled(decomposition, inverse)),
+        solution=estimate.solution,
+        full_parameters=None if estimate.standard is None else np.asarray(estimate.standard),
+        recordings=tuple(o.name for o in rows.recordings) if recordings is None else recordings,
+        notes=(*base.notes, *_pulled(decomposition, estimate.solution), *estimate.notes),
     )
 
 
@@ -106,11 +125,7 @@ def _check(base: BaseParameters, recordings: Sequence[Observations | LongLog]) -
 
 
 def _covariance(
-    factors: Factors,
-    weights: np.ndarray,
-    decomposition: Decomposition,
-    inverse: np.ndarray,
-    squares: np.ndarray,
+    factors: Factors, weights: np.ndarray, decomposition: Decomposition, estimate: Estimate
 ) -> np.ndarray:
     r"""Covariance of the estimates when every joint has a variance of its own.
 
@@ -118,10 +133,11 @@ def _covariance(
     $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights are not the
     reciprocals of the standard deviations.
     """
-    s, scale = np.asarray(decomposition.values), np.asarray(decomposition.scale)
-    V = np.asarray(decomposition.directions) / scale
-    B = (V.T * inverse) @ V
-    freedom = 1.0 - float(np.sum(inverse * s**2)) / float(factors.rows.sum())
+    s = np.asarray(decomposition.values)
+    B = np.asarray(estimate.inverse)
+    R, _ = factors.weighted(weights)
+    squares = factors.residual_squares(estimate.parameters)
+    freedom = 1.0 - float(np.sum((R @ B) * R)) / float(factors.rows.sum())
     inner = np.zeros_like(B)
     for joint, w, square in zip(factors.joints, weights, squares, strict=True):
         variance = square / max(joint.rows * freedom, 1.0)
@@ -134,11 +150,11 @@ def _covariance(
     return inner
 
 
-def _pulled(decomposition: Decomposition, inverse: np.ndarray) -> tuple[str, ...]:
+def _pulled(decomposition: Decomposition, solution: AbstractSpectralSolution) -> tuple[str, ...]:
     """Says what standard deviations leave out where a solution keeps weak directions small."""
     s = np.asarray(decomposition.values)
     live = s > NUMERICAL * s.max(initial=0.0)
-    pulled = int(np.count_nonzero(live & (inverse * s**2 <= 0.5)))
+    pulled = int(np.count_nonzero(live & (solution.inverse(s) * s**2 <= 0.5)))
     if not pulled:
         return ()
     return (

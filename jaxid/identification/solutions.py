@@ -55,6 +55,13 @@ class Decomposition(eqx.Module):
         along = np.asarray(inverse) * np.asarray(self.values) * np.asarray(self.forces)
         return np.asarray(self.directions).T @ along / np.asarray(self.scale)
 
+    def inverse_information(
+        self, inverse: Float[AnyArray, " base"]
+    ) -> Float[np.ndarray, "base base"]:
+        """What takes the place of the inverse of the information, in the parameters' units."""
+        V = np.asarray(self.directions) / np.asarray(self.scale)
+        return (V.T * np.asarray(inverse)) @ V
+
 
 class AbstractSolution(eqx.Module):
     """A way to solve a weighted least-squares problem (Eq. 33)."""

@@ -1,0 +1,62 @@
+"""How single rows move an estimate: what its uncertainty is computed from."""
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.identification.rows import RowChunk
+from jaxid.types import AnyArray, Float
+
+
+class Channel(NamedTuple):
+    r"""One series of equations, $u_t = \theta_t (p - \hat p) + $ disturbance; a joint's, as a rule.
+
+    The estimate moves by $B \sum_t z_t u_t$. Rows that do not count are zero.
+
+    Attributes:
+        columns: The base parameters in question.
+        instruments: $z_t$ [rows, columns]: for least squares the equations themselves.
+        equations: $\theta_t$ [rows, columns], weighted.
+        disturbance: $u_t$ [rows]: residuals, weighted.
+    """
+
+    columns: tuple[int, ...]
+    instruments: np.ndarray
+    equations: np.ndarray
+    disturbance: np.ndarray
+
+
+class AbstractInfluence(eqx.Module):
+    """How an estimator's rows enter its estimate."""
+
+    @abstractmethod
+    def channels(
+        self, chunk: RowChunk, residuals: Float[np.ndarray, "rows joints"]
+    ) -> list[Channel]:
+        """The equations of some rows, as they count.
+
+        Args:
+            chunk: The rows.
+            residuals: What the estimate leaves of the forces [N m or N].
+        """
+
+
+class ByJoint(AbstractInfluence):
+    """Least squares whose rows are weighted by joint.
+
+    Attributes:
+        weights: Of the joints' rows [1/(N m) or 1/N].
+    """
+
+    weights: Float[AnyArray, " joints"]
+
+    def channels(self, chunk, residuals):
+        """One channel for each joint."""
+        found = []
+        for j, (theta, own) in enumerate(zip(chunk.columns, chunk.acting, strict=True)):
+            rows = np.asarray(self.weights)[j] * np.where(chunk.counted[:, j], 1.0, 0.0)
+            weighted = rows[:, None] * theta
+            found.append(Channel(own, weighted, weighted, rows * residuals[:, j]))
+        return found
