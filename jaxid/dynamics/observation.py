@@ -12,6 +12,8 @@ from jaxid.types import Float
 
 SAMPLES = 25
 ROWS_PER_COLUMN = 3.0
+SLOWEST = 1e-3
+"""Speed of the slowest random motions, of that of the others."""
 
 
 def observation_matrix(
@@ -33,10 +35,15 @@ def observation_matrix(
 
 
 def random_motion(model: Model, samples: int, seed: int) -> Motion:
-    """Uniformly random coordinates, velocities and accelerations."""
+    """Uniformly random coordinates, velocities and accelerations; every second sample is slow.
+
+    Slow by any factor up to `SLOWEST`: some friction shows itself only there.
+    """
     rng = np.random.default_rng(seed)
     shape = (samples, model.robot.joints)
-    return Motion(*(rng.uniform(-s, s, shape) * row_units(model) for s in (3.0, 3.0, 6.0)))
+    q, qd, qdd = (rng.uniform(-s, s, shape) * row_units(model) for s in (3.0, 3.0, 6.0))
+    qd[1::2] *= SLOWEST ** rng.uniform(0.0, 1.0, qd[1::2].shape)
+    return Motion(q, qd, qdd)
 
 
 def row_units(model: Model) -> Float[np.ndarray, " joints"]:

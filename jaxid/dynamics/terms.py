@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.dynamics import projection
+from jaxid.dynamics.transitions import AbstractTransition, Shape, Tanh, has_dead_zone
 from jaxid.robot.robot import AXES, Robot
 from jaxid.types import AnyArray, Float
 
@@ -60,6 +61,11 @@ class AbstractTerm(eqx.Module):
     ) -> Float[AnyArray, " columns"]:
         """Potential energy [J] of unit parameters; none unless the term stores energy."""
         return jnp.zeros(len(self.parameters(robot)), q.dtype)
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """What `identify_nonlinear` can find beside the parameters; nothing for most terms."""
+        return ()
 
 
 class RigidBodies(AbstractTerm):
@@ -114,64 +120,15 @@ class RigidBodies(AbstractTerm):
         return projection.potential_energy_columns(robot, q)[:, : self._kept].ravel()
 
 
-class AbstractTransition(eqx.Module):
-    """How a friction force passes from one direction of motion to the other."""
-
-    @abstractmethod
-    def __call__(self, qd: Float[AnyArray, " joints"]) -> Float[AnyArray, " joints"]:
-        """A number between -1 and 1 for each speed [rad/s or m/s]."""
-
-
-class Tanh(AbstractTransition):
-    r"""The smooth transition $\tanh(\dot q / \epsilon_c)$ (Eq. 14).
-
-    Attributes:
-        epsilon: Speed of the transition, one for all joints or one for each, in the joint's own
-            unit [rad/s or m/s].
-        dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
-    """
-
-    epsilon: float | Float[AnyArray, "..."] = 0.01
-    dead_zone: float | Float[AnyArray, "..."] = 0.0
-
-    def __check_init__(self):
-        if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
-            raise ValueError(
-                f"`epsilon` must be a positive speed, but is {self.epsilon}: "
-                "use `HardSign` for a transition without width."
-            )
-
-    def __call__(self, qd):
-        """The smooth sign of the speed."""
-        return _outside(self.dead_zone, qd, jnp.tanh(qd / self.epsilon))
+def transition_shapes(transition: AbstractTransition) -> tuple[Shape, ...]:
+    """The shapes of a term's attribute `transition`."""
+    return tuple(
+        s._replace(leaf=lambda term, inner=s.leaf: inner(term.transition))
+        for s in transition.shapes
+    )
 
 
-class HardSign(AbstractTransition):
-    """The sign of the speed: it says nothing at standstill, where a dead zone belongs.
-
-    Attributes:
-        dead_zone: Speed below which there is no force [rad/s or m/s].
-    """
-
-    dead_zone: float | Float[AnyArray, "..."] = 0.0
-
-    def __call__(self, qd):
-        """The sign of the speed."""
-        return _outside(self.dead_zone, qd, jnp.sign(qd))
-
-
-def _has_dead_zone(transition: AbstractTransition) -> bool:
-    dead_zone = getattr(transition, "dead_zone", 0.0)
-    return isinstance(dead_zone, jax.Array) or bool(np.any(dead_zone))
-
-
-def _outside(dead_zone, qd, value):
-    if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
-        return value
-    return jnp.where(jnp.abs(qd) > dead_zone, value, jnp.zeros_like(value))
-
-
-def _each(robot: Robot, name: str, unit_r: str, unit_p: str) -> tuple[tuple[str, str], ...]:
+def each_joint(robot: Robot, name: str, unit_r: str, unit_p: str) -> tuple[tuple[str, str], ...]:
     """One parameter for each joint, with the unit of a revolute or a prismatic one."""
     return tuple((f"{name}{i + 1}", unit_r if r else unit_p) for i, r in enumerate(robot.revolute))
 
@@ -181,7 +138,7 @@ class ViscousFriction(AbstractTerm):
 
     def parameters(self, robot):
         """`fv1`, … [N m s/rad or N s/m]."""
-        return _each(robot, "fv", "N m s", "N s/m")
+        return each_joint(robot, "fv", "N m s", "N s/m")
 
     def columns(self, robot, q, qd, qdd):
         """The diagonal matrix of speeds."""
@@ -199,11 +156,16 @@ class CoulombFriction(AbstractTerm):
 
     def parameters(self, robot):
         """`fc1`, … [N m or N]."""
-        return _each(robot, "fc", "N m", "N")
+        return each_joint(robot, "fc", "N m", "N")
 
     def columns(self, robot, q, qd, qdd):
         """The diagonal matrix of smooth signs."""
         return jnp.diag(self.transition(qd))
+
+    @property
+    def shapes(self):
+        """Those of the transition."""
+        return transition_shapes(self.transition)
 
 
 class AsymmetricCoulombFriction(AbstractTerm):
@@ -220,16 +182,19 @@ class AsymmetricCoulombFriction(AbstractTerm):
 
     def parameters(self, robot):
         """`fcp1`, … for positive, then `fcn1`, … for negative speeds [N m or N]."""
-        return (*_each(robot, "fcp", "N m", "N"), *_each(robot, "fcn", "N m", "N"))
+        return (*each_joint(robot, "fcp", "N m", "N"), *each_joint(robot, "fcn", "N m", "N"))
 
     def columns(self, robot, q, qd, qdd):
         """The shares of the two directions."""
         s = self.transition(qd)
         # Within a dead zone both shares vanish, as the force does.
-        moving = (
-            jnp.where(s == 0.0, s, jnp.ones_like(s)) if _has_dead_zone(self.transition) else 1.0
-        )
+        moving = jnp.where(s == 0.0, s, jnp.ones_like(s)) if has_dead_zone(self.transition) else 1.0
         return jnp.concatenate([jnp.diag(0.5 * (moving + s)), jnp.diag(0.5 * (s - moving))], axis=1)
+
+    @property
+    def shapes(self):
+        """Those of the transition."""
+        return transition_shapes(self.transition)
 
 
 class ConstantOffset(AbstractTerm):
@@ -237,7 +202,7 @@ class ConstantOffset(AbstractTerm):
 
     def parameters(self, robot):
         """`fo1`, … [N m or N]."""
-        return _each(robot, "fo", "N m", "N")
+        return each_joint(robot, "fo", "N m", "N")
 
     def columns(self, robot, q, qd, qdd):
         """The identity."""
@@ -249,7 +214,7 @@ class RotorInertia(AbstractTerm):
 
     def parameters(self, robot):
         """`Ia1`, … [kg m² or kg]."""
-        return _each(robot, "Ia", "kg m²", "kg")
+        return each_joint(robot, "Ia", "kg m²", "kg")
 
     def columns(self, robot, q, qd, qdd):
         """The diagonal matrix of accelerations."""
@@ -267,7 +232,7 @@ class LinearSpring(AbstractTerm):
 
     def parameters(self, robot):
         """`ks1`, … [N m/rad or N/m]."""
-        return _each(robot, "ks", "N m/rad", "N/m")
+        return each_joint(robot, "ks", "N m/rad", "N/m")
 
     def columns(self, robot, q, qd, qdd):
         """The diagonal matrix of deflections."""

@@ -4,18 +4,16 @@ import numpy as np
 
 from jaxid.dynamics.terms import (
     AbstractTerm,
-    AbstractTransition,
     AsymmetricCoulombFriction,
     ConstantOffset,
     CoulombFriction,
     CoupledDrives,
-    HardSign,
     LinearSpring,
     RigidBodies,
     RotorInertia,
-    Tanh,
     ViscousFriction,
 )
+from jaxid.dynamics.transitions import AbstractTransition, HardSign, Tanh
 from jaxid.experiment.robot_tables import each
 from jaxid.experiment.tables import (
     ButterworthTable,

@@ -2,13 +2,21 @@
 
 import inspect
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trees
 
-from jaxid.dynamics import terms
+from jaxid.dynamics import friction, terms
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.friction import (
+    AsymmetricViscousFriction,
+    LoadFriction,
+    StribeckFriction,
+    TemperatureScaled,
+)
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import (
     AbstractTerm,
@@ -16,13 +24,12 @@ from jaxid.dynamics.terms import (
     ConstantOffset,
     CoulombFriction,
     CoupledDrives,
-    HardSign,
     LinearSpring,
     RigidBodies,
     RotorInertia,
-    Tanh,
     ViscousFriction,
 )
+from jaxid.dynamics.transitions import HardSign, Tanh
 from jaxid.robot.drives import Drives
 from jaxid.robot.library import tx40
 
@@ -49,6 +56,11 @@ ALL = [
     LinearSpring(),
     LinearSpring(np.array([0.1, 0.2, 0.3])),
     CoupledDrives(),
+    StribeckFriction(),
+    StribeckFriction(np.array([0.1, 0.2, 0.05]), exponent=1.3),
+    AsymmetricViscousFriction(),
+    LoadFriction(np.random.default_rng(44).uniform(0.2, 2.0, (N, 10))),
+    TemperatureScaled(ViscousFriction(), rate=0.02, temperature=40.0),
 ]
 FORCE = ("N m", "N", "N m")
 
@@ -113,7 +125,8 @@ class TestContract:
 def test_the_contract_covers_every_term():
     members = {
         c
-        for _, c in inspect.getmembers(terms, inspect.isclass)
+        for module in (terms, friction)
+        for _, c in inspect.getmembers(module, inspect.isclass)
         if issubclass(c, AbstractTerm) and not inspect.isabstract(c)
     }
     assert members == {type(t) for t in ALL}, "add the new term to the list `ALL` of this file"
@@ -256,3 +269,55 @@ def test_asymmetric_friction_vanishes_in_its_dead_zone():
     np.testing.assert_array_equal(columns, 0.0)
     fast = np.asarray(term.columns(robot, qd, qd + 1.0, qd))
     np.testing.assert_allclose(fast[:, : robot.joints], np.eye(robot.joints), atol=1e-12)
+
+
+def test_stribeck_friction_falls_from_its_static_level(robot):
+    """At a few epsilons the sum of both levels, at the Stribeck speed what is left of it."""
+    speeds = np.array([0.1, 0.2, 0.4])
+    term = StribeckFriction(speeds, exponent=1.5, transition=Tanh(1e-4))
+    levels = np.array([1.0, 2.0, 3.0, 0.5, 0.6, 0.7])
+    slow = _columns(term, robot, qd=np.full(N, 2e-3)) @ levels
+    np.testing.assert_allclose(slow, levels[:N] + levels[N:], rtol=2e-3)
+    at = _columns(term, robot, qd=-speeds) @ levels
+    np.testing.assert_allclose(at, -(levels[:N] + levels[N:] / np.e), rtol=1e-12)
+    fast = _columns(term, robot, qd=np.full(N, 30.0)) @ levels
+    np.testing.assert_allclose(fast, levels[:N], rtol=1e-12)
+
+
+def test_friction_under_load_is_a_share_of_the_weight(robot):
+    p = np.random.default_rng(45).uniform(0.2, 2.0, 10 * N)
+    weight = RigidBodies().forces(
+        robot, jnp.asarray(p), *(jnp.asarray(x) for x in (Q, 0 * Q, 0 * Q))
+    )
+    found = np.diag(_columns(LoadFriction.of(robot, p, HardSign()), robot))
+    np.testing.assert_allclose(found, np.abs(weight) * np.sign(QD), rtol=1e-12)
+    with pytest.raises(ValueError, match="`standard_parameters` must begin with ten"):
+        LoadFriction.of(robot, p[:5])
+
+
+def test_warm_friction_is_smaller(robot):
+    rates = np.array([0.01, 0.02, 0.03])
+    cold = TemperatureScaled(ViscousFriction(), rates)
+    np.testing.assert_allclose(_columns(cold, robot), np.diag(QD), rtol=1e-15)
+    warm = TemperatureScaled(ViscousFriction(), rates, temperature=45.0)
+    np.testing.assert_allclose(_columns(warm, robot), np.diag(np.exp(-20 * rates) * QD), rtol=1e-12)
+
+
+def test_every_shape_is_found_in_its_term():
+    """Names are unique, and changing the leaf that a shape names changes the columns."""
+    wrapped = TemperatureScaled(StribeckFriction(), temperature=40.0)
+    assert [s.name for s in wrapped.shapes] == ["eps", "vs", "delta", "rate"]
+    before = np.asarray(wrapped.columns(TREE.robot(), Q, 0.1 * QD, QDD))
+    for shape in wrapped.shapes:
+        other = eqx.tree_at(shape.leaf, wrapped, 1.5 * shape.leaf(wrapped))
+        assert np.any(np.asarray(other.columns(TREE.robot(), Q, 0.1 * QD, QDD)) != before)
+    assert CoulombFriction(HardSign()).shapes == ViscousFriction().shapes == ()
+
+
+def test_base_parameters_see_friction_near_standstill():
+    model = Model(
+        tx40(), (RigidBodies(), ViscousFriction(), StribeckFriction(0.02), RotorInertia())
+    )
+    base = base_parameters(model)
+    assert {f"fs{k}" for k in range(1, 7)} < set(base.names)
+    assert not base.notes

@@ -1,0 +1,96 @@
+"""How friction passes from one direction of motion to the other, and numbers that shape it."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.types import AnyArray, Float
+
+
+class Shape(NamedTuple):
+    """A positive number of a friction law in which forces are not linear: one for each joint.
+
+    Attributes:
+        name: Before the joint's number.
+        units: For a revolute and a prismatic joint.
+        leaf: Finds it in the term (or transition) that names it.
+        wanted: Whether it is identified unless a user says otherwise.
+    """
+
+    name: str
+    units: tuple[str, str]
+    leaf: Callable[[Any], Any]
+    wanted: bool = True
+
+
+class AbstractTransition(eqx.Module):
+    """How a friction force passes from one direction of motion to the other."""
+
+    @abstractmethod
+    def __call__(self, qd: Float[AnyArray, " joints"]) -> Float[AnyArray, " joints"]:
+        """A number between -1 and 1 for each speed [rad/s or m/s]."""
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """What `identify_nonlinear` can find of it."""
+        return ()
+
+
+class Tanh(AbstractTransition):
+    r"""The smooth transition $\tanh(\dot q / \epsilon_c)$ (Eq. 14).
+
+    Attributes:
+        epsilon: Speed of the transition, one for all joints or one for each, in the joint's own
+            unit [rad/s or m/s].
+        dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
+    """
+
+    epsilon: float | Float[AnyArray, "..."] = 0.01
+    dead_zone: float | Float[AnyArray, "..."] = 0.0
+
+    def __check_init__(self):
+        if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
+            raise ValueError(
+                f"`epsilon` must be a positive speed, but is {self.epsilon}: "
+                "use `HardSign` for a transition without width."
+            )
+
+    def __call__(self, qd):
+        """The smooth sign of the speed."""
+        return _outside(self.dead_zone, qd, jnp.tanh(qd / self.epsilon))
+
+    @property
+    def shapes(self):
+        """`eps1`, … [rad/s or m/s]."""
+        return (Shape("eps", ("rad/s", "m/s"), lambda transition: transition.epsilon),)
+
+
+class HardSign(AbstractTransition):
+    """The sign of the speed: it says nothing at standstill, where a dead zone belongs.
+
+    Attributes:
+        dead_zone: Speed below which there is no force [rad/s or m/s].
+    """
+
+    dead_zone: float | Float[AnyArray, "..."] = 0.0
+
+    def __call__(self, qd):
+        """The sign of the speed."""
+        return _outside(self.dead_zone, qd, jnp.sign(qd))
+
+
+def _outside(dead_zone, qd, value):
+    if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
+        return value
+    return jnp.where(jnp.abs(qd) > dead_zone, value, jnp.zeros_like(value))
+
+
+def has_dead_zone(transition: AbstractTransition) -> bool:
+    """Whether there are speeds at which a transition says nothing."""
+    dead_zone = getattr(transition, "dead_zone", 0.0)
+    return isinstance(dead_zone, jax.Array) or bool(np.any(dead_zone))
