@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
 from jaxid.identification.factors import Blocks, streamed
-from jaxid.identification.streaming_log import open_log
+from jaxid.identification.opening import open_log
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
 RATE = 1000.0

@@ -38,11 +38,11 @@ from jaxid.identification.identify import fit_blocks as fit_blocks
 from jaxid.identification.identify import fit_rows as fit_rows
 from jaxid.identification.identify import identify as identify
 from jaxid.identification.rows import Rows as Rows
+from jaxid.identification.opening import open_log as open_log
 from jaxid.identification.solutions import Complete as Complete
 from jaxid.identification.solutions import CrossValidated as CrossValidated
 from jaxid.identification.solutions import Ridge as Ridge
 from jaxid.identification.solutions import Truncated as Truncated
-from jaxid.identification.streaming_log import open_log as open_log
 from jaxid.identification.weights import MaximumForces as MaximumForces
 from jaxid.identification.weights import MeasuredForces as MeasuredForces
 from jaxid.identification.weights import ResidualVariances as ResidualVariances

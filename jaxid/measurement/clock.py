@@ -102,8 +102,7 @@ def clock(
             f"{twins} of {len(stamps)} rows repeat the time stamp of the row before and were "
             "removed; if every row is a sample, give `sample_time` instead of the time stamps"
         )
-    if stamps[0] != 0:
-        notes.append(f"time counts from the first row, which was stamped {stamps[0]:.9g} s")
+    notes += said_start(stamps[0])
     t = stamps[kept] - stamps[0]
     steps = np.diff(t)
     typical = float(np.median(steps))
@@ -111,10 +110,7 @@ def clock(
     # A gap is a pause that neither the limit nor the usual jitter explains.
     gaps = np.flatnonzero(steps > max(largest_gap * typical, typical + 8.0 * spread))
     regular = steps[steps < 1.5 * typical + 8.0 * spread]
-    sample_time = float(regular.mean())
-    # Stamps are rounded numbers: a round sample time that fits them as well is the true one.
-    if abs(float(f"{sample_time:.6g}") - sample_time) * len(t) < 0.01 * sample_time:
-        sample_time = float(f"{sample_time:.6g}")
+    sample_time = rounded(float(regular.mean()), len(t))
     edges = [0, *(int(g) + 1 for g in gaps), len(t)]
     ranges = [(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
     lonely = len(t) - sum(b - a for a, b in ranges)
@@ -124,13 +120,8 @@ def clock(
             f"at the median, with {len(gaps)} gaps; check `time_unit`, or give `sample_time`."
         )
     if gaps.size:
-        notes.append(
-            f"{len(gaps)} gap{'s' if len(gaps) > 1 else ''} in time, the first after "
-            f"{t[gaps[0]]:.6g} s, the longest of {float(steps[gaps].max()):.6g} s (sample time "
-            f"{sample_time:.6g} s), split the log into segments"
-        )
-    if lonely:
-        notes.append(f"{lonely} rows between gaps are too few for a segment and were left out")
+        notes += said_gaps(len(gaps), t[gaps[0]], float(steps[gaps].max()), sample_time)
+    notes += said_lonely(lonely)
     uneven = max(np.abs(t[a:b] - t[a] - sample_time * np.arange(b - a)).max() for a, b in ranges)
     exact = bool(uneven <= JITTER * sample_time)
     if not exact:
@@ -142,6 +133,37 @@ def clock(
             "samples uniformly and only the stamps are late, give `sample_time` instead"
         )
     return Clock(kept, t, sample_time, tuple(ranges), exact, tuple(notes))
+
+
+def rounded(sample_time: float, rows: int) -> float:
+    """A sample time, without what the rounding of stamps has left in it.
+
+    Stamps are rounded numbers: a round sample time that fits them as well is the true one.
+    """
+    short = float(f"{sample_time:.6g}")
+    return short if abs(short - sample_time) * rows < 0.01 * sample_time else sample_time
+
+
+def said_start(stamp: float) -> list[str]:
+    """What became of the first stamp."""
+    if stamp == 0:
+        return []
+    return [f"time counts from the first row, which was stamped {stamp:.9g} s"]
+
+
+def said_gaps(count: int, first: float, longest: float, sample_time: float) -> list[str]:
+    """That there are gaps."""
+    return [
+        f"{count} gap{'s' if count > 1 else ''} in time, the first after {first:.6g} s, the "
+        f"longest of {longest:.6g} s (sample time {sample_time:.6g} s), split the log into segments"
+    ]
+
+
+def said_lonely(rows: int) -> list[str]:
+    """That rows between gaps are lost."""
+    if not rows:
+        return []
+    return [f"{rows} rows between gaps are too few for a segment and were left out"]
 
 
 def uniform(samples: int, sample_time: float) -> Clock:

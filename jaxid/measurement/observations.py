@@ -1,6 +1,7 @@
 """What an estimator sees: a motion and forces with the filter and the rows that belong to them."""
 
 import itertools
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -233,21 +234,8 @@ def observe(
     dt = recording.sample_time
     decimation.check(filter.low_pass(dt).cutoff, dt)
     speeds = per_joint("slow", None if slow is None else np.asarray(slow, np.float64), n, 0.0)
-    edge = filter.edge(dt)
-    fewest = 2 * edge + (FEWEST_ROWS - 1) * decimation.factor + 1
-    used = [(a, b) for a, b in recording.segments if b - a >= max(fewest, 5)]
-    if not used:
-        longest = max(b - a for a, b in recording.segments)
-        raise ValueError(
-            f"the longest segment of `{recording.name}` has {longest} samples, but {edge} at each "
-            f"end are lost to the filter and {FEWEST_ROWS} rows of {decimation.factor} are needed: "
-            "record longer, close the gaps (`largest_gap`), or set a smaller `margin`."
-        )
-    notes = list(recording.notes)
-    short = len(recording.segments) - len(used)
-    if short:
-        notes.append(f"{short} segment(s), shorter than the filter's edges, were left out")
-
+    used, said = usable(recording.segments, filter, decimation, dt, recording.name)
+    notes = [*recording.notes, *said]
     angles, forces, velocities = _joint_side(recording, robot)
     motions = [
         filter.motion(angles[a:b], None if velocities is None else velocities[a:b], dt)
@@ -271,13 +259,56 @@ def observe(
         notes=tuple(notes),
     )
     mask = np.abs(np.asarray(observations.reduced_motion.qd)) >= speeds
-    if not mask.any(axis=0).all():
-        j = int(np.flatnonzero(~mask.any(axis=0))[0])
+    refuse_standstill(mask, speeds, robot, recording.name)
+    return eqx.tree_at(lambda o: o.mask, observations, mask)
+
+
+def usable(
+    segments: Sequence[tuple[int, int]],
+    filter: AbstractFilter,
+    decimation: AbstractDecimation,
+    sample_time: float,
+    name: str,
+) -> tuple[list[tuple[int, int]], list[str]]:
+    """The segments that are longer than what filters lose at their ends, and what to say.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    edge = filter.edge(sample_time)
+    fewest = 2 * edge + (FEWEST_ROWS - 1) * decimation.factor + 1
+    used = [(a, b) for a, b in segments if b - a >= max(fewest, 5)]
+    if not used:
+        longest = max(b - a for a, b in segments)
+        raise ValueError(
+            f"the longest segment of `{name}` has {longest} samples, but {edge} at each "
+            f"end are lost to the filter and {FEWEST_ROWS} rows of {decimation.factor} are needed: "
+            "record longer, close the gaps (`largest_gap`), or set a smaller `margin`."
+        )
+    short = len(segments) - len(used)
+    if not short:
+        return used, []
+    return used, [f"{short} segment(s), shorter than the filter's edges, were left out"]
+
+
+def refuse_standstill(
+    mask: Bool[np.ndarray, "rows joints"],
+    speeds: Float[np.ndarray, " joints"],
+    robot: Robot,
+    name: str,
+) -> None:
+    """Refuses a log in which a joint is never fast enough.
+
+    Raises:
+        ValueError: If no row of some joint counts.
+    """
+    slow = np.flatnonzero(~mask.any(axis=0))
+    if slow.size:
+        j = int(slow[0])
         raise ValueError(
             f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of `slow` in "
-            f"`{recording.name}`: take a smaller one, or a log in which it moves."
+            f"`{name}`: take a smaller one, or a log in which it moves."
         )
-    return eqx.tree_at(lambda o: o.mask, observations, mask)
 
 
 def _join(parts: list) -> np.ndarray:

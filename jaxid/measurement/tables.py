@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,9 +11,7 @@ import numpy as np
 import polars as pl
 
 from jaxid.measurement.columns import Selection
-
-TEXT = (".csv", ".tsv", ".txt", ".dat")
-SEPARATORS = (";", "\t", ",", " ")
+from jaxid.measurement.text import SUFFIXES, Dialect
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,15 +23,18 @@ class Table:
         columns: By name: one column, or a whole array (samples x joints).
         first_line: Line of the file that holds the first row of numbers; None if not a text.
         named: Whether the columns have names of their own.
+        before: Rows of the file before the first of these.
     """
 
     source: str
     columns: Mapping[str, pl.Series | np.ndarray]
     first_line: int | None = None
     named: bool = True
+    before: int = 0
 
     def row(self, index: int) -> str:
         """Where a row is found in the file."""
+        index += self.before
         return f"row {index + 1}" if self.first_line is None else f"line {index + self.first_line}"
 
     def expand(self, what: str, selection: Selection) -> tuple[str, ...]:
@@ -186,7 +186,7 @@ def read_table(path: str | Path) -> Table:
     if not path.is_file():
         raise ValueError(f"`{path}` is no file: check the path of the log.")
     suffix = path.suffix.lower()
-    if suffix in TEXT:
+    if suffix in SUFFIXES:
         return _read_text(path)
     if suffix == ".parquet":
         return _read_parquet(path)
@@ -195,63 +195,16 @@ def read_table(path: str | Path) -> Table:
     if suffix == ".mat":
         return _read_mat(path)
     raise ValueError(
-        f"`{path.name}` must end in {', '.join(TEXT)}, .parquet, .npz or .mat, to be read as a "
+        f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet, .npz or .mat, to be read as a "
         "log: convert it to one of them."
     )
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell.replace(",", "."))
-    except ValueError:
-        return False
-    return True
-
-
 def _read_text(path: Path) -> Table:
-    raw = path.read_bytes()
-    line = raw.split(b"\n", 1)[0].decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
-    if not line.strip():
-        raise ValueError(f"`{path.name}` must start with a header or with numbers, but is empty.")
-    separator = next((s for s in SEPARATORS if s in line.strip()), ",")
-    if separator == " ":
-        raw = b"\n".join(b" ".join(row.split()) for row in raw.splitlines())
-        line = " ".join(line.split())
-    elif b" " in raw:
-        mark = separator.encode()
-        raw = re.sub(rb" *" + mark + rb" *", mark, raw)
-    cells = [cell.strip().strip('"') for cell in line.split(separator)]
-    named = not all(_is_number(cell) for cell in cells if cell) or not any(cells)
-    names = cells if named else [str(i) for i in range(len(cells))]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(
-            f"the header of `{path.name}` names the column `{twice[0]}` twice: rename one of them."
-        )
-    decimal_comma = separator == ";" and re.search(rb"\d,\d", raw[:65536]) is not None
-    try:
-        frame = pl.read_csv(
-            io.BytesIO(raw),
-            separator=separator,
-            has_header=False,
-            new_columns=names,
-            skip_rows=int(named),
-            infer_schema_length=None,
-            decimal_comma=decimal_comma,
-            encoding="utf8-lossy",
-        )
-    except pl.exceptions.PolarsError as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
-        raise ValueError(
-            f"`{path.name}` is no table with {len(names)} columns in every line ({reason}): "
-            "repair or remove the lines that differ."
-        ) from error
-    if frame.width != len(names):
-        raise ValueError(
-            f"`{path.name}` has {len(names)} names in its header, but {frame.width} columns of "
-            "numbers: make them agree."
-        )
-    return Table(path.name, frame.to_dict(as_series=True), 1 + int(named), named)
+    raw = path.read_bytes().rstrip(b"\r\n")
+    dialect = Dialect.of(path.name, raw)
+    columns = dialect.columns(raw[dialect.start :])
+    return Table(path.name, columns, dialect.first_line, dialect.named)
 
 
 def _read_parquet(path: Path) -> Table:
