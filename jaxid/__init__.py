@@ -37,8 +37,8 @@ from jaxid.identification.fit import Trust as Trust
 from jaxid.identification.identify import fit_blocks as fit_blocks
 from jaxid.identification.identify import fit_rows as fit_rows
 from jaxid.identification.identify import identify as identify
-from jaxid.identification.rows import Rows as Rows
 from jaxid.identification.opening import open_log as open_log
+from jaxid.identification.rows import Rows as Rows
 from jaxid.identification.solutions import Complete as Complete
 from jaxid.identification.solutions import CrossValidated as CrossValidated
 from jaxid.identification.solutions import Ridge as Ridge
