@@ -39,6 +39,10 @@ from jaxid.identification.identify import fit_rows as fit_rows
 from jaxid.identification.identify import identify as identify
 from jaxid.identification.opening import open_log as open_log
 from jaxid.identification.rows import Rows as Rows
+from jaxid.identification.runs.comparison import Comparison as Comparison
+from jaxid.identification.runs.comparison import Verdict as Verdict
+from jaxid.identification.runs.comparison import compare as compare
+from jaxid.identification.runs.estimates import Estimates as Estimates
 from jaxid.identification.solutions import Complete as Complete
 from jaxid.identification.solutions import CrossValidated as CrossValidated
 from jaxid.identification.solutions import Ridge as Ridge

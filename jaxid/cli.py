@@ -1,4 +1,4 @@
-"""The command line: `jaxid init`, `inspect`, `identify` and `example`."""
+"""The command line: `jaxid init`, `inspect`, `identify`, `compare` and `example`."""
 
 import dataclasses
 import dis
@@ -23,7 +23,9 @@ from jaxid.experiment.template import write_template
 from jaxid.identification.identify import fit_rows
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.rows import Rows
+from jaxid.identification.runs.comparison import Comparison
 from jaxid.measurement.observations import Observations
+from jaxid.report.compared_files import read_estimates, write_comparison
 from jaxid.report.content import Beside
 from jaxid.report.write import write_report
 from jaxid.validation.validate import validate
@@ -301,6 +303,42 @@ def identify(
     terminal.show_validation(console, loaded.robot, found, len(fitted))
     if beside is not None:
         terminal.show_beside(console, fit, found.errors, beside)
+    terminal.show_files(console, output, [p.name for p in files])
+
+
+@app.command()
+def compare(
+    first: Annotated[
+        Path, typer.Argument(help="Report of one run, like that of the cold robot.", metavar="COLD")
+    ],
+    second: Annotated[
+        Path, typer.Argument(help="Report of another run of the same robot.", metavar="WARM")
+    ],
+    level: Annotated[
+        float, typer.Option("--level", metavar="L", help="Confidence of the decisions, of 1.")
+    ] = 0.95,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of table and figure.")
+    ] = Path("comparison"),
+    force: Annotated[
+        bool, typer.Option("--force", help="Write into a folder that holds other files too.")
+    ] = False,
+) -> None:
+    """Decide which parameters have changed between two runs.
+
+    Each argument is a folder that `jaxid identify` has written.
+    """
+    console = _console()
+    if first.resolve() == second.resolve():
+        raise ValueError(f"`{first}` is given twice: compare two different runs.")
+    refuse_foreign_folder(output, force)
+    twins = first.resolve().name == second.resolve().name
+    runs = [read_estimates(path, str(path) if twins else None) for path in (first, second)]
+    found = Comparison.of(*runs, level)
+    with _stages(1) as stage:
+        stage("drawing")
+        files = write_comparison(output, found, (first, second))
+    terminal.show_comparison(console, found)
     terminal.show_files(console, output, [p.name for p in files])
 
 

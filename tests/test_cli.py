@@ -400,3 +400,37 @@ def test_a_log_does_not_verify_what_has_seen_it(run, folder):
     assert code == 2
     assert "`a.csv` is given both to identify and to verify with" in err
     assert not (folder / "report").exists()
+
+
+def test_what_has_changed_between_two_runs_is_told(folder, run):
+    for name, logs in (("cold", "ab"), ("warm", "c")):
+        for log in logs:
+            lines = np.loadtxt(folder / f"{log}.csv", delimiter=",", skiprows=1)
+            if name == "warm":
+                lines[:, 3] -= 0.25 * np.gradient(lines[:, 1], lines[:, 0])
+            header = "t,q1,q2,tau1,tau2"
+            np.savetxt(folder / f"{log}.csv", lines, "%.7f", ",", header=header, comments="")
+        files = [f"{log}.csv" for log in logs]
+        assert run("identify", "experiment.toml", *files, "-o", f"{name}")[0] == 0
+    code, out, err = run("compare", "cold", "warm/")
+    assert code == 0, err
+    assert err == ""
+    changed = [line for line in out.splitlines() if line.rstrip().endswith("  changed")]
+    assert len(changed) == 2, "one parameter and its kind"
+    assert " fv1 " in changed[0]
+    assert changed[1].startswith("viscous friction")
+    assert max(map(len, out.splitlines())) <= 100
+    content = json.loads((folder / "comparison" / "comparison.json").read_text(encoding="utf-8"))
+    rows = {r["name"]: r for r in content["parameters"]}
+    assert abs(rows["fv1"]["difference"] + 0.25) < 0.02
+    assert rows["fv1"]["verdict"] == "changed"
+    assert content["sources"] == ["cold", "warm"]
+    assert set(os.listdir("comparison")) == {
+        "comparison.json",
+        "comparison.csv",
+        "comparison.png",
+    }
+    assert run("compare", "warm", "cold")[0] == 0, "an earlier comparison may go"
+    assert refused(run("compare", "cold", "cold/"), "`cold` is given twice")
+    assert refused(run("compare", "cold", "none"), "`none` must be a folder", "`jaxid identify`")
+    assert refused(run("compare", "cold", "warm", "-o", "."), "`.` holds files but no report")

@@ -1,9 +1,12 @@
-"""Whether a folder may take a report."""
+"""Whether a folder may take a report or a comparison."""
 
 import json
 from pathlib import Path
 
-from jaxid.report.content import SCHEMA
+from jaxid.report import compared_files, content
+
+WRITTEN = (("result.json", content.SCHEMA), ("comparison.json", compared_files.SCHEMA))
+"""Files by which earlier results are known, and their schemas."""
 
 
 def refuse_foreign_folder(target: Path, force: bool) -> None:
@@ -27,8 +30,12 @@ def refuse_foreign_folder(target: Path, force: bool) -> None:
 
 
 def _is_report(folder: Path) -> bool:
+    return any(_has(folder / file, schema) for file, schema in WRITTEN)
+
+
+def _has(path: Path, schema: str) -> bool:
     try:
-        content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        return str(content["schema"]).startswith(SCHEMA.split("/")[0])
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return str(found["schema"]).startswith(schema.split("/")[0])
     except (OSError, ValueError, KeyError, TypeError):
         return False

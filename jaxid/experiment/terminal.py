@@ -15,12 +15,14 @@ from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.sanity import LogCheck, known_forces
 from jaxid.identification.fit import DOUBTFUL as DOUBTFUL_SHARE
 from jaxid.identification.fit import TRUSTED, Fit, Trust
+from jaxid.identification.runs.comparison import Comparison, Verdict
 from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
+from jaxid.report.compared import comparison_table, group_table
 from jaxid.report.content import Beside
 from jaxid.report.numbers import MISSING, aligned, percent, significant
-from jaxid.report.tables import error_table, joint_table, parameter_table
+from jaxid.report.tables import error_table, joint_table, parameter_table, plain_table
 from jaxid.robot.robot import Robot
 from jaxid.validation.errors import TorqueErrors
 from jaxid.validation.validate import Validation
@@ -107,18 +109,6 @@ def _motor_table(robot: Robot) -> Table:
     for i in range(n):
         table.add_row(str(i + 1), Text(turns[i]), *(column[i] for column in cells))
     return table
-
-
-def plain_table(title: str) -> Table:
-    """An empty table in the style of the report's."""
-    return Table(
-        title=Text(title, style="bold"),
-        title_justify="left",
-        box=None,
-        pad_edge=False,
-        header_style="bold",
-        padding=(0, 2, 0, 0),
-    )
 
 
 def show_base(console: Console, base: BaseParameters) -> None:
@@ -335,3 +325,22 @@ def show_files(console: Console, folder: Path, names: Iterable[str]) -> None:
     """What was written, and where."""
     console.print()
     console.print(Text(f"wrote {folder}: {', '.join(names)}"))
+
+
+def show_comparison(console: Console, comparison: Comparison) -> None:
+    """Which parameters have changed, one by one and by kinds, and how that was decided."""
+    show_table(console, comparison_table(comparison))
+    show_table(console, group_table(comparison))
+    console.print()
+    verdicts, level = comparison.verdicts, comparison.level
+    tested = len(verdicts) - verdicts.count(Verdict.UNKNOWN)
+    sentences(
+        console,
+        [
+            f"{verdicts.count(Verdict.CHANGED)} of {tested} parameters have changed: if none had, "
+            f"the chance to call any of them so would be {100 * (1 - level):.3g} % at most (Holm)",
+            f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies outside the "
+            f"{100 * level:g} % interval of their difference; of {tested} parameters that never "
+            f"change, about {(1 - level) * tested:.2g} look so",
+        ],
+    )

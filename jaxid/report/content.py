@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.fit import Fit
+from jaxid.identification.runs.estimates import groups
 from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
@@ -131,12 +132,13 @@ def parameters(fit: Fit) -> list[dict[str, Any]]:
         fit.base.names,
         fit.base.expressions,
         fit.base.units,
+        groups(fit.base),
         np.asarray(fit.parameters).tolist(),
         fit.standard_deviations.tolist(),
         fit.relative_standard_deviations.tolist(),
         strict=True,
     )
-    keys = ("name", "expression", "unit", "estimate", "standard_deviation", "relative")
+    keys = ("name", "expression", "unit", "group", "estimate", "standard_deviation", "relative")
     return [dict(zip(keys, row, strict=True)) for row in columns]
 
 

@@ -31,7 +31,7 @@ def parameter_table(fit: Fit, expressions: bool = True) -> Table:
     values, deviations = (aligned(column) for column in zip(*pairs, strict=True))
     relative = np.asarray(fit.relative_standard_deviations)
     shares = aligned([percent(float(r)) for r in relative])
-    table = _table(f"{base.model.robot.name}: {base.size} base parameters")
+    table = plain_table(f"{base.model.robot.name}: {base.size} base parameters")
     table.add_column("#", justify="right", style="dim")
     table.add_column("parameter", overflow="fold")
     table.add_column("estimate", justify="right", no_wrap=True)
@@ -66,7 +66,7 @@ def error_table(errors: TorqueErrors, robot: Robot) -> Table:
     """
     require_joints(errors, robot)
     n = robot.joints
-    table = _table(f"{errors.name}: relative error {percent(errors.relative)} %")
+    table = plain_table(f"{errors.name}: relative error {percent(errors.relative)} %")
     table.add_column("joint")
     table.add_column("unit", no_wrap=True)
     columns = [
@@ -97,7 +97,7 @@ def joint_table(robot: Robot) -> Table:
     """
     limits = robot.limits
     force = np.where(np.isfinite(limits.force), limits.force, robot.drives.max_forces)
-    table = _table(f"{robot.name}: {robot.joints} joints")
+    table = plain_table(f"{robot.name}: {robot.joints} joints")
     table.add_column("joint")
     table.add_column("moves")
     columns = [
@@ -125,7 +125,8 @@ def joint_table(robot: Robot) -> Table:
     return table
 
 
-def _table(title: str) -> Table:
+def plain_table(title: str) -> Table:
+    """An empty table in the style of the report."""
     return Table(
         title=Text(title, style="bold"),
         title_justify="left",

@@ -59,8 +59,8 @@ def write_report(
     names += [file for file, _, _ in named]
     content["files"] = names
     with written_whole(folder) as staging:
-        _write_json(staging / "result.json", content)
-        _write_csv(staging / "parameters.csv", parameters(fit))
+        write_json(staging / "result.json", content)
+        write_csv(staging / "parameters.csv", parameters(fit))
         save(error_figure(identification, verification, robot), staging / "errors.png")
         save(parameter_figure(fit), staging / "parameters.png")
         for file, role, errors in named:
@@ -72,14 +72,16 @@ def write_report(
     return [folder / name for name in names]
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Writes a file that programs read exactly and people can read."""
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     # A list of numbers or texts stands on one line. Texts hold no line breaks, so none is touched.
     text = re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text)
     path.write_text(f"{text}\n", encoding="utf-8")
 
 
-def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Writes rows with the same keys below a line of these keys."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()

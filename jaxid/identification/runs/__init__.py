@@ -1,0 +1,1 @@
+"""Several runs of one robot: what has changed between them, and what they tell together."""

@@ -1,0 +1,86 @@
+"""What others need of a fit to compare it: numbers with names, units and their covariance."""
+
+import re
+
+import equinox as eqx
+import numpy as np
+from scipy import stats
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.fit import Fit
+from jaxid.types import AnyArray, Float
+
+
+class Estimates(eqx.Module):
+    """Estimated parameters and their uncertainty.
+
+    Attributes:
+        label: Of the run that they come from, such as `cold`.
+        names: Of the parameters.
+        expressions: What each parameter is made of, in letters; its name where nobody knows.
+        units: Of the parameters.
+        groups: The kind of each parameter, such as `viscous friction`.
+        parameters: The estimates.
+        covariance: Of the estimates; infinite on the diagonal where nothing is known.
+        freedom: Degrees of freedom of each standard deviation; infinite where it is taken as exact.
+    """
+
+    label: str = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    expressions: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    groups: tuple[str, ...] = eqx.field(static=True)
+    parameters: Float[AnyArray, " parameters"]
+    covariance: Float[AnyArray, "parameters parameters"]
+    freedom: Float[AnyArray, " parameters"]
+
+    @classmethod
+    def of(cls, fit: Fit, label: str | None = None) -> "Estimates":
+        """The estimates of a fit.
+
+        Args:
+            fit: The fit.
+            label: Of the run; the names of its recordings if None.
+        """
+        base = fit.base
+        return cls(
+            label=", ".join(fit.recordings) if label is None else label,
+            names=base.names,
+            expressions=base.names,
+            units=base.units,
+            groups=groups(base),
+            parameters=np.asarray(fit.parameters),
+            covariance=np.asarray(fit.covariance),
+            freedom=np.full(base.size, np.inf),
+        )
+
+    @property
+    def standard_deviations(self) -> Float[np.ndarray, " parameters"]:
+        """Standard deviations of the estimates."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def half_widths(self, level: float) -> Float[np.ndarray, " parameters"]:
+        """Half the widths of the estimates' intervals, each for itself.
+
+        Args:
+            level: Confidence, of 1.
+        """
+        quantile = stats.t.ppf(0.5 + 0.5 * level, np.asarray(self.freedom))
+        return quantile * self.standard_deviations
+
+
+def groups(base: BaseParameters) -> tuple[str, ...]:
+    """For each base parameter the effect that its leading parameter belongs to, in words."""
+    model = base.model
+    words = [_words(type(term).__name__) for term in model.terms]
+    of = [
+        word
+        for word, term in zip(words, model.terms, strict=True)
+        for _ in term.parameters(model.robot)
+    ]
+    return tuple(of[k] for k in base.indices)
+
+
+def _words(name: str) -> str:
+    """`ViscousFriction` as `viscous friction`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()

@@ -1,0 +1,160 @@
+"""Reads the results of two identifications, and writes what has changed between them."""
+
+import datetime
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxid.files import written_whole
+from jaxid.identification.runs.comparison import Comparison
+from jaxid.identification.runs.estimates import Estimates
+from jaxid.report.compared import comparison_figure
+from jaxid.report.content import plain, versions
+from jaxid.report.style import save
+from jaxid.report.write import write_csv, write_json
+
+SCHEMA = "jaxid-comparison/1"
+RESULT = "jaxid-result/"
+UNGROUPED = "base parameters"
+"""Kind of every parameter in files that do not tell it."""
+
+
+def read_estimates(folder: Path, label: str | None = None) -> Estimates:
+    """Reads the base parameters and their covariance from a report.
+
+    Args:
+        folder: That `write_report` has written, or its `result.json`.
+        label: Of the run; the folder's name if None.
+
+    Raises:
+        ValueError: If there is no result, or the file lacks something.
+    """
+    path = folder if folder.is_file() else folder / "result.json"
+    if not path.is_file():
+        raise ValueError(
+            f"`{folder}` must be a folder that `jaxid identify` has written, but holds no "
+            "`result.json`."
+        )
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"`{path}` is no JSON file: {error}; identify again.") from None
+    if not isinstance(content, dict) or not str(content.get("schema")).startswith(RESULT):
+        raise ValueError(
+            f"`{path}` must be the result of an identification (`schema` = `{RESULT}…`): identify "
+            "again."
+        )
+    rows = _list(content, "base_parameters", path)
+    columns = {
+        key: [_entry(row, key, path, k) for k, row in enumerate(rows)]
+        for key in ("name", "expression", "unit", "estimate")
+    }
+    covariance = np.array(_list(content.get("fit", {}), "covariance", path), np.float64)
+    size = len(rows)
+    if covariance.shape != (size, size):
+        raise ValueError(
+            f"`{path}`: `fit.covariance` must be {size} x {size}, one row for each base parameter, "
+            f"but has shape {covariance.shape}: identify again."
+        )
+    return Estimates(
+        label=(path.parent.resolve().name if label is None else label),
+        names=tuple(columns["name"]),
+        expressions=tuple(columns["expression"]),
+        units=tuple(columns["unit"]),
+        groups=tuple(str(row.get("group", UNGROUPED)) for row in rows),
+        parameters=np.array(columns["estimate"], np.float64),
+        # What is not finite is null in JSON, and nothing is known of it.
+        covariance=np.where(np.isnan(covariance), np.inf, covariance),
+        freedom=np.array([_freedom(row) for row in rows]),
+    )
+
+
+def _list(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
+    found = content.get(key)
+    if not isinstance(found, list) or not found:
+        raise ValueError(f"`{path}` has no `{key}`: identify again.")
+    return found
+
+
+def _entry(row: Any, key: str, path: Path, number: int) -> Any:
+    if not isinstance(row, dict) or row.get(key) is None:
+        raise ValueError(f"`{path}`: `base_parameters[{number}]` has no `{key}`: identify again.")
+    return row[key]
+
+
+def _freedom(row: Mapping[str, Any]) -> float:
+    found = row.get("degrees_of_freedom")
+    return np.inf if found is None else float(found)
+
+
+def write_comparison(
+    folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
+) -> list[Path]:
+    """Writes `comparison.json`, `comparison.csv` and `comparison.png`, all of them or nothing.
+
+    Args:
+        folder: Of the files; made with its parents.
+        comparison: Of two runs.
+        sources: Where the two runs come from, for the record.
+
+    Returns:
+        The files.
+
+    Raises:
+        ValueError: If `folder` is a file.
+    """
+    rows = _rows(comparison)
+    content = plain(
+        {
+            "schema": SCHEMA,
+            "made": {
+                "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+                "versions": versions(),
+            },
+            "first": comparison.first.label,
+            "second": comparison.second.label,
+            "sources": [str(source) for source in sources],
+            "level": comparison.level,
+            "parameters": rows,
+            "covariance_of_differences": comparison.covariance,
+            "groups": [
+                {
+                    "name": g.name,
+                    "parameters": g.size,
+                    "statistic": g.statistic,
+                    "p_value": g.p_value,
+                    "changed": g.changed,
+                }
+                for g in comparison.groups
+            ],
+        }
+    )
+    names = ["comparison.json", "comparison.csv", "comparison.png"]
+    with written_whole(folder) as staging:
+        write_json(staging / names[0], content)
+        write_csv(staging / names[1], rows)
+        save(comparison_figure(comparison), staging / names[2])
+    return [folder / name for name in names]
+
+
+def _rows(comparison: Comparison) -> list[dict[str, Any]]:
+    first, second = comparison.first, comparison.second
+    columns = {
+        "name": first.names,
+        "expression": first.expressions,
+        "unit": first.units,
+        "group": first.groups,
+        "first": np.asarray(first.parameters).tolist(),
+        "first_standard_deviation": first.standard_deviations.tolist(),
+        "second": np.asarray(second.parameters).tolist(),
+        "second_standard_deviation": second.standard_deviations.tolist(),
+        "difference": np.asarray(comparison.difference).tolist(),
+        "half_width": comparison.half_widths.tolist(),
+        "p_value": comparison.p_values.tolist(),
+        "adjusted_p_value": comparison.adjusted_p_values.tolist(),
+        "verdict": [v.value for v in comparison.verdicts],
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
