@@ -333,8 +333,8 @@ def compare(
         raise ValueError(f"`{first}` is given twice: compare two different runs.")
     refuse_foreign_folder(output, force)
     twins = first.resolve().name == second.resolve().name
-    runs = [read_estimates(path, str(path) if twins else None) for path in (first, second)]
-    found = Comparison.of(*runs, level)
+    cold, warm = (read_estimates(path, str(path) if twins else None) for path in (first, second))
+    found = Comparison.of(cold, warm, level)
     with _stages(1) as stage:
         stage("drawing")
         files = write_comparison(output, found, (first, second))
