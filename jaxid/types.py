@@ -4,7 +4,9 @@ Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (c
 regressor), `samples` (rows of a log), `rows` (what is left of them after filtering), `batch`.
 """
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,6 +18,10 @@ from jaxtyping import PRNGKeyArray as PRNGKeyArray
 
 AnyArray = jax.Array | np.ndarray
 """A JAX array, or a NumPy array: what stays in NumPy stays a constant when JAX traces."""
+
+# NumPy's own `ArrayLike` turns tuples away when types are checked at run time.
+Numbers = AnyArray | Sequence[Any] | float | int
+"""What users may pass where an array is meant: an array, nested lists or tuples, one number."""
 
 
 def require_float64(what: str) -> None:

@@ -2,14 +2,17 @@
 
 import enum
 import functools
+from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Hashable, as_array
 from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
 from jaxid.dynamics.machine import on_samples
-from jaxid.dynamics.model import Model
+from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.observation import observation_matrix
 from jaxid.dynamics.rank import (
@@ -19,7 +22,9 @@ from jaxid.dynamics.rank import (
     SingularValues,
     regrouping,
 )
-from jaxid.types import AnyArray, Float
+from jaxid.types import AnyArray, Array, Float, Numbers
+
+Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
 CLEAR_GAP = 1e3
 BARELY = 1e-4
@@ -33,7 +38,7 @@ class Identifiability(enum.Enum):
     NONE = "not identifiable"
 
 
-class BaseParameters(eqx.Module):
+class BaseParameters(Hashable):
     r"""A model regrouped to its base parameters: $\hat\Theta_1 (p_1 + \kappa p_2) = Q_m$ (Eq. 22).
 
     Attributes:
@@ -104,35 +109,32 @@ class BaseParameters(eqx.Module):
         return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
 
     def from_standard(
-        self, p: Float[AnyArray, "*batch standard"]
+        self, p: Float[AnyArray, "*batch standard"] | Sequence[Any]
     ) -> Float[AnyArray, "*batch base"]:
         r"""The base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
-        p = jnp.asarray(p)
+        p = _one_each("standard", p, self.model.size)
         first, second = np.array(self.indices), np.array(self.dependent, dtype=int)
         return p[..., first] + p[..., second] @ self.kappa.T
 
-    def to_standard(self, p: Float[AnyArray, "*batch base"]) -> Float[AnyArray, "*batch standard"]:
+    def to_standard(
+        self, p: Float[AnyArray, "*batch base"] | Sequence[Any]
+    ) -> Float[AnyArray, "*batch standard"]:
         """The standard parameters with the same forces whose dependent ones are zero.
 
         They are no physical masses and inertias, but give the same forces and mass matrix.
         """
-        p = jnp.asarray(p)
+        p = _one_each("base", p, self.size)
         full = jnp.zeros((*p.shape[:-1], self.model.size), p.dtype)
         return full.at[..., np.array(self.indices)].set(p)
 
-    def inverse_dynamics(
-        self, p: Float[AnyArray, " base"], motion: Motion
-    ) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""The generalized forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
         self.model.check(motion.q)
         return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
 
-    def mass_matrix(
-        self, p: Float[AnyArray, " base"], q: Float[AnyArray, "*batch joints"]
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
         """The mass matrix, which base parameters determine completely (Eq. 38)."""
-        self.model.check(q)
-        return on_samples(self, self.inertia, q, shared=(p,))
+        return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
 
     @property
     def identifiability(self) -> tuple[Identifiability, ...]:
@@ -146,6 +148,16 @@ class BaseParameters(eqx.Module):
             if mixed[:, column].any():
                 verdict[k] = Identifiability.COMBINED
         return tuple(verdict)
+
+
+def _one_each(kind: str, p: Numbers, size: int) -> Float[Array, "*batch parameters"]:
+    p = jnp.asarray(as_array("p", p))
+    if p.shape[-1:] != (size,):
+        raise ValueError(
+            f"`p` must hold one number for each {kind} parameter ({size}) along its last axis, but "
+            f"has shape {p.shape}."
+        )
+    return p
 
 
 def base_parameters(

@@ -15,10 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
+from jaxid.arrays import as_array, content, is_traced
 from jaxid.program import Program, evaluate, lower, trace
-from jaxid.types import AnyArray, Array
+from jaxid.types import AnyArray, Array, Numbers
 
 FEW = 4096
 """Samples up to which NumPy is faster than what compiling costs."""
@@ -46,7 +46,7 @@ def machines(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) 
         definition: Its method for one sample.
         shapes: Of the method's arguments.
     """
-    key = (definition.__name__, shapes, *_content(owner))
+    key = (definition.__name__, shapes, *content(owner))
     with _lock:
         if key in _machines:
             _machines.move_to_end(key)
@@ -68,7 +68,7 @@ def on_samples(
     owner: eqx.Module,
     definition: Callable,
     *samples: AnyArray,
-    shared: tuple[AnyArray, ...] = (),
+    shared: tuple[Numbers, ...] = (),
 ) -> Array:
     """Applies a method for one sample to arrays with any leading batch axes.
 
@@ -76,11 +76,12 @@ def on_samples(
         owner: The model.
         definition: Its method of first the shared arguments, then those of one sample.
         samples: Arguments with batch axes before their last axis.
-        shared: Arguments that all samples have in common.
+        shared: Parameters that all samples have in common.
 
     Raises:
-        ValueError: If the arguments do not have the same shape.
+        ValueError: If the arguments do not have the same shape, or parameters are no numbers.
     """
+    shared = tuple(as_array("p", x) for x in shared)
     if any(x.shape != samples[0].shape for x in samples):
         came = ", ".join(str(x.shape) for x in samples)
         raise ValueError(
@@ -89,13 +90,13 @@ def on_samples(
     batch = samples[0].shape[:-1]
     count = math.prod(batch)
     flat = [x.reshape((count, x.shape[-1])) for x in samples]
-    if _is_traced(owner):
+    if is_traced(owner):
         out = jax.vmap(lambda *x: definition(*shared, *x))(*map(jnp.asarray, flat))
         return jnp.reshape(out, (*batch, *out.shape[1:]))
     shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in flat))
     machine = machines(owner, definition, *shapes)
     arguments = (*shared, *(x.T for x in flat))
-    if count <= FEW and not any(isinstance(x, Tracer) for x in arguments):
+    if count <= FEW and not is_traced(arguments):
         out = jnp.asarray(evaluate(machine.program, *arguments), _precision(arguments))
     else:
         out = machine.compiled(*arguments)
@@ -117,16 +118,5 @@ def in_numpy(
     return np.moveaxis(np.broadcast_to(out, (*out.shape[:-1], len(samples[0]))), -1, 0)
 
 
-def _is_traced(owner: eqx.Module) -> bool:
-    return any(isinstance(x, Tracer) for x in jax.tree.leaves(owner))
-
-
 def _precision(arguments: tuple[AnyArray, ...]) -> Any:
     return jnp.result_type(*(x.dtype for x in arguments), float)
-
-
-def _content(owner: eqx.Module) -> tuple:
-    """What a model is, by value: two equal models share their programs."""
-    leaves, structure = jax.tree.flatten(owner)
-    arrays = [np.asarray(x) for x in leaves]
-    return structure, tuple((x.shape, x.dtype.str, x.tobytes()) for x in arrays)

@@ -1,12 +1,14 @@
 """A model: a robot and the terms of its equations of motion, linear in the parameters."""
 
+from collections.abc import Sequence
 from functools import reduce
 from operator import add
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Hashable, as_array, namespace
 from jaxid.dynamics import projection
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.motion import Motion
@@ -20,17 +22,20 @@ from jaxid.dynamics.terms import (
 from jaxid.robot.robot import Robot
 from jaxid.types import AnyArray, Float
 
+Coordinates = Float[AnyArray, "*batch joints"] | Sequence[Any]
+Parameters = Float[AnyArray, " standard"] | Sequence[float | int]
+
 DEFAULT_TERMS = (RigidBodies(), ViscousFriction(), CoulombFriction(), RotorInertia())
 
 
-class Model(eqx.Module):
+class Model(Hashable):
     r"""The equations of motion $\Theta(q, \dot q, \ddot q)\, p = Q_m$ (Eqs. 16, 18).
 
     The columns stand in the order of the terms, the paper's order by default: bodies, viscous,
     Coulomb, rotors. Every method takes any leading batch axes and works under `jit`, `vmap` and
     `grad`, also with respect to the robot's geometry. For few samples it runs in NumPy at once; for
-    many it is compiled for the robot, whose numbers are then constants: let `jit` close over the
-    model, as in `jax.jit(lambda motion: model.regressor(motion))`, rather than pass it.
+    many it is compiled for the robot, whose numbers are then constants: write
+    `jax.jit(model.regressor)` rather than pass the model to what is compiled.
 
     Attributes:
         robot: What is known.
@@ -113,8 +118,9 @@ class Model(eqx.Module):
         tool = self.robot.tool
         if tool is None:
             return jnp.zeros_like(q)
-        p = np.zeros((self.robot.joints, 10))
-        p[tool.body] = tool.parameters
+        known = tool.parameters
+        bodies = range(self.robot.joints)
+        p = namespace(known).stack([known if i == tool.body else np.zeros(10) for i in bodies])
         return projection.rigid_body_forces(self.robot, p, q, qd, qdd)
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
@@ -126,9 +132,7 @@ class Model(eqx.Module):
         self.check(motion.q)
         return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
 
-    def inverse_dynamics(
-        self, p: Float[AnyArray, " standard"], motion: Motion
-    ) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""The generalized forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
@@ -138,23 +142,20 @@ class Model(eqx.Module):
         self.check(motion.q)
         return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
 
-    def mass_matrix(
-        self, p: Float[AnyArray, " standard"], q: Float[AnyArray, "*batch joints"]
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
         r"""The mass matrix $M(q)$, rotors included (Eq. 38).
 
         Args:
             p: Standard parameters.
             q: Joint coordinates [rad or m].
         """
-        self.check(q)
-        return on_samples(self, self.inertia, q, shared=(p,))
+        return on_samples(self, self.inertia, self.check(q), shared=(p,))
 
     def bias_forces(
         self,
-        p: Float[AnyArray, " standard"],
-        q: Float[AnyArray, "*batch joints"],
-        qd: Float[AnyArray, "*batch joints"],
+        p: Parameters,
+        q: Coordinates,
+        qd: Coordinates,
     ) -> Float[AnyArray, "*batch joints"]:
         r"""The forces $h(q, \dot q)$ that are left without accelerations [N m or N] (Eq. 38).
 
@@ -163,39 +164,37 @@ class Model(eqx.Module):
             q: Joint coordinates [rad or m].
             qd: Joint velocities [rad/s or m/s].
         """
-        self.check(q)
-        return on_samples(self, self.bias, q, qd, shared=(p,))
+        return on_samples(self, self.bias, self.check(q), self.check(qd), shared=(p,))
 
     def kinetic_energy(
         self,
-        p: Float[AnyArray, " standard"],
-        q: Float[AnyArray, "*batch joints"],
-        qd: Float[AnyArray, "*batch joints"],
+        p: Parameters,
+        q: Coordinates,
+        qd: Coordinates,
     ) -> Float[AnyArray, "*batch"]:
         r"""The kinetic energy $\frac12 \dot q^T M \dot q$ [J]."""
-        M = self.mass_matrix(p, q)
+        M, qd = self.mass_matrix(p, q), self.check(qd)
         return 0.5 * jnp.einsum("...i,...ij,...j->...", qd, M, qd)
 
-    def potential_energy(
-        self, p: Float[AnyArray, " standard"], q: Float[AnyArray, "*batch joints"]
-    ) -> Float[AnyArray, "*batch"]:
+    def potential_energy(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch"]:
         """The potential energy of gravity and springs [J], zero at the ground's origin."""
-        self.check(q)
-        return on_samples(self, self.potential, q, shared=(p,))
+        return on_samples(self, self.potential, self.check(q), shared=(p,))
 
     def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         """What the known tool adds to the measured forces [N m or N]; zero without a tool."""
         self.check(motion.q)
         return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
 
-    def check(self, q: Float[AnyArray, "*batch joints"]) -> None:
-        """Refuses coordinates that are not those of the robot's joints.
+    def check(self, q: Coordinates) -> Float[AnyArray, "*batch joints"]:
+        """Coordinates as an array; refuses those that are not of the robot's joints.
 
         Raises:
             ValueError: If the last axis is not one for each joint.
         """
+        q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
             raise ValueError(
                 f"the motion must have one coordinate for each joint ({self.robot.joints}) along "
                 f"its last axis, but has shape {q.shape}."
             )
+        return q

@@ -2,7 +2,13 @@
 
 import equinox as eqx
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import as_array
+from jaxid.types import AnyArray, Float, Numbers
+
+
+def _coordinates(value: Numbers) -> AnyArray:
+    # Only lists: trees of what is no array, such as `in_axes` of `vmap`, stay as they are.
+    return as_array("motion", value) if isinstance(value, list | tuple) else value
 
 
 class Motion(eqx.Module):
@@ -14,9 +20,9 @@ class Motion(eqx.Module):
         qdd: Accelerations [rad/s² or m/s²].
     """
 
-    q: Float[AnyArray, "*batch joints"]
-    qd: Float[AnyArray, "*batch joints"]
-    qdd: Float[AnyArray, "*batch joints"]
+    q: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
+    qd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
+    qdd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
 
     def __getitem__(self, index) -> "Motion":
         """The motion at some of its instants: indexes the leading axis."""

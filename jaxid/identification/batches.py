@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
+from jaxid.arrays import is_traced
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.estimators import WeightedLeastSquares
@@ -82,7 +82,7 @@ def identify_batch(
         None if mask is None else jnp.asarray(mask, float),
         numbers,
     )
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves(batch)):
+    if is_traced(batch):
         fit = solve(rows, batch)
     else:
         fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch))

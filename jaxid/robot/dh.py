@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits, Numbers
+from jaxid.robot.limits import Limits
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.snap import (
     SNAP_TOLERANCE,
@@ -12,6 +12,7 @@ from jaxid.robot.snap import (
     check_tolerance,
     snap_angles,
 )
+from jaxid.types import Numbers
 
 _X, _, _Z = np.eye(3)
 CONVENTIONS = ("modified", "standard")

@@ -1,13 +1,13 @@
 """From motors to joints and back: gears, coupled axes, and the duality of power."""
 
-import equinox as eqx
 import numpy as np
 
-from jaxid.robot.limits import Numbers, per_joint
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import Hashable, namespace
+from jaxid.robot.limits import per_joint
+from jaxid.types import AnyArray, Float, Numbers
 
 
-class Drives(eqx.Module):
+class Drives(Hashable):
     r"""The motors of a robot: $q_M = A (q - q_0)$ and, by equal power, $Q = A^T M$ (Eq. 19).
 
     For independent axes $A$ is the diagonal matrix of gear ratios; a wrist whose motors turn more
@@ -68,17 +68,24 @@ class Drives(eqx.Module):
         eye = np.eye(len(self.zero))
         return np.array_equal(self.reduction, eye) and not np.any(self.zero)
 
+    @property
+    def _inverse(self) -> Float[AnyArray, "joints joints"]:
+        return namespace(self.reduction).linalg.inv(self.reduction)
+
+    def _zeros(self, like: AnyArray) -> AnyArray:
+        return namespace(like, self.zero).broadcast_to(self.zero, like.shape)
+
     def joint_angles(
         self, motor_angles: Float[AnyArray, "*batch joints"]
     ) -> Float[AnyArray, "*batch joints"]:
         """Joint angles [rad or m] of motor angles [rad]."""
-        return self.joint_velocities(motor_angles) + self.zero
+        return self.joint_velocities(motor_angles) + self._zeros(motor_angles)
 
     def joint_velocities(
         self, motor_velocities: Float[AnyArray, "*batch joints"]
     ) -> Float[AnyArray, "*batch joints"]:
         """Joint velocities [rad/s or m/s] of motor velocities [rad/s]; accelerations likewise."""
-        return motor_velocities @ np.linalg.inv(self.reduction).T
+        return motor_velocities @ self._inverse.T
 
     def joint_forces(
         self, motor_torques: Float[AnyArray, "*batch joints"]
@@ -90,7 +97,7 @@ class Drives(eqx.Module):
         self, angles: Float[AnyArray, "*batch joints"]
     ) -> Float[AnyArray, "*batch joints"]:
         """Motor angles [rad] of joint angles [rad or m]."""
-        return self.motor_velocities(angles - self.zero)
+        return self.motor_velocities(angles - self._zeros(angles))
 
     def motor_velocities(
         self, velocities: Float[AnyArray, "*batch joints"]
@@ -102,7 +109,7 @@ class Drives(eqx.Module):
         self, forces: Float[AnyArray, "*batch joints"]
     ) -> Float[AnyArray, "*batch joints"]:
         """Motor torques [N m] of generalized forces [N m or N]."""
-        return forces @ np.linalg.inv(self.reduction)
+        return forces @ self._inverse
 
     @property
     def max_forces(self) -> Float[AnyArray, " joints"]:

@@ -8,9 +8,10 @@ import numpy as np
 
 from jaxid.robot.dh import from_dh
 from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits, Numbers
+from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 from jaxid.robot.snap import axis_rotation
+from jaxid.types import Numbers
 
 _HALF = np.pi / 2
 _X, _Y, _Z = np.eye(3)

@@ -1,16 +1,9 @@
 """What the joints can do: ranges, speeds, accelerations, jerks and forces."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import equinox as eqx
 import numpy as np
 
-from jaxid.types import AnyArray, Float
-
-# NumPy's own `ArrayLike` turns tuples away when types are checked at run time.
-Numbers = AnyArray | Sequence[Any] | float | int
-"""What users may pass where an array is meant: an array, nested lists or tuples, one number."""
+from jaxid.types import AnyArray, Float, Numbers
 
 
 def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> np.ndarray:

@@ -6,9 +6,10 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import as_array, is_traced, namespace
 from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits, Numbers
-from jaxid.types import AnyArray, Float
+from jaxid.robot.limits import Limits
+from jaxid.types import AnyArray, Float, Numbers
 
 GRAVITY = (0.0, 0.0, -9.81)
 AXES = "xyz"
@@ -31,22 +32,32 @@ class Tool(eqx.Module):
 
     @classmethod
     def of(
-        cls, body: int, *, mass: float, centre_of_mass: Numbers, inertia: Numbers | None = None
+        cls,
+        body: int,
+        *,
+        mass: Float[AnyArray, ""] | float | int,
+        centre_of_mass: Numbers,
+        inertia: Numbers | None = None,
     ) -> "Tool":
         """Builds a tool and checks it; a point mass if no inertia is given.
 
         Raises:
             ValueError: If the mass is not positive, or the inertia belongs to no body.
         """
-        m, r = np.array(mass, np.float64), np.array(centre_of_mass, np.float64)
-        J = np.zeros((3, 3)) if inertia is None else np.array(inertia, np.float64)
-        if m.shape != () or not 0.0 < m < np.inf:
+        m, r = as_array("mass", mass), as_array("centre_of_mass", centre_of_mass)
+        J = np.zeros((3, 3)) if inertia is None else as_array("inertia", inertia)
+        if m.shape != () or not (is_traced(m) or 0.0 < m < np.inf):
             raise ValueError(f"`mass` of the tool must be a positive number [kg], but is {mass}.")
-        if r.shape != (3,) or not np.isfinite(r).all():
+        if r.shape != (3,) or not (is_traced(r) or np.isfinite(r).all()):
             raise ValueError("`centre_of_mass` of the tool must hold three finite numbers [m].")
-        if J.shape != (3, 3) or not np.abs(J - J.T).max() <= 1e-9 * np.abs(J).max() < np.inf:
+        if J.shape != (3, 3) or not (is_traced(J) or _is_symmetric(np.asarray(J))):
             raise ValueError("`inertia` of the tool must be a symmetric 3 x 3 matrix [kg m²].")
-        principal = np.linalg.eigvalsh(J)
+        if not is_traced(J):
+            cls._refuse_impossible(np.linalg.eigvalsh(J))
+        return cls(body, m, r, J)
+
+    @staticmethod
+    def _refuse_impossible(principal: np.ndarray) -> None:
         slack = 1e-9 * np.abs(principal).max()
         if principal[0] < -slack or principal[2] > principal[0] + principal[1] + slack:
             raise ValueError(
@@ -54,15 +65,14 @@ class Tool(eqx.Module):
                 f"{principal[0]:.3g}, {principal[1]:.3g}, {principal[2]:.3g} kg m², but none may "
                 "be negative or larger than the sum of the others; is it about the centre of mass?"
             )
-        return cls(body, m, r, J)
 
     @property
     def parameters(self) -> Float[AnyArray, "10"]:
         """The ten parameters $(m, m r_c, A, B, C, D, E, F)$ about the body's origin (Eqs. 8, 9)."""
-        m, r = self.mass, np.asarray(self.centre_of_mass)
-        J = self.inertia + m * (r @ r * np.eye(3) - np.outer(r, r))
-        return np.array(
-            [m, *(m * r), J[0, 0], J[1, 1], J[2, 2], -J[1, 2], -J[0, 2], -J[0, 1]], np.float64
+        m, r = self.mass, self.centre_of_mass
+        J = self.inertia + m * (r @ r * np.eye(3) - r[:, None] * r[None, :])
+        return namespace(m, r, J).stack(
+            [m, *(m * r), J[0, 0], J[1, 1], J[2, 2], -J[1, 2], -J[0, 2], -J[0, 1]]
         )
 
 
@@ -109,6 +119,27 @@ class Robot(eqx.Module):
     tip_offset: Float[AnyArray, "3"]
     source: str = eqx.field(static=True, default="")
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        n = self.joints
+        if len(self.revolute) != n or any(not -1 <= p < i for i, p in enumerate(self.parent)):
+            raise ValueError(
+                f"`parent` must name for each of the {len(self.revolute)} bodies an earlier one "
+                f"(or -1 for the ground), but is {self.parent}."
+            )
+        if len(self.joint_names) != n or len(set(self.joint_names)) != n:
+            raise ValueError(
+                f"`joint_names` must be {n} different names, but is {self.joint_names}."
+            )
+        carrier = self.tip_body if self.tool is None else self.tool.body
+        for what, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
+            if not 0 <= body < n:
+                raise ValueError(f"`{what}` must be a body from 0 to {n - 1}, but is {body}.")
+        for what, one in (("limits", self.limits.force), ("drives", self.drives.zero)):
+            if one.shape[-1:] != (n,):
+                raise ValueError(
+                    f"`{what}` must be of {n} joints, like the robot, but are of {one.shape[-1]}."
+                )
 
     @classmethod
     def of(
@@ -159,11 +190,6 @@ class Robot(eqx.Module):
         if n == 0:
             raise ValueError("a robot must have at least one joint, but has none.")
         parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
-        if len(parent) != n or any(not -1 <= p < i for i, p in enumerate(parent)):
-            raise ValueError(
-                f"`parent` must name for each of the {n} bodies an earlier one (or -1 for the "
-                f"ground), but is {parent}."
-            )
         arrays = {}
         for key, value, shape in (
             ("axis", axis, (n, 3)),
@@ -189,13 +215,7 @@ class Robot(eqx.Module):
         for j, R in enumerate(arrays["rotation"]):
             _require_rotation(f"`rotation` of joint {j + 1}", R)
         _require_rotation("`tip_rotation`", arrays["tip_rotation"])
-        tip = n - 1 if tip_body is None else tip_body
-        for what, body in (("tip_body", tip), ("tool.body", tip if tool is None else tool.body)):
-            if not 0 <= body < n:
-                raise ValueError(f"`{what}` must be a body from 0 to {n - 1}, but is {body}.")
         names = tuple(f"joint{i + 1}" for i in range(n)) if joint_names is None else joint_names
-        if len(names) != n or len(set(names)) != n:
-            raise ValueError(f"`joint_names` must be {n} different names, but is {names}.")
         return cls(
             name=name,
             joint_names=tuple(names),
@@ -204,7 +224,7 @@ class Robot(eqx.Module):
             limits=Limits.of(n) if limits is None else limits,
             drives=Drives.of(n) if drives is None else drives,
             tool=tool,
-            tip_body=tip,
+            tip_body=n - 1 if tip_body is None else tip_body,
             source=source,
             notes=tuple(notes),
             **arrays,
@@ -255,21 +275,30 @@ class Robot(eqx.Module):
         Raises:
             ValueError: If the attitude is no rotation, or the position no point.
         """
-        R = np.eye(3) if rotation is None else np.array(rotation, dtype=np.float64)
-        r = np.array(position, dtype=np.float64)
+        R = np.eye(3) if rotation is None else as_array("rotation", rotation)
+        r = as_array("position", position)
         if R.shape != (3, 3):
             raise ValueError(f"the base's rotation must be a 3 x 3 matrix, not of shape {R.shape}.")
-        _require_rotation("the base's rotation", R)
-        if r.shape != (3,) or not np.isfinite(r).all():
+        if not is_traced(R):
+            _require_rotation("the base's rotation", np.asarray(R))
+        if r.shape != (3,) or not (is_traced(r) or np.isfinite(r).all()):
             raise ValueError("the base's position must hold three finite numbers [m].")
         on_ground = np.array(self.parent) < 0
+        moves = np.broadcast_to(on_ground[:, None], self.offset.shape)
+        turns = np.broadcast_to(on_ground[:, None, None], self.rotation.shape)
+        xp = namespace(R, r, self.rotation, self.offset)
+        r = xp.broadcast_to(r, self.offset.shape)
         return self.replace(
-            rotation=np.where(on_ground[:, None, None], R @ self.rotation, self.rotation),
-            offset=np.where(on_ground[:, None], r + self.offset @ R.T, self.offset),
+            rotation=xp.where(turns, R @ self.rotation, self.rotation),
+            offset=xp.where(moves, r + self.offset @ R.T, self.offset),
         )
 
     def with_tool(
-        self, *, mass: float, centre_of_mass: Numbers, inertia: Numbers | None = None
+        self,
+        *,
+        mass: Float[AnyArray, ""] | float | int,
+        centre_of_mass: Numbers,
+        inertia: Numbers | None = None,
     ) -> "Robot":
         """The robot with a known load at its end-effector, in place of the load it had.
 
@@ -302,6 +331,10 @@ class Robot(eqx.Module):
     def force_unit(self, joint: int) -> str:
         """Unit of a joint's generalized force: N m or N."""
         return "N m" if self.revolute[joint] else "N"
+
+
+def _is_symmetric(J: np.ndarray) -> bool:
+    return bool(np.abs(J - J.T).max() <= 1e-9 * np.abs(J).max() < np.inf)
 
 
 def _require_rotation(what: str, R: np.ndarray) -> None:

@@ -6,8 +6,7 @@ parameter too many, at a condition number of 1e7. What is snapped stands in the 
 
 import numpy as np
 
-from jaxid.robot.limits import Numbers
-from jaxid.types import Float
+from jaxid.types import Float, Numbers
 
 SNAP_TOLERANCE = 1e-4
 _QUARTER = np.pi / 2

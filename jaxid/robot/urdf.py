@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.robot.limits import Limits, Numbers
+from jaxid.robot.limits import Limits
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.snap import (
     SNAP_TOLERANCE,
@@ -18,7 +18,7 @@ from jaxid.robot.snap import (
     snap_rotation,
 )
 from jaxid.robot.urdf_file import UrdfTree
-from jaxid.types import AnyArray, Float
+from jaxid.types import AnyArray, Float, Numbers
 
 _TURNING = ("revolute", "continuous")
 _ZERO = (0.0, 0.0, 0.0)

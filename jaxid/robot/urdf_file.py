@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from urdf_parser_py.urdf import URDF
 
-from jaxid.robot.limits import Numbers
+from jaxid.types import Numbers
 
 _LARGEST_FILE = 64 * 2**20
 

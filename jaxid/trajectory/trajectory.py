@@ -2,13 +2,12 @@
 
 from abc import abstractmethod
 
-import equinox as eqx
-
+from jaxid.arrays import Hashable
 from jaxid.dynamics.motion import Motion
 from jaxid.types import AnyArray, Float
 
 
-class AbstractTrajectory(eqx.Module):
+class AbstractTrajectory(Hashable):
     """A motion of all joints as a function of time, with exact derivatives."""
 
     @abstractmethod

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trees
 
+from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
@@ -90,3 +91,39 @@ def test_motors_in_another_order_than_their_joints():
     robot = robots.planar_arm(2).replace(drives=Drives.of(2, reduction=[[0, 50], [40, 10]]))
     with _refused("`drives.reduction` of `planar arm, 2 joints` must name the motors in the order"):
         Model(robot, (CoupledDrives(),))
+
+
+def test_parameters_as_a_list():
+    p, motion = list(np.linspace(1.0, 2.0, 65)), Motion(*np.ones((3, 2, 5)))
+    expected = MODEL.inverse_dynamics(np.array(p), motion)
+    np.testing.assert_array_equal(MODEL.inverse_dynamics(p, motion), expected)
+    as_lists = Motion(*([[1.0] * 5] * 2 for _ in range(3)))
+    np.testing.assert_array_equal(MODEL.inverse_dynamics(p, as_lists), expected)
+    q = [1.0] * 5
+    np.testing.assert_array_equal(
+        MODEL.mass_matrix(p, q), MODEL.mass_matrix(np.array(p), np.ones(5))
+    )
+    with _refused(r"`p` must hold one number for each standard parameter \(65\), but has shape"):
+        MODEL.inverse_dynamics(p[:-1], motion)
+
+
+@pytest.mark.parametrize("p", [[1.0, "heavy"], [[1.0, 2.0], [3.0]]])
+def test_parameters_that_are_no_numbers(p):
+    with _refused("`p` must be an array of numbers, but is "):
+        on_samples(MODEL, MODEL.inertia, np.zeros(5), shared=(p,))
+
+
+def test_wrong_number_of_base_parameters():
+    base = base_parameters(Model(robots.planar_arm(2), (ViscousFriction(),)))
+    motion = Motion(*np.zeros((3, 2)))
+    for refused in (
+        lambda p: base.inverse_dynamics(p, motion),
+        lambda p: base.mass_matrix(p, motion.q),
+        lambda p: base.to_standard(p),
+    ):
+        with _refused(
+            r"`p` must hold one number for each base parameter \(2\) along its last axis"
+        ):
+            refused(np.zeros(3))
+    with _refused(r"`p` must hold one number for each standard parameter \(2\) along its last"):
+        base.from_standard([1.0, 2.0, 3.0])

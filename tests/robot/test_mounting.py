@@ -1,10 +1,14 @@
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from forward_kinematics import body_transforms, from_rpy, random_configuration, tip_transform
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jaxid.robot.drives import Drives
 from jaxid.robot.library import panda, planar_arm, tx90l_on_rail
+from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot, Tool
 
 INERTIA = np.diag([0.01, 0.02, 0.015])
@@ -103,3 +107,38 @@ def test_a_tip_or_a_tool_on_no_body_is_refused():
         Robot.of("arm", **arm, tool=load)
     with pytest.raises(ValueError, match="`tip_rotation` is no rotation matrix"):
         Robot.of("arm", **arm, tip_rotation=2 * np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"tool": Tool.of(3, mass=1.0, centre_of_mass=(0, 0, 0))}, "`tool.body` must be a body"),
+        ({"tip_body": -1}, "`tip_body` must be a body from 0 to 2, but is -1"),
+        ({"parent": (-1, 1, 0)}, "`parent` must name for each of the 3 bodies an earlier one"),
+        ({"joint_names": ("a", "b")}, "`joint_names` must be 3 different names"),
+        ({"limits": Limits.of(2)}, "`limits` must be of 3 joints, like the robot, but are of 2"),
+        ({"drives": Drives.of(4)}, "`drives` must be of 3 joints, like the robot, but are of 4"),
+    ],
+)
+def test_a_replaced_field_is_checked_like_a_given_one(fields, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        planar_arm(3).replace(**fields)
+
+
+def test_mounting_and_a_tool_are_differentiable():
+    """The gradient by the base's attitude and the tool agrees with differences."""
+
+    def number(x):
+        c, s = jnp.cos(x[0]), jnp.sin(x[0])
+        R = jnp.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+        robot = planar_arm(2).mounted(R, position=x[1:4])
+        tool = robot.with_tool(mass=x[4], centre_of_mass=x[5:8], inertia=x[8] * jnp.eye(3)).tool
+        parts = robot.rotation[0] @ np.arange(3.0), robot.offset[0] ** 2, tool.parameters**2
+        return sum(jnp.sum(part) for part in parts)
+
+    x = np.array([0.4, 0.1, 0.2, 0.3, 2.0, 0.05, 0.02, 0.01, 0.03])
+    found = np.asarray(jax.jit(jax.grad(number))(x))
+    value = jax.jit(number)
+    expected = [float(value(x + h) - value(x - h)) / 2e-6 for h in 1e-6 * np.eye(len(x))]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert np.abs(found).min() > 0.01

@@ -1,0 +1,97 @@
+"""Methods as users hand them to `jax.jit` and `jax.vmap`: bound, without a lambda around them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.terms import LinearSpring
+from jaxid.robot.drives import Drives
+from jaxid.robot.library import planar_arm
+from jaxid.trajectory.fourier import random_fourier_series
+
+ROBOT = planar_arm(2)
+MODEL = Model(ROBOT)
+BASE = base_parameters(MODEL)
+SERIES = random_fourier_series(ROBOT, omega=1.0)
+DRIVES = Drives.of(2, reduction=[[10.0, 0.0], [2.0, 20.0]], zero=[0.1, 0.2])
+Q, QD, QDD = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 2)))
+MOTION = Motion(Q, QD, QDD)
+P = jnp.linspace(1.0, 2.0, MODEL.size)
+P_BASE = jnp.linspace(1.0, 2.0, BASE.size)
+METHODS = {
+    "model.regressor": (MODEL.regressor, (MOTION,)),
+    "model.inverse_dynamics": (MODEL.inverse_dynamics, (P, MOTION)),
+    "model.mass_matrix": (MODEL.mass_matrix, (P, Q)),
+    "model.bias_forces": (MODEL.bias_forces, (P, Q, QD)),
+    "model.kinetic_energy": (MODEL.kinetic_energy, (P, Q, QD)),
+    "model.potential_energy": (MODEL.potential_energy, (P, Q)),
+    "model.tool_forces": (MODEL.tool_forces, (MOTION,)),
+    "base.regressor": (BASE.regressor, (MOTION,)),
+    "base.inverse_dynamics": (BASE.inverse_dynamics, (P_BASE, MOTION)),
+    "base.mass_matrix": (BASE.mass_matrix, (P_BASE, Q)),
+    "base.from_standard": (BASE.from_standard, (P,)),
+    "base.to_standard": (BASE.to_standard, (P_BASE,)),
+    "series.motion": (SERIES.motion, (Q[:, 0],)),
+    "drives.joint_angles": (DRIVES.joint_angles, (Q,)),
+    "drives.joint_velocities": (DRIVES.joint_velocities, (Q,)),
+    "drives.joint_forces": (DRIVES.joint_forces, (Q,)),
+    "drives.motor_angles": (DRIVES.motor_angles, (Q,)),
+    "drives.motor_velocities": (DRIVES.motor_velocities, (Q,)),
+    "drives.motor_torques": (DRIVES.motor_torques, (Q,)),
+}
+
+
+def _leaves(tree):
+    return jax.tree.leaves(tree)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_bound_method_goes_through_jit(name):
+    method, arguments = METHODS[name]
+    for found, expected in zip(
+        _leaves(jax.jit(method)(*arguments)), _leaves(method(*arguments)), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_bound_method_goes_through_vmap_and_jit(name):
+    """Samples mapped one by one are the batch; parameters are mapped for `from_standard`."""
+    method, arguments = METHODS[name]
+    each = all(x is not P and x is not P_BASE for x in arguments)
+    axes = (0,) if each else (None,) * (len(arguments) - 1) + (0,)
+    axes = axes if each else tuple(None if x is P or x is P_BASE else 0 for x in arguments)
+    if not any(a == 0 for a in axes):
+        arguments, axes = tuple(jnp.stack([x, 2 * x]) for x in arguments), (0,)
+    mapped = jax.jit(jax.vmap(method, in_axes=axes))
+    for found, expected in zip(
+        _leaves(mapped(*arguments)), _leaves(method(*arguments)), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_many_parameters_by_vmap():
+    found = jax.vmap(MODEL.inverse_dynamics, in_axes=(0, None))(jnp.stack([P, 3 * P]), MOTION)
+    np.testing.assert_allclose(found[1], 3 * found[0], rtol=1e-12)
+
+
+def test_equal_models_have_equal_hashes_and_others_do_not():
+    same, other = Model(planar_arm(2)), Model(planar_arm(2).replace(gravity=np.zeros(3)))
+    assert hash(same.regressor) == hash(MODEL.regressor)
+    assert hash(other.regressor) != hash(MODEL.regressor)
+    assert hash(MODEL.tool_forces) != hash(MODEL.regressor)
+
+
+def test_a_bound_method_of_a_model_that_is_traced():
+    """A derivative by a number of the model, through a compiled method of the model."""
+
+    def size(rest):
+        model = Model(ROBOT, (LinearSpring(rest),))
+        return jnp.sum(jax.jit(model.regressor)(MOTION) ** 2)
+
+    found = jax.grad(size)(jnp.array([0.3, -0.2]))
+    np.testing.assert_allclose(found, -2 * np.sum(Q - np.array([0.3, -0.2]), axis=0), rtol=1e-12)
