@@ -94,4 +94,6 @@ def test_a_bound_method_of_a_model_that_is_traced():
         return jnp.sum(jax.jit(model.regressor)(MOTION) ** 2)
 
     found = jax.grad(size)(jnp.array([0.3, -0.2]))
-    np.testing.assert_allclose(found, -2 * np.sum(Q - np.array([0.3, -0.2]), axis=0), rtol=1e-12)
+    np.testing.assert_allclose(
+        found, -2 * np.sum(np.asarray(Q) - np.array([0.3, -0.2]), axis=0), rtol=1e-12
+    )
