@@ -1,12 +1,14 @@
 """The currency between the rooms: joint angles, velocities and accelerations, always together."""
 
+from typing import Any
+
 import equinox as eqx
 
 from jaxid.arrays import as_array
-from jaxid.types import AnyArray, Float, Numbers
+from jaxid.types import AnyArray, Float
 
 
-def _coordinates(value: Numbers) -> AnyArray:
+def _coordinates(value: Any) -> AnyArray:
     # Only lists: trees of what is no array, such as `in_axes` of `vmap`, stay as they are.
     return as_array("motion", value) if isinstance(value, list | tuple) else value
 
