@@ -68,7 +68,8 @@ class Times:
 def interleaved(cases: dict[str, Callable[[], object]], turns: int) -> dict[str, Times]:
     """Times all cases in turn, again and again, after warming each of them up.
 
-    A case must block until its result is there.
+    A case must block until its result is there. Each turn begins with a call that does not count:
+    caches and the memory that the process holds are as the case before left them.
     """
     calls = {}
     for name, case in cases.items():
@@ -80,6 +81,7 @@ def interleaved(cases: dict[str, Callable[[], object]], turns: int) -> dict[str,
     seconds = {name: [] for name in cases}
     for _ in range(turns):
         for name, case in cases.items():
+            case()
             start = time.perf_counter()
             for _ in range(calls[name]):
                 case()
