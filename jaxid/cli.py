@@ -3,27 +3,29 @@
 import dataclasses
 import dis
 import importlib.metadata
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
 import jax
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 from typer.core import TyperCommand
 
 from jaxid.experiment import terminal
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
-from jaxid.experiment.sanity import check_log, negative_friction
+from jaxid.experiment.loading import Loaded, load_log
+from jaxid.experiment.progress import Stages, stages
+from jaxid.experiment.sanity import negative_friction
 from jaxid.experiment.template import write_template
+from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.rows import Rows
 from jaxid.identification.runs.comparison import Comparison
+from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
 from jaxid.report.compared_files import read_estimates, write_comparison
 from jaxid.report.content import Beside
@@ -191,22 +193,20 @@ def inspect(
     terminal.show_robot(console, loaded)
     terminal.show_base(console, loaded.base)
     terminal.sentences(console, loaded.notes)
-    for recording, observations, fit in seen:
-        terminal.show_recording(console, recording)
-        check = check_log(loaded.robot, recording, observations)
-        terminal.show_check(console, loaded.robot, check, negative_friction(fit))
+    for log, fit in seen:
+        terminal.show_recording(console, log.recording)
+        terminal.show_check(console, loaded.robot, log.check, negative_friction(fit))
         console.print()
-        terminal.show_rows(console, (observations,), fit)
+        terminal.show_rows(console, (log.observations,), fit)
         terminal.show_undetermined(console, fit, loaded.regularised)
 
 
-def _look(experiment: Experiment, path: Path, stage):
-    stage(f"reading {path.name}")
-    recording = experiment.read(path)
-    stage(f"filtering {path.name}")
-    observations = experiment.observe(recording)
+def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fit]:
+    log = load_log(experiment, path, stage)
     stage(f"factorising {path.name}")
-    return recording, observations, estimate(experiment.base, observations, experiment.estimator)
+    progress = stage.through(log.recording.samples)
+    fit = estimate(experiment.base, log.observations, experiment.estimator, progress)
+    return log, fit
 
 
 @app.command(cls=SpreadVerify)
@@ -254,7 +254,7 @@ def identify(
     loaded = load_experiment(experiment)
     others = verify or []
     with _stages(4 + 2 * (len(logs) + len(others))) as stage:
-        fitted, checked, doubts = _observe_all(loaded, logs, others, stage)
+        fitted, checked, said, doubts = _observe_all(loaded, logs, others, stage)
         if split is not None:
             parts = [o.split(split) for o in fitted]
             percent = f"{100 * split:g}"
@@ -263,15 +263,16 @@ def identify(
         stage("finding base parameters")
         base = loaded.base
         stage("factorising the rows")
-        rows = Rows.of(base, fitted)
+        rows = Rows.of(base, fitted, stage.through(sum(map(_samples, fitted))))
         fit = fit_rows(rows, loaded.estimator)
         stage("predicting torques")
-        found = validate(fit, [*fitted, *checked])
+        through = stage.through(max(map(_samples, [*fitted, *checked])))
+        found = validate(fit, [*fitted, *checked], progress=through)
         beside = None
         if loaded.regularised or fit.undetermined:
             beside = Beside.of(fit_rows(rows, loaded.other_estimator), [*fitted, *checked])
         stage("writing the report")
-        logs_said = [n for o in (*fitted, *checked) for n in o.notes]
+        logs_said = [*(n for o in (*fitted, *checked) for n in o.notes), *said]
         files = write_report(
             output,
             fit,
@@ -342,42 +343,33 @@ def compare(
     terminal.show_files(console, output, [p.name for p in files])
 
 
-def _observe_all(experiment: Experiment, logs: list[Path], others: list[Path], stage):
-    """Reads and filters all logs, and doubts them; equal names take their folders' in front."""
+def _observe_all(experiment: Experiment, logs: list[Path], others: list[Path], stage: Stages):
+    """Reads all logs, and doubts them; equal names take their folders' in front."""
     paths = [*logs, *others]
     stems = [p.stem for p in paths]
-    observed, doubts = [], []
+    observed, said, doubts = [], [], []
     for path in paths:
-        stage(f"reading {path.name}")
-        recording = experiment.read(path)
-        if stems.count(path.stem) > 1:
-            recording = dataclasses.replace(
-                recording, name=f"{path.resolve().parent.name}/{path.stem}"
-            )
-        stage(f"filtering {path.name}")
-        observed.append(experiment.observe(recording))
-        check = check_log(experiment.robot, recording, observed[-1])
-        doubts += [f"{recording.name}: {warning}" for warning in check.warnings]
-    return observed[: len(logs)], observed[len(logs) :], doubts
+        twice = stems.count(path.stem) > 1
+        name = f"{path.resolve().parent.name}/{path.stem}" if twice else None
+        log = load_log(experiment, path, stage, name)
+        observed.append(log.observations)
+        said += log.notes
+        doubts += [f"{log.recording.name}: {warning}" for warning in log.check.warnings]
+    return observed[: len(logs)], observed[len(logs) :], said, doubts
 
 
-def _named(observations: Observations, name: str) -> Observations:
+def _named(observations: Observations | LongLog, name: str) -> Observations | LongLog:
+    if isinstance(observations, LongLog):
+        return observations.named(name)
     return dataclasses.replace(observations, name=name)
 
 
-@contextmanager
-def _stages(total: int) -> Iterator:
-    """A progress bar on stderr; call what it gives with the name of each stage as it begins."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    console = _console(stderr=True)
-    quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
-        task = progress.add_task("starting", total=total + 1)
+def _samples(observations: Observations | LongLog) -> int:
+    return len(source(observations)[0].time)
 
-        def stage(name: str) -> None:
-            progress.update(task, description=name, advance=1)
 
-        yield stage
+def _stages(total: int) -> AbstractContextManager[Stages]:
+    return stages(_console(stderr=True), total)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,16 @@
 """The command line: what it writes, what it refuses, and that it leaves nothing half-written."""
 
 import csv
+import io
 import json
 import os
+import re
 import subprocess
 import sys
+import time
 
 import numpy as np
+import polars as pl
 import pytest
 
 from jaxid import cli
@@ -434,3 +438,87 @@ def test_what_has_changed_between_two_runs_is_told(folder, run):
     assert refused(run("compare", "cold", "cold/"), "`cold` is given twice")
     assert refused(run("compare", "cold", "none"), "`none` must be a folder", "`jaxid identify`")
     assert refused(run("compare", "cold", "warm", "-o", "."), "`.` holds files but no report")
+
+
+SLOW = EXPERIMENT.replace("every = 4", "every = 4\nslow = 0.05")
+SLOW = SLOW.replace('time = "t"', 'time = "t"\nstart = 0.5\nstop = 5.5')
+
+
+@pytest.mark.parametrize(("kind", "compiled"), [("csv", True), ("parquet", False)])
+def test_long_logs_give_what_short_ones_give(folder, run, monkeypatch, kind, compiled):
+    if kind == "parquet":
+        for name in "ab":
+            pl.read_csv(f"{name}.csv").write_parquet(f"{name}.parquet")
+    (folder / "slow.toml").write_text(SLOW)
+    logs = (f"a.{kind}", "--verify", f"b.{kind}", "--split", "0.6")
+    assert run("identify", "slow.toml", *logs, "-o", "short")[0] == 0
+    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
+    monkeypatch.setattr("jaxid.experiment.experiment.read_recording", None)
+    if compiled:
+        monkeypatch.setattr("jaxid.identification.streaming.LONG", 500)
+    code, out, err = run("identify", "slow.toml", *logs, "-o", "long")
+    assert code == 0, err
+    short, long = (result(folder, name) for name in ("short", "long"))
+    for key in ("rows", "recordings"):
+        assert short["fit"][key] == long["fit"][key]
+    for a, b in zip(short["base_parameters"], long["base_parameters"], strict=True):
+        assert abs(a["estimate"] - b["estimate"]) < 1e-7 * a["standard_deviation"]
+        assert b["standard_deviation"] == pytest.approx(a["standard_deviation"], rel=1e-9)
+    for role in ("identification", "verification"):
+        for a, b in zip(short["errors"][role], long["errors"][role], strict=True):
+            assert b["relative"] == pytest.approx(a["relative"], rel=1e-9)
+            assert [j["rows"] for j in a["joints"]] == [j["rows"] for j in b["joints"]]
+    assert short["notes"] == long["notes"]
+    code, out, err = run("inspect", "slow.toml", f"a.{kind}")
+    assert code == 0, err
+    monkeypatch.undo()
+    assert_same_words(out, run("inspect", folder / "slow.toml", folder / f"a.{kind}")[1])
+
+
+def assert_same_words(a, b):
+    """The same up to the last digit of a rounded number."""
+    for x, y in zip(a.split(), b.split(), strict=True):
+        assert x == y, (x, y)
+
+
+def test_errors_of_many_rows_are_of_every_nth(folder, run, monkeypatch):
+    assert run("identify", "experiment.toml", "a.csv", "-o", "short")[0] == 0
+    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
+    monkeypatch.setattr("jaxid.validation.errors.ROWS", 100)
+    code, out, _ = run("identify", "experiment.toml", "a.csv", "-o", "long")
+    assert code == 0
+    assert "torque errors and figures take one of every 3 of its 2" in " ".join(out.split())
+    short, long = (result(folder, n)["errors"]["identification"][0] for n in ("short", "long"))
+    rows = short["joints"][0]["rows"]
+    assert long["joints"][0]["rows"] == -(-rows // 3)
+    assert long["relative"] == pytest.approx(short["relative"], rel=0.1)
+
+
+def test_a_long_log_that_must_be_mended_is_read_as_a_whole(folder, run, monkeypatch):
+    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
+    lines = (folder / "a.csv").read_text().splitlines()
+    lines.insert(700, lines[700])
+    (folder / "twins.csv").write_text("\n".join(lines))
+    code, out, err = run("identify", "experiment.toml", "twins.csv")
+    assert code == 0, err
+    assert "twins.csv is long, but was read as a whole: rows of" in " ".join(out.split())
+    (folder / "bad.csv").write_text("\n".join([*lines[:900], "1,2,x,4,5", *lines[901:]]))
+    assert refused(run("identify", "experiment.toml", "bad.csv"), "bad.csv")
+
+
+def test_a_bar_says_how_fast_and_how_long_still():
+    from rich.console import Console
+
+    from jaxid.experiment.progress import stages
+
+    console = Console(force_terminal=True, width=120, file=io.StringIO())
+    with stages(console, 2) as stage:
+        stage("factorising")
+        told = stage.through(4_000_000)
+        for share in (0.1, 0.2, 0.5):
+            time.sleep(0.05)
+            told(share)
+        stage._bar.refresh()
+    shown = console.file.getvalue()
+    assert re.search(r"50 %, [\d.]+ million rows/s, 0:0\d left", shown)
+    assert "factorising" in shown

@@ -20,15 +20,22 @@ from jaxid.experiment.reading import read_tables
 from jaxid.experiment.robot_tables import build_robot, within
 from jaxid.experiment.tables import RecordingTable
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
+from jaxid.identification.opening import open_log
 from jaxid.identification.solutions import Complete, CrossValidated
+from jaxid.identification.streaming import Progress
+from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
 from jaxid.measurement.filters import AbstractFilter
 from jaxid.measurement.observations import Observations, observe
+from jaxid.measurement.parts import estimated_rows
 from jaxid.measurement.read import read_recording
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
+
+LONG = 500_000
+"""Samples from which a log is read part by part."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,15 +94,11 @@ class Experiment:
         Raises:
             ValueError: If the file has no table `[recording]`, or the log is not as it says.
         """
-        log, table = Path(log), self.recording
-        if table is None or self.columns is None:
-            raise ValueError(
-                f"{self.path.name}: the table `[recording]` is missing: it says which columns of "
-                f"`{log.name}` hold angles and forces."
-            )
+        log = Path(log)
+        table, columns = self._columns_of(log)
         recording = read_recording(
             log,
-            self.columns,
+            columns,
             forces_path=_beside(log, table.forces_file),
             velocities_path=_beside(log, table.velocities_file),
             largest_gap=table.largest_gap,
@@ -123,6 +126,46 @@ class Experiment:
         """
         with within(self.path.name, "filter` and `rows"):
             return observe(recording, self.robot, self.filter, self.decimation, self.slow)
+
+    def is_long(self, log: str | Path) -> bool:
+        """Whether a log is better read part by part than as a whole."""
+        return estimated_rows(Path(log)) >= LONG
+
+    def open(self, log: str | Path, progress: Progress | None = None) -> LongLog:
+        """Opens a log that need not fit into memory: like `read` and `observe`, part by part.
+
+        Args:
+            log: Path of the log.
+            progress: Is told which share of the log was gone through for `rows.slow`, of 1.
+
+        Raises:
+            NeedsMemory: If it can be read only as a whole.
+            ValueError: Like `read` and `observe`.
+        """
+        log = Path(log)
+        table, columns = self._columns_of(log)
+        return open_log(
+            log,
+            columns,
+            self.robot,
+            self.filter,
+            self.decimation,
+            self.slow,
+            forces_path=_beside(log, table.forces_file),
+            velocities_path=_beside(log, table.velocities_file),
+            largest_gap=table.largest_gap,
+            start=-np.inf if table.start is None else table.start,
+            stop=np.inf if table.stop is None else table.stop,
+            progress=progress,
+        )
+
+    def _columns_of(self, log: Path) -> tuple[RecordingTable, Columns]:
+        if self.recording is None or self.columns is None:
+            raise ValueError(
+                f"{self.path.name}: the table `[recording]` is missing: it says which columns of "
+                f"`{log.name}` hold angles and forces."
+            )
+        return self.recording, self.columns
 
 
 def _beside(log: Path, name: str | None) -> Path | None:

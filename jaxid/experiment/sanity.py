@@ -4,11 +4,14 @@ import dataclasses
 
 import numpy as np
 
+from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit import Fit
+from jaxid.identification.streaming import Progress
+from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
+from jaxid.types import AnyArray, Float
 
 SLACK = 0.02
 """How far outside a range, relative to it, a log may reach without a word."""
@@ -20,6 +23,10 @@ FRICTION = ("fv", "fc")
 """Parameters that are negative on no robot."""
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
+STANDS = 2**18
+"""Samples by which it is judged how long joints stand."""
+AT_ONCE = 65536
+"""Samples of a long log that are read at once."""
 HARDLY = 0.02
 """A motion in [rad] or [m] that is too small to tell anything."""
 
@@ -63,31 +70,106 @@ def check_log(robot: Robot, recording: Recording, observations: Observations) ->
         recording: As it was read.
         observations: What the filter made of it.
     """
-    q = np.asarray(observations.motion.q)
-    qd = np.asarray(observations.motion.qd)
-    forces = np.asarray(observations.forces)
-    speed = np.abs(qd).max(axis=0)
-    stands = np.abs(qd) < STANDING * np.maximum(speed, 1e-12)
-    check = LogCheck(
-        lowest=q.min(axis=0),
-        highest=q.max(axis=0),
-        speed=speed,
-        acceleration=np.abs(np.asarray(observations.motion.qdd)).max(axis=0),
-        force=np.abs(forces).max(axis=0),
-        standing=stands.mean(axis=0),
-        all_standing=float(stands.all(axis=1).mean()),
-        warnings=(),
+    look = _Look(robot.joints, 1)
+    angles = np.asarray(recording.angles)
+    for a, b in recording.segments:
+        look.steps(angles[a:b])
+    for a, b in observations.segments:
+        look.motion(observations.motion[a:b], observations.forces[a:b], observations.sample_time)
+    measured = recording.velocities is not None
+    return look.check(robot, not recording.angles_on_motor_side, measured)
+
+
+def check_long_log(robot: Robot, log: LongLog, progress: Progress | None = None) -> LogCheck:
+    """The same for a log that is gone through part by part.
+
+    Whether joints stand is judged by every n-th sample.
+
+    Args:
+        robot: Whose log it is.
+        log: The log.
+        progress: Is told now and then which share is done, of 1.
+    """
+    look = _Look(robot.joints, -(-log.samples // STANDS))
+    for a, b in log.segments:
+        last = np.zeros((0, robot.joints))
+        for start in range(a, b, AT_ONCE):
+            stop = min(start + AT_ONCE, b)
+            motion, forces, angles = log.seen(slice(start, stop))
+            look.steps(np.concatenate([last, angles]))
+            look.motion(motion, forces, log.sample_time)
+            last = angles[-1:]
+            if progress is not None:
+                progress(stop / log.samples)
+    return look.check(
+        robot, not log.columns.angles_on_motor_side, log.columns.velocities is not None
     )
-    warnings = [w for j in range(robot.joints) for w in _joint(robot, j, check)]
-    warnings += _signs(qd, forces)
-    warnings += _jumps(robot, recording)
-    warnings += _velocities(robot, recording, observations)
-    if check.all_standing > 0.5:
-        warnings.append(
-            f"the robot stands still for {100 * check.all_standing:.0f} % of the log: crop it with "
-            "`recording.start` and `recording.stop`."
+
+
+class _Look:
+    """What was seen of a log so far: extremes and sums, and every n-th velocity."""
+
+    def __init__(self, joints: int, every: int):
+        self._every, self._samples = every, 0
+        self._lowest, self._highest = np.full(joints, np.inf), np.full(joints, -np.inf)
+        self._speed, self._acceleration, self._force, self._jump = np.zeros((4, joints))
+        self._power, self._forces, self._velocities = 0.0, 0.0, 0.0
+        self._rates, self._along = np.zeros((2, joints))
+        self._kept: list[np.ndarray] = []
+
+    def steps(self, angles: np.ndarray) -> None:
+        """Unfiltered angles of consecutive samples."""
+        if len(angles) > 1:
+            self._jump = np.maximum(self._jump, np.abs(np.diff(angles, axis=0)).max(axis=0))
+
+    def motion(self, motion: Motion, forces: AnyArray, sample_time: float) -> None:
+        """What the filter made of consecutive samples."""
+        q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
+        forces = np.asarray(forces)
+        self._lowest = np.minimum(self._lowest, q.min(axis=0))
+        self._highest = np.maximum(self._highest, q.max(axis=0))
+        self._speed = np.maximum(self._speed, np.abs(qd).max(axis=0))
+        self._acceleration = np.maximum(self._acceleration, np.abs(qdd).max(axis=0))
+        self._force = np.maximum(self._force, np.abs(forces).max(axis=0))
+        self._power += float(np.sum(forces * qd))
+        self._forces += float(np.sum(forces**2))
+        self._velocities += float(np.sum(qd**2))
+        if len(q) > 1:
+            rate = np.gradient(q, sample_time, axis=0)
+            self._rates = self._rates + np.sum(rate**2, axis=0)
+            self._along = self._along + np.sum(rate * qd, axis=0)
+        self._kept.append(qd[-self._samples % self._every :: self._every])
+        self._samples += len(q)
+
+    def check(self, robot: Robot, jumps: bool, velocities: bool) -> LogCheck:
+        """What is strange about it."""
+        kept = np.concatenate(self._kept)
+        stands = np.abs(kept) < STANDING * np.maximum(self._speed, 1e-12)
+        check = LogCheck(
+            lowest=self._lowest,
+            highest=self._highest,
+            speed=self._speed,
+            acceleration=self._acceleration,
+            force=self._force,
+            standing=stands.mean(axis=0),
+            all_standing=float(stands.all(axis=1).mean()),
+            warnings=(),
         )
-    return dataclasses.replace(check, warnings=tuple(warnings))
+        warnings = [w for j in range(robot.joints) for w in _joint(robot, j, check)]
+        # Over a whole log, friction makes a robot consume energy.
+        if self._power < -0.05 * np.sqrt(self._forces * self._velocities):
+            warnings.append(
+                "the robot gives off energy over the whole log: check the signs of its angles and "
+                "forces (`recording.angle_signs`, `force_signs`)."
+            )
+        warnings += _jumps(robot, self._jump) if jumps else []
+        warnings += _velocities(robot, self._rates, self._along) if velocities else []
+        if check.all_standing > 0.5:
+            warnings.append(
+                f"the robot stands still for {100 * check.all_standing:.0f} % of the log: crop it "
+                "with `recording.start` and `recording.stop`."
+            )
+        return dataclasses.replace(check, warnings=tuple(warnings))
 
 
 def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
@@ -123,25 +205,8 @@ def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
     return said
 
 
-def _signs(qd: np.ndarray, forces: np.ndarray) -> list[str]:
-    """Over a whole log, friction makes a robot consume energy."""
-    power = float(np.mean(np.sum(forces * qd, axis=1)))
-    size = float(np.sqrt(np.mean(np.sum(forces**2, axis=1)) * np.mean(np.sum(qd**2, axis=1))))
-    if power >= -0.05 * size:
-        return []
-    return [
-        "the robot gives off energy over the whole log: check the signs of its angles and forces "
-        "(`recording.angle_signs`, `force_signs`)."
-    ]
-
-
-def _jumps(robot: Robot, recording: Recording) -> list[str]:
+def _jumps(robot: Robot, largest: np.ndarray) -> list[str]:
     """A joint does not turn by half a turn or more from one sample to the next."""
-    if recording.angles_on_motor_side:
-        return []
-    angles = np.asarray(recording.angles)
-    steps = [np.abs(np.diff(angles[a:b], axis=0)) for a, b in recording.segments if b > a + 1]
-    largest = np.max([s.max(axis=0) for s in steps], axis=0)
     return [
         f"the angle of joint `{name}` jumps by {largest[j]:.3g} rad from one sample to the next: "
         "undo the wrapping at a full turn before the log is filtered."
@@ -163,17 +228,9 @@ def negative_friction(fit: Fit) -> tuple[str, ...]:
     )
 
 
-def _velocities(robot: Robot, recording: Recording, observations: Observations) -> list[str]:
+def _velocities(robot: Robot, squares: np.ndarray, along: np.ndarray) -> list[str]:
     """Measured velocities must be the derivatives of the angles."""
-    if recording.velocities is None:
-        return []
-    q = np.asarray(observations.motion.q)
-    qd = np.asarray(observations.motion.qd)
-    rate = np.concatenate(
-        [np.gradient(q[a:b], observations.sample_time, axis=0) for a, b in observations.segments]
-    )
-    squares = np.sum(rate**2, axis=0)
-    ratio = np.sum(rate * qd, axis=0) / np.where(squares > 0, squares, 1.0)
+    ratio = along / np.where(squares > 0, squares, 1.0)
     return [
         f"the measured velocities of joint `{robot.joint_names[j]}` are {ratio[j]:.3g} times the "
         "derivatives of its angles: check `recording.velocity_unit` and the order of the columns."

@@ -155,15 +155,23 @@ def factorise(
         blocks: Number of blocks into which the counted rows of each recording are divided.
         progress: Is told now and then which share of a long log is done, of 1.
     """
-    parts = []
-    for recording in recordings:
-        observations, read = source(recording)
-        edges = block_edges(observations, blocks)
+    parts, done = [], 0
+    sources = [source(recording) for recording in recordings]
+    whole = sum(len(observations.time) for observations, _ in sources)
+    for observations, read in sources:
+        edges, samples = block_edges(observations, blocks), len(observations.time)
+        told = None if progress is None else _share_of(progress, done / whole, samples / whole)
         if suits(observations):
-            parts += streamed(base, observations, edges, read=read, progress=progress)
+            parts += streamed(base, observations, edges, read=read, progress=told)
         else:
             parts += _in_numpy(base, observations, edges, read)
+        done += samples
     return Blocks(tuple(parts))
+
+
+def _share_of(progress: Progress, done: float, share: float) -> Progress:
+    """The progress of one recording among several."""
+    return lambda own: progress(min(1.0, done + share * own))
 
 
 def block_edges(observations: Observations, blocks: int = BLOCKS) -> list[int]:

@@ -73,6 +73,21 @@ class LongLog(eqx.Module):
         return self.outline.rows
 
     @property
+    def sample_time(self) -> float:
+        """Time between two samples [s]."""
+        return self.outline.sample_time
+
+    @property
+    def duration(self) -> float:
+        """Time that was recorded, gaps not counted [s]."""
+        return self.samples * self.sample_time
+
+    @property
+    def segments(self) -> tuple[tuple[int, int], ...]:
+        """Half-open ranges of samples without gaps."""
+        return self.outline.segments
+
+    @property
     def row_time(self) -> float:
         """Time between two rows [s]."""
         return self.outline.row_time
@@ -95,12 +110,21 @@ class LongLog(eqx.Module):
         Raises:
             ValueError: If a column holds what is no number.
         """
+        motion, forces, _ = self.seen(samples)
+        return motion, forces
+
+    def seen(self, samples: slice) -> tuple[Motion, np.ndarray, np.ndarray]:
+        """Motion and forces like `read`, and the angles before any filter.
+
+        Raises:
+            ValueError: Like `read`.
+        """
         begin, end, _ = self._placed(samples)
         a, b = max(begin, samples.start - self.overlap), min(end, samples.stop + self.overlap)
         angles, velocities, forces = self.measured(slice(a, b))
         motion = self.outline.filter.motion(angles, velocities, self.outline.sample_time)
         own = slice(samples.start - a, samples.stop - a, samples.step)
-        return motion[own], forces[own]
+        return motion[own], forces[own], angles[own]
 
     def measured(self, samples: slice) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """Angles, velocities and forces of some samples of one segment, joint side, unfiltered.

@@ -15,6 +15,7 @@ from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import groups
 from jaxid.identification.solutions import AbstractSpectralSolution
+from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 from jaxid.validation.definiteness import Definiteness
@@ -37,7 +38,7 @@ class Beside:
     errors: tuple[TorqueErrors, ...]
 
     @classmethod
-    def of(cls, fit: Fit, observations: Sequence[Observations]) -> "Beside":
+    def of(cls, fit: Fit, observations: Sequence[Observations | LongLog]) -> "Beside":
         """Judges another fit on some recordings."""
         return cls(fit.solution, tuple(torque_errors(fit, o) for o in observations))
 

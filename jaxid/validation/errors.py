@@ -4,9 +4,15 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.compiled import tool_forces
+from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit import Fit
+from jaxid.identification.streaming import Progress
+from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Bool, Float
+
+ROWS = 2**18
+"""Rows of a long log that are compared at most."""
 
 
 class TorqueErrors(eqx.Module):
@@ -85,23 +91,68 @@ def _share(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray:
     return np.asarray(part / np.where(whole > 0, whole, np.nan))
 
 
-def torque_errors(fit: Fit, observations: Observations) -> TorqueErrors:
+def torque_errors(
+    fit: Fit, observations: Observations | LongLog, progress: Progress | None = None
+) -> TorqueErrors:
     """Compares the forces that a model predicts with measured ones (Eqs. 27, 37).
 
-    The prediction is filtered and decimated like the measurement.
+    The prediction is filtered and decimated like the measurement. Long logs are gone through part
+    by part; of more than `ROWS` rows every n-th is compared.
 
     Args:
         fit: The model.
         observations: Of any recording of the same robot.
+        progress: Is told now and then which share of a long log is done, of 1.
     """
     robot = fit.base.model.robot
-    predicted = fit.predict(observations.motion) + tool_forces(fit.base, observations.motion)
     known = np.where(np.isfinite(robot.limits.force), robot.limits.force, robot.drives.max_forces)
+    known = np.where(np.isfinite(known), known, np.nan)
+    if isinstance(observations, LongLog):
+        every = compared_rows(observations)
+        measured, predicted = _by_parts(fit, observations, every, progress)
+        return TorqueErrors(
+            name=observations.name,
+            time=observations.reduced_time[::every],
+            measured=measured,
+            predicted=predicted,
+            counted=np.asarray(observations.outline.mask)[::every],
+            max_forces=known,
+        )
     return TorqueErrors(
         name=observations.name,
         time=observations.reduced_time,
         measured=observations.reduced_forces,
-        predicted=observations.reduce(predicted),
+        predicted=observations.reduce(_predicted(fit, observations.motion)),
         counted=np.asarray(observations.mask),
-        max_forces=np.where(np.isfinite(known), known, np.nan),
+        max_forces=known,
     )
+
+
+def compared_rows(log: LongLog) -> int:
+    """The n of a long log of which every n-th row is compared."""
+    return -(-log.rows // ROWS)
+
+
+def _predicted(fit: Fit, motion: Motion) -> np.ndarray:
+    return fit.predict(motion) + tool_forces(fit.base, motion)
+
+
+def _by_parts(
+    fit: Fit, log: LongLog, every: int, progress: Progress | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measured and predicted forces of every n-th row; nothing is computed for masked parts."""
+    outline = log.outline
+    mask = np.asarray(outline.mask)
+    kept = len(range(0, log.rows, every))
+    measured, predicted = np.zeros((2, kept, log.joints))
+    for chunk in outline.chunks():
+        first, stop = chunk.rows
+        own = slice(-(-first // every), -(-stop // every))
+        if mask[first:stop].any():
+            motion, forces = log.read(slice(*chunk.samples))
+            away = slice(own.start * every - first, None, every)
+            measured[own] = chunk.reduce(forces)[away]
+            predicted[own] = chunk.reduce(_predicted(fit, motion))[away]
+        if progress is not None:
+            progress(stop / log.rows)
+    return measured, predicted

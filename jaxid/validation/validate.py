@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import equinox as eqx
 
 from jaxid.identification.fit import Fit
+from jaxid.identification.streaming import Progress
+from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.validation.definiteness import Definiteness, definiteness
 from jaxid.validation.errors import TorqueErrors, torque_errors
@@ -23,7 +25,11 @@ class Validation(eqx.Module):
 
 
 def validate(
-    fit: Fit, observations: Observations | Sequence[Observations], *, seed: int = 0
+    fit: Fit,
+    observations: Observations | LongLog | Sequence[Observations | LongLog],
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
 ) -> Validation:
     """Checks a model: torque errors on recordings, and the definiteness of its mass matrix.
 
@@ -31,8 +37,10 @@ def validate(
         fit: The model.
         observations: One or several recordings, best some that the fit has not seen.
         seed: Of the poses in which the mass matrix is looked at.
+        progress: Is told now and then which share of each long log is done, of 1.
     """
-    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    single = isinstance(observations, Observations | LongLog)
+    recordings = (observations,) if single else tuple(observations)
     return Validation(
-        tuple(torque_errors(fit, o) for o in recordings), definiteness(fit, seed=seed)
+        tuple(torque_errors(fit, o, progress) for o in recordings), definiteness(fit, seed=seed)
     )

@@ -1,0 +1,67 @@
+"""How far a command is: its stages, and the samples of a long log with their speed."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+from jaxid.identification.streaming import Progress as Told
+
+
+class _Speed(ProgressColumn):
+    """How fast samples go through, and how long it will still take."""
+
+    def render(self, task):
+        """Nothing before the speed is known."""
+        if not task.fields.get("samples") or not task.speed:
+            return Text("")
+        done = 100 * task.completed / (task.total or 1.0)
+        left = "" if task.time_remaining is None else f", {_clock(float(task.time_remaining))} left"
+        return Text(f"{done:3.0f} %, {_large(float(task.speed))} rows/s{left}")
+
+
+def _clock(seconds: float) -> str:
+    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+def _large(count: float) -> str:
+    return f"{count / 1e6:.1f} million" if count >= 1e6 else f"{count:,.0f}".replace(",", " ")
+
+
+class Stages:
+    """A progress bar: call it with the name of each stage as it begins."""
+
+    def __init__(self, bar: Progress, total: int):
+        self._bar = bar
+        self._task = bar.add_task("starting", total=total + 1)
+        self._samples = bar.add_task("", total=1, samples=True, visible=False)
+
+    def __call__(self, name: str) -> None:
+        """A stage begins."""
+        self._bar.update(self._task, description=name, advance=1)
+        self._bar.update(self._samples, visible=False)
+
+    def through(self, samples: int) -> Told:
+        """Who is told which share of so many samples is done; a second bar shows it."""
+        self._bar.reset(self._samples, total=samples, visible=False)
+
+        def progress(share: float) -> None:
+            self._bar.update(self._samples, completed=share * samples, visible=True)
+
+        return progress
+
+
+@contextmanager
+def stages(console: Console, total: int) -> Iterator[Stages]:
+    """A progress bar in a terminal; nothing elsewhere.
+
+    Args:
+        console: Where it stands.
+        total: Number of stages.
+    """
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), _Speed())
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+        yield Stages(progress, total)
