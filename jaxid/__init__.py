@@ -62,6 +62,7 @@ from jaxid.measurement.observations import Observations as Observations
 from jaxid.measurement.observations import observe as observe
 from jaxid.measurement.read import read_recording as read_recording
 from jaxid.measurement.recording import Recording as Recording
+from jaxid.program.cache import keep_compiled as keep_compiled
 from jaxid.robot import library as robots  # noqa: F401
 from jaxid.robot.dh import from_dh as from_dh
 from jaxid.robot.drives import Drives as Drives

@@ -27,6 +27,7 @@ from jaxid.identification.rows import Rows
 from jaxid.identification.runs.comparison import Comparison
 from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
+from jaxid.program.cache import keep_compiled
 from jaxid.report.compared_files import read_estimates, write_comparison
 from jaxid.report.content import Beside
 from jaxid.report.write import write_report
@@ -73,6 +74,7 @@ class SpreadVerify(TyperCommand):
 def main() -> None:
     """Runs a command; what a user can mend is one sentence on stderr and exit code 2."""
     jax.config.update("jax_enable_x64", True)
+    keep_compiled()
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:

@@ -1,5 +1,10 @@
 """What all tests share: float64, shapes that are enforced, and the measured data where they are."""
 
+import os
+
+# Tests compile anew, and leave the user's cache alone.
+os.environ["JAXID_CACHE_DIR"] = "off"
+
 import jax
 
 jax.config.update("jax_enable_x64", True)
