@@ -43,6 +43,12 @@ from jaxid.identification.runs.comparison import Comparison as Comparison
 from jaxid.identification.runs.comparison import Verdict as Verdict
 from jaxid.identification.runs.comparison import compare as compare
 from jaxid.identification.runs.estimates import Estimates as Estimates
+from jaxid.identification.runs.run import Run as Run
+from jaxid.identification.runs.states import StatesFit as StatesFit
+from jaxid.identification.runs.states import identify_states as identify_states
+from jaxid.identification.runs.update import load_run as load_run
+from jaxid.identification.runs.update import save_run as save_run
+from jaxid.identification.runs.update import update as update
 from jaxid.identification.solutions import Complete as Complete
 from jaxid.identification.solutions import CrossValidated as CrossValidated
 from jaxid.identification.solutions import Ridge as Ridge

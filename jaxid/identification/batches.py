@@ -23,7 +23,7 @@ from jaxid.identification.geometries import geometries
 from jaxid.identification.identify import fit_blocks
 from jaxid.identification.joint_rows import JointRows
 from jaxid.identification.normal_equations import BatchFit, DataSets, solve
-from jaxid.identification.weights import AbstractWeights
+from jaxid.identification.weights import GivenWeights
 from jaxid.robot.robot import Robot
 from jaxid.types import AnyArray, Array, Bool, Float, require_float64
 
@@ -155,13 +155,6 @@ def _solve_in_parts(rows: JointRows, batch: DataSets) -> BatchFit:
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:datasets], *fits)
 
 
-class _Given(AbstractWeights):
-    weights: Float[AnyArray, " joints"]
-
-    def __call__(self, robot, factors):
-        return np.asarray(self.weights)
-
-
 def _solved_again(
     base: BaseParameters, rows: JointRows, batch: DataSets, fit: BatchFit
 ) -> BatchFit:
@@ -177,7 +170,7 @@ def _solved_again(
             if factors.rows.sum() <= rows.size:
                 p[k, draw], deviations[k, draw], condition[k] = 0.0, np.inf, np.inf
                 continue
-            estimator = WeightedLeastSquares(_Given(one.weights))
+            estimator = WeightedLeastSquares(GivenWeights(one.weights))
             again = fit_blocks(base, Blocks((factors,)), estimator)
             known = np.isfinite(again.standard_deviations).all()
             p[k, draw], deviations[k, draw] = again.parameters, again.standard_deviations

@@ -8,7 +8,7 @@ import numpy as np
 from jaxid.identification.factors import Factors
 from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
+from jaxid.types import AnyArray, Float
 
 
 class AbstractWeights(eqx.Module):
@@ -25,6 +25,20 @@ class Unweighted(AbstractWeights):
     def __call__(self, robot, factors):
         """Ones."""
         return np.ones(robot.joints)
+
+
+class GivenWeights(AbstractWeights):
+    """Weights that are known from elsewhere.
+
+    Attributes:
+        weights: One for each joint [1/(N m) or 1/N].
+    """
+
+    weights: Float[AnyArray, " joints"]
+
+    def __call__(self, robot, factors):
+        """As they are."""
+        return np.asarray(self.weights)
 
 
 class MaximumForces(AbstractWeights):

@@ -178,30 +178,48 @@ class Comparison(eqx.Module):
         return tuple(GroupChange(n, len(m), s, p, bool(c)) for n, m, (s, p), c in rows)
 
     def jointly(self, chosen: np.ndarray) -> tuple[float, float]:
-        r"""Tests some parameters at once by $d^T C^{-1} d$: statistic and chance, of 1.
-
-        It is chi-squared where standard deviations are exact, else Hotelling's $T^2$.
+        """Tests some parameters at once: statistic and chance, of 1.
 
         Args:
             chosen: Indices of the parameters.
         """
         if not len(chosen):
             return 0.0, 1.0
-        deviations = self.standard_deviations[chosen]
-        correlation = np.asarray(self.covariance)[np.ix_(chosen, chosen)]
-        correlation = correlation / np.outer(deviations, deviations)
-        values, directions = np.linalg.eigh(0.5 * (correlation + correlation.T))
-        kept = values > INDEPENDENT * values[-1]
-        along = directions.T @ (np.asarray(self.difference)[chosen] / deviations)
-        statistic = float(np.sum(along[kept] ** 2 / values[kept]))
-        size = int(np.count_nonzero(kept))
-        freedom = float(np.min(np.asarray(self.freedom)[chosen]))
-        if not np.isfinite(freedom):
-            return statistic, float(stats.chi2.sf(statistic, size))
-        rest = freedom - size + 1.0
-        if rest <= 0:
-            return statistic, 1.0
-        return statistic, float(stats.f.sf(statistic * rest / (freedom * size), size, rest))
+        return joint_test(
+            np.asarray(self.difference)[chosen],
+            np.asarray(self.covariance)[np.ix_(chosen, chosen)],
+            float(np.min(np.asarray(self.freedom)[chosen])),
+        )
+
+
+def joint_test(
+    difference: Float[AnyArray, " tested"],
+    covariance: Float[AnyArray, "tested tested"],
+    freedom: float,
+) -> tuple[float, float]:
+    r"""Tests by $d^T C^{-1} d$ if differences are more than chance: statistic, and chance, of 1.
+
+    It is chi-squared where the covariance is exact, else Hotelling's $T^2$.
+
+    Args:
+        difference: Of estimates.
+        covariance: Of the differences, with finite variances above zero.
+        freedom: Degrees of freedom of the covariance.
+    """
+    d, C = np.asarray(difference), np.asarray(covariance)
+    deviations = np.sqrt(np.diag(C))
+    correlation = C / deviations / deviations[:, None]
+    values, directions = np.linalg.eigh(0.5 * (correlation + correlation.T))
+    kept = values > INDEPENDENT * values[-1]
+    along = directions.T @ (d / deviations)
+    statistic = float(np.sum(along[kept] ** 2 / values[kept]))
+    size = int(np.count_nonzero(kept))
+    if not np.isfinite(freedom):
+        return statistic, float(stats.chi2.sf(statistic, size))
+    rest = freedom - size + 1.0
+    if rest <= 0:
+        return statistic, 1.0
+    return statistic, float(stats.f.sf(statistic * rest / (freedom * size), size, rest))
 
 
 def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:

@@ -1,6 +1,8 @@
 """What others need of a fit to compare it: numbers with names, units and their covariance."""
 
+import dataclasses
 import re
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -51,7 +53,26 @@ class Estimates(eqx.Module):
             groups=groups(base),
             parameters=np.asarray(fit.parameters),
             covariance=np.asarray(fit.covariance),
-            freedom=np.full(base.size, np.inf),
+            freedom=freedom_of(fit),
+        )
+
+    def only(self, chosen: Sequence[int]) -> "Estimates":
+        """Some of the parameters.
+
+        Args:
+            chosen: Their indices.
+        """
+        k = np.array(chosen, int)
+        texts = {
+            key: tuple(getattr(self, key)[i] for i in k)
+            for key in ("names", "expressions", "units", "groups")
+        }
+        return Estimates(
+            label=self.label,
+            **texts,
+            parameters=np.asarray(self.parameters)[k],
+            covariance=np.asarray(self.covariance)[np.ix_(k, k)],
+            freedom=np.asarray(self.freedom)[k],
         )
 
     @property
@@ -84,3 +105,20 @@ def groups(base: BaseParameters) -> tuple[str, ...]:
 def _words(name: str) -> str:
     """`ViscousFriction` as `viscous friction`."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name).lower()
+
+
+def freedom_of(fit: Fit) -> Float[np.ndarray, " base"]:
+    """Degrees of freedom of a fit's standard deviations."""
+    return np.full(fit.base.size, np.inf)
+
+
+def with_covariance(
+    fit: Fit,
+    parameters: Float[AnyArray, " base"],
+    covariance: Float[AnyArray, "base base"],
+    freedom: Float[AnyArray, " base"],
+) -> Fit:
+    """A fit with estimates and an uncertainty that were found in another way."""
+    return dataclasses.replace(
+        fit, parameters=np.asarray(parameters), covariance=np.asarray(covariance)
+    )

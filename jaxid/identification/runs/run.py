@@ -1,0 +1,134 @@
+"""What a run has told, without its data: enough to add, compare and combine runs later."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.estimators import WeightedLeastSquares
+from jaxid.identification.factors import Blocks, Factors, JointFactor
+from jaxid.identification.fit import Fit
+from jaxid.identification.identify import fit_blocks, fit_rows
+from jaxid.identification.rows import Rows
+from jaxid.identification.runs.estimates import freedom_of, with_covariance
+from jaxid.identification.streaming import Progress
+from jaxid.identification.streaming_log import LongLog
+from jaxid.identification.weights import AbstractWeights, GivenWeights, MaximumForces
+from jaxid.measurement.observations import Observations
+from jaxid.types import AnyArray, Float
+
+
+class Run(eqx.Module):
+    """One or several recordings of a robot in one state: their factors, estimates, uncertainty.
+
+    The factors are all that least squares need of the data, and the covariance, found while the
+    rows were at hand, is right for errors that are alike from row to row. A run takes a few hundred
+    kilobytes, whatever the length of its logs.
+
+    Attributes:
+        base: The base parameters.
+        blocks: Factors of the rows, by contiguous blocks of time.
+        weights: Of the joints' rows [1/(N m) or 1/N].
+        parameters: Weighted least squares of this run alone.
+        covariance: Of these estimates; infinite on the diagonal where nothing is known.
+        freedom: Degrees of freedom of their standard deviations.
+        name: Of the run, such as `cold`.
+        recordings: Names of its recordings.
+    """
+
+    base: BaseParameters
+    blocks: Blocks
+    weights: Float[AnyArray, " joints"]
+    parameters: Float[AnyArray, " base"]
+    covariance: Float[AnyArray, "base base"]
+    freedom: Float[AnyArray, " base"]
+    name: str = eqx.field(static=True)
+    recordings: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(
+        cls,
+        base: BaseParameters,
+        observations: Observations | LongLog | Sequence[Observations | LongLog],
+        *,
+        weights: AbstractWeights | None = None,
+        name: str | None = None,
+        progress: Progress | None = None,
+    ) -> "Run":
+        """Goes through recordings once or twice, and keeps what they tell.
+
+        Args:
+            base: What can be identified on this robot.
+            observations: Of one recording, or of several in the same state.
+            weights: Of the joints; the reciprocals of the largest forces if None. Runs that are to
+                be combined should have the same.
+            name: Of the run; those of its recordings if None.
+            progress: Is told now and then which share of a pass over a long log is done, of 1.
+
+        Raises:
+            ValueError: If there are fewer rows than parameters, or weights are not known.
+        """
+        single = isinstance(observations, Observations | LongLog)
+        recordings = (observations,) if single else tuple(observations)
+        rows = Rows.of(base, recordings, progress)
+        chosen = MaximumForces() if weights is None else weights
+        fit = fit_rows(rows, WeightedLeastSquares(chosen))
+        return cls(
+            base=base,
+            blocks=rows.blocks,
+            weights=np.asarray(fit.weights),
+            parameters=np.asarray(fit.parameters),
+            covariance=np.asarray(fit.covariance),
+            freedom=freedom_of(fit),
+            name=", ".join(fit.recordings) if name is None else name,
+            recordings=fit.recordings,
+        )
+
+    @property
+    def factor(self) -> tuple[Float[np.ndarray, "height base"], Float[np.ndarray, " height"]]:
+        """Matrix and right-hand side with the norms of all weighted rows (Eq. 29)."""
+        return self.blocks.total.weighted(self.weights)
+
+    @property
+    def fit(self) -> Fit:
+        """The estimates as a fit: to validate, compare and report."""
+        estimator = WeightedLeastSquares(GivenWeights(self.weights))
+        fit = fit_blocks(self.base, self.blocks, estimator, self.recordings)
+        return with_covariance(fit, self.parameters, self.covariance, self.freedom)
+
+    def weighted_like(self, weights: Float[AnyArray, " joints"]) -> "Run":
+        """The same run with factors that say the same under other weights of the joints."""
+        ratio = np.asarray(self.weights) / np.asarray(weights)
+        if np.allclose(ratio, 1.0, rtol=1e-12, atol=0.0):
+            return self
+        parts = tuple(
+            Factors(
+                tuple(
+                    JointFactor(joint.columns, r * np.asarray(joint.R), joint.rows)
+                    for joint, r in zip(part.joints, ratio, strict=True)
+                ),
+                part.size,
+            )
+            for part in self.blocks.parts
+        )
+        return dataclasses.replace(self, blocks=Blocks(parts), weights=np.asarray(weights))
+
+
+def require_same_base(runs: Sequence[Run]) -> None:
+    """Refuses to combine runs of different base parameters.
+
+    Raises:
+        ValueError: If there is no run, or base parameters differ.
+    """
+    if not runs:
+        raise ValueError("`runs` must hold at least one run, but is empty.")
+    first = runs[0]
+    for run in runs[1:]:
+        same = run.base.indices == first.base.indices and run.base.names == first.base.names
+        if not same or not np.allclose(run.base.kappa, first.base.kappa, rtol=1e-6, atol=1e-9):
+            raise ValueError(
+                f"the runs `{first.name}` and `{run.name}` have different base parameters: use one "
+                "robot and the same terms for both."
+            )

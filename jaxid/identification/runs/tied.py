@@ -1,0 +1,119 @@
+r"""Least squares over several runs whose parameters depend on common unknowns.
+
+Run $s$ has the base parameters $p_s = E_s x + c_s$: shared and own ones of several states, a
+payload on top, known loads. Its rows enter by their factors only. The common estimate is linear in
+those of the single runs, $x = \sum_s A_s (\hat p_s - c_s)$ with
+$A_s = (\sum E^T G E)^{-1} E_s^T G_s$ and the information $G_s$ of each run, and so is its error:
+the covariance of the single estimates, right for errors that are alike from row to row, leads to
+that of the common one.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.identification.runs.run import Run
+from jaxid.identification.solutions import NUMERICAL, Complete, Decomposition
+from jaxid.types import AnyArray, Float
+
+
+class Tied(eqx.Module):
+    """The common unknowns of several runs.
+
+    Attributes:
+        parameters: Estimates of the unknowns.
+        covariance: Of the estimates; infinite on the diagonal where nothing is known.
+        freedom: Degrees of freedom of their standard deviations.
+        factor: Triangle with the norm of all weighted rows, as a matrix on the unknowns.
+        target: The right-hand side that belongs to it.
+    """
+
+    parameters: Float[AnyArray, " unknowns"]
+    covariance: Float[AnyArray, "unknowns unknowns"]
+    freedom: Float[AnyArray, " unknowns"]
+    factor: Float[AnyArray, "height unknowns"]
+    target: Float[AnyArray, " height"]
+
+
+def tied(
+    runs: Sequence[Run],
+    maps: Sequence[Float[AnyArray, "base unknowns"]],
+    known: Sequence[Float[AnyArray, " base"]] | None = None,
+) -> Tied:
+    """Estimates the unknowns from the factors of all runs (Eq. 33).
+
+    Args:
+        runs: Independent of each other.
+        maps: For each run how its base parameters follow from the unknowns.
+        known: For each run what is known of its base parameters; nothing if None.
+    """
+    known = [np.zeros(run.base.size) for run in runs] if known is None else known
+    maps = [np.asarray(E, np.float64) for E in maps]
+    factors = [run.factor for run in runs]
+    R = np.vstack([own @ E for (own, _), E in zip(factors, maps, strict=True)])
+    z = np.concatenate([z - own @ c for (own, z), c in zip(factors, known, strict=True)])
+    triangle = np.asarray(np.linalg.qr(np.column_stack([R, z]), mode="r"))
+    decomposition = Decomposition.of(triangle[:, :-1], triangle[:, -1])
+    inverse = Complete().inverse(decomposition.values)
+    B = decomposition.inverse_information(inverse)
+    covariance = np.zeros_like(B)
+    scatter = np.zeros(len(B))
+    for run, (own, _), E in zip(runs, factors, maps, strict=True):
+        part, freedom = _carried(run, B @ E.T @ own.T, own)
+        covariance += part
+        scatter += np.diag(part) ** 2 / freedom
+    variances = np.diag(covariance).copy()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = np.where(scatter > 0, variances**2 / scatter, np.inf)
+    s = np.asarray(decomposition.values)
+    null = np.asarray(decomposition.directions)[s <= NUMERICAL * s.max(initial=0.0)]
+    unknown = np.sum(null**2, axis=0) > 1e-8
+    covariance[unknown, unknown] = np.inf
+    return Tied(
+        decomposition.solve(inverse), covariance, freedom, triangle[:, :-1], triangle[:, -1]
+    )
+
+
+def _carried(
+    run: Run, onto: Float[np.ndarray, "unknowns height"], own: Float[np.ndarray, "height base"]
+) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
+    """What a run's errors make of the unknowns' covariance, and its degrees of freedom."""
+    C = np.asarray(run.covariance)
+    if np.isfinite(C).all():
+        A = onto @ own
+        weights = A**2 * np.diag(C)
+        whole = weights.sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            freedom = whole / (weights / np.asarray(run.freedom)).sum(axis=1)
+        return A @ C @ A.T, np.where(whole > 0, freedom, np.inf)
+    # The run alone does not determine everything, so its estimates have no covariance. What its
+    # errors do to others follows from blocks of time.
+    size = np.linalg.norm(own, axis=0)
+    scale = np.where(size > 0, size, 1.0)
+    scores = _block_scores(run, scale)
+    # onto is B E' R', so B E' is onto times the pseudo-inverse of R'.
+    spread = onto @ np.linalg.pinv((own / scale).T, rcond=NUMERICAL)
+    moved = spread @ scores.T
+    count = len(scores)
+    freedom = np.full(len(onto), max(count - 1.0, 1.0))
+    return moved @ moved.T * count / max(count - 1, 1), freedom
+
+
+def _block_scores(run: Run, scale: Float[np.ndarray, " base"]) -> Float[np.ndarray, "blocks base"]:
+    r"""$\Theta_k^T W^2 e_k$ of each block of time, as if the block had not been fitted.
+
+    The columns are divided by `scale`.
+    """
+    own, z = run.factor
+    decomposition = Decomposition.of(own, z)
+    inverse = Complete().inverse(decomposition.values)
+    B, p = decomposition.inverse_information(inverse), decomposition.solve(inverse)
+    B = B * scale * scale[:, None]
+    found = []
+    for part in run.blocks.parts:
+        R, z = part.weighted(run.weights)
+        rows = R / scale
+        taken = np.eye(len(p)) - rows.T @ rows @ B
+        found.append(np.linalg.lstsq(taken, rows.T @ (z - R @ p), rcond=None)[0])
+    return np.array(found)
