@@ -60,7 +60,7 @@ def save_run(path: str | Path, run: Run) -> None:
     Raises:
         ValueError: If the file's place is no place for a file.
     """
-    arrays = {
+    arrays: dict[str, Any] = {
         key: np.asarray(getattr(run, key))
         for key in ("weights", "parameters", "covariance", "freedom")
     }
