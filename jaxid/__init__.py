@@ -53,6 +53,7 @@ from jaxid.identification.solutions import Complete as Complete
 from jaxid.identification.solutions import CrossValidated as CrossValidated
 from jaxid.identification.solutions import Ridge as Ridge
 from jaxid.identification.solutions import Truncated as Truncated
+from jaxid.identification.weights import GivenWeights as GivenWeights
 from jaxid.identification.weights import MaximumForces as MaximumForces
 from jaxid.identification.weights import MeasuredForces as MeasuredForces
 from jaxid.identification.weights import ResidualVariances as ResidualVariances

@@ -68,7 +68,7 @@ def test_masked_rows_and_weights_of_each_data_set(base):
     fit = identify_batch(base, m, forces, weights, mask=mask)
     for k, o in enumerate(sets):
         masked = jid.Observations(**{**vars(o), "mask": mask[k]})
-        estimator = jid.WeightedLeastSquares(batches._Given(weights[k]))
+        estimator = jid.WeightedLeastSquares(jid.GivenWeights(weights[k]))
         assert_same(base, fit, k, jid.identify(base, masked, estimator))
 
 
