@@ -8,7 +8,7 @@ from virtual import motion, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
-from jaxid.identification import batches, normal_equations
+from jaxid.identification import normal_equations
 from jaxid.identification.batches import identify_batch
 from jaxid.identification.bootstrap import bootstrap
 from jaxid.identification.factors import factorise
