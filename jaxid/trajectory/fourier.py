@@ -53,6 +53,11 @@ class FourierSeries(AbstractTrajectory):
         """Time after which the motion repeats [s]."""
         return 2 * math.pi / self.omega
 
+    @property
+    def duration(self) -> Float[AnyArray, ""] | float:
+        """One period [s]."""
+        return self.period
+
     def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
         """The motion at one time or at many [s]."""
         a, b, offset = (jnp.asarray(x) for x in (self.a, self.b, self.offset))
@@ -100,7 +105,7 @@ def random_fourier_series(
         raise ValueError(f"`harmonics` must be from 1 to {GRID // 8}, but is {harmonics}.")
     if not 0 < reach <= 1:
         raise ValueError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
-    low, high, velocity, acceleration = _bounds(robot)
+    low, high, velocity, acceleration = assumed_bounds(robot)
     centre, half = 0.5 * (low + high), reach * 0.5 * (high - low)
 
     random = np.random.default_rng(seed)
@@ -130,8 +135,8 @@ def random_fourier_series(
     return FourierSeries(offset, scale[:, None] * a, scale[:, None] * b, float(omega))
 
 
-def _bounds(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Ranges, speeds and accelerations, with assumptions where they are not known."""
+def assumed_bounds(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Ends of ranges, speeds and accelerations, with assumptions where they are not known."""
     turns, limits = np.array(robot.revolute, int), robot.limits
     half, speed = np.array(ASSUMED_RANGE)[turns], np.array(ASSUMED_SPEED)[turns]
     low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
