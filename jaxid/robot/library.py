@@ -6,6 +6,8 @@ nobody published. What is not listed is infinite (limits) or direct (drives).
 
 import numpy as np
 
+from jaxid.robot.capsules import GROUND, Capsule, HalfSpace
+from jaxid.robot.collision import CollisionModel
 from jaxid.robot.dh import from_dh
 from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
@@ -69,6 +71,31 @@ def tx90l_on_rail() -> Robot:
             "joints; the paper states motor torques of 69 N m (rail) and 2.2 N m (last joint).",
         ),
     )
+
+
+def tx90l_on_rail_collision() -> CollisionModel:
+    """Capsules of the TX90L on its rail, and the ground: assumed, for nobody published them.
+
+    The shoulder's column moves with the rail; the wrist's capsule has a tool of 0.2 m beyond the
+    flange's joint.
+    """
+    capsules = (
+        Capsule.of("column", 0, start=(0.0, 0.0, 0.05), end=(0.0, 0.0, 0.45), radius=0.19),
+        Capsule.of("upper arm", 2, start=(0.0, 0.0, 0.05), end=(0.0, -0.5, 0.05), radius=0.13),
+        Capsule.of("forearm", 4, start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 0.55), radius=0.12),
+        Capsule.of("wrist", 6, start=(0.0, 0.0, -0.1), end=(0.0, 0.0, 0.2), radius=0.07),
+        Capsule.of("rail", GROUND, start=(-2.5, 0.0, -0.15), end=(2.5, 0.0, -0.15), radius=0.25),
+    )
+    pairs = (
+        ("forearm", "column"),
+        ("wrist", "column"),
+        ("wrist", "upper arm"),
+        ("forearm", "rail"),
+        ("wrist", "rail"),
+        ("forearm", "ground"),
+        ("wrist", "ground"),
+    )
+    return CollisionModel.of(tx90l_on_rail(), capsules, (HalfSpace.of("ground"),), pairs)
 
 
 def tx40() -> Robot:

@@ -1,6 +1,6 @@
 """From standstill into a periodic motion and out of it, within the limits of the joints."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -141,7 +141,7 @@ class _Bounds(NamedTuple):
         return cls(centre - half, centre + half, reach * velocity, reach * acceleration, jerk)
 
 
-def _lead(qd: Array, qdd: Array, duration: AnyArray, time: Array) -> Motion:
+def _lead(qd: AnyArray, qdd: AnyArray, duration: AnyArray, time: AnyArray) -> Motion:
     """The motion of a lead, its positions counted from where it ends."""
     alpha, beta = _cubic(qd, qdd, duration)
     x = jnp.clip(time, 0.0, duration)
@@ -150,7 +150,7 @@ def _lead(qd: Array, qdd: Array, duration: AnyArray, time: Array) -> Motion:
     return Motion(travelled - whole, alpha * x**2 + beta * x**3, 2 * alpha * x + 3 * beta * x**2)
 
 
-def _cubic(qd: AnyArray, qdd: AnyArray, duration: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _cubic(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
     """Coefficients of the velocity that has these values at the end of a duration."""
     return 3 * qd / duration**2 - qdd / duration, qdd / duration**2 - 2 * qd / duration**3
 

@@ -116,7 +116,7 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "coefficients free"]:
     _require_harmonics(harmonics)
     order = np.arange(1.0, harmonics + 1.0)
     a, b = (np.linalg.svd(x[None, :])[2][1:].T for x in (np.ones(harmonics), order))
-    return block_diag(np.ones((1, 1)), a, b)
+    return np.asarray(block_diag(np.ones((1, 1)), a, b))
 
 
 def _require_harmonics(harmonics: int) -> None:
