@@ -58,15 +58,13 @@ class Capsule(eqx.Module):
         Raises:
             ValueError: If the ends are no points, or the radius is not positive.
         """
-        ends = [
-            _point(f"the ends of capsule `{name}`", x)
-            for x in (start, start if end is None else end)
-        ]
+        first = _point(f"the start of capsule `{name}`", start)
+        last = first if end is None else _point(f"the end of capsule `{name}`", end)
         if not 0 < radius < np.inf:
             raise ValueError(
                 f"the radius of capsule `{name}` must be positive [m], not {radius:g}."
             )
-        return cls(name, body, *ends, np.array(radius, np.float64))
+        return cls(name, body, first, last, np.array(radius, np.float64))
 
 
 class AbstractObstacle(eqx.Module):
@@ -80,7 +78,7 @@ class AbstractObstacle(eqx.Module):
 
     @abstractmethod
     def distance(
-        self, start: Float[Array, "*batch 3"], end: Float[Array, "*batch 3"]
+        self, start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
     ) -> Float[Array, "*batch"]:
         """Signed distance between segments and the solid's surface [m].
 
@@ -124,10 +122,10 @@ class HalfSpace(AbstractObstacle):
         return cls(name, n / length, np.array(height, np.float64))
 
     def distance(
-        self, start: Float[Array, "*batch 3"], end: Float[Array, "*batch 3"]
+        self, start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
     ) -> Float[Array, "*batch"]:
         """Height of the lower end above the plane [m]."""
-        n = jnp.asarray(self.normal)
+        n, start, end = (jnp.asarray(x) for x in (self.normal, start, end))
         return jnp.minimum(start @ n, end @ n) - self.height
 
 
@@ -170,15 +168,16 @@ class Box(AbstractObstacle):
         return cls(name, _point(f"the centre of box `{name}`", centre), R, edges / 2)
 
     def distance(
-        self, start: Float[Array, "*batch 3"], end: Float[Array, "*batch 3"]
+        self, start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
     ) -> Float[Array, "*batch"]:
         """Signed distance of the segment's deepest or nearest point [m]."""
+        start, end = jnp.asarray(start), jnp.asarray(end)
         first, along = self._local(start), (end - start) @ jnp.asarray(self.rotation)
         # The point is where the distance, convex along the segment, stops falling. Its own
         # derivative adds nothing to that of the distance.
         origin, direction = jax.lax.stop_gradient((first, along))
 
-        def halve(_: int, interval: tuple[Array, Array]) -> tuple[Array, Array]:
+        def halve(_: int | Array, interval: tuple[Array, Array]) -> tuple[Array, Array]:
             low, high = interval
             middle = 0.5 * (low + high)
             falls = jnp.sum(self._outward(origin + middle * direction) * direction, -1) < 0
@@ -211,16 +210,16 @@ class Box(AbstractObstacle):
         return rounded_norm(jnp.maximum(beyond, 0.0)) + inside
 
 
-def rounded_norm(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
+def rounded_norm(vector: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch"]:
     """Length of vectors, smooth at zero and there at most `ROUNDING` too small [m]."""
     return jnp.sqrt(jnp.sum(vector**2, axis=-1) + ROUNDING**2) - ROUNDING
 
 
 def segment_distance(
-    start: Float[Array, "*batch 3"],
-    end: Float[Array, "*batch 3"],
-    other_start: Float[Array, "*batch 3"],
-    other_end: Float[Array, "*batch 3"],
+    start: Float[AnyArray, "*batch 3"],
+    end: Float[AnyArray, "*batch 3"],
+    other_start: Float[AnyArray, "*batch 3"],
+    other_end: Float[AnyArray, "*batch 3"],
 ) -> Float[Array, "*batch"]:
     """Distance between segments, which may be parallel, touch, or be points [m].
 
@@ -230,6 +229,8 @@ def segment_distance(
         other_start: Ends of the second segments [m].
         other_end: Their other ends [m].
     """
+    start, end = jnp.asarray(start), jnp.asarray(end)
+    other_start, other_end = jnp.asarray(other_start), jnp.asarray(other_end)
     u, v = end - start, other_end - other_start
     # Where the closest points are is found without derivatives: theirs add nothing to that of
     # the distance, and they have none at parallel axes.

@@ -134,14 +134,17 @@ class CollisionModel(eqx.Module):
             rows.append(points)
         return jnp.stack(rows)
 
-    def clearances(self, ends: Float[Array, "*batch capsules 2 3"]) -> Float[Array, "*batch pairs"]:
+    def clearances(
+        self, ends: Float[AnyArray, "*batch capsules 2 3"]
+    ) -> Float[Array, "*batch pairs"]:
         """Distance between the surfaces of every pair, negative where they overlap [m].
 
         Args:
             ends: Ends of all axes in the frame of the ground [m].
         """
+        ends = jnp.asarray(ends)
         start, end = ends[..., 0, :], ends[..., 1, :]
-        radii = np.array([float(c.radius) for c in self.capsules])
+        radii = jnp.stack([jnp.asarray(c.radius) for c in self.capsules])
         found = []
         if self.pairs:
             i, k = (np.array(x) for x in zip(*self.pairs, strict=True))
@@ -163,8 +166,7 @@ class CollisionModel(eqx.Module):
             robot: Whose bodies carry the capsules.
             q: Joint coordinates [rad or m].
         """
-        flat = jnp.reshape(jnp.asarray(q), (-1, robot.joints))
-        gaps = self.clearances(jax.vmap(lambda x: self.ends(robot, x))(flat))
+        gaps = _clearances(self, robot, jnp.reshape(jnp.asarray(q), (-1, robot.joints)))
         return gaps.reshape(*q.shape[:-1], gaps.shape[-1])
 
     def _always(self, robot: Robot) -> np.ndarray:
@@ -178,6 +180,11 @@ class CollisionModel(eqx.Module):
             return np.zeros(0, bool)
         with double_precision():
             return np.asarray(self.clearance(robot, q)).max(axis=0) <= 0
+
+
+@eqx.filter_jit
+def _clearances(model: CollisionModel, robot: Robot, q: Float[Array, "samples joints"]) -> Array:
+    return model.clearances(jax.vmap(lambda x: model.ends(robot, x))(q))
 
 
 def _can_meet(robot: Robot, capsules: Sequence[Capsule], i: int, k: int) -> bool:

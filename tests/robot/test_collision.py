@@ -1,0 +1,241 @@
+"""Distances of capsules, planes and boxes against Coal and points; derivatives everywhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from forward_kinematics import body_transforms, random_configuration
+
+from jaxid.robot import library
+from jaxid.robot.capsules import ROUNDING, Box, Capsule, HalfSpace, segment_distance
+from jaxid.robot.collision import CollisionModel
+
+ALONG = np.linspace(0.0, 1.0, 401)[:, None]
+
+
+def segments(seed, count=200, scale=1.0):
+    return scale * np.random.default_rng(seed).uniform(-1.0, 1.0, (4, count, 3))
+
+
+def brute_force(a, b, c, d):
+    """Least distance between points of two segments."""
+    x, y = a + ALONG * (b - a), c + ALONG * (d - c)
+    return np.linalg.norm(x[:, None] - y[None], axis=2).min()
+
+
+def test_segments_agree_with_points_on_them():
+    ends = segments(0)
+    found = np.asarray(segment_distance(*ends))
+    for k in range(0, 200, 4):
+        expected = brute_force(*ends[:, k])
+        assert found[k] <= expected
+        assert found[k] >= expected - 6e-3
+
+
+SPECIAL = {
+    "parallel side by side": [(0, 0, 0), (1, 0, 0), (0.3, 0.5, 0), (0.8, 0.5, 0), 0.5],
+    "parallel apart": [(0, 0, 0), (1, 0, 0), (6, 0, 0), (5, 0, 0), 4.0],
+    "collinear overlap": [(0, 0, 0), (1, 0, 0), (0.5, 0, 0), (2, 0, 0), 0.0],
+    "crossing": [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), 0.0],
+    "touching ends": [(0, 0, 0), (1, 0, 0), (1, 0, 0), (1, 1, 0), 0.0],
+    "point and segment": [(0.5, 2, 0), (0.5, 2, 0), (0, 0, 0), (1, 0, 0), 2.0],
+    "two points": [(0, 0, 0), (0, 0, 0), (0, 3, 4), (0, 3, 4), 5.0],
+    "the same segment": [(0, 0, 0), (1, 1, 1), (0, 0, 0), (1, 1, 1), 0.0],
+    "nearly parallel": [(0, 0, 0), (1, 0, 0), (0, 0.5, 0), (1, 0.5 + 1e-9, 0), 0.5],
+}
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_special_segments_have_a_distance_and_a_derivative(name):
+    *ends, expected = SPECIAL[name]
+    ends = [np.array(x, float) for x in ends]
+    assert float(segment_distance(*ends)) == pytest.approx(expected, abs=2 * ROUNDING)
+    gradient = jax.grad(lambda *x: segment_distance(*x), argnums=(0, 1, 2, 3))(
+        *map(jnp.asarray, ends)
+    )
+    assert np.isfinite(gradient).all()
+    assert np.linalg.norm(np.asarray(gradient).reshape(-1)) <= 2.0 + 1e-9
+
+
+def test_distances_never_come_out_too_large():
+    ends = segments(1, 100, 1e-6)
+    exact = [brute_force(*ends[:, k]) for k in range(100)]
+    assert (np.asarray(segment_distance(*ends)) <= np.array(exact) + 1e-15).all()
+
+
+def test_derivatives_of_segments_are_difference_quotients():
+    ends = segments(2)
+    gradient = jax.grad(lambda x: jnp.sum(segment_distance(*x)))(jnp.asarray(ends))
+    h, direction = 1e-6, np.random.default_rng(3).standard_normal(ends.shape)
+    up, down = (np.asarray(segment_distance(*(ends + s * h * direction))) for s in (1, -1))
+    along = np.sum(np.asarray(gradient) * direction, axis=(0, 2))
+    np.testing.assert_allclose(along, (up - down) / (2 * h), atol=2e-7)
+
+
+def coal_pose(R, r):
+    coal = pytest.importorskip("coal")
+    return coal.Transform3s(np.ascontiguousarray(R), np.ascontiguousarray(r))
+
+
+def coal_capsule(start, end, radius):
+    """Coal's capsule about its own z axis, and its pose."""
+    coal = pytest.importorskip("coal")
+    length = np.linalg.norm(end - start)
+    z = (end - start) / length
+    x = np.cross(z, [1.0, 0, 0] if abs(z[0]) < 0.9 else [0, 1.0, 0])
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z], axis=1)
+    return coal.Capsule(radius, length), coal_pose(R, 0.5 * (start + end))
+
+
+def coal_distance(first, second):
+    coal = pytest.importorskip("coal")
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    return coal.distance(*first, *second, request, result)
+
+
+def test_capsules_agree_with_coal():
+    ends, radii = segments(4, 60), (0.05, 0.1)
+    found = np.asarray(segment_distance(*ends)) - sum(radii)
+    for k in range(60):
+        first = coal_capsule(ends[0, k], ends[1, k], radii[0])
+        second = coal_capsule(ends[2, k], ends[3, k], radii[1])
+        expected = coal_distance(first, second)
+        if expected > 1e-3:  # deep overlaps are coal's own approximation
+            assert found[k] == pytest.approx(expected, abs=3e-6)
+
+
+def a_box():
+    R = library.tx90l_on_rail().rotation[2]
+    turn = np.array([[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]])
+    return Box.of("box", centre=(0.2, -0.1, 0.3), size=(0.6, 0.4, 0.8), rotation=turn @ R)
+
+
+def test_boxes_agree_with_coal():
+    coal = pytest.importorskip("coal")
+    box, ends = a_box(), segments(5, 80)[:2] * 1.5
+    found = np.asarray(box.distance(*map(jnp.asarray, ends)))
+    other = coal.Box(*(2 * box.half)), coal_pose(box.rotation, box.centre)
+    compared = 0
+    for k in range(80):
+        expected = coal_distance(coal_capsule(ends[0, k], ends[1, k], 1e-9), other)
+        if expected > 1e-3:
+            compared += 1
+            assert found[k] == pytest.approx(expected, abs=3e-6)
+        else:
+            assert found[k] < 2e-3
+    assert compared > 20
+
+
+def test_the_depth_in_a_box_is_that_to_the_nearest_face():
+    box = Box.of("box", centre=(0, 0, 0), size=(2, 2, 2))
+    inside = jnp.array([[0.0, 0.0, 0.9], [0.0, 0.7, 0.0]])
+    np.testing.assert_allclose(box.distance(inside, inside), [-0.1, -0.3], atol=2e-6)
+    through = box.distance(jnp.array([-3.0, 0.2, 0.1]), jnp.array([3.0, 0.2, 0.1]))
+    assert float(through) == pytest.approx(-0.8, abs=2e-6)
+
+
+def test_derivatives_of_boxes_and_planes_are_difference_quotients():
+    ends = jnp.asarray(segments(6)[:2] * 1.5)
+    direction = np.random.default_rng(7).standard_normal(ends.shape)
+    for obstacle in (a_box(), HalfSpace.of("wall", normal=(1.0, 2.0, 0.5), height=0.3)):
+        gradient = jax.grad(lambda x, o=obstacle: jnp.sum(o.distance(*x)))(ends)
+        h = 1e-6
+        up, down = (np.asarray(obstacle.distance(*(ends + s * h * direction))) for s in (1, -1))
+        along = np.sum(np.asarray(gradient) * direction, axis=(0, 2))
+        wrong = np.abs(along - (up - down) / (2 * h)) > 1e-6
+        # Inside a box the nearest face may change between the two.
+        assert wrong.mean() <= 0.01
+
+
+def test_ends_are_where_plain_numpy_puts_them():
+    robot, model = library.tx90l_on_rail(), library.tx90l_on_rail_collision()
+    q = random_configuration(robot, 3)
+    poses = body_transforms(robot, q)
+    ends = np.asarray(model.ends(robot, q))
+    for capsule, (start, end) in zip(model.capsules, ends, strict=True):
+        T = poses[capsule.body] if capsule.body >= 0 else np.eye(4)
+        np.testing.assert_allclose(start, T[:3, :3] @ capsule.start + T[:3, 3], atol=1e-13)
+        np.testing.assert_allclose(end, T[:3, :3] @ capsule.end + T[:3, 3], atol=1e-13)
+
+
+def test_capsules_of_the_rail_robot_lie_along_its_links():
+    robot, model = library.tx90l_on_rail(), library.tx90l_on_rail_collision()
+    upright = dict(
+        zip((c.name for c in model.capsules), model.ends(robot, np.zeros(7)), strict=True)
+    )
+    np.testing.assert_allclose(upright["upper arm"][:, 2], [0.478, 0.978], atol=1e-12)
+    np.testing.assert_allclose(upright["forearm"][:, 2], [0.978, 1.528], atol=1e-12)
+    np.testing.assert_allclose(upright["wrist"][:, 2], [1.528, 1.828], atol=1e-12)
+    gap = upright["forearm"][0] - upright["upper arm"][1]
+    assert np.linalg.norm(gap) <= 0.051
+    clearance = dict(
+        zip(model.pair_names, np.asarray(model.clearance(robot, np.zeros(7))), strict=True)
+    )
+    assert clearance["forearm and ground"] == pytest.approx(0.978 - 0.12, abs=1e-5)
+    assert min(clearance.values()) > 0.3
+    # Folded down: the forearm meets the ground.
+    q = np.zeros(7)
+    q[2] = 2.3
+    assert model.clearance(robot, q).min() < 0
+
+
+def test_clearances_of_many_poses_are_those_of_each():
+    robot, model = library.tx90l_on_rail(), library.tx90l_on_rail_collision()
+    q = np.stack([random_configuration(robot, seed) for seed in range(6)]).reshape(2, 3, 7)
+    many = model.clearance(robot, q)
+    assert many.shape == (2, 3, len(model.pair_names))
+    np.testing.assert_allclose(many[1, 2], model.clearance(robot, q[1, 2]), atol=1e-12)
+
+
+def test_pairs_are_found_where_none_are_named():
+    robot = library.planar_arm(4)
+    links = [
+        Capsule.of(f"link {i}", i, start=(0, 0, 0), end=(1, 0, 0), radius=0.05) for i in range(4)
+    ]
+    hub = Capsule.of("hub", -1, start=(0, 0, 0), radius=0.1)
+    model = CollisionModel.of(
+        robot, [*links, hub], [HalfSpace.of("floor", normal=(0, 1, 0), height=-9.0)]
+    )
+    assert "link 0 and link 2" in model.pair_names
+    assert "link 0 and link 1" not in model.pair_names  # neighbours
+    assert "link 0 and hub" not in model.pair_names
+    assert "link 1 and hub" in model.pair_names
+    assert "link 3 and floor" in model.pair_names
+    fat = [*links[:3], Capsule.of("link 3", 3, start=(0, 0, 0), end=(1, 0, 0), radius=9.0)]
+    model = CollisionModel.of(robot, fat)
+    assert "link 0 and link 3" not in model.pair_names
+    assert any("link 0 and link 3" in note for note in model.notes)
+
+
+ROD = {"start": (0, 0, 0), "end": (1, 0, 0), "radius": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda r: Capsule.of("a", 0, start=(0, 0), radius=0.1), "three finite numbers"),
+        (lambda r: Capsule.of("a", 0, start=(0, 0, 0), radius=0.0), "radius of capsule `a`"),
+        (lambda r: Box.of("b", centre=(0, 0, 0), size=(1, 0, 1)), "edges of box `b`"),
+        (lambda r: HalfSpace.of("h", normal=(0, 0, 0)), "`h` needs a normal"),
+        (lambda r: CollisionModel.of(r, [Capsule.of("a", 7, **ROD)]), "body from 0 to 6"),
+        (
+            lambda r: CollisionModel.of(r, [Capsule.of("a", 0, **ROD)] * 2),
+            "two shapes are named `a`",
+        ),
+        (lambda r: CollisionModel.of(r, [Capsule.of("a", 0, **ROD)]), "at least one pair"),
+        (
+            lambda r: CollisionModel.of(r, [Capsule.of("a", 0, **ROD)], pairs=[("a", "c")]),
+            "`c` is none of the shapes `a`",
+        ),
+        (
+            lambda r: CollisionModel.of(
+                r, [], [HalfSpace.of("f"), HalfSpace.of("g")], pairs=[("f", "g")]
+            ),
+            "both obstacles",
+        ),
+    ],
+)
+def test_refuses(make, message):
+    with pytest.raises(ValueError, match=message):
+        make(library.panda())
