@@ -71,6 +71,11 @@ from jaxid.measurement.read import read_recording as read_recording
 from jaxid.measurement.recording import Recording as Recording
 from jaxid.program.cache import keep_compiled as keep_compiled
 from jaxid.robot import library as robots  # noqa: F401
+from jaxid.robot.capsules import AbstractObstacle as AbstractObstacle
+from jaxid.robot.capsules import Box as Box
+from jaxid.robot.capsules import Capsule as Capsule
+from jaxid.robot.capsules import HalfSpace as HalfSpace
+from jaxid.robot.collision import CollisionModel as CollisionModel
 from jaxid.robot.dh import from_dh as from_dh
 from jaxid.robot.drives import Drives as Drives
 from jaxid.robot.limits import Limits as Limits

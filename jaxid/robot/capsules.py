@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.robot.limits import Numbers
-from jaxid.types import AnyArray, Array, Float
+from jaxid.types import AnyArray, Array, Float, Numbers
 
 GROUND = -1
 """The body of what does not move."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Hashable
 from jaxid.robot.capsules import GROUND, AbstractObstacle, Capsule, segment_distance
 from jaxid.robot.kinematics import placements
 from jaxid.robot.robot import Robot
@@ -19,7 +20,7 @@ FREE_RANGE = np.pi
 """Half of the range in which a joint without limits is tried [rad or m]."""
 
 
-class CollisionModel(eqx.Module):
+class CollisionModel(Hashable):
     """Shapes and the pairs of them that must stay apart.
 
     Attributes:

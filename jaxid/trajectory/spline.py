@@ -9,10 +9,9 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from jaxid.dynamics.motion import Motion
-from jaxid.robot.limits import Numbers
 from jaxid.trajectory.basis import ORDERS, AbstractBasis, Envelope
 from jaxid.trajectory.trajectory import AbstractTrajectory, each_time
-from jaxid.types import AnyArray, Array, Float
+from jaxid.types import AnyArray, Array, Float, Numbers
 
 DEGREE = 5
 AT_REST = 3
