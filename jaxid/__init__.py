@@ -37,6 +37,9 @@ from jaxid.identification.fit import Trust as Trust
 from jaxid.identification.identify import fit_blocks as fit_blocks
 from jaxid.identification.identify import fit_rows as fit_rows
 from jaxid.identification.identify import identify as identify
+from jaxid.identification.nonlinear.estimator import NonlinearFriction as NonlinearFriction
+from jaxid.identification.nonlinear.verdict import NonlinearFit as NonlinearFit
+from jaxid.identification.nonlinear.verdict import identify_nonlinear as identify_nonlinear
 from jaxid.identification.opening import open_log as open_log
 from jaxid.identification.rows import Rows as Rows
 from jaxid.identification.runs.comparison import Comparison as Comparison

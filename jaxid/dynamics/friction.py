@@ -12,7 +12,6 @@ from jaxid.dynamics.terms import (
     INERTIAL_NAMES,
     AbstractTerm,
     each_joint,
-    transition_shapes,
 )
 from jaxid.dynamics.transitions import AbstractTransition, Shape, Tanh
 from jaxid.robot.robot import Robot
@@ -52,9 +51,9 @@ class StribeckFriction(AbstractTerm):
     def shapes(self):
         """`vs1`, … [rad/s or m/s]; `delta1`, … if asked for; and those of the transition."""
         return (
-            *transition_shapes(self.transition),
-            Shape("vs", ("rad/s", "m/s"), lambda term: term.speed),
-            Shape("delta", ("1", "1"), lambda term: term.exponent, wanted=False),
+            *(s.below("transition") for s in self.transition.shapes),
+            Shape("vs", ("rad/s", "m/s"), ("speed",)),
+            Shape("delta", ("1", "1"), ("exponent",), wanted=False),
         )
 
 
@@ -133,7 +132,7 @@ class LoadFriction(AbstractTerm):
     @property
     def shapes(self):
         """Those of the transition, if asked for: `CoulombFriction` finds them better."""
-        return tuple(s._replace(wanted=False) for s in transition_shapes(self.transition))
+        return tuple(s.below("transition")._replace(wanted=False) for s in self.transition.shapes)
 
 
 class TemperatureScaled(AbstractTerm):
@@ -166,7 +165,5 @@ class TemperatureScaled(AbstractTerm):
     @property
     def shapes(self):
         """Those of the term, and `rate1`, … [1/K]."""
-        inner = (
-            s._replace(leaf=lambda term, leaf=s.leaf: leaf(term.term)) for s in self.term.shapes
-        )
-        return (*inner, Shape("rate", ("1/K", "1/K"), lambda term: term.rate))
+        inner = (s.below("term") for s in self.term.shapes)
+        return (*inner, Shape("rate", ("1/K", "1/K"), ("rate",)))

@@ -120,14 +120,6 @@ class RigidBodies(AbstractTerm):
         return projection.potential_energy_columns(robot, q)[:, : self._kept].ravel()
 
 
-def transition_shapes(transition: AbstractTransition) -> tuple[Shape, ...]:
-    """The shapes of a term's attribute `transition`."""
-    return tuple(
-        s._replace(leaf=lambda term, inner=s.leaf: inner(term.transition))
-        for s in transition.shapes
-    )
-
-
 def each_joint(robot: Robot, name: str, unit_r: str, unit_p: str) -> tuple[tuple[str, str], ...]:
     """One parameter for each joint, with the unit of a revolute or a prismatic one."""
     return tuple((f"{name}{i + 1}", unit_r if r else unit_p) for i, r in enumerate(robot.revolute))
@@ -165,7 +157,7 @@ class CoulombFriction(AbstractTerm):
     @property
     def shapes(self):
         """Those of the transition."""
-        return transition_shapes(self.transition)
+        return tuple(s.below("transition") for s in self.transition.shapes)
 
 
 class AsymmetricCoulombFriction(AbstractTerm):
@@ -194,7 +186,7 @@ class AsymmetricCoulombFriction(AbstractTerm):
     @property
     def shapes(self):
         """Those of the transition."""
-        return transition_shapes(self.transition)
+        return tuple(s.below("transition") for s in self.transition.shapes)
 
 
 class ConstantOffset(AbstractTerm):

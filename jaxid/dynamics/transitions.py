@@ -1,7 +1,7 @@
 """How friction passes from one direction of motion to the other, and numbers that shape it."""
 
+import functools
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,14 +18,22 @@ class Shape(NamedTuple):
     Attributes:
         name: Before the joint's number.
         units: For a revolute and a prismatic joint.
-        leaf: Finds it in the term (or transition) that names it.
+        path: Attributes that lead to it, from the term (or transition) that names it.
         wanted: Whether it is identified unless a user says otherwise.
     """
 
     name: str
     units: tuple[str, str]
-    leaf: Callable[[Any], Any]
+    path: tuple[str, ...]
     wanted: bool = True
+
+    def leaf(self, owner: Any) -> Any:
+        """The number, or the numbers of the joints, in the term that names it."""
+        return functools.reduce(getattr, self.path, owner)
+
+    def below(self, attribute: str) -> "Shape":
+        """The same for a term that holds the owner as an attribute."""
+        return self._replace(path=(attribute, *self.path))
 
 
 class AbstractTransition(eqx.Module):
@@ -67,7 +75,7 @@ class Tanh(AbstractTransition):
     @property
     def shapes(self):
         """`eps1`, … [rad/s or m/s]."""
-        return (Shape("eps", ("rad/s", "m/s"), lambda transition: transition.epsilon),)
+        return (Shape("eps", ("rad/s", "m/s"), ("epsilon",)),)
 
 
 class HardSign(AbstractTransition):

@@ -1,0 +1,171 @@
+"""Nonlinear friction: shapes that are known are found again, with honest uncertainties."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import virtual
+
+import jaxid as jid
+from jaxid.identification.factors import factorise
+from jaxid.identification.nonlinear.estimator import NonlinearFriction
+from jaxid.identification.nonlinear.projection import Search, project
+from jaxid.identification.nonlinear.separable import SeparableRows
+from jaxid.identification.nonlinear.shapes import Shapes
+from jaxid.identification.rows import Rows
+
+ROBOT = jid.robots.planar_arm(3)
+TRUE_EPSILON, TRUE_SPEED = np.array([0.02, 0.05, 0.03]), np.array([0.2, 0.3, 0.15])
+WLS = jid.WeightedLeastSquares(jid.Unweighted())
+
+
+def model(epsilon, speed=None, exponent=2.0):
+    dry = (
+        jid.CoulombFriction(jid.Tanh(epsilon))
+        if speed is None
+        else jid.StribeckFriction(speed, exponent, jid.Tanh(epsilon))
+    )
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), dry, jid.ConstantOffset())
+    return jid.Model(ROBOT, terms)
+
+
+TRUTH = model(TRUE_EPSILON, TRUE_SPEED)
+P = virtual.standard_parameters(TRUTH, seed=3)
+START = jid.base_parameters(model(0.04, 0.4))
+
+
+def observations(**changed):
+    return virtual.observations(TRUTH, P, **{"samples": 1500, **changed})
+
+
+def separable(base, o, free=None):
+    rows = Rows.of(base, [o])
+    return SeparableRows(rows, Shapes.of(base, free))
+
+
+def test_shapes_are_found_again_through_filters():
+    """Exact forces, smoothed and decimated: the minimum is zero, at the truth."""
+    o = observations(filter=jid.ZeroPhaseButterworth(5.0), every=4)
+    fit = jid.identify(START, o, NonlinearFriction(WLS))
+    stribeck = fit.base.model.terms[2]
+    np.testing.assert_allclose(stribeck.transition.epsilon, TRUE_EPSILON, rtol=1e-3)
+    np.testing.assert_allclose(stribeck.speed, TRUE_SPEED, rtol=1e-3)
+    assert stribeck.exponent == 2.0
+    assert fit.residual < 1e-4
+    np.testing.assert_allclose(fit.parameters, START.from_standard(P), rtol=2e-3, atol=2e-3)
+
+
+def test_factors_are_those_of_the_model_with_these_shapes():
+    """Fixed columns once and friction anew is the same as everything at once; masks count."""
+    mask = np.random.default_rng(5).random((375, 3)) < 0.7
+    o = observations(filter=jid.ZeroPhaseButterworth(5.0, margin=0.0), every=4, mask=mask)
+    rows = separable(START, o)
+    x = np.array([0.01, 0.02, 0.03, 0.5, 0.2, 0.1])
+    found = rows.blocks(x)
+    other = factorise(rows.shapes.set(START, x), [o])
+    for a, b in zip(found.parts, other.parts, strict=True):
+        R, z = a.weighted(np.array([1.0, 2.0, 3.0]))
+        S, y = b.weighted(np.array([1.0, 2.0, 3.0]))
+        R = R[:, : START.size]
+        np.testing.assert_allclose(R.T @ R, S.T @ S, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(R.T @ z, S.T @ y, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(a.rows, b.rows)
+
+
+@pytest.mark.parametrize("exponent", [2.0, 1.3])
+def test_the_jacobian_is_that_of_what_is_left(exponent):
+    """Central differences of half the squared residual; the linear parameters follow the shapes."""
+    base = jid.base_parameters(model(0.04, 0.4, exponent))
+    rows = separable(
+        base,
+        observations(noise=1.0),
+        lambda t: (t[2].transition.epsilon, t[2].speed, t[2].exponent),
+    )
+    assert [n for n, _ in rows.shapes.parameters][-3:] == ["delta1", "delta2", "delta3"]
+    weights, x = np.array([1.0, 2.0, 3.0]), rows.shapes.values(base)
+
+    def left(x):
+        r = project(rows.blocks(x).total, rows, weights).residual
+        return 0.5 * r @ r
+
+    at = project(rows.blocks(x).total, rows, weights)
+    slopes = at.jacobian.T @ at.residual
+    for k in range(len(x)):
+        step = np.zeros(len(x))
+        step[k] = 1e-5 * x[k]
+        difference = (left(x + step) - left(x - step)) / (2 * step[k])
+        assert slopes[k] == pytest.approx(difference, rel=1e-5, abs=1e-6 * np.abs(slopes).max())
+
+
+def test_deviations_of_shapes_agree_with_their_scatter():
+    """White noise on every row: the linearised problem predicts the scatter over 20 draws."""
+    found = []
+    for seed in range(20):
+        o = observations(samples=600, noise=0.3, noise_seed=seed)
+        rows = separable(START, o)
+        found.append(Search(rows, np.ones(3), rows.shapes.values(START))().x)
+    fit = jid.identify_nonlinear(
+        START, observations(samples=600, noise=0.3), NonlinearFriction(WLS)
+    )
+    assert fit.names == ("eps1", "eps2", "eps3", "vs1", "vs2", "vs3")
+    assert set(fit.units) == {"rad/s"}
+    scatter = np.std(found, axis=0, ddof=1)
+    # 20 draws tell a deviation to 16 %: 1.6 is three of these.
+    assert (scatter / fit.shape_deviations < 1.6).all()
+    assert (scatter / fit.shape_deviations > 1 / 1.6).all()
+    assert (np.abs(fit.shapes - [*TRUE_EPSILON, *TRUE_SPEED]) < 4 * fit.shape_deviations).all()
+
+
+def test_unknown_shapes_make_their_levels_less_certain():
+    o = observations(samples=600, noise=0.3)
+    whole = jid.identify_nonlinear(START, o, NonlinearFriction(WLS))
+    known = jid.identify(whole.fit.base, o, WLS)
+    ratio = whole.fit.standard_deviations / known.standard_deviations
+    assert (ratio > 1 - 1e-9).all()
+    assert ratio[list(START.names).index("fs1")] > 1.1
+
+
+def test_it_pays_where_friction_is_nonlinear_and_only_there():
+    linear = jid.base_parameters(model(0.03))
+    o = observations(samples=1000, noise=0.05)
+    whole = jid.identify_nonlinear(START, o, NonlinearFriction(WLS), linear=linear)
+    assert whole.held_out.pays
+    assert whole.held_out.gain > 0.3
+    assert whole.better is whole.fit
+    assert "nonlinear friction pays: it leaves" in str(whole.held_out)
+
+    plain = model(0.03)
+    p = virtual.standard_parameters(plain, seed=3)
+    o = virtual.observations(plain, p, samples=1000, noise=0.5)
+    whole = jid.identify_nonlinear(START, o, NonlinearFriction(WLS), linear=linear)
+    assert not whole.held_out.pays
+    assert abs(whole.held_out.gain) < 0.05
+    assert whole.better is whole.linear
+    assert "nonlinear friction does not pay" in str(whole.held_out)
+
+
+def test_two_recordings_are_fitted_together():
+    both = [observations(samples=500, seed=s, noise=0.1, noise_seed=s) for s in (0, 1)]
+    fit = jid.identify_nonlinear(START, both, NonlinearFriction(WLS))
+    alone = jid.identify_nonlinear(START, both[0], NonlinearFriction(WLS))
+    assert fit.fit.rows == (1000,) * 3
+    assert fit.shape_deviations.mean() < alone.shape_deviations.mean()
+
+
+def test_what_cannot_be_searched_is_refused():
+    terms = (jid.RigidBodies(), jid.CoulombFriction(jid.HardSign()))
+    hard = jid.base_parameters(jid.Model(ROBOT, terms))
+    with pytest.raises(ValueError, match="no friction law with a shape"):
+        Shapes.of(hard)
+    with pytest.raises(ValueError, match="`free` picks a leaf that is no shape"):
+        Shapes.of(START, lambda terms: (terms[2].transition.dead_zone,))
+    friction = jid.StribeckFriction(), jid.LoadFriction(np.ones((3, 10)))
+    double = jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), *friction)))
+    with pytest.raises(ValueError, match="two terms have a shape called `eps`"):
+        Shapes.of(double, lambda t: (t[1].transition.epsilon, t[2].transition.epsilon))
+    zero = dataclasses.replace(START, model=model(0.04, np.array([0.1, 0.0, 0.1])))
+    with pytest.raises(ValueError, match="`vs2` must begin at a positive number"):
+        Shapes.of(zero).values(zero)
+    blocks = factorise(START, [observations(samples=300)])
+    with pytest.raises(ValueError, match="needs the rows themselves"):
+        jid.fit_blocks(START, blocks, NonlinearFriction(WLS))
