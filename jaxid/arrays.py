@@ -26,6 +26,26 @@ def as_array(name: str, value: Numbers) -> AnyArray:
         raise ValueError(f"`{name}` must be an array of numbers, but is {value!r:.60}.") from error
 
 
+def one_or_each(value: Any) -> Any:
+    """A converter of fields that hold one number for all joints, or a list of one for each."""
+    return as_array("value", value) if isinstance(value, list | tuple) else value
+
+
+def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | float:
+    """A number for all joints, or one for each of those that move with `qd`.
+
+    Raises:
+        ValueError: If there are more or fewer than joints.
+    """
+    shape = np.shape(value)
+    if shape and shape != qd.shape[-1:]:
+        raise ValueError(
+            f"`{name}` must be one number for all joints or one for each ({qd.shape[-1]}), but "
+            f"has shape {shape}."
+        )
+    return value
+
+
 def is_traced(*trees: Any) -> bool:
     """Whether JAX is tracing some number of these, so that nothing can be asked of its value."""
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))

@@ -3,6 +3,9 @@
 import dataclasses
 import dis
 import importlib.metadata
+import os
+import stat
+import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
@@ -144,7 +147,21 @@ def init(
 
     Like this: jaxid init arm.urdf > experiment.toml
     """
-    typer.echo(write_template(urdf, tip=tip, base=base), nl=False)
+    folder = None if _goes_elsewhere() else Path()
+    typer.echo(write_template(urdf, tip=tip, base=base, folder=folder), nl=False)
+
+
+def _goes_elsewhere() -> bool:
+    """Whether the output is redirected into a file of another folder than this."""
+    try:
+        status = os.fstat(sys.stdout.fileno())
+    except (OSError, ValueError):
+        return False
+    if not stat.S_ISREG(status.st_mode):
+        return False
+    return not any(
+        os.path.samestat(status, entry.stat(follow_symlinks=False)) for entry in os.scandir()
+    )
 
 
 @app.command()

@@ -33,6 +33,10 @@ cutoff = 10
 every = 4
 """
 GRAVITY = 9.81
+STICK = (
+    '<robot name="stick"><link name="a"/><link name="b"/><joint name="hinge" '
+    'type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>'
+)
 
 
 def two_links(q, qd, qdd):
@@ -268,14 +272,27 @@ def test_run_as_a_module_mistakes_are_sentences_too(folder):
 
 def test_init_writes_a_file_that_loads(tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "arm.urdf").write_text(
-        '<robot name="stick"><link name="a"/><link name="b"/><joint name="hinge" '
-        'type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>'
-    )
+    (tmp_path / "arm.urdf").write_text(STICK)
     code, out, err = run("init", "arm.urdf")
     assert (code, err) == (0, "")
     (tmp_path / "experiment.toml").write_text(out)
     assert load_experiment("experiment.toml").robot.joint_names == ("hinge",)
+
+
+@pytest.mark.parametrize("target", ["experiment.toml", "sub/experiment.toml", "link/one.toml"])
+def test_init_into_a_folder_finds_its_robot(tmp_path, target):
+    """The shell opens the file; its path is not told, but where it lies can be seen."""
+    (tmp_path / "arm.urdf").write_text(STICK)
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "link").symlink_to("sub")
+    (tmp_path / "dangling").symlink_to("nowhere")
+    command = [sys.executable, "-m", "jaxid.cli", "init", "arm.urdf"]
+    with open(tmp_path / target, "w") as file:
+        environment = {**os.environ, "PYTHONPATH": ROOT}
+        subprocess.run(command, cwd=tmp_path, stdout=file, check=True, env=environment)
+    text = (tmp_path / target).read_text()
+    assert load_experiment(tmp_path / target).robot.joint_names == ("hinge",)
+    assert ('urdf = "arm.urdf" ' in text) == (target == "experiment.toml")
 
 
 def test_the_example_runs(tmp_path, run, monkeypatch):

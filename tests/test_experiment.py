@@ -590,6 +590,8 @@ def test_the_template_breaks_long_lists(tmp_path):
             '`angle_unit` of joint `shoulder` is "mm", but the joint turns',
         ),
         ("velocity_unit = 'rpm'", '`velocity_unit` of joint `rail` is "rpm", but the joint slides'),
+        ("force_unit = 'N m'", '`force_unit` of joint `rail` is "N m", but the joint slides'),
+        ("force_unit = 'N'", '`force_unit` of joint `shoulder` is "N", but the joint turns'),
     ],
 )
 def test_degrees_for_a_rail_are_refused(tmp_path, load, units, sentence):
@@ -600,3 +602,25 @@ def test_degrees_for_a_rail_are_refused(tmp_path, load, units, sentence):
         load(text)
     motors = load(text + '\nside = "motor"\n')
     assert motors.columns.angles_on_motor_side
+
+
+def test_motors_count_in_newton_metres_whatever_they_move(tmp_path, load):
+    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
+    text = '[robot]\nurdf = "arm.urdf"\n' + RECORDING + "forces_side = 'motor'\nforce_unit = 'N m'"
+    assert load(text).columns.force_unit == units.NM
+
+
+def test_which_largest_force_decides_is_said(load):
+    text = ARM + "[limits]\nforce = [80, 20]\n[drives]\ngear_ratios = [50, 50]\n"
+    notes = load(text + "max_torques = [2, 0.4]").notes
+    assert any("`limits.force`), which decide before" in n for n in notes)
+    assert any("joint1 80, not 100 N m." in n for n in notes)
+    assert not any("limits.force" in n for n in load(text).notes)
+
+
+def test_the_path_of_the_urdf_where_the_file_goes_elsewhere(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
+    path = tmp_path / "sub" / "experiment.toml"
+    path.parent.mkdir()
+    path.write_text(write_template(tmp_path / "arm.urdf", folder=None), encoding="utf-8")
+    assert load_experiment(path).robot.joints == 2

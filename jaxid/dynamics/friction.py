@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import matching, one_or_each
 from jaxid.dynamics import projection
 from jaxid.dynamics.terms import (
     INERTIAL_NAMES,
@@ -33,8 +34,8 @@ class StribeckFriction(AbstractTerm):
         transition: From one direction of motion to the other.
     """
 
-    speed: float | Float[AnyArray, "..."] = 0.1
-    exponent: float | Float[AnyArray, "..."] = 2.0
+    speed: float | Float[AnyArray, "..."] = eqx.field(converter=one_or_each, default=0.1)
+    exponent: float | Float[AnyArray, "..."] = eqx.field(converter=one_or_each, default=2.0)
     transition: AbstractTransition = Tanh()
 
     def parameters(self, robot):
@@ -44,7 +45,8 @@ class StribeckFriction(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """The diagonal matrices of smooth signs, and of those that fade with speed."""
         sign = self.transition(qd)
-        power = 0.5 * self.exponent * jnp.log((qd / self.speed) ** 2 + TINY)
+        relative = qd / matching("speed", self.speed, qd)
+        power = 0.5 * matching("exponent", self.exponent, qd) * jnp.log(relative**2 + TINY)
         return jnp.concatenate([jnp.diag(sign), jnp.diag(sign * jnp.exp(-jnp.exp(power)))], axis=1)
 
     @property

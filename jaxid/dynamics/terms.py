@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import matching, one_or_each
 from jaxid.dynamics import projection
 from jaxid.dynamics.transitions import AbstractTransition, Shape, Tanh, has_dead_zone
 from jaxid.robot.robot import AXES, Robot
@@ -220,7 +221,7 @@ class LinearSpring(AbstractTerm):
         rest: Position without force [rad or m]; an unknown one shows up as a `ConstantOffset`.
     """
 
-    rest: float | Float[AnyArray, " joints"] = 0.0
+    rest: float | Float[AnyArray, " joints"] = eqx.field(converter=one_or_each, default=0.0)
 
     def parameters(self, robot):
         """`ks1`, … [N m/rad or N/m]."""
@@ -228,7 +229,7 @@ class LinearSpring(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """The diagonal matrix of deflections."""
-        return jnp.diag(q - self.rest)
+        return jnp.diag(q - matching("rest", self.rest, q))
 
     def potential_columns(self, robot, q):
         """Half the squares of the deflections."""
@@ -286,11 +287,13 @@ class CoupledDrives(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """Inertia and viscous parts beside the diagonal; Coulomb friction of the motor's motion."""
         inertia, viscous, dry = [], [], []
-        for _, ratios in self.couplings(robot):
+        for i, ratios in self.couplings(robot):
             beside = np.outer(ratios, ratios)
             np.fill_diagonal(beside, 0.0)
             inertia.append(beside.astype(qdd.dtype) @ qdd)
             viscous.append(beside.astype(qd.dtype) @ qd)
             r = ratios.astype(qd.dtype)
-            dry.append(r * self.transition(jnp.dot(r, qd)))
+            # In the place of its own joint, whose width of the transition is the motor's.
+            speeds = jnp.stack([jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))])
+            dry.append(r * self.transition(speeds)[i])
         return jnp.stack([*inertia, *viscous, *dry], axis=1)

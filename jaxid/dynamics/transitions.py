@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Hashable, matching, one_or_each
 from jaxid.types import AnyArray, Float
 
 
@@ -36,7 +37,7 @@ class Shape(NamedTuple):
         return self._replace(path=(attribute, *self.path))
 
 
-class AbstractTransition(eqx.Module):
+class AbstractTransition(Hashable):
     """How a friction force passes from one direction of motion to the other."""
 
     @abstractmethod
@@ -58,8 +59,8 @@ class Tanh(AbstractTransition):
         dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
     """
 
-    epsilon: float | Float[AnyArray, "..."] = 0.01
-    dead_zone: float | Float[AnyArray, "..."] = 0.0
+    epsilon: float | Float[AnyArray, "..."] = eqx.field(converter=one_or_each, default=0.01)
+    dead_zone: float | Float[AnyArray, "..."] = eqx.field(converter=one_or_each, default=0.0)
 
     def __check_init__(self):
         if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
@@ -70,7 +71,7 @@ class Tanh(AbstractTransition):
 
     def __call__(self, qd):
         """The smooth sign of the speed."""
-        return _outside(self.dead_zone, qd, jnp.tanh(qd / self.epsilon))
+        return _outside(self.dead_zone, qd, jnp.tanh(qd / matching("epsilon", self.epsilon, qd)))
 
     @property
     def shapes(self):
@@ -85,7 +86,7 @@ class HardSign(AbstractTransition):
         dead_zone: Speed below which there is no force [rad/s or m/s].
     """
 
-    dead_zone: float | Float[AnyArray, "..."] = 0.0
+    dead_zone: float | Float[AnyArray, "..."] = eqx.field(converter=one_or_each, default=0.0)
 
     def __call__(self, qd):
         """The sign of the speed."""
@@ -95,7 +96,8 @@ class HardSign(AbstractTransition):
 def _outside(dead_zone, qd, value):
     if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
         return value
-    return jnp.where(jnp.abs(qd) > dead_zone, value, jnp.zeros_like(value))
+    moves = jnp.abs(qd) > matching("dead_zone", dead_zone, qd)
+    return jnp.where(moves, value, jnp.zeros_like(value))
 
 
 def has_dead_zone(transition: AbstractTransition) -> bool:

@@ -172,6 +172,22 @@ def _beside(log: Path, name: str | None) -> Path | None:
     return None if name is None else log.parent / name.replace("{}", log.stem)
 
 
+def _two_forces(robot: Robot) -> list[str]:
+    """Says which of two known largest forces decides."""
+    own, motors = np.asarray(robot.limits.force), np.asarray(robot.drives.max_forces)
+    both = np.isfinite(own) & np.isfinite(motors) & ~np.isclose(own, motors, rtol=1e-6)
+    if not both.any():
+        return []
+    shown = (
+        f"{robot.joint_names[j]} {own[j]:.4g}, not {motors[j]:.4g} {robot.force_unit(j)}"
+        for j in np.flatnonzero(both).tolist()
+    )
+    return [
+        "the largest forces are those of the joints (`limits.force`), which decide before what the "
+        f"motors give through the gears (`drives.max_torques`): {'; '.join(shown)}."
+    ]
+
+
 def load_experiment(path: str | Path) -> Experiment:
     """Loads an experiment file.
 
@@ -186,7 +202,7 @@ def load_experiment(path: str | Path) -> Experiment:
     path = Path(path)
     tables, text = read_tables(path)
     robot = build_robot(tables, path)
-    notes = []
+    notes = _two_forces(robot)
     with within(path.name, "model"):
         model = Model(robot, build_terms(tables.model, robot))
     with within(path.name, "recording"):

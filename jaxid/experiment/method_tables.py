@@ -42,12 +42,12 @@ from jaxid.measurement.filters import (
     PeriodicFourier,
     ZeroPhaseButterworth,
 )
-from jaxid.measurement.units import Unit, unit
+from jaxid.measurement.units import NM, Unit, unit
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
 
-TURNS = ("deg", "rev", "deg/s", "rpm")
-LENGTHS = ("mm", "mm/s")
+TURNS = ("deg", "rev", "deg/s", "rpm", "N m")
+SLIDES = ("mm", "mm/s", "N")
 CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
 
@@ -119,6 +119,8 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
     if table.side == "joint":
         _refuse_mixed(robot, "angle_unit", table.angle_unit)
         _refuse_mixed(robot, "velocity_unit", table.velocity_unit)
+    if forces_side == "joint":
+        _refuse_mixed(robot, "force_unit", table.force_unit)
     return Columns(
         _selection(robot, "angles", table.angles),
         _selection(robot, "forces", table.forces),
@@ -132,7 +134,7 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
             if table.velocity_unit is None
             else _units(robot, "velocity_unit", table.velocity_unit)
         ),
-        force_unit=_units(robot, "force_unit", table.force_unit),
+        force_unit=_units(robot, "force_unit", _force_unit(robot, table)),
         torque_constants=table.torque_constants,
         angle_signs=table.angle_signs,
         force_signs=table.force_signs,
@@ -152,8 +154,13 @@ def _units(robot: Robot, name: str, value: str | list[str]) -> Unit | list[Unit]
     return [unit(one) for one in each(robot, name, value) or []]
 
 
+def _force_unit(robot: Robot, table: RecordingTable) -> str | list[str]:
+    """As the file says; otherwise SI units, which are the same number for both kinds of joint."""
+    return NM.symbol if table.force_unit is None else table.force_unit
+
+
 def _refuse_mixed(robot: Robot, name: str, value: str | list[str] | None) -> None:
-    """Refuses degrees for a joint that slides and millimetres for one that turns.
+    """Refuses degrees or N m for a joint that slides, and millimetres or N for one that turns.
 
     Raises:
         ValueError: If there is such a joint.
@@ -162,12 +169,12 @@ def _refuse_mixed(robot: Robot, name: str, value: str | list[str] | None) -> Non
         return
     symbols = [value] * robot.joints if isinstance(value, str) else each(robot, name, value) or []
     for label, turns, symbol in zip(robot.joint_names, robot.revolute, symbols, strict=True):
-        if symbol in (LENGTHS if turns else TURNS):
-            others = "an angle" if turns else "a length"
+        if symbol in (SLIDES if turns else TURNS):
+            kinds = ("a torque", "a force") if "force" in name else ("an angle", "a length")
             raise ValueError(
                 f'`{name}` of joint `{label}` is "{symbol}", but the joint '
                 f"{'turns' if turns else 'slides'}: give a list with one unit for each joint, of "
-                f"{others} for this one."
+                f"{kinds[not turns]} for this one."
             )
 
 

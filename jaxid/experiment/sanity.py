@@ -56,12 +56,6 @@ class LogCheck:
     warnings: tuple[str, ...]
 
 
-def known_forces(robot: Robot) -> Float[np.ndarray, " joints"]:
-    """Largest forces of the joints as far as they are known; infinite otherwise [N m or N]."""
-    own = np.asarray(robot.limits.force)
-    return np.where(np.isfinite(own), own, np.asarray(robot.drives.max_forces))
-
-
 def check_log(robot: Robot, recording: Recording, observations: Observations) -> LogCheck:
     """Compares a log with what its robot can do: a wrong unit or sign shows here.
 
@@ -189,7 +183,7 @@ def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
             f"{float(limits.velocity[j]):.3g} {unit}/s: check the units of angles and time, or "
             "lower the filter's cut-off."
         )
-    known = float(known_forces(robot)[j])
+    known = float(robot.known_max_forces[j])
     if check.force[j] > STRONG * known:
         said.append(
             f"joint `{name}` needs {check.force[j]:.3g} {robot.force_unit(j)}, but its limit is "

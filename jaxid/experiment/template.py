@@ -25,7 +25,7 @@ _TEMPLATE = """\
 #   jaxid identify {file} log.csv -o report/   parameters and torque errors
 
 [robot]
-urdf = {urdf}
+urdf = {urdf}    # as seen from the folder of this file
 {tip}      # link of the end-effector: only the chain from `base` to it
 {base}    # link that stands on the ground
 # gravity = [0.0, 0.0, -9.81]         # in the frame of the ground [m/s²]
@@ -138,7 +138,7 @@ def write_template(
     *,
     tip: str | None = None,
     base: str | None = None,
-    folder: str | Path = ".",
+    folder: str | Path | None = ".",
 ) -> str:
     """Writes a complete commented experiment file for a robot; it loads again as it is.
 
@@ -146,15 +146,18 @@ def write_template(
         urdf: The robot's URDF file.
         tip: Link of the end-effector; the end of the longest chain if None.
         base: Link that stands on the ground; the root if None.
-        folder: Where the experiment file is going to lie: the URDF's path is relative to it.
+        folder: Where the experiment file is going to lie: the URDF's path is relative to it. If
+            None, nobody knows, and the path is absolute.
 
     Raises:
         FileNotFoundError: If the URDF file does not exist.
         ValueError: If it cannot be loaded.
     """
     robot = load_urdf(urdf, tip=tip, base=base)
-    path = os.path.relpath(Path(urdf).resolve(), Path(folder).resolve())
-    return render(robot, Path(path).as_posix(), tip, base)
+    path = Path(urdf).resolve()
+    if folder is not None:
+        path = Path(os.path.relpath(path, Path(folder).resolve()))
+    return render(robot, path.as_posix(), tip, base)
 
 
 def render(robot: Robot, urdf: str, tip: str | None = None, base: str | None = None) -> str:

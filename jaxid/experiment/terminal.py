@@ -12,7 +12,8 @@ from rich.text import Text
 
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.experiment.experiment import Experiment
-from jaxid.experiment.sanity import LogCheck, known_forces
+from jaxid.experiment.sanity import LogCheck
+from jaxid.identification.excited import LARGEST_UNCERTAINTY, UndeterminedDirection
 from jaxid.identification.fit import DOUBTFUL as DOUBTFUL_SHARE
 from jaxid.identification.fit import TRUSTED, Fit, Trust
 from jaxid.identification.runs.comparison import Comparison, Verdict
@@ -172,7 +173,7 @@ def show_check(console: Console, robot: Robot, check: LogCheck, doubts: Iterable
     table.add_column("stands", justify="right")
     if not alike:
         table.add_column("units")
-    limits, forces = robot.limits, known_forces(robot)
+    limits, forces = robot.limits, robot.known_max_forces
     for j, name in enumerate(robot.joint_names):
         table.add_row(
             Text(name),
@@ -226,6 +227,12 @@ def show_rows(console: Console, observations: Iterable[Observations | LongLog], 
     )
 
 
+def _openness(direction: UndeterminedDirection) -> str:
+    if not np.isfinite(direction.uncertainty):
+        return "not moved at all"
+    return f"{percent(direction.uncertainty)} % of the forces left open"
+
+
 def show_undetermined(console: Console, fit: Fit, regularised: bool) -> None:
     """Which combinations the logs do not determine, and what to do about it."""
     if not fit.undetermined:
@@ -241,16 +248,19 @@ def show_undetermined(console: Console, fit: Fit, regularised: bool) -> None:
     sentences(
         console,
         (
-            f"{d.sentence(fit.base)} (singular value {d.singular_value:.1e} of the largest)."
+            f"{d.sentence(fit.base)} ({_openness(d)}, singular value "
+            f"{d.singular_value:.1e} of the largest)."
             for d in fit.undetermined
         ),
         BAD,
         "✗",
     )
     advice = (
-        "Estimates of these parameters mean nothing one by one, and the model may fail on other "
-        "motions. Record a motion that moves these joints in more poses, faster and in both "
-        "directions, or leave effects out in `[model]`"
+        "A combination counts as not determined if it leaves more than "
+        f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of these parameters "
+        "mean nothing one by one, and the model may fail on other motions. Record a motion that "
+        "moves these joints in more poses, faster and in both directions, or leave effects out in "
+        "`[model]`"
     )
     if regularised:
         advice += "; until then `[estimator]` keeps small what these logs do not decide."

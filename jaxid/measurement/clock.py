@@ -155,7 +155,8 @@ def said_gaps(count: int, first: float, longest: float, sample_time: float) -> l
     """That there are gaps."""
     return [
         f"{count} gap{'s' if count > 1 else ''} in time, the first after {first:.6g} s, the "
-        f"longest of {longest:.6g} s (sample time {sample_time:.6g} s), split the log into segments"
+        f"longest of {longest:.6g} s (sample time {sample_time:.6g} s), split the log into "
+        f"segments; a `largest_gap` above {longest / sample_time:.3g} would bridge them"
     ]
 
 

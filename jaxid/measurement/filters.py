@@ -44,6 +44,11 @@ class AbstractFilter(eqx.Module):
             sample_time: Time between two samples [s].
         """
 
+    @property
+    def uses_velocities(self) -> bool:
+        """Whether measured velocities, where there are any, enter the motion."""
+        return True
+
     @abc.abstractmethod
     def low_pass(self, sample_time: float) -> LowPass:
         """The zero-phase filter of forces and columns."""
@@ -51,6 +56,13 @@ class AbstractFilter(eqx.Module):
     @abc.abstractmethod
     def edge(self, sample_time: float) -> int:
         """Samples to drop at both ends of a segment, where the filters have not settled."""
+
+    def said(self, measured_velocities: bool) -> list[str]:
+        """What a user should know who gives this filter a log, in sentences."""
+        if not measured_velocities or self.uses_velocities:
+            return []
+        name = type(self).__name__
+        return [f"the measured velocities are not used: `{name}` takes them from the angles"]
 
     def smooth(
         self, x: Float[AnyArray, "samples *columns"], sample_time: float
@@ -151,6 +163,11 @@ class PaperFilter(AbstractFilter):
         _positive("PaperFilter", velocity=self.velocity, acceleration=self.acceleration)
         _refuse_negative_margin(self.margin)
 
+    @property
+    def uses_velocities(self) -> bool:
+        """Never."""
+        return False
+
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         self._refuse_slow_logs(sample_time)
         way = angles - angles[0]
@@ -187,6 +204,7 @@ class PeriodicFourier(AbstractFilter):
     One series for each segment, by least squares over all of its samples, which must span at least
     one period. Forces and columns are not averaged over the periods: least squares do that, and the
     scatter between the periods tells the uncertainty. They see a zero-phase Butterworth low-pass.
+    Measured velocities are not used.
 
     Attributes:
         period: Of the motion [s].
@@ -207,6 +225,11 @@ class PeriodicFourier(AbstractFilter):
         _positive("PeriodicFourier", period=self.period, harmonics=self.harmonics)
         _positive("PeriodicFourier", force_harmonics=self.force_harmonics, order=self.order)
         _refuse_negative_margin(self.margin)
+
+    @property
+    def uses_velocities(self) -> bool:
+        """Never."""
+        return False
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         samples = len(angles)

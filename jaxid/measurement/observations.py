@@ -235,7 +235,7 @@ def observe(
     decimation.check(filter.low_pass(dt).cutoff, dt)
     speeds = per_joint("slow", None if slow is None else np.asarray(slow, np.float64), n, 0.0)
     used, said = usable(recording.segments, filter, decimation, dt, recording.name)
-    notes = [*recording.notes, *said]
+    notes = [*recording.notes, *said, *filter.said(recording.velocities is not None)]
     angles, forces, velocities = _joint_side(recording, robot)
     motions = [
         filter.motion(angles[a:b], None if velocities is None else velocities[a:b], dt)

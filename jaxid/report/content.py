@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxid.identification.excited import UndeterminedDirection
+from jaxid.identification.excited import LARGEST_UNCERTAINTY, UndeterminedDirection
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import groups
 from jaxid.identification.solutions import AbstractSpectralSolution
@@ -104,6 +104,7 @@ def result(
                 "residual_rms": fit.residual_rms,
                 "covariance": fit.covariance,
                 "undetermined": [_direction(fit, d) for d in fit.undetermined],
+                "undetermined_above": LARGEST_UNCERTAINTY,
             },
             "errors": {
                 "identification": [_errors(e, robot) for e in identification],

@@ -96,7 +96,6 @@ def joint_table(robot: Robot) -> Table:
         robot: The robot.
     """
     limits = robot.limits
-    force = np.where(np.isfinite(limits.force), limits.force, robot.drives.max_forces)
     table = plain_table(f"{robot.name}: {robot.joints} joints")
     table.add_column("joint")
     table.add_column("moves")
@@ -105,7 +104,7 @@ def joint_table(robot: Robot) -> Table:
         ("to", limits.position_max),
         ("speed\n[unit/s]", limits.velocity),
         ("acceleration\n[unit/s²]", limits.acceleration),
-        ("largest\nforce", force),
+        ("largest\nforce", robot.known_max_forces),
     ]
     cells = []
     for title, values in columns:

@@ -244,13 +244,19 @@ class Robot(eqx.Module):
         return tuple(chains)
 
     @property
+    def known_max_forces(self) -> Float[AnyArray, " joints"]:
+        """Largest force of every joint as far as it is known; else infinite [N m or N]."""
+        own = np.asarray(self.limits.force)
+        return np.where(np.isfinite(own), own, self.drives.max_forces)
+
+    @property
     def max_forces(self) -> Float[AnyArray, " joints"]:
         """Largest force of every joint [N m or N]: its own, else that of its motors (Eq. 30).
 
         Raises:
             ValueError: If neither is known for some joint.
         """
-        forces = np.where(np.isfinite(self.limits.force), self.limits.force, self.drives.max_forces)
+        forces = self.known_max_forces
         if not np.isfinite(forces).all():
             j = int(np.flatnonzero(~np.isfinite(forces))[0])
             raise ValueError(

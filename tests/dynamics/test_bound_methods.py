@@ -9,6 +9,7 @@ from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import LinearSpring
+from jaxid.dynamics.transitions import Tanh
 from jaxid.robot.drives import Drives
 from jaxid.robot.library import planar_arm
 from jaxid.trajectory.fourier import random_fourier_series
@@ -97,3 +98,8 @@ def test_a_bound_method_of_a_model_that_is_traced():
     np.testing.assert_allclose(
         found, -2 * np.sum(np.asarray(Q) - np.array([0.3, -0.2]), axis=0), rtol=1e-12
     )
+
+
+def test_a_transition_with_a_width_for_each_joint_goes_through_jit():
+    smooth = Tanh((0.01, 0.1))
+    np.testing.assert_allclose(jax.jit(smooth)(QD[0]), smooth(QD[0]), rtol=1e-12)

@@ -5,16 +5,18 @@ import pytest
 import trees
 
 from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.friction import StribeckFriction
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import (
     CoulombFriction,
     CoupledDrives,
+    LinearSpring,
     RigidBodies,
-    Tanh,
     ViscousFriction,
 )
+from jaxid.dynamics.transitions import HardSign, Tanh
 from jaxid.robot import library as robots
 from jaxid.robot.drives import Drives
 
@@ -127,3 +129,21 @@ def test_wrong_number_of_base_parameters():
             refused(np.zeros(3))
     with _refused(r"`p` must hold one number for each standard parameter \(2\) along its last"):
         base.from_standard([1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("term", "name"),
+    [
+        (CoulombFriction(Tanh((0.01, 0.02, 0.03))), "epsilon"),
+        (CoulombFriction(Tanh(dead_zone=[0.01, 0.02, 0.03])), "dead_zone"),
+        (CoulombFriction(HardSign((0.01, 0.02, 0.03))), "dead_zone"),
+        (StribeckFriction(speed=(0.1, 0.1, 0.1)), "speed"),
+        (StribeckFriction(exponent=(1.0, 1.0, 1.0)), "exponent"),
+        (LinearSpring((0.0, 0.0, 0.1)), "rest"),
+    ],
+)
+def test_numbers_of_another_robot(term, name):
+    motion = Motion(*np.ones((3, 4, 2)))
+    model = Model(robots.planar_arm(2), (term,))
+    with _refused(rf"`{name}` must be one number for all joints or one for each \(2\), but has sh"):
+        model.regressor(motion)

@@ -321,3 +321,13 @@ def test_base_parameters_see_friction_near_standstill():
     base = base_parameters(model)
     assert {f"fs{k}" for k in range(1, 7)} < set(base.names)
     assert not base.notes
+
+
+def test_a_coupled_motor_has_the_transition_of_its_own_joint():
+    """Widths for each joint: the wrist's motor 3 turns two axes, with one friction on both."""
+    robot = TREE.robot().replace(drives=Drives.of(N, reduction=REDUCTION))
+    widths = (0.01, 0.3, 0.7)
+    found = CoupledDrives(Tanh(widths)).columns(robot, Q, QD, QDD)
+    for column, motor in zip(found[:, -2:].T, (1, 2), strict=True):
+        ratios = REDUCTION[motor] / REDUCTION[motor, motor]
+        np.testing.assert_allclose(column, ratios * np.tanh(ratios @ QD / widths[motor]))

@@ -225,3 +225,19 @@ def test_ur10_measured_velocities_agree_with_the_angles(shared_data):
             assert np.corrcoef(a[60:-60, j], b[60:-60, j])[0, 1] > 0.99
     with pytest.raises(ValueError, match="382 Hz"):
         observe(r, a_robot(6), PaperFilter())
+
+
+@pytest.mark.parametrize(
+    ("filter", "ignored"),
+    [
+        (ZeroPhaseButterworth(10.0), ""),
+        (PaperFilter(), "PaperFilter"),
+        (PeriodicFourier(2.0, 3), "PeriodicFourier"),
+    ],
+)
+def test_measured_velocities_that_are_not_used_are_mentioned(filter, ignored):
+    r = a_recording()
+    expected = [f"the measured velocities are not used: `{ignored}` takes them from the angles"]
+    assert list(observe(r, a_robot(), filter).notes) == (expected if ignored else [])
+    without = dataclasses.replace(r, velocities=None)
+    assert observe(without, a_robot(), filter).notes == ()

@@ -132,3 +132,12 @@ def test_is_a_pytree():
     np.testing.assert_array_equal(doubled.forces, 2 * r.forces)
     assert eqx.tree_equal(jax.tree.map(lambda x: x / 2, doubled), r)
     assert hash(jax.tree.structure(r)) is not None
+
+
+def test_gaps_are_said_with_the_key_that_bridges_them():
+    t = 0.01 * np.arange(200.0)
+    t[120:] += 0.05
+    note = recording(t).notes[0]
+    assert "1 gap in time" in note
+    bridging = float(note.split("`largest_gap` above ")[1].split()[0])
+    assert recording(t, largest_gap=1.05 * bridging).segments == ((0, 205),)
