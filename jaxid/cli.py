@@ -1,11 +1,7 @@
 """The command line: `jaxid init`, `inspect`, `identify`, `compare` and `example`."""
 
 import dataclasses
-import dis
 import importlib.metadata
-import os
-import stat
-import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +14,8 @@ from typer.core import TyperCommand
 
 from jaxid.experiment import terminal
 from jaxid.experiment.experiment import Experiment, load_experiment
-from jaxid.experiment.folder import refuse_foreign_folder
+from jaxid.experiment.failures import is_for_the_user, sentence
+from jaxid.experiment.folder import output_folder, refuse_foreign_folder
 from jaxid.experiment.loading import Loaded, load_log
 from jaxid.experiment.progress import Stages, stages
 from jaxid.experiment.sanity import negative_friction
@@ -53,6 +50,10 @@ ExperimentFile = Annotated[
     Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
 ]
 
+Force = Annotated[
+    bool, typer.Option("--force", help="Write into a folder that holds other files too.")
+]
+
 
 class SpreadVerify(TyperCommand):
     """Takes `--verify b.csv c.csv` for `--verify b.csv --verify c.csv`; `--verify=b.csv` alike.
@@ -81,32 +82,10 @@ def main() -> None:
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
-        if not _is_for_the_user(error):
+        if not is_for_the_user(error):
             raise
-        _console(stderr=True).print(Text(f"jaxid: {_sentence(error)}"), soft_wrap=True)
+        _console(stderr=True).print(Text(f"jaxid: {sentence(error)}"), soft_wrap=True)
         raise SystemExit(2) from None
-
-
-def _is_for_the_user(error: Exception) -> bool:
-    """Whether it comes from a file, or was raised by name in this package: not from a bug."""
-    if isinstance(error, OSError):
-        return True
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    # The package, not the module: that is called `__main__` where it is run with `python -m`.
-    package = "" if trace is None else trace.tb_frame.f_globals.get("__package__") or ""
-    if trace is None or package.partition(".")[0] != "jaxid":
-        return False
-    # NumPy's own errors have no frame below ours: only a `raise` statement is a sentence.
-    return trace.tb_frame.f_code.co_code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
-
-
-def _sentence(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        where = f"`{error.filename}`: " if error.filename else ""
-        return f"{where}{error.strerror}."
-    return str(error)
 
 
 def _console(stderr: bool = False) -> Console:
@@ -147,21 +126,7 @@ def init(
 
     Like this: jaxid init arm.urdf > experiment.toml
     """
-    folder = None if _goes_elsewhere() else Path()
-    typer.echo(write_template(urdf, tip=tip, base=base, folder=folder), nl=False)
-
-
-def _goes_elsewhere() -> bool:
-    """Whether the output is redirected into a file of another folder than this."""
-    try:
-        status = os.fstat(sys.stdout.fileno())
-    except (OSError, ValueError):
-        return False
-    if not stat.S_ISREG(status.st_mode):
-        return False
-    return not any(
-        os.path.samestat(status, entry.stat(follow_symlinks=False)) for entry in os.scandir()
-    )
+    typer.echo(write_template(urdf, tip=tip, base=base, folder=output_folder()), nl=False)
 
 
 @app.command()
@@ -252,9 +217,7 @@ def identify(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the report.")
     ] = Path("report"),
-    force: Annotated[
-        bool, typer.Option("--force", help="Write into a folder that holds other files too.")
-    ] = False,
+    force: Force = False,
 ) -> None:
     """Estimate the parameters and write a report.
 
@@ -340,9 +303,7 @@ def compare(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of table and figure.")
     ] = Path("comparison"),
-    force: Annotated[
-        bool, typer.Option("--force", help="Write into a folder that holds other files too.")
-    ] = False,
+    force: Force = False,
 ) -> None:
     """Decide which parameters have changed between two runs.
 

@@ -1,6 +1,9 @@
-"""Whether a folder may take a report or a comparison."""
+"""Folders: whether one may take a report or a comparison, and where the output ends up."""
 
 import json
+import os
+import stat
+import sys
 from pathlib import Path
 
 from jaxid.report import compared_files, content
@@ -39,3 +42,15 @@ def _has(path: Path, schema: str) -> bool:
         return str(found["schema"]).startswith(schema.split("/")[0])
     except (OSError, ValueError, KeyError, TypeError):
         return False
+
+
+def output_folder() -> Path | None:
+    """This folder, or None if the output is redirected into a file of another one."""
+    try:
+        status = os.fstat(sys.stdout.fileno())
+    except (OSError, ValueError):
+        return Path()
+    if not stat.S_ISREG(status.st_mode):
+        return Path()
+    here = (entry.stat(follow_symlinks=False) for entry in os.scandir())
+    return Path() if any(os.path.samestat(status, one) for one in here) else None

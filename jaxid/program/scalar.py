@@ -8,7 +8,6 @@ The rules keep the value of every finite computation up to the rounding of one o
 the result: check inputs before they come here.
 """
 
-import math
 from typing import overload
 
 from jaxid.program.operation import COMMUTATIVE, EVEN, ODD, TRUTH_VALUED, Operation, on_constants
@@ -244,8 +243,3 @@ def as_truth(x: Operand) -> Operand:
     if not isinstance(x, Scalar):
         return bool(x)
     return x if x.operation in TRUTH_VALUED else apply(Operation.NOT_EQUAL, x, 0.0)
-
-
-def is_zero(x: Operand) -> bool:
-    """Whether x is the constant 0."""
-    return not isinstance(x, Scalar) and not math.isnan(x) and x == 0

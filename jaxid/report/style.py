@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
-BLUE, ORANGE, VERMILION, GREEN = "#0072B2", "#E69F00", "#D55E00", "#009E73"
+BLUE, ORANGE, VERMILION = "#0072B2", "#E69F00", "#D55E00"
 INK, GREY, PALE = "#22262b", "#5f6b78", "#d5dae0"
 MEASURED, PREDICTED, ERROR = "#9aa6b2", VERMILION, BLUE
 

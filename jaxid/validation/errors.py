@@ -105,7 +105,7 @@ def torque_errors(
         progress: Is told now and then which share of a long log is done, of 1.
     """
     robot = fit.base.model.robot
-    known = np.where(np.isfinite(robot.limits.force), robot.limits.force, robot.drives.max_forces)
+    known = robot.known_max_forces
     known = np.where(np.isfinite(known), known, np.nan)
     if isinstance(observations, LongLog):
         every = compared_rows(observations)
