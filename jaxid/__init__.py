@@ -23,6 +23,16 @@ from jaxid.dynamics.terms import ViscousFriction as ViscousFriction
 from jaxid.dynamics.transitions import AbstractTransition as AbstractTransition
 from jaxid.dynamics.transitions import HardSign as HardSign
 from jaxid.dynamics.transitions import Tanh as Tanh
+from jaxid.excitation.constraints.constraint import AbstractConstraint as AbstractConstraint
+from jaxid.excitation.criteria import AbstractCriterion as AbstractCriterion
+from jaxid.excitation.criteria import AOptimal as AOptimal
+from jaxid.excitation.criteria import ConditionNumber as ConditionNumber
+from jaxid.excitation.criteria import DOptimal as DOptimal
+from jaxid.excitation.criteria import EOptimal as EOptimal
+from jaxid.excitation.criteria import ScaledConditionNumber as ScaledConditionNumber
+from jaxid.excitation.criteria import WeightedConditionNumber as WeightedConditionNumber
+from jaxid.excitation.design import design_excitation as design_excitation
+from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
 from jaxid.identification.batches import identify_batch as identify_batch
 from jaxid.identification.bootstrap import bootstrap as bootstrap
 from jaxid.identification.devices import factorise_across_processes as factorise_across_processes

@@ -16,12 +16,12 @@ import numpy as np
 
 from jaxid.arrays import is_traced
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.estimators import WeightedLeastSquares
 from jaxid.identification.factors import CHUNK, Blocks, Factors, JointFactor
 from jaxid.identification.geometries import geometries
 from jaxid.identification.identify import fit_blocks
-from jaxid.identification.joint_rows import JointRows
 from jaxid.identification.normal_equations import BatchFit, DataSets, solve
 from jaxid.identification.weights import GivenWeights
 from jaxid.robot.robot import Robot

@@ -19,9 +19,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
+from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.factors import Blocks, Factors, JointFactor, factorise
-from jaxid.identification.joint_rows import JointRows
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Array, Float, require_float64
 

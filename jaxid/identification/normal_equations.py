@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
-from jaxid.identification.joint_rows import JointRows
 from jaxid.types import AnyArray, Array, Bool, Float
 
 AT_ONCE = 4096

@@ -1,0 +1,262 @@
+"""Designs the motion of an experiment (Eq. 36)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.excitation.constraints.constraint import AbstractConstraint
+from jaxid.excitation.criteria import AbstractCriterion, DOptimal
+from jaxid.excitation.limits import JointLimits
+from jaxid.excitation.plan import ExcitationPlan
+from jaxid.excitation.polish import Polish
+from jaxid.excitation.problem import Problem
+from jaxid.excitation.search import Best, Search, Searched, random_starts
+from jaxid.excitation.state import fingerprint, load_state, save_state
+from jaxid.robot.limits import Limits
+from jaxid.trajectory.basis import AbstractBasis, FourierBasis
+from jaxid.types import AnyArray, Float, PRNGKeyArray, require_float64
+
+NOISE = 0.01
+"""Standard deviation of the noise that is assumed, as a share of the largest forces."""
+REFERENCES = 8
+"""Random motions that give the parameters their sizes."""
+
+
+class DesignProgress(NamedTuple):
+    """How far a design is.
+
+    Attributes:
+        share: Done, of 1.
+        doing: What comes next, in words.
+        best: Value of the criterion for the best motion so far that keeps all limits, or of the
+            best in all if none does.
+        feasible: Whether it keeps all limits.
+    """
+
+    share: float
+    doing: str
+    best: float
+    feasible: bool
+
+
+class _State(NamedTuple):
+    """Everything that a design has done so far."""
+
+    searched: Searched
+    order: np.ndarray
+    polished: int
+    best: Best
+
+
+def design_excitation(
+    base: BaseParameters,
+    *,
+    limits: Limits | None = None,
+    harmonics: int = 5,
+    omega: float = 0.8,
+    basis: AbstractBasis | None = None,
+    criterion: AbstractCriterion | None = None,
+    constraints: tuple[AbstractConstraint, ...] = (),
+    starts: int = 32,
+    polish: int = 4,
+    key: PRNGKeyArray | None = None,
+    noise: Float[AnyArray, " joints"] | None = None,
+    prior: Float[AnyArray, "base base"] | None = None,
+    nominal: Float[AnyArray, " base"] | None = None,
+    samples: int = 800,
+    progress: Callable[[DesignProgress], None] | None = None,
+    state: str | Path | None = None,
+    resume: bool = False,
+    throw: bool = True,
+) -> ExcitationPlan:
+    r"""Finds the motion that determines the base parameters best within all limits (Eq. 36).
+
+    Many random starts are improved at once by an interior point method that is JAX from end to end;
+    the best of them are polished one by one. Joint limits hold for all times, not only at samples.
+    Ctrl-C ends the design with the best motion so far. The same key gives the same motion.
+
+    Args:
+        base: Whose parameters the motion shall determine.
+        limits: Of the joints; the robot's own if None. What is unknown is assumed as in
+            `random_fourier_series`.
+        harmonics: Number of harmonics of the Fourier series.
+        omega: Its ground frequency [rad/s].
+        basis: Trajectories to choose from, in place of Fourier series: for instance
+            `RestToRestBasis`. `harmonics` and `omega` are not used then.
+        criterion: What is made small; D-optimality if None.
+        constraints: What must be kept beside the joints' limits.
+        starts: Random motions to start from.
+        polish: How many of the best are polished; 0 for the path that is JAX alone.
+        key: Of the random motions; `jax.random.key(0)` if None.
+        noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
+            if None. The weights of the criterion are its inverse, like the estimator's.
+        prior: Information of earlier experiments in the same noise, the inverse of their
+            covariance: the design adds to it.
+        nominal: Base parameters as far as they are known, for relative deviations.
+        samples: Measured samples of one run of the motion.
+        progress: Is told after each step how far the design is.
+        state: File in which the design keeps its state, so that it can be resumed.
+        resume: Goes on from the state file if there is one.
+        throw: Whether a design that finds no feasible motion is an error; otherwise the plan says
+            which limits are not kept.
+
+    Raises:
+        ValueError: If arguments do not fit, or no motion keeps all constraints: the message says
+            which limit is exceeded, and by how much.
+        RuntimeError: If JAX runs in single precision.
+    """
+    require_float64("designing a motion")
+    criterion = DOptimal() if criterion is None else criterion
+    basis = FourierBasis(harmonics, omega) if basis is None else basis
+    key = jax.random.key(0) if key is None else key
+    _check(base, criterion, starts, polish, samples, prior)
+    robot = base.model.robot
+    noise = NOISE * np.asarray(robot.max_forces) if noise is None else np.asarray(noise, float)
+    if noise.shape != (robot.joints,) or not (noise > 0).all():
+        raise ValueError(
+            f"`noise` must hold one positive number for each joint ({robot.joints}), "
+            f"but is {noise}."
+        )
+    problem = Problem(
+        base,
+        JointLimits.of(robot, basis, limits),
+        criterion,
+        tuple(constraints),
+        weights=1.0 / noise,
+        prior=np.zeros((base.size, base.size)) if prior is None else np.asarray(prior),
+        sizes=np.ones(base.size),
+        measured=samples,
+    )
+    problem.sizes = _sizes(problem)
+    design = _Design(problem, starts, polish, progress, None if state is None else Path(state))
+    found, interrupted = design.run(key, resume)
+    plan = _plan(problem, found, key, starts, noise, nominal, interrupted)
+    if throw and not plan.feasible:
+        raise ValueError("no motion was found that keeps all limits: " + "; ".join(plan.diagnosis))
+    return plan
+
+
+def _check(base, criterion, starts, polish, samples, prior) -> None:
+    for name, value, least in (
+        ("starts", starts, 1),
+        ("polish", polish, 0),
+        ("samples", samples, 2),
+    ):
+        if value < least:
+            raise ValueError(f"`{name}` must be at least {least}, but is {value}.")
+    if prior is not None and np.shape(prior) != (base.size, base.size):
+        raise ValueError(
+            f"`prior` must be a matrix of the {base.size} base parameters, but has shape "
+            f"{np.shape(prior)}."
+        )
+    if prior is not None and not criterion.weighted:
+        raise ValueError(
+            f"`prior` is in units of the noise, which the {criterion.name} does not know: choose "
+            "a weighted criterion."
+        )
+
+
+class _Design:
+    """The steps of a design, one after the other."""
+
+    def __init__(self, problem, starts, polish, progress, path):
+        self._problem, self._progress, self._path = problem, progress, path
+        self._search = Search(problem, starts)
+        self._polish = Polish(problem)
+        self._polished = min(polish, starts)
+        self._starts = starts
+
+    def run(self, key: PRNGKeyArray, resume: bool) -> tuple[_State, bool]:
+        """All steps; the last state, and whether Ctrl-C has ended them."""
+        p = self._problem
+        digest = fingerprint(
+            (p.base, p.limits, p.criterion, p.constraints, p.weights, p.prior),
+            [type(x).__name__ for x in (p.criterion, p.basis, *p.constraints)],
+            (repr(p.basis), p.measured, self._starts, self._polished),
+            jax.random.key_data(key),
+        )
+        searched = self._search.begin(key)
+        state = _State(searched, searched.best.order(), 0, searched.best)
+        if resume and self._path is not None and self._path.is_file():
+            state = load_state(self._path, digest, state)
+            state = jax.tree.map(np.asarray, state)
+        total = self._search.legs + 4 * self._polished
+        try:
+            self._tell(state, total)
+            while (step := self._next(state)) is not None:
+                state = step
+                if self._path is not None:
+                    save_state(self._path, digest, state)
+                self._tell(state, total)
+        except KeyboardInterrupt:
+            return state, True
+        return state, False
+
+    def _next(self, state: _State) -> _State | None:
+        if int(state.searched.leg) < self._search.legs:
+            searched = self._search.advance(state.searched)
+            return _State(searched, searched.best.order(), 0, searched.best)
+        if int(state.polished) >= self._polished:
+            return None
+        start = int(state.order[int(state.polished)])
+        y = self._polish(state.searched.best.y[start])
+        x = np.asarray(self._problem.limits.numbers(y))
+        value, excess = self._problem.value(x), self._problem.excess(x)
+        old = state.best
+        worse = max(float(old.excess[start]), 0.0), float(old.value[start])
+        if np.isfinite(value) and (max(excess, 0.0), value) < worse:
+            best = Best(*(np.array(part) for part in old))
+            best.y[start], best.value[start], best.excess[start] = y, value, excess
+            old = best
+        return state._replace(polished=int(state.polished) + 1, best=old)
+
+    def _tell(self, state: _State, total: int) -> None:
+        if self._progress is None:
+            return
+        done = int(state.searched.leg) + 4 * int(state.polished)
+        first = int(state.best.order()[0])
+        searching = int(state.searched.leg) < self._search.legs
+        self._progress(
+            DesignProgress(
+                done / total,
+                "searching from many starts" if searching else "polishing the best",
+                float(np.exp(state.best.value[first])),
+                bool(state.best.excess[first] <= 0.0),
+            )
+        )
+
+
+def _sizes(problem: Problem) -> np.ndarray:
+    """The deviation of each parameter in random motions if it were the only unknown one."""
+    random = _numbers(problem, random_starts(problem.limits, jax.random.key(0), REFERENCES))
+    squares = np.mean([np.diag(problem.information(x).weighted) for x in random], axis=0)
+    return 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
+
+
+def _numbers(problem: Problem, y: Float[AnyArray, "starts scaled"]) -> list[np.ndarray]:
+    return [np.asarray(problem.limits.numbers(np.asarray(one))) for one in y]
+
+
+def _plan(problem, state: _State, key, starts, noise, nominal, interrupted) -> ExcitationPlan:
+    first = int(state.best.order()[0])
+    (x,) = _numbers(problem, state.best.y[first][None])
+    middle = int(np.argsort(np.asarray(state.searched.first))[starts // 2])
+    random = _numbers(problem, random_starts(problem.limits, key, starts))[middle]
+    return ExcitationPlan(
+        base=problem.base,
+        trajectory=problem.basis.trajectory(x),
+        criterion=problem.criterion,
+        limits=problem.limits,
+        numbers=x,
+        information=problem.information(x),
+        reference=problem.information(random),
+        noise=noise,
+        samples=problem.measured,
+        findings=tuple(problem.findings(x)),
+        nominal=None if nominal is None else np.asarray(nominal),
+        interrupted=interrupted,
+    )

@@ -1,0 +1,166 @@
+"""The search from many starts at once: relaxed limits first, then tight ones; the best is kept.
+
+Everything a search knows between two legs is in its state, so it can be stopped, saved and resumed.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.excitation.interior_point import InteriorPoint, Stage, State
+from jaxid.excitation.limits import CERTIFIED, JointLimits, held_within, random_motion
+from jaxid.excitation.problem import Context, Problem
+from jaxid.types import AnyArray, Array, Float, PRNGKeyArray
+
+GRID = 64
+"""Rows of each order by which limits are kept during the search."""
+GROWTH = 1.05
+"""Most by which a motion is enlarged to meet its limits in the end."""
+FIRST_WEIGHT = 30.0
+"""Weight of constraints that are not kept, at the start."""
+LAST_WEIGHT = 3e4
+"""The largest it becomes."""
+HEAVIER = 3.0
+"""Its growth with every leg within the limits."""
+TIGHT = 0.998
+"""Share of the limits within which legs end: what is left is for rounding."""
+
+
+class Leg(NamedTuple):
+    """A stage of the interior point method, and what goes with it.
+
+    Attributes:
+        stage: Of the method.
+        sharpness: Of smooth extremes.
+        judged: Whether its results are compared with the best so far.
+    """
+
+    stage: Stage
+    sharpness: float
+    judged: bool
+
+
+LEGS = (
+    Leg(Stage(2.0, 1e-2, 1e-3, 80), 4.0, False),
+    Leg(Stage(1.5, 1e-3, 1e-3, 40), 4.0, False),
+    Leg(Stage(1.25, 1e-3, 1e-3, 40), 4.0, False),
+    Leg(Stage(1.1, 1e-3, 1e-3, 40), 4.0, False),
+    Leg(Stage(TIGHT, 1e-3, 1e-5, 100), 4.0, False),
+    Leg(Stage(TIGHT, 1e-3, 1e-6, 100), 4.0, True),
+    Leg(Stage(TIGHT, 1e-3, 1e-6, 150), 8.0, False),
+    Leg(Stage(TIGHT, 1e-3, 1e-6, 150), 8.0, True),
+    Leg(Stage(1.3, 1e-3, 1e-3, 60), 8.0, False),
+    Leg(Stage(TIGHT, 1e-3, 1e-6, 125), 8.0, False),
+    Leg(Stage(TIGHT, 1e-3, 1e-6, 125), 8.0, True),
+    Leg(Stage(TIGHT, 1e-3, 1e-6, 150), 20.0, True),
+)
+"""Relaxed limits, then the limits; once more a little relaxed; sharper in the end."""
+
+
+class Best(NamedTuple):
+    """The best motion of each start so far, certified to keep the joints' limits.
+
+    Attributes:
+        y: Scaled numbers.
+        value: The criterion's logarithm, exact.
+        excess: Relative excess of the worst constraint; not positive where all are kept.
+    """
+
+    y: Float[AnyArray, "starts scaled"]
+    value: Float[AnyArray, " starts"]
+    excess: Float[AnyArray, " starts"]
+
+    def order(self) -> np.ndarray:
+        """Starts from the best to the worst; what keeps its constraints comes first."""
+        broken = np.maximum(np.asarray(self.excess), 0.0)
+        return np.lexsort((np.asarray(self.value), broken))
+
+
+class Searched(NamedTuple):
+    """What a search knows between two legs."""
+
+    state: State
+    multipliers: Float[AnyArray, "starts samples values"]
+    weight: Float[AnyArray, ""]
+    leg: int
+    first: Float[AnyArray, " starts"]
+    best: Best
+
+
+class Search:
+    """The search for one problem.
+
+    Args:
+        problem: What is to be found.
+        starts: Number of starts.
+    """
+
+    def __init__(self, problem: Problem, starts: int):
+        self._problem, self._starts = problem, starts
+        limits = problem.limits
+        self._solver = InteriorPoint(problem.objective(), limits.grid(GRID), limits.still)
+        self._fine = limits.grid(CERTIFIED)
+        growth = 1.0 if problem.constraints else GROWTH
+        self._restore = jax.jit(
+            jax.vmap(lambda y: held_within(self._fine, limits.still, y, self._fine.bound, growth))
+        )
+        self._excess = jax.jit(lambda y: problem.constrained(y, problem.seen))
+
+    def begin(self, key: PRNGKeyArray) -> Searched:
+        """Random motions that fill their limits."""
+        y, starts = random_starts(self._problem.limits, key, self._starts), self._starts
+        best = self._judged(y)
+        none = jnp.zeros((starts, self._problem.seen, self._problem.entries))
+        weight = jnp.asarray(FIRST_WEIGHT)
+        return Searched(self._solver.start(y), none, weight, 0, best.value, best)
+
+    def advance(self, searched: Searched) -> Searched:
+        """The next leg."""
+        leg = LEGS[searched.leg]
+        context = Context(jnp.asarray(leg.sharpness), searched.multipliers, searched.weight)
+        state = self._solver.run(searched.state, leg.stage, context)
+        multipliers, weight = searched.multipliers, searched.weight
+        if self._problem.constraints and leg.stage.bound <= 1.0:
+            excess = self._excess(state.y)
+            multipliers = jnp.maximum(0.0, multipliers + weight * excess)
+            weight = jnp.minimum(HEAVIER * weight, LAST_WEIGHT)
+        best = searched.best
+        if leg.judged:
+            best = _better(best, self._judged(self._restore(state.y)))
+        return Searched(state, multipliers, weight, searched.leg + 1, searched.first, best)
+
+    @property
+    def legs(self) -> int:
+        """Number of legs."""
+        return len(LEGS)
+
+    def _judged(self, y: Array) -> Best:
+        numbers = [np.asarray(self._problem.limits.numbers(np.asarray(one))) for one in y]
+        values = np.array([self._problem.value(x) for x in numbers])
+        excess = np.array([self._problem.excess(x) for x in numbers])
+        return Best(np.asarray(y), np.where(np.isfinite(values), values, np.inf), excess)
+
+
+def random_starts(
+    limits: JointLimits, key: PRNGKeyArray, starts: int
+) -> Float[Array, "starts scaled"]:
+    """Motions with random shapes and places that fill their limits, in scaled numbers."""
+    joints, variables = limits.shape
+    fine = limits.grid(CERTIFIED)
+    shape, place = jax.random.split(key)
+    draws = jax.random.normal(shape, (starts, joints * variables), float)
+    places = jax.random.uniform(place, (starts, joints), float)
+    return jax.vmap(lambda a, b: random_motion(fine, limits.still, a, b))(draws, places)
+
+
+def _better(old: Best, new: Best) -> Best:
+    """Start by start the better of two."""
+    a, b = np.maximum(old.excess, 0.0), np.maximum(new.excess, 0.0)
+    improved = (b < a) | ((b == a) & (new.value < old.value))
+    return Best(
+        np.where(improved[:, None], new.y, old.y),
+        np.where(improved, new.value, old.value),
+        np.where(improved, new.excess, old.excess),
+    )

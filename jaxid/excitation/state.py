@@ -1,0 +1,63 @@
+"""The state of a design as a file: written whole, and only read back for the same problem."""
+
+import hashlib
+import io
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxid.files import written_whole
+
+
+def fingerprint(*parts: Any) -> str:
+    """A digest of everything that a result depends on: numbers by their bits, the rest by name."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(parts, is_leaf=lambda x: x is None):
+        array = np.asarray(leaf) if not isinstance(leaf, str) and leaf is not None else None
+        if array is None or array.dtype == object:
+            digest.update(str(leaf).encode())
+        else:
+            digest.update(f"{array.shape}{array.dtype.str}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+def save_state(path: Path, digest: str, state: Any) -> None:
+    """Writes a state, or leaves the file as it was.
+
+    Args:
+        path: Of the file.
+        digest: Of the problem that the state belongs to.
+        state: Any tree of arrays and numbers.
+    """
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+    buffer = io.BytesIO()
+    np.savez(buffer, np.array(digest), *leaves)
+    with written_whole(path.parent) as folder:
+        (folder / path.name).write_bytes(buffer.getvalue())
+
+
+def load_state(path: Path, digest: str, like: Any) -> Any:
+    """Reads a state that was saved for the same problem.
+
+    Args:
+        path: Of the file.
+        digest: Of the problem.
+        like: A state of the same structure.
+
+    Raises:
+        ValueError: If the file is no state, or belongs to another problem.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            arrays = [content[f"arr_{k}"] for k in range(len(content.files))]
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ValueError(f"`{path}` is no saved state of a design: remove it.") from error
+    structure = jax.tree.structure(like)
+    if str(arrays[0]) != digest or len(arrays) - 1 != structure.num_leaves:
+        raise ValueError(
+            f"`{path}` was saved by a design with other settings: use those again, or remove the "
+            "file to start anew."
+        )
+    return jax.tree.unflatten(structure, arrays[1:])

@@ -1,0 +1,42 @@
+"""A small arm whose programs compile in a second, and its base parameters."""
+
+import numpy as np
+import pytest
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.robot import library
+from jaxid.robot.limits import Limits
+
+
+@pytest.fixture(scope="package")
+def arm():
+    return library.planar_arm(2).replace(
+        limits=Limits.of(
+            2,
+            position_min=[-2.0, -1.0],
+            position_max=[1.0, 2.5],
+            velocity=[2.0, 3.0],
+            acceleration=[4.0, 9.0],
+            force=[80.0, 20.0],
+        )
+    )
+
+
+@pytest.fixture(scope="package")
+def base(arm):
+    return base_parameters(Model(arm))
+
+
+@pytest.fixture(scope="package")
+def pendulum():
+    """The base parameters of one joint, for designs that differ in their settings."""
+    limits = Limits.of(
+        1, position_min=[-2.0], position_max=[2.0], velocity=[2.0], acceleration=[4.0], force=[9.0]
+    )
+    return base_parameters(Model(library.planar_arm(1).replace(limits=limits)))
+
+
+@pytest.fixture(scope="package")
+def random():
+    return np.random.default_rng(0)

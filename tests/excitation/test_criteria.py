@@ -1,0 +1,136 @@
+"""Contract of every criterion, and each against its textbook formula in NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxid.dynamics.motion import Motion
+from jaxid.excitation import criteria as members
+from jaxid.excitation.information import Information, InformationMap, information
+from jaxid.excitation.plan import CRITERIA, deviations
+from jaxid.excitation.spectral import log_condition, spectral
+from jaxid.trajectory.basis import FourierBasis
+
+SIZE = 7
+
+
+def sample(seed=0, size=SIZE):
+    random = np.random.default_rng(seed)
+    A, B = random.standard_normal((2, 30, size)) * np.geomspace(0.1, 10.0, size)
+    return Information(A.T @ A, B.T @ B, np.geomspace(2.0, 0.5, size))
+
+
+def changed(information, D, h):
+    return Information(information.plain + h * D, information.weighted + h * D, information.sizes)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: type(c).__name__)
+@pytest.mark.parametrize("sharpness", [None, 8.0])
+def test_gradients_are_central_differences(criterion, sharpness):
+    info = jax.tree.map(jnp.asarray, sample())
+    random, h = np.random.default_rng(1), 1e-5
+    g = jax.grad(lambda i: criterion(i, sharpness))(info)
+    total = np.asarray(g.plain + g.weighted)
+    for _ in range(4):
+        D = random.standard_normal((SIZE, SIZE))
+        D = D + D.T
+        up, down = (criterion(changed(info, D, s * h), sharpness) for s in (1, -1))
+        slope = float(up - down) / (2 * h)
+        assert abs(np.sum(total * D) - slope) <= 1e-6 * np.linalg.norm(total) * np.linalg.norm(D)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: type(c).__name__)
+def test_smooth_values_lie_above_the_exact_ones_and_approach_them(criterion):
+    info = jax.tree.map(jnp.asarray, sample())
+    exact, blunt, sharp = (float(criterion(info, p)) for p in (None, 4.0, 100.0))
+    assert blunt >= sharp - 1e-12 >= exact - 1e-9
+    assert sharp - exact < 0.05
+
+
+def test_values_are_the_textbooks():
+    info = sample(2)
+    V = info.weighted
+    S = np.diag(info.sizes)
+    scaled = V / np.sqrt(np.outer(np.diag(V), np.diag(V)))
+    expected = {
+        members.ConditionNumber: np.linalg.cond(info.plain),
+        members.WeightedConditionNumber: np.linalg.cond(V),
+        members.ScaledConditionNumber: np.linalg.cond(scaled),
+        members.DOptimal: np.linalg.det(V) ** (-0.5 / SIZE),
+        members.AOptimal: np.sqrt(np.trace(np.linalg.inv(S @ V @ S)) / SIZE),
+        members.EOptimal: np.sqrt(np.linalg.norm(np.linalg.inv(S @ V @ S), 2)),
+    }
+    for criterion in CRITERIA:
+        assert criterion.value(info) == pytest.approx(expected.pop(type(criterion)), rel=1e-8)
+    assert not expected
+
+
+def test_own_sizes_replace_those_of_random_motions():
+    info, sizes = sample(), np.full(SIZE, 3.0)
+    for kind in (members.AOptimal, members.EOptimal):
+        same = Information(info.plain, info.weighted, sizes)
+        assert kind(sizes).value(info) == pytest.approx(kind().value(same))
+
+
+def test_units_and_the_choice_of_base_parameters_do_not_move_the_d_optimum():
+    one, two = sample(0), sample(1)
+    T = np.random.default_rng(5).standard_normal((SIZE, SIZE))
+    d = members.DOptimal()
+
+    def log(information, T):
+        w = jnp.asarray(T.T @ information.weighted @ T)
+        return float(d(Information(w, w, information.sizes)))
+
+    here = log(one, np.eye(SIZE)) - log(two, np.eye(SIZE))
+    assert log(one, T) - log(two, T) == pytest.approx(here, rel=1e-9)
+
+
+def test_equal_eigenvalues_are_differentiated():
+    g = jax.grad(lambda L: spectral(log_condition, L, 8.0))(2.0 * jnp.eye(4))
+    assert np.isfinite(g).all()
+
+
+def test_compiled_information_is_that_of_all_samples(base, random):
+    basis = FourierBasis(3, 1.2)
+    x = random.standard_normal((5, 2, basis.variables))
+    weights, prior = np.array([0.1, 0.7]), 1e-3 * np.eye(base.size)
+    made = InformationMap.of(
+        base,
+        basis,
+        evaluated=50,
+        measured=50,
+        weights=weights,
+        prior=prior,
+        sizes=np.ones(base.size),
+    )(jnp.asarray(x))
+    for k, one in enumerate(x):
+        motion = basis.trajectory(one).motion(basis.times(50))
+        theta = np.asarray(base.regressor(motion))
+        plain = np.einsum("sji,sjk->ik", theta, theta)
+        weighted = np.einsum("sji,j,sjk->ik", theta, weights**2, theta) + prior
+        exact = information(base, motion, weights, prior)
+        for got, asked in (
+            (made.plain[k], plain),
+            (made.weighted[k], weighted),
+            (exact.plain, plain),
+            (exact.weighted, weighted),
+        ):
+            np.testing.assert_allclose(got, asked, atol=1e-10 * np.abs(asked).max())
+
+
+def test_deviations_are_those_of_the_inverse_and_infinite_where_nothing_is_known():
+    V = sample().weighted
+    np.testing.assert_allclose(deviations(V), np.sqrt(np.diag(np.linalg.inv(V))), rtol=1e-8)
+    A = np.random.default_rng(0).standard_normal((30, 4))
+    A[:, 2] = 0.0
+    A[:, 1] = A[:, 0]
+    found = deviations(A.T @ A)
+    np.testing.assert_array_equal(np.isinf(found), [True, True, True, False])
+
+
+def test_information_counts_samples(base):
+    still = Motion(*np.zeros((3, 10, 2)))
+    twice = Motion(*np.zeros((3, 20, 2)))
+    one, two = (information(base, m, np.ones(2)).plain for m in (still, twice))
+    np.testing.assert_allclose(2 * one, two)

@@ -1,0 +1,74 @@
+"""Limits as matrices: random and restored motions keep them at all times, and use them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxid.excitation.limits import JointLimits, held_within, random_motion
+from jaxid.robot.limits import Limits
+from jaxid.trajectory.basis import FourierBasis
+from jaxid.trajectory.rest import RestToRestBasis
+from jaxid.trajectory.spline import RestToRestSplineBasis
+
+BASES = (FourierBasis(4, 1.1), RestToRestBasis(4, 1.1), RestToRestSplineBasis(12, 6.0))
+
+
+@pytest.fixture(params=BASES, ids=lambda b: type(b).__name__)
+def limits(request, arm):
+    return JointLimits.of(arm, request.param)
+
+
+def peaks(limits, x, samples=8000):
+    """Largest relative excess of any limit, from dense samples and no envelope."""
+    rows = limits.basis.rows(np.linspace(0.0, limits.basis.duration, samples))
+    q, qd, qdd = (part @ np.asarray(x).T for part in rows[:3])
+    own = limits.limits
+    half = (own.position_max - own.position_min) / 2
+    return max(
+        ((q - own.position_max) / half).max(),
+        ((own.position_min - q) / half).max(),
+        (np.abs(qd) / own.velocity - 1).max(),
+        (np.abs(qdd) / own.acceleration - 1).max(),
+    )
+
+
+def test_random_and_restored_motions_keep_limits_and_use_them(limits):
+    fine = limits.grid(512)
+    for seed in range(5):
+        shape, place = jax.random.split(jax.random.key(seed))
+        size = limits.scale.size
+        draws = 3.0 * jax.random.normal(shape, (size,))
+        y = random_motion(fine, limits.still, draws, jax.random.uniform(place, (2,)))
+        assert -0.12 < peaks(limits, limits.numbers(y)) <= 0.0
+        # A motion that breaks its limits, and one that leaves room.
+        for z, growth in ((3.0 * y + 0.5, 1.0), (0.97 * y, 1.1)):
+            held = held_within(fine, limits.still, z, fine.bound, growth)
+            x = np.asarray(limits.numbers(held))
+            assert peaks(limits, x) <= 1e-12
+            assert limits.use(x).max() <= 1.0 + 1e-9
+            assert (limits.use(x).max(axis=0) > 0.9).all()
+
+
+def test_what_is_within_is_not_touched(limits):
+    fine = limits.grid(512)
+    y = jnp.asarray(0.01 * np.random.default_rng(0).standard_normal(limits.scale.size))
+    middle = held_within(fine, limits.still, y, fine.bound)
+    again = held_within(fine, limits.still, middle, fine.bound)
+    np.testing.assert_allclose(again, middle, atol=1e-12)
+
+
+def test_scaled_numbers_go_there_and_back(limits, random):
+    x = random.standard_normal((3, *limits.shape))
+    np.testing.assert_allclose(limits.numbers(limits.scaled(x)), x, atol=1e-12)
+
+
+def test_unknown_limits_are_assumed_and_known_jerks_are_kept(arm):
+    free = JointLimits.of(arm, BASES[0], Limits.of(2))
+    assert np.isfinite(free.limits.acceleration).all()
+    assert len(free.grid(64).kinds) == 3
+    jerky = JointLimits.of(arm, BASES[0], Limits.of(2, jerk=[5.0, np.inf]))
+    grid = jerky.grid(64)
+    assert len(grid.kinds) == 4
+    y = held_within(grid, jerky.still, jnp.ones(jerky.scale.size), grid.bound)
+    assert jerky.use(jerky.numbers(np.asarray(y)))[3, 0] <= 1.05
