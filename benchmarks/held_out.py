@@ -1,0 +1,102 @@
+"""Held-out errors of estimators and friction models on two measured robots, side by side.
+
+Data: the logs of the Stäubli TX40 and the Universal Robots UR10 in `../shared/data`, prepared as the
+experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th sample) and `ur10.toml` (4 Hz) say,
+divided in time: the first 60 % of the rows to identify with, the rest to verify with.
+
+Model: rigid bodies with ten parameters each, rotor inertias, viscous and Coulomb friction (smooth
+sign, epsilon 0.01 rad/s), offsets, and on the TX40 the coupled wrist. The row "epsilons" finds one
+epsilon for each joint, the row "Stribeck" has Stribeck's law and finds its speeds too; each is the
+linear model where held-out blocks *of the identification part* say that it does not pay (last
+column). The row "essential" leaves out base parameters by held-out blocks of the same part.
+
+Statistics: "weighted" is the RMS error in percent of the largest forces, root mean square of the
+joints: what weighted least squares minimise. "relative" is the norm of all errors over the norm of
+all forces. "of WLS" compares the weighted errors on the 40 % with those of weighted least squares.
+
+    python benchmarks/held_out.py            # both robots, all rows
+    python benchmarks/held_out.py --quick    # the UR10, without the rows that search
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import jaxid as jid
+from jaxid.experiment.experiment import load_experiment
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT.parent / "shared" / "data"
+LOGS = {"tx40": "tx40/motor_position.csv", "ur10": "ur10/exciting_measured.csv"}
+SHARE = 0.6
+
+jax.config.update("jax_enable_x64", True)
+
+
+def stribeck(base: jid.BaseParameters) -> jid.BaseParameters:
+    """The same model with Stribeck's law in place of Coulomb's."""
+    terms = [
+        jid.StribeckFriction(transition=term.transition)
+        if isinstance(term, jid.CoulombFriction)
+        else term
+        for term in base.model.terms
+    ]
+    return jid.base_parameters(jid.Model(base.model.robot, tuple(terms)))
+
+
+def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
+    """Name, fit and remark of each row of the table."""
+    wls = jid.identify(base, train, jid.WeightedLeastSquares())
+    yield "WLS, largest forces", wls, ""
+    yield "LS", jid.identify(base, train, jid.LeastSquares()), ""
+    variances = jid.WeightedLeastSquares(jid.ResidualVariances())
+    yield "WLS, residual variances", jid.identify(base, train, variances), ""
+    stepwise = jid.identify(base, train, jid.Stepwise())
+    yield "axis by axis", stepwise, ""
+    essential = jid.essential_parameters(wls, train)
+    yield "essential parameters", essential.fit, f"{essential.chosen.left} of {base.size}"
+    if quick:
+        return
+    for name, other in (("epsilons", base), ("Stribeck", stribeck(base))):
+        found = jid.identify_nonlinear(other, train, linear=base)
+        verdict = f"{-100 * found.held_out.gain:+.0f} ± {100 * found.held_out.gain_deviation:.0f} %"
+        pays = "pays" if found.held_out.pays else "does not pay"
+        yield f"{name}, as found", found.fit, f"{pays}: {verdict}"
+        yield f"{name}, where they pay", found.better, ""
+
+
+def table(name: str, *, quick: bool) -> list[str]:
+    """The rows of one robot."""
+    experiment = load_experiment(ROOT / "tests" / "real_data" / f"{name}.toml")
+    recording = experiment.read(DATA / LOGS[name])
+    train, test = experiment.observe(recording).split(SHARE)
+    lines = [
+        f"| {name.upper()} | weighted, first 60 % | weighted, rest | relative, rest | of WLS | |",
+        "|---|---|---|---|---|---|",
+    ]
+    reference = None
+    for label, fit, remark in fits(experiment.base, train, quick=quick):
+        errors = jid.validate(fit, [train, test]).errors
+        before, after = (float(np.sqrt(np.mean(e.rms_percent**2))) for e in errors)
+        reference = after if reference is None else reference
+        lines.append(
+            f"| {label} | {before:.2f} % | {after:.2f} % | {100 * errors[1].relative:.2f} % "
+            f"| {100 * (after / reference - 1):+.1f} % | {remark} |"
+        )
+    return lines
+
+
+def main() -> None:
+    """Prints the tables."""
+    quick = "--quick" in sys.argv
+    if not DATA.is_dir():
+        print("measured data (../shared/data beside the project) are not here")
+        return
+    for name in ("ur10",) if quick else LOGS:
+        print("\n".join(table(name, quick=quick)), end="\n\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()
