@@ -1,7 +1,7 @@
 """Held-out errors of estimators and friction models on two measured robots, side by side.
 
-Data: the logs of the Stäubli TX40 and the Universal Robots UR10 in `../shared/data`, prepared as the
-experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th sample) and `ur10.toml` (4 Hz) say,
+Data: the logs of the Stäubli TX40 and the Universal Robots UR10 in `../shared/data`, prepared as
+the experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th row) and `ur10.toml` (4 Hz) say,
 divided in time: the first 60 % of the rows to identify with, the rest to verify with.
 
 Model: rigid bodies with ten parameters each, rotor inertias, viscous and Coulomb friction (smooth
