@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from scipy import linalg
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import in_numpy
@@ -146,15 +145,22 @@ def friction_parameters(base: BaseParameters) -> set[int]:
 
 
 def _independent(R: Float[np.ndarray, "height columns"], size: float | None = None) -> list[int]:
-    """Columns that the others do not replace, the largest first, in order."""
-    norms = np.linalg.norm(R, axis=0)
-    live = np.flatnonzero(norms > 0)
-    if not len(live):
-        return []
-    scaled = R[:, live] / (norms[live] if size is None else size)
-    _, triangle, order = linalg.qr(scaled, mode="economic", pivoting=True)
-    new = np.abs(np.diag(triangle)) > DECIDED
-    return sorted(int(live[k]) for k in order[: len(new)][new])
+    """Columns of which enough is left beside earlier ones, by Gram-Schmidt.
+
+    Args:
+        R: The columns.
+        size: What their lengths are compared with; the columns' own if None.
+    """
+    Q, kept = np.zeros((len(R), 0)), []
+    for k, length in enumerate(np.linalg.norm(R, axis=0)):
+        left = R[:, k]
+        for _ in range(2):
+            left = left - Q @ (Q.T @ left)
+        new = float(np.linalg.norm(left))
+        if new > DECIDED * (length if size is None else size):
+            Q = np.column_stack([Q, left / new])
+            kept.append(k)
+    return kept
 
 
 def _moving(base: BaseParameters, observations: Observations) -> int:
@@ -252,10 +258,10 @@ def identify_stepwise(
     stepwise = Stepwise() if stepwise is None else stepwise
     at_once = WeightedLeastSquares(stepwise.weights) if at_once is None else at_once
     rows = Rows.of(base, recordings)
-    fits = [fit_rows(rows, estimator) for estimator in (at_once, stepwise)]
-    weights = np.asarray(fits[1].weights)
+    whole, single_steps = (fit_rows(rows, estimator) for estimator in (at_once, stepwise))
+    weights = np.asarray(single_steps.weights)
     errors = [
         weighted_error(held_out_squares(rows, estimator), rows, weights)
         for estimator in (at_once, stepwise)
     ]
-    return StepwiseComparison(*fits, *errors)
+    return StepwiseComparison(whole, single_steps, errors[0], errors[1])
