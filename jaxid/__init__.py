@@ -64,7 +64,13 @@ from jaxid.identification.rows import Rows as Rows
 from jaxid.identification.runs.comparison import Comparison as Comparison
 from jaxid.identification.runs.comparison import Verdict as Verdict
 from jaxid.identification.runs.comparison import compare as compare
+from jaxid.identification.runs.delay import Delay as Delay
+from jaxid.identification.runs.delay import estimate_delay as estimate_delay
+from jaxid.identification.runs.drive_gains import DriveGains as DriveGains
+from jaxid.identification.runs.drive_gains import identify_drive_gains as identify_drive_gains
 from jaxid.identification.runs.estimates import Estimates as Estimates
+from jaxid.identification.runs.payload import Payload as Payload
+from jaxid.identification.runs.payload import identify_payload as identify_payload
 from jaxid.identification.runs.run import Run as Run
 from jaxid.identification.runs.states import StatesFit as StatesFit
 from jaxid.identification.runs.states import identify_states as identify_states
@@ -86,6 +92,7 @@ from jaxid.identification.weights import Unweighted as Unweighted
 from jaxid.measurement.columns import Columns as Columns
 from jaxid.measurement.decimation import Decimation as Decimation
 from jaxid.measurement.decimation import Subsample as Subsample
+from jaxid.measurement.delay import remove_delay as remove_delay
 from jaxid.measurement.filters import AbstractFilter as AbstractFilter
 from jaxid.measurement.filters import PaperFilter as PaperFilter
 from jaxid.measurement.filters import PeriodicFourier as PeriodicFourier

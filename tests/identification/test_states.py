@@ -73,16 +73,16 @@ def test_shared_and_own_parameters_equal_dense_least_squares(base, truths):
 
 def test_covariance_is_that_of_many_noise_draws(base, truths):
     draws, variances = [], []
-    for seed in range(80):
+    for seed in range(40):
         runs = [jid.Run.of(base, o) for o in observed(base, truths, seed, samples=200)]
         found = jid.identify_states(runs)
         draws.append(found.found.parameters)
         variances.append(np.diag(found.found.covariance))
     scatter = np.var(draws, axis=0, ddof=1)
     ratio = np.mean(variances, axis=0) / scatter
-    # A variance from 80 draws scatters by sqrt(2 / 80) = 0.16.
-    assert abs(np.mean(ratio) - 1.0) < 0.12
-    np.testing.assert_allclose(ratio, 1.0, atol=0.5)
+    # A variance from 40 draws scatters by sqrt(2 / 40) = 0.22.
+    assert abs(np.mean(ratio) - 1.0) < 0.15
+    np.testing.assert_allclose(ratio, 1.0, atol=0.7)
 
 
 def test_what_changed_is_found_and_what_is_shared_is_tested(base, truths):

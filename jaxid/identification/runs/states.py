@@ -12,7 +12,7 @@ from jaxid.identification.runs.comparison import LEVEL, Comparison, joint_test
 from jaxid.identification.runs.estimates import Estimates, groups, with_covariance
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.tied import Tied, tied
-from jaxid.types import Bool
+from jaxid.types import Bool, Float
 
 POSES = 3
 """Random poses in which energies are looked at."""
@@ -174,15 +174,28 @@ def identify_states(
             f"{', '.join(states)}: name them by their states."
         )
     base = runs[0].base
-    own = _own(base, varying, shared)
+    own = own_parameters(base, varying, shared)
     same = tuple(k for k in range(base.size) if k not in own)
-    unknowns = len(same) + len(own) * len(runs)
+    return StatesFit(runs, same, own, tied(runs, state_maps(base.size, own, len(runs))))
+
+
+def state_maps(
+    size: int, varying: tuple[int, ...], states: int
+) -> list[Float[np.ndarray, "base unknowns"]]:
+    """For each state how its base parameters follow from shared ones and those of all states.
+
+    Args:
+        size: Number of base parameters.
+        varying: Those that each state has for itself.
+        states: Number of states.
+    """
+    shared = tuple(k for k in range(size) if k not in varying)
     maps = []
-    for number in range(len(runs)):
-        E = np.zeros((base.size, unknowns))
-        E[np.arange(base.size), list(_places(base.size, same, own, number))] = 1.0
+    for number in range(states):
+        E = np.zeros((size, len(shared) + len(varying) * states))
+        E[np.arange(size), list(_places(size, shared, varying, number))] = 1.0
         maps.append(E)
-    return StatesFit(runs, same, own, tied(runs, maps))
+    return maps
 
 
 def _places(
@@ -194,10 +207,19 @@ def _places(
     return tuple(places[k] for k in range(size))
 
 
-def _own(
+def own_parameters(
     base: BaseParameters, varying: Sequence[str] | None, shared: Sequence[str] | None
 ) -> tuple[int, ...]:
-    """Indices of the base parameters that each state has for itself."""
+    """Indices of the base parameters that each state has for itself.
+
+    Args:
+        base: The base parameters.
+        varying: Their names; if None, those that store no energy.
+        shared: Names of the others; an alternative to `varying`.
+
+    Raises:
+        ValueError: If both are given, or there is no such base parameter.
+    """
     if varying is not None and shared is not None:
         raise ValueError("give either `varying` or `shared`, and not both.")
     named = shared if varying is None else varying

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.identification.runs.left_out import Block, block_covariance
 from jaxid.identification.runs.run import Run
 from jaxid.identification.solutions import NUMERICAL, Complete, Decomposition
 from jaxid.types import AnyArray, Float
@@ -79,41 +80,24 @@ def _carried(
     run: Run, onto: Float[np.ndarray, "unknowns height"], own: Float[np.ndarray, "height base"]
 ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
     """What a run's errors make of the unknowns' covariance, and its degrees of freedom."""
-    C = np.asarray(run.covariance)
-    if np.isfinite(C).all():
-        A = onto @ own
-        weights = A**2 * np.diag(C)
-        whole = weights.sum(axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            freedom = whole / (weights / np.asarray(run.freedom)).sum(axis=1)
-        return A @ C @ A.T, np.where(whole > 0, freedom, np.inf)
-    # The run alone does not determine everything, so its estimates have no covariance. What its
-    # errors do to others follows from blocks of time.
-    size = np.linalg.norm(own, axis=0)
-    scale = np.where(size > 0, size, 1.0)
-    scores = _block_scores(run, scale)
-    # onto is B E' R', so B E' is onto times the pseudo-inverse of R'.
-    spread = onto @ np.linalg.pinv((own / scale).T, rcond=NUMERICAL)
-    moved = spread @ scores.T
-    count = len(scores)
-    freedom = np.full(len(onto), max(count - 1.0, 1.0))
-    return moved @ moved.T * count / max(count - 1, 1), freedom
+    C, own_freedom = np.asarray(run.covariance), np.asarray(run.freedom)
+    if not np.isfinite(C).all():
+        # The run alone does not determine everything, so not all of its estimates have a variance.
+        # What its errors do to others follows from blocks of time.
+        C, few = block_covariance(*_blocks(run))
+        own_freedom = np.full(len(C), few)
+    A = onto @ own
+    weights = A**2 * np.diag(C)
+    whole = weights.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = whole / (weights / own_freedom).sum(axis=1)
+    return A @ C @ A.T, np.where(whole > 0, freedom, np.inf)
 
 
-def _block_scores(run: Run, scale: Float[np.ndarray, " base"]) -> Float[np.ndarray, "blocks base"]:
-    r"""$\Theta_k^T W^2 e_k$ of each block of time, as if the block had not been fitted.
-
-    The columns are divided by `scale`.
-    """
-    own, z = run.factor
-    decomposition = Decomposition.of(own, z)
+def _blocks(run: Run) -> tuple[list[Block], Float[np.ndarray, "base base"]]:
+    """What the run's estimates leave of each block of time, and the inverse of its information."""
+    decomposition = Decomposition.of(*run.factor)
     inverse = Complete().inverse(decomposition.values)
-    B, p = decomposition.inverse_information(inverse), decomposition.solve(inverse)
-    B = B * scale * scale[:, None]
-    found = []
-    for part in run.blocks.parts:
-        R, z = part.weighted(run.weights)
-        rows = R / scale
-        taken = np.eye(len(p)) - rows.T @ rows @ B
-        found.append(np.linalg.lstsq(taken, rows.T @ (z - R @ p), rcond=None)[0])
-    return np.array(found)
+    p = decomposition.solve(inverse)
+    parts = (part.weighted(run.weights) for part in run.blocks.parts)
+    return [(R, z - R @ p) for R, z in parts], decomposition.inverse_information(inverse)

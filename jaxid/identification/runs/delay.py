@@ -1,0 +1,184 @@
+"""How late a log's forces are against its angles, found from the model itself."""
+
+import itertools
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from scipy import stats
+
+from jaxid.dynamics import compiled
+from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.factors import (
+    Blocks,
+    Factors,
+    JointFactor,
+    block_edges,
+    empty,
+    reduced_rows,
+)
+from jaxid.identification.runs.comparison import joint_test
+from jaxid.identification.runs.left_out import block_covariance
+from jaxid.identification.solutions import Complete, Decomposition
+from jaxid.identification.weights import AbstractWeights, MaximumForces
+from jaxid.measurement.delay import without_delay
+from jaxid.measurement.observations import Observations
+from jaxid.types import AnyArray, Float
+
+BLOCKS = 20
+"""Blocks of time of all recordings together, from which the uncertainty is found."""
+PASSES = 12
+"""Most passes over the data."""
+SETTLED = 1e-3
+"""Change, in standard deviations, below which the search ends."""
+ROUNDING = 1e-9
+"""Change, in sample times, below which the search ends in any case."""
+
+
+class Delay(eqx.Module):
+    """By how much forces stand later in a log than the angles that belong to them.
+
+    Attributes:
+        seconds: The delay of all joints [s].
+        standard_deviation: Of the delay [s].
+        freedom: Degrees of freedom of the standard deviation.
+        of_joints: Each joint's own delay [s].
+        covariance: Of the joints' own delays [s²].
+        joint_names: Of the joints.
+    """
+
+    seconds: float
+    standard_deviation: float
+    freedom: float
+    of_joints: Float[AnyArray, " joints"]
+    covariance: Float[AnyArray, "joints joints"]
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Lower and upper limit of the delay [s].
+
+        Args:
+            level: Share of cases in which it holds the truth, of 1.
+        """
+        half = self.standard_deviation * float(stats.t.ppf(0.5 + 0.5 * level, self.freedom))
+        return self.seconds - half, self.seconds + half
+
+    @property
+    def alike(self) -> float:
+        """Chance that joints with one common delay would differ so much, of 1."""
+        d, C = np.asarray(self.of_joints), np.asarray(self.covariance)
+        if len(d) < 2:
+            return 1.0
+        contrast = np.eye(len(d))[1:] - np.eye(len(d))[:1]
+        return joint_test(contrast @ d, contrast @ C @ contrast.T, self.freedom)[1]
+
+
+def estimate_delay(
+    base: BaseParameters,
+    observations: Observations | Sequence[Observations],
+    weights: AbstractWeights | None = None,
+) -> Delay:
+    r"""Estimates the delay of the forces together with the base parameters.
+
+    Forces that are late by $\tau$ are $\Theta(t - \tau) p$: the motion is shifted until the rate of
+    the model's own forces explains nothing more of the residuals. The rate is the model's, not that
+    of the measured forces, so that noise does not pull the delay towards zero. Remove what was
+    found by `remove_delay`, and observe again.
+
+    Args:
+        base: What can be identified on this robot.
+        observations: Of one recording, or of several with the same delay.
+        weights: Of the joints; the reciprocals of the largest forces if None.
+
+    Raises:
+        ValueError: If weights are not known, or the search does not settle: the delay is longer
+            than the motion's shortest swings.
+    """
+    single = isinstance(observations, Observations)
+    recordings = (observations,) if single else tuple(observations)
+    n, size = base.model.robot.joints, base.size
+    common = np.zeros((size + n, size + 1))
+    common[:size, :size] = np.eye(size)
+    common[size:, size] = 1.0
+    each = -(-BLOCKS // len(recordings))
+    whole = _together(base, recordings, np.zeros(size), each)
+    w = (MaximumForces() if weights is None else weights)(base.model.robot, whole.total)
+    p, seconds = _solved(*whole.total.weighted(w))[0][:size], 0.0
+    for _ in range(PASSES):
+        blocks = _together(base, [without_delay(o, seconds) for o in recordings], p, each)
+        R, z = blocks.total.weighted(w)
+        x, B = _solved(R @ common, z)
+        p, step = x[:size], float(x[size])
+        parts = [part.weighted(w) for part in blocks.parts]
+        joint = [(rows @ common, f - rows @ common @ x) for rows, f in parts]
+        covariance, freedom = block_covariance(joint, B)
+        deviation = float(np.sqrt(covariance[size, size]))
+        seconds += step
+        if abs(step) <= max(SETTLED * deviation, ROUNDING * recordings[0].sample_time):
+            break
+    else:
+        raise ValueError(
+            f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the log to where "
+            "the robot moves, check angle columns and signs, or remove most of the delay first."
+        )
+    own, B = _solved(R, z)
+    covariance, _ = block_covariance([(rows, f - rows @ own) for rows, f in parts], B)
+    return Delay(
+        seconds=seconds,
+        standard_deviation=deviation,
+        freedom=freedom,
+        of_joints=seconds - step + own[size:],
+        covariance=covariance[size:, size:],
+        joint_names=base.model.robot.joint_names,
+    )
+
+
+def _together(
+    base: BaseParameters,
+    recordings: Sequence[Observations],
+    p: Float[np.ndarray, " base"],
+    blocks: int,
+) -> Blocks:
+    return Blocks(tuple(part for o in recordings for part in _factors(base, o, p, blocks)))
+
+
+def _factors(
+    base: BaseParameters, observations: Observations, p: Float[np.ndarray, " base"], blocks: int
+) -> list[Factors]:
+    """Factors of blocks of time, with a column for the delay of each joint behind the others."""
+    o, n = observations, base.model.robot.joints
+    forces = compiled.forces(base, p, o.motion)
+    rates = np.concatenate([np.gradient(forces[a:b], o.sample_time, axis=0) for a, b in o.segments])
+    late = -o.reduce(rates)
+    mask, edges = np.asarray(o.mask), block_edges(o, blocks)
+    found = [_widened(part, base.size) for part in [empty(base)] * (len(edges) - 1)]
+    for rows, columns, measured in reduced_rows(base, o):
+        for k, (low, high) in enumerate(itertools.pairwise(edges)):
+            a, b = max(low, rows.start), min(high, rows.stop)
+            if a >= b:
+                continue
+            own, joints = slice(a - rows.start, b - rows.start), []
+            for j in range(n):
+                kept = mask[a:b, j]
+                parts = [columns[j][own], late[a:b, j], measured[own, j]]
+                joints.append(found[k].joints[j].joined(np.column_stack(parts)[kept]))
+            found[k] = Factors(tuple(joints), base.size + n)
+    return found
+
+
+def _widened(factors: Factors, size: int) -> Factors:
+    """Room for one more column of each joint."""
+    joints = tuple(
+        JointFactor((*joint.columns, size + j), np.zeros((0, len(joint.columns) + 2)), 0)
+        for j, joint in enumerate(factors.joints)
+    )
+    return Factors(joints, size + len(joints))
+
+
+def _solved(
+    R: Float[np.ndarray, "height unknowns"], z: Float[np.ndarray, " height"]
+) -> tuple[Float[np.ndarray, " unknowns"], Float[np.ndarray, "unknowns unknowns"]]:
+    """The solution, and the inverse of the information."""
+    decomposition = Decomposition.of(R, z)
+    inverse = Complete().inverse(decomposition.values)
+    return decomposition.solve(inverse), decomposition.inverse_information(inverse)

@@ -1,0 +1,157 @@
+"""A payload's ten parameters from a run without it and a run with it."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.terms import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.identification.runs.estimates import Estimates
+from jaxid.identification.runs.run import Run, require_same_base
+from jaxid.identification.runs.states import own_parameters, state_maps
+from jaxid.identification.runs.tied import tied
+from jaxid.robot.robot import Tool
+from jaxid.types import AnyArray, Array, Float
+
+TEN = len(INERTIAL_NAMES)
+CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
+CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
+
+
+class Payload(eqx.Module):
+    """What a load on a body weighs, where its mass is, and how it resists turning.
+
+    Attributes:
+        body: Index of the body that carries it (0 is the first).
+        parameters: $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame: the
+            estimate, or the body nearest to it, in units of its uncertainty, that could exist.
+        estimate: What the forces say, whether such a body could exist or not.
+        covariance: Of the estimate.
+        freedom: Degrees of freedom of its standard deviations.
+    """
+
+    body: int = eqx.field(static=True)
+    parameters: Float[AnyArray, "10"]
+    estimate: Float[AnyArray, "10"]
+    covariance: Float[AnyArray, "10 10"]
+    freedom: Float[AnyArray, "10"]
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        return float(self.parameters[0])
+
+    @property
+    def centre_of_mass(self) -> Float[np.ndarray, "3"]:
+        """In the frame of the body [m]."""
+        return np.asarray(self.parameters)[1:4] / self.mass
+
+    @property
+    def inertia(self) -> Float[np.ndarray, "3 3"]:
+        """Inertia tensor about the centre of mass, along the body's axes [kg m²]."""
+        A, B, C, D, E, F = np.asarray(_central(jnp.asarray(self.parameters)))[4:]
+        return np.array([[A, -F, -E], [-F, B, -D], [-E, -D, C]])
+
+    @property
+    def tool(self) -> Tool:
+        """The payload as a known load: `robot.replace(tool=payload.tool)`.
+
+        Raises:
+            ValueError: If it is no body that could exist.
+        """
+        return Tool.of(
+            self.body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia
+        )
+
+    @property
+    def estimates(self) -> Estimates:
+        """The ten parameters about the body's origin, with the uncertainty of the estimate."""
+        return self._named(INERTIAL_NAMES, INERTIAL_UNITS, self.parameters, self.covariance)
+
+    @property
+    def central(self) -> Estimates:
+        """Mass, centre of mass, and moments of inertia about it, with their uncertainty."""
+        p = jnp.asarray(self.parameters)
+        J = np.asarray(jax.jacfwd(_central)(p))
+        covariance = J @ np.asarray(self.covariance) @ J.T
+        return self._named(CENTRAL_NAMES, CENTRAL_UNITS, np.asarray(_central(p)), covariance)
+
+    def _named(self, names, units, parameters, covariance) -> Estimates:
+        return Estimates(
+            label="payload",
+            names=tuple(names),
+            expressions=tuple(names),
+            units=tuple(units),
+            groups=("payload",) * TEN,
+            parameters=parameters,
+            covariance=covariance,
+            freedom=np.full(TEN, float(np.min(self.freedom))),
+        )
+
+
+def identify_payload(
+    unloaded: Run, loaded: Run, *, body: int | None = None, varying: Sequence[str] | None = None
+) -> Payload:
+    """Identifies a payload from a run without it and a run with it.
+
+    Both runs are fitted together. What the payload adds to the base parameters depends on its ten
+    parameters alone, and these are determined all ten although the last body's own are not: the
+    robot without the payload is known from the other run. Uncertainties of both runs count.
+
+    Args:
+        unloaded: Without the payload.
+        loaded: With it.
+        body: Index of the body that carries it; that of the end-effector if None.
+        varying: Names of base parameters that may differ between the runs beside the payload. If
+            None, friction and offsets: they change with load and temperature.
+
+    Raises:
+        ValueError: If the runs have different base parameters, or the model does not have ten
+            parameters for the body.
+    """
+    runs = (unloaded, loaded)
+    require_same_base(runs)
+    base = unloaded.base
+    body = base.model.robot.tip_body if body is None else body
+    own = own_parameters(base, varying, None)
+    maps = [np.hstack([E, np.zeros((base.size, TEN))]) for E in state_maps(base.size, own, 2)]
+    maps[1][:, -TEN:] = body_columns(base, body)
+    found = tied(runs, maps)
+    p, C = np.asarray(found.parameters)[-TEN:], np.asarray(found.covariance)[-TEN:, -TEN:]
+    return Payload(body, p, p, C, np.asarray(found.freedom)[-TEN:])
+
+
+def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:
+    """What unit parameters of a load on a body add to the base parameters.
+
+    Args:
+        base: The base parameters.
+        body: Index of the body (0 is the first).
+
+    Raises:
+        ValueError: If there is no such body, or the model lacks some of its ten parameters.
+    """
+    robot, names = base.model.robot, base.model.parameter_names
+    if not 0 <= body < robot.joints:
+        raise ValueError(f"`body` must be from 0 to {robot.joints - 1}, but is {body}.")
+    ten = [f"{name}{body + 1}" for name in INERTIAL_NAMES]
+    missing = [name for name in ten if name not in names]
+    if missing:
+        raise ValueError(
+            f"a load on body {body} has ten parameters, but the model lacks `{missing[0]}`: use "
+            "`RigidBodies()` with all ten."
+        )
+    unit = np.zeros((TEN, base.model.size))
+    unit[range(TEN), [names.index(name) for name in ten]] = 1.0
+    return np.asarray(base.from_standard(unit)).T
+
+
+def _central(p: Float[Array, "10"]) -> Float[Array, "10"]:
+    """Mass, centre of mass, and the six moments about it."""
+    m, r = p[0], p[1:4] / p[0]
+    x, y, z = r
+    squares = jnp.stack([y * y + z * z, x * x + z * z, x * x + y * y, y * z, x * z, x * y])
+    return jnp.concatenate([m[None], r, p[4:] - m * squares])
