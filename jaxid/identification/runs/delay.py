@@ -104,6 +104,7 @@ def estimate_delay(
     whole = _together(base, recordings, np.zeros(size), each)
     w = (MaximumForces() if weights is None else weights)(base.model.robot, whole.total)
     p, seconds = _solved(*whole.total.weighted(w))[0][:size], 0.0
+    step = np.inf
     for _ in range(PASSES):
         blocks = _together(base, [without_delay(o, seconds) for o in recordings], p, each)
         R, z = blocks.total.weighted(w)

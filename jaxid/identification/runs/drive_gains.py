@@ -121,7 +121,7 @@ def identify_drive_gains(
     found = optimize.least_squares(
         lambda u: np.concatenate([rows.residuals(u) for rows in terms]),
         start,
-        lambda u: np.vstack([rows.derivatives(u) for rows in terms]),
+        lambda u: np.vstack([rows.derivatives(u) for rows in terms]),  # pyright: ignore[reportArgumentType]
         method="lm",
         x_scale="jac",
         xtol=1e-14,
