@@ -49,6 +49,11 @@ class StribeckFriction(AbstractTerm):
         power = 0.5 * matching("exponent", self.exponent, qd) * jnp.log(relative**2 + TINY)
         return jnp.concatenate([jnp.diag(sign), jnp.diag(sign * jnp.exp(-jnp.exp(power)))], axis=1)
 
+    def lower_bounds(self, robot):
+        """Friction brakes at speed; near standstill it may be less or more."""
+        n = robot.joints
+        return np.concatenate([np.zeros(n), np.full(n, -np.inf)])
+
     @property
     def shapes(self):
         """`vs1`, … [rad/s or m/s]; `delta1`, … if asked for; and those of the transition."""
@@ -76,6 +81,10 @@ class AsymmetricViscousFriction(AbstractTerm):
         """The diagonal matrices of speeds in either direction."""
         size = jnp.abs(qd)
         return jnp.concatenate([jnp.diag(0.5 * (qd + size)), jnp.diag(0.5 * (qd - size))], axis=1)
+
+    def lower_bounds(self, robot):
+        """Friction brakes in both directions."""
+        return np.zeros(2 * robot.joints)
 
 
 class LoadFriction(AbstractTerm):
@@ -131,6 +140,10 @@ class LoadFriction(AbstractTerm):
         load = projection.rigid_body_forces(robot, bodies, q, rest, rest)
         return jnp.diag(jnp.abs(load) * self.transition(qd))
 
+    def lower_bounds(self, robot):
+        """Friction brakes."""
+        return np.zeros(robot.joints)
+
     @property
     def shapes(self):
         """Those of the transition, if asked for: `CoulombFriction` finds them better."""
@@ -163,6 +176,14 @@ class TemperatureScaled(AbstractTerm):
         warmer = jnp.asarray(self.temperature, qd.dtype) - self.reference
         scale = jnp.broadcast_to(jnp.exp(-self.rate * warmer), qd.shape)
         return scale[:, None] * self.term.columns(robot, q, qd, qdd)
+
+    def lower_bounds(self, robot):
+        """Those of the term."""
+        return self.term.lower_bounds(robot)
+
+    def drive_matrices(self, robot):
+        """Those of the term: temperature scales them by a positive number."""
+        return self.term.drive_matrices(robot)
 
     @property
     def shapes(self):

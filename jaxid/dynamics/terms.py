@@ -68,6 +68,23 @@ class AbstractTerm(eqx.Module):
         """What `identify_nonlinear` can find beside the parameters; nothing for most terms."""
         return ()
 
+    @property
+    def body_parameters(self) -> int:
+        """How many inertial parameters each body has in this term; none unless it has bodies."""
+        return 0
+
+    def lower_bounds(self, robot: Robot) -> Float[np.ndarray, " columns"]:
+        """What the parameters cannot fall below: 0, or -inf where both signs are possible."""
+        return np.full(len(self.parameters(robot)), -np.inf)
+
+    def drive_matrices(self, robot: Robot) -> Float[np.ndarray, "2 joints joints columns"]:
+        """What unit parameters add to the drives' inertia and to their viscous friction.
+
+        Both are symmetric and cannot be negative for any motion.
+        """
+        n = robot.joints
+        return np.zeros((2, n, n, len(self.parameters(robot))))
+
 
 class RigidBodies(AbstractTerm):
     r"""Inertia and gravity of the bodies by the Projection Equation (Eqs. 1-12).
@@ -99,6 +116,11 @@ class RigidBodies(AbstractTerm):
         r"""The columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
         theta = projection.rigid_body_regressor(robot, q, qd, qdd)
         return theta[:, :, : self._kept].reshape(robot.joints, -1)
+
+    @property
+    def body_parameters(self) -> int:
+        """Ten, or seven."""
+        return self._kept
 
     def all_ten(self, robot: Robot, p: Float[AnyArray, " columns"]) -> Float[AnyArray, "joints 10"]:
         """The parameters of all bodies, with zeros for products of inertia that are left out."""
@@ -137,6 +159,17 @@ class ViscousFriction(AbstractTerm):
         """The diagonal matrix of speeds."""
         return jnp.diag(qd)
 
+    def lower_bounds(self, robot):
+        """Friction brakes."""
+        return np.zeros(len(self.parameters(robot)))
+
+    def drive_matrices(self, robot):
+        """The diagonal of the viscous friction."""
+        n = robot.joints
+        matrices = np.zeros((2, n, n, n))
+        matrices[1, range(n), range(n), range(n)] = 1.0
+        return matrices
+
 
 class CoulombFriction(AbstractTerm):
     r"""Dry friction, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14).
@@ -159,6 +192,10 @@ class CoulombFriction(AbstractTerm):
     def shapes(self):
         """Those of the transition."""
         return tuple(s.below("transition") for s in self.transition.shapes)
+
+    def lower_bounds(self, robot):
+        """Friction brakes."""
+        return np.zeros(len(self.parameters(robot)))
 
 
 class AsymmetricCoulombFriction(AbstractTerm):
@@ -189,6 +226,10 @@ class AsymmetricCoulombFriction(AbstractTerm):
         """Those of the transition."""
         return tuple(s.below("transition") for s in self.transition.shapes)
 
+    def lower_bounds(self, robot):
+        """Friction brakes in both directions."""
+        return np.zeros(len(self.parameters(robot)))
+
 
 class ConstantOffset(AbstractTerm):
     """A constant force at each joint: a torque sensor's or current's offset, or uneven friction."""
@@ -212,6 +253,17 @@ class RotorInertia(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """The diagonal matrix of accelerations."""
         return jnp.diag(qdd)
+
+    def lower_bounds(self, robot):
+        """Rotors are not lighter than nothing."""
+        return np.zeros(len(self.parameters(robot)))
+
+    def drive_matrices(self, robot):
+        """The diagonal of the inertia."""
+        n = robot.joints
+        matrices = np.zeros((2, n, n, n))
+        matrices[0, range(n), range(n), range(n)] = 1.0
+        return matrices
 
 
 class LinearSpring(AbstractTerm):
@@ -297,3 +349,18 @@ class CoupledDrives(AbstractTerm):
             speeds = jnp.stack([jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))])
             dry.append(r * self.transition(speeds)[i])
         return jnp.stack([*inertia, *viscous, *dry], axis=1)
+
+    def lower_bounds(self, robot):
+        """Rotors and friction of the motors."""
+        return np.zeros(len(self.parameters(robot)))
+
+    def drive_matrices(self, robot):
+        """What the coupled motors add beside the diagonals."""
+        couplings = self.couplings(robot)
+        n, found = robot.joints, len(couplings)
+        matrices = np.zeros((2, n, n, 3 * found))
+        for place, (_, ratios) in enumerate(couplings):
+            beside = np.outer(ratios, ratios)
+            np.fill_diagonal(beside, 0.0)
+            matrices[0, :, :, place] = matrices[1, :, :, found + place] = beside
+        return matrices

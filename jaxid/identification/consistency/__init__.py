@@ -1,0 +1,1 @@
+"""Physical consistency: parameters that belong to bodies which could exist."""

@@ -1,0 +1,58 @@
+"""Weighted rows as data of a consistent estimate: all standard parameters, units of the noise."""
+
+from types import ModuleType
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.consistency.possible import NOISE
+from jaxid.types import AnyArray, Float
+
+
+class Data(eqx.Module):
+    r"""The rows $|A p - b|^2$ of all standard parameters, in units of their standard deviation.
+
+    Attributes:
+        A: Matrix.
+        b: Right-hand side.
+        noise: The standard deviation that is the unit.
+        scale: What the sum of squares is about in the end, halved.
+    """
+
+    A: Float[AnyArray, "*batch height standard"]
+    b: Float[AnyArray, "*batch height"]
+    noise: Float[AnyArray, "*batch"]
+    scale: Float[AnyArray, "*batch"]
+
+
+def combination(base: BaseParameters) -> Float[np.ndarray, "base standard"]:
+    r"""The matrix $[I\; \kappa]$ of $p_B = p_1 + \kappa p_2$, in the order of the columns (Eq. 22)."""
+    C = np.zeros((base.size, base.model.size))
+    C[range(base.size), base.indices] = 1.0
+    C[:, list(base.dependent)] = np.asarray(base.kappa)
+    return C
+
+
+def whitened(
+    xp: ModuleType,
+    base: BaseParameters,
+    R: Float[AnyArray, "height base"],
+    z: Float[AnyArray, " height"],
+    rows: AnyArray | int,
+) -> Data:
+    """Divides a weighted triangular factor by the standard deviation of what it leaves.
+
+    Args:
+        xp: NumPy, or what JAX has in its place.
+        base: Whose columns they are.
+        R: Upper triangle of the weighted rows.
+        z: Weighted forces, of the same decomposition.
+        rows: How many rows it stands for.
+    """
+    left = z[base.size :]
+    freedom = xp.maximum(xp.asarray(rows - base.size, float), 1.0)
+    square = xp.maximum((left @ left) / freedom, NOISE**2 * (z @ z) / (freedom + base.size))
+    noise = xp.sqrt(xp.where(square > 0, square, 1.0))
+    scale = 0.5 * (freedom + (z @ z) / noise**2 * 1e-12)
+    return Data((R @ combination(base)) / noise, z / noise, noise, scale)
