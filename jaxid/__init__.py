@@ -35,6 +35,16 @@ from jaxid.excitation.design import design_excitation as design_excitation
 from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
 from jaxid.identification.batches import identify_batch as identify_batch
 from jaxid.identification.bootstrap import bootstrap as bootstrap
+from jaxid.identification.consistency.batch import ConsistentBatch as ConsistentBatch
+from jaxid.identification.consistency.batch import consistent_batch as consistent_batch
+from jaxid.identification.consistency.bounds import BodyBounds as BodyBounds
+from jaxid.identification.consistency.consistency import Consistency as Consistency
+from jaxid.identification.consistency.estimator import PhysicallyConsistent as PhysicallyConsistent
+from jaxid.identification.consistency.priors import EntropicPull as EntropicPull
+from jaxid.identification.consistency.priors import ParameterPrior as ParameterPrior
+from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia as pseudo_inertia
+from jaxid.identification.consistency.single_body import ConsistentBody as ConsistentBody
+from jaxid.identification.consistency.single_body import consistent_body as consistent_body
 from jaxid.identification.devices import factorise_across_processes as factorise_across_processes
 from jaxid.identification.devices import factorise_on_devices as factorise_on_devices
 from jaxid.identification.essential import EssentialParameters as EssentialParameters

@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.consistency.consistency import Consistency
 from jaxid.identification.factors import Blocks
 from jaxid.identification.influence import AbstractInfluence, ByJoint
 from jaxid.identification.rows import Rows
@@ -38,6 +39,7 @@ class Estimate(eqx.Module):
         solution: How the weighted system was solved.
         standard: Standard parameters, of an estimator that finds a complete set of them.
         notes: What the user should know, in sentences.
+        consistency: How a physically consistent estimate came about.
     """
 
     base: BaseParameters
@@ -49,6 +51,7 @@ class Estimate(eqx.Module):
     solution: AbstractSpectralSolution = Complete()
     standard: Float[AnyArray, " standard"] | None = None
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+    consistency: Consistency | None = None
 
     @classmethod
     def solved(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.identification.consistency.consistency import Consistency
 from jaxid.identification.estimators import AbstractEstimator
 from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.solutions import AbstractSpectralSolution
@@ -57,6 +58,7 @@ class Fit(eqx.Module):
         solution: How the system was solved in the end, with everything chosen that it chose.
         recordings: Names of the observations.
         notes: What the user should know, in sentences.
+        consistency: How a physically consistent estimate came about, and which bounds decide.
         full_parameters: Standard parameters, of an estimator that finds a complete set of them.
     """
 
@@ -73,6 +75,7 @@ class Fit(eqx.Module):
     solution: AbstractSpectralSolution
     recordings: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
+    consistency: Consistency | None = None
     full_parameters: Float[AnyArray, " standard"] | None = None
 
     @property

@@ -106,6 +106,7 @@ def fit_rows(
         undetermined=undetermined_directions(blocks, weights, decomposition),
         estimator=estimator,
         solution=estimate.solution,
+        consistency=estimate.consistency,
         full_parameters=None if estimate.standard is None else np.asarray(estimate.standard),
         recordings=tuple(o.name for o in rows.recordings) if recordings is None else recordings,
         notes=(*base.notes, *_pulled(decomposition, estimate.solution), *estimate.notes),

@@ -6,13 +6,14 @@ arrays: no calls of LAPACK for matrices of sixteen numbers.
 
 from types import ModuleType
 
+from jaxid.identification.consistency.cone_program import Values
 from jaxid.types import AnyArray, Bool, Float
 
 
-def _cholesky(xp: ModuleType, P: AnyArray) -> list[list[AnyArray]]:
+def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
     """Entries of the lower triangles; not numbers where a matrix is not positive definite."""
     n = P.shape[-1]
-    L: list[list[AnyArray]] = [[P[..., 0, 0]] * n for _ in range(n)]
+    L: list[list[Values]] = [[P[..., 0, 0]] * n for _ in range(n)]
     for j in range(n):
         pivot = P[..., j, j]
         for k in range(j):
@@ -38,7 +39,10 @@ def definite(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Bool[AnyArray,
 def log_determinant(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[AnyArray, "*stack"]:
     """Logarithms of the determinants of positive definite matrices."""
     L = _cholesky(xp, P)
-    return 2.0 * sum((xp.log(L[j][j]) for j in range(1, P.shape[-1])), xp.log(L[0][0]))
+    total = xp.log(L[0][0])
+    for j in range(1, P.shape[-1]):
+        total = total + xp.log(L[j][j])
+    return 2.0 * total
 
 
 def inverse(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[AnyArray, "*stack n n"]:

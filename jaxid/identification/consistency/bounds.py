@@ -5,10 +5,10 @@ import numpy as np
 
 from jaxid.robot.limits import Numbers
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
+from jaxid.types import AnyArray, Bool, Float
 
 MASS_OF_A_METRE = 100.0
-"""Largest mass of a body of a robot that reaches one metre [kg]; it grows with the reach squared."""
+"""Largest mass of a body of a robot that reaches one metre [kg]; it grows with the square."""
 MARGIN = 0.25
 """How far matter reaches beyond the neighbouring joints, as a share of the robot's reach."""
 
@@ -48,7 +48,7 @@ class BodyBounds(eqx.Module):
         centre_max: Numbers | None = None,
         ellipsoid_centre: Numbers | None = None,
         ellipsoid_axes: Numbers | None = None,
-        total_mass: float | None = None,
+        total_mass: float | int | None = None,
     ) -> "BodyBounds":
         """Builds bounds and checks them: one number for all bodies, or one for each.
 
@@ -59,7 +59,7 @@ class BodyBounds(eqx.Module):
             mass_min: Smallest masses [kg]; 0 if None.
             centre_min: Lower corners of boxes for the centres of mass [m]; None for no box.
             centre_max: Upper corners [m].
-            ellipsoid_centre: Centres of ellipsoids for the centres of mass [m]; the origins if None.
+            ellipsoid_centre: Centres of ellipsoids for the centres of mass [m]; origins if None.
             ellipsoid_axes: Half axes of the ellipsoids [m]; None for no ellipsoids.
             total_mass: Mass of all bodies together [kg], if it is known.
 
@@ -137,9 +137,9 @@ class BodyBounds(eqx.Module):
         return said
 
     @property
-    def has_ellipsoid(self) -> np.ndarray:
+    def has_ellipsoid(self) -> Bool[np.ndarray, " bodies"]:
         """Which bodies have an ellipsoid for their centre of mass."""
-        return np.isfinite(np.asarray(self.ellipsoid_axes)).all(axis=1)
+        return np.asarray(np.isfinite(np.asarray(self.ellipsoid_axes)).all(axis=1))
 
     @property
     def interior(self) -> Float[np.ndarray, "bodies 3"]:

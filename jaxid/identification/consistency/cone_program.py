@@ -2,15 +2,23 @@ r"""Least squares over bodies that could exist, as a small convex program in sca
 
 The variables are those of the bodies, as many for each, then those of the drives. Every body is
 measured in its largest mass and the radius of its sphere, every number of a drive in its largest
-value: all lie between -1 and 1, so that distances to an optimum are bounded and units do not matter.
+value: all lie between -1 and 1, so that distances to an optimum are bounded and units do not
+matter.
 """
 
 from types import ModuleType
+from typing import Any
 
 import equinox as eqx
+import numpy as np
 
 from jaxid.identification.consistency.pseudo_inertia import BASIS
 from jaxid.types import AnyArray, Float, Int
+
+Values = Any
+"""What either machine computes with: arrays of NumPy or JAX, and NumPy's numbers."""
+Number = Float[AnyArray, "*batch"] | np.floating
+"""One number of a program, or one for each of many."""
 
 
 class ConeProgram(eqx.Module):
@@ -42,10 +50,10 @@ class ConeProgram(eqx.Module):
     members: Int[AnyArray, "*batch couplings members"]
     fillings: Float[AnyArray, "*batch couplings 4 4"]
     equal: Float[AnyArray, "*batch equal variables"]
-    pull: Float[AnyArray, "*batch"]
+    pull: Number
     prior: Float[AnyArray, "*batch bodies 4 4"]
     diameters: Float[AnyArray, "*batch variables"]
-    scale: Float[AnyArray, "*batch"]
+    scale: Number
     start: Float[AnyArray, "*batch variables"]
 
     @property
@@ -69,11 +77,26 @@ class ConeProgram(eqx.Module):
         matrices = 4 * (self.bodies + self.members.shape[-2])
         return matrices + self.bodies * self.rows.shape[-2] + 2 * self.drives
 
-    def of_bodies(self, xp: ModuleType, y: AnyArray) -> AnyArray:
+    def require_interior(self) -> None:
+        """Refuses a start on or beyond a bound.
+
+        Raises:
+            ValueError: If there is none within.
+        """
+        y = np.asarray(self.start)
+        S = self.matrices(np, y) + self.constant_matrices(np)
+        s = self.slacks(np, y) + self.constant_slacks(np)
+        if not (np.linalg.eigvalsh(S)[:, 0].min(initial=1.0) > 0 and s.min(initial=1.0) > 0):
+            raise ValueError(
+                "no ball-shaped body lies within all bounds: make `margin` smaller, or widen the "
+                "bounds of masses, spheres and centres of mass."
+            )
+
+    def of_bodies(self, xp: ModuleType, y: Values) -> Values:
         """The bodies' variables, one row for each."""
         return xp.reshape(y[: self.bodies * self.width], (self.bodies, self.width))
 
-    def matrices(self, xp: ModuleType, y: AnyArray) -> AnyArray:
+    def matrices(self, xp: ModuleType, y: Values) -> Values:
         """What variables add to the matrices that are positive semidefinite."""
         flat = BASIS[: self.width].reshape(self.width, 16)
         P = xp.reshape(self.of_bodies(xp, y) @ flat, (self.bodies, 4, 4))
@@ -81,22 +104,22 @@ class ConeProgram(eqx.Module):
             return P
         return xp.concatenate([P, xp.einsum("ki,kiab->kab", y[self.members], self.couplings)])
 
-    def slacks(self, xp: ModuleType, y: AnyArray) -> AnyArray:
+    def slacks(self, xp: ModuleType, y: Values) -> Values:
         """What variables add to the linear functions that are not negative."""
         linear = xp.einsum("kri,ki->kr", self.rows, self.of_bodies(xp, y))
         drives = y[self.bodies * self.width :]
         return xp.concatenate([xp.ravel(linear), drives, -drives])
 
-    def constant_matrices(self, xp: ModuleType) -> AnyArray:
+    def constant_matrices(self, xp: ModuleType) -> Values:
         """The constant parts of the matrices."""
         return xp.concatenate([-self.floors, self.fillings])
 
-    def constant_slacks(self, xp: ModuleType) -> AnyArray:
+    def constant_slacks(self, xp: ModuleType) -> Values:
         """The constant parts of the linear functions."""
         n = self.drives
         return xp.concatenate([xp.ravel(self.offsets), xp.zeros(n), xp.ones(n)])
 
-    def adjoint(self, xp: ModuleType, Z: AnyArray, z: AnyArray) -> AnyArray:
+    def adjoint(self, xp: ModuleType, Z: Values, z: Values) -> Values:
         """The transpose of `matrices` and `slacks`."""
         flat = BASIS[: self.width].reshape(self.width, 16)
         own = xp.reshape(Z[: self.bodies], (self.bodies, 16)) @ flat.T
@@ -109,11 +132,9 @@ class ConeProgram(eqx.Module):
         if not self.members.shape[-2]:
             return y
         more = xp.einsum("kab,kiab->ki", Z[self.bodies :], self.couplings)
-        return added(xp, y, self.members, more)
+        return y + xp.einsum("ki,kij->j", more, indicators(self.members, y.shape[0]))
 
 
-def added(xp: ModuleType, target: AnyArray, places: AnyArray, values: AnyArray) -> AnyArray:
-    """A vector after values were added at places that may come more than once."""
-    # NumPy adds in place only what a matrix product adds anywhere: ones at the places.
-    ones = (places[..., None] == xp.arange(target.shape[0])) * 1.0
-    return target + xp.einsum("ki,kij->j", values, ones)
+def indicators(places: Values, size: int) -> Values:
+    """For each place a vector with a one there: sums over places become products of matrices."""
+    return (places[..., None] == np.arange(size)[None, None]).astype(float)

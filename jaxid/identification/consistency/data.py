@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.consistency.cone_program import Number, Values
 from jaxid.identification.consistency.possible import NOISE
 from jaxid.types import AnyArray, Float
 
@@ -22,12 +23,12 @@ class Data(eqx.Module):
 
     A: Float[AnyArray, "*batch height standard"]
     b: Float[AnyArray, "*batch height"]
-    noise: Float[AnyArray, "*batch"]
-    scale: Float[AnyArray, "*batch"]
+    noise: Number
+    scale: Number
 
 
 def combination(base: BaseParameters) -> Float[np.ndarray, "base standard"]:
-    r"""The matrix $[I\; \kappa]$ of $p_B = p_1 + \kappa p_2$, in the order of the columns (Eq. 22)."""
+    r"""The matrix $[I\; \kappa]$, with its columns in the order of the standard parameters."""
     C = np.zeros((base.size, base.model.size))
     C[range(base.size), base.indices] = 1.0
     C[:, list(base.dependent)] = np.asarray(base.kappa)
@@ -39,7 +40,7 @@ def whitened(
     base: BaseParameters,
     R: Float[AnyArray, "height base"],
     z: Float[AnyArray, " height"],
-    rows: AnyArray | int,
+    rows: Values | int,
 ) -> Data:
     """Divides a weighted triangular factor by the standard deviation of what it leaves.
 

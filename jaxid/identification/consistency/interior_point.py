@@ -5,9 +5,9 @@ of Helmberg, Kojima and Monteiro, predictor and corrector as of Mehrotra, and on
 both sides. A pull towards bodies of a prior is the same loop with $S Z = \gamma I$ in the end. The
 variables are feasible from the start; what remains of the optimality conditions is bounded.
 
-Certificate: for any feasible $y$ and dual variables $Z, z \succeq 0$ with $r = \nabla f(y) - F^*(Z) -
-G^T z$, convexity gives $f(y) - f^* \le \langle S, Z \rangle + s^T z + \sum_i |r_i| d_i$, where $d_i$
-bounds how far two feasible values of $y_i$ are apart. Nothing in it is estimated.
+Certificate: for any feasible $y$ and any $Z, z \succeq 0$ with $r = \nabla f(y) - F^*(Z) - G^T z$,
+convexity gives $f(y) - f^* \le \langle S, Z \rangle + s^T z + \sum_i |r_i| d_i$, where $d_i$ bounds
+how far two feasible values of $y_i$ are apart. Nothing in it is estimated.
 """
 
 import enum
@@ -22,14 +22,16 @@ import numpy as np
 import scipy.linalg
 
 from jaxid.identification.consistency import blocks
-from jaxid.identification.consistency.cone_program import ConeProgram
-from jaxid.identification.consistency.pseudo_inertia import BASIS
-from jaxid.types import AnyArray, Array, Float, Int, require_float64
-
-STEPS = np.array(
-    [1, 0.99, 0.98, 0.96, 0.93, 0.9, 0.86, 0.81, 0.75, 0.68]
-    + [0.6, 0.52, 0.44, 0.36, 0.28, 0.2, 0.13, 0.08, 0.04, 0.01]
+from jaxid.identification.consistency.cone_program import (
+    ConeProgram,
+    Number,
+    Values,
+    indicators,
 )
+from jaxid.identification.consistency.pseudo_inertia import BASIS
+from jaxid.types import AnyArray, Array, Bool, Float, Int, require_float64
+
+STEPS = np.array([1.0, *1.0 - np.geomspace(0.01, 0.64, 13), 0.28, 0.2, 0.13, 0.08, 0.04, 0.01])
 TOLERANCE = 2.5e-7
 """Error bound at which an optimum counts as found, as a share of the objective."""
 MOST = 50
@@ -68,32 +70,32 @@ class Optimum(eqx.Module):
     """
 
     y: Float[AnyArray, "*batch variables"]
-    value: Float[AnyArray, "*batch"]
-    error: Float[AnyArray, "*batch"]
-    certified: AnyArray
-    iterations: Int[AnyArray, "*batch"]
+    value: Number
+    error: Number
+    certified: Bool[AnyArray, "*batch"] | np.bool
+    iterations: Int[AnyArray, "*batch"] | np.integer
     multipliers: Float[AnyArray, "*batch linear"]
 
 
 class _Point(NamedTuple):
     """Variables, slacks and multipliers, and how far they are from the optimum."""
 
-    y: AnyArray
-    S: AnyArray
-    s: AnyArray
-    Z: AnyArray
-    z: AnyArray
-    residual: AnyArray
-    value: AnyArray
-    error: AnyArray
+    y: Values
+    S: Values
+    s: Values
+    Z: Values
+    z: Values
+    residual: Values
+    value: Values
+    error: Values
 
 
 class _State(NamedTuple):
     point: _Point
     best: _Point
-    iterations: AnyArray
-    stalled: AnyArray
-    finished: AnyArray
+    iterations: Values
+    stalled: Values
+    finished: Values
 
 
 class _Machine(NamedTuple):
@@ -105,7 +107,7 @@ class _Machine(NamedTuple):
     """
 
     xp: ModuleType
-    factor: Callable[[AnyArray], Callable[[AnyArray], AnyArray]]
+    factor: Callable[[Values], Callable[[Values], Values]]
 
 
 def solve_at_once(program: ConeProgram) -> Optimum:
@@ -154,12 +156,13 @@ def _first(machine: _Machine, p: ConeProgram) -> _State:
     force = xp.linalg.norm(p.adjoint(xp, inverse, 1.0 / s))
     most = (value + TINY) / p.complementarity
     mu = xp.clip(xp.linalg.norm(away @ p.A) / force, 1e-6 * most, most)
-    point = _point(xp, p, y, mu * inverse, mu / s)
+    Z = xp.maximum(_targets(xp, p), mu) * inverse
+    point = _point(xp, p, y, Z, mu / s)
     zero = xp.zeros((), int)
     return _State(point, point, zero, zero, zero > 0)
 
 
-def _point(xp: ModuleType, p: ConeProgram, y: AnyArray, Z: AnyArray, z: AnyArray) -> _Point:
+def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _Point:
     """Slacks, residual of the optimality conditions, and the error bound."""
     S = p.matrices(xp, y) + p.constant_matrices(xp)
     s = p.slacks(xp, y) + p.constant_slacks(xp)
@@ -177,7 +180,13 @@ def _point(xp: ModuleType, p: ConeProgram, y: AnyArray, Z: AnyArray, z: AnyArray
     return _Point(y, S, s, Z, z, residual, value, error)
 
 
-def _gap(xp: ModuleType, p: ConeProgram, S: AnyArray, Z: AnyArray) -> AnyArray:
+def _targets(xp: ModuleType, p: ConeProgram) -> Values:
+    """The products of slacks and multipliers in the end: the pull's strength for bodies."""
+    strengths = [xp.ones(p.bodies) * p.pull, xp.zeros(p.members.shape[-2])]
+    return xp.concatenate(strengths)[:, None, None]
+
+
+def _gap(xp: ModuleType, p: ConeProgram, S: Values, Z: Values) -> Values:
     r"""The duality gap of the matrices: $\gamma \sum (\lambda - 1 - \ln \lambda)$ with a pull.
 
     There $\lambda$ are the eigenvalues of $S Z / \gamma$, all one in the optimum.
@@ -209,21 +218,20 @@ def _next(machine: _Machine, p: ConeProgram, state: _State) -> _State:
     return _State(point, best, iterations, stalled, finished)
 
 
-def _moved(machine: _Machine, p: ConeProgram, x: _Point) -> tuple[_Point, AnyArray]:
+def _moved(machine: _Machine, p: ConeProgram, x: _Point) -> tuple[_Point, Values]:
     """Predictor, corrector, and the step between them and the boundary."""
     xp = machine.xp
     inverse = blocks.inverse(xp, x.S)
     ratio = x.z / x.s
     solve = _directions(machine, p, _hessian(xp, p, inverse, x.Z, ratio))
-    target = xp.concatenate([xp.full(p.bodies, 1.0) * p.pull, xp.zeros(p.members.shape[-2])])
-    target = target[:, None, None]
+    target = _targets(xp, p)
 
-    def direction(rZ: AnyArray, rz: AnyArray) -> tuple[AnyArray, ...]:
+    def direction(rZ: Values, rz: Values) -> tuple[Values, ...]:
         dy = solve(p.adjoint(xp, rZ, rz) - x.residual)
         dS, ds = p.matrices(xp, dy), p.slacks(xp, dy)
         return dy, dS, ds, rZ - blocks.symmetric(xp, inverse @ dS @ x.Z), rz - ratio * ds
 
-    def complementarity(S: AnyArray, Z: AnyArray, s: AnyArray, z: AnyArray) -> AnyArray:
+    def complementarity(S: Values, Z: Values, s: Values, z: Values) -> Values:
         matrices = xp.sum(S * Z) - 4.0 * p.bodies * p.pull
         return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
 
@@ -240,9 +248,7 @@ def _moved(machine: _Machine, p: ConeProgram, x: _Point) -> tuple[_Point, AnyArr
     return _point(xp, p, x.y + a * dy, x.Z + a * dZ, x.z + a * dz), a
 
 
-def _length(
-    xp: ModuleType, x: _Point, dS: AnyArray, ds: AnyArray, dZ: AnyArray, dz: AnyArray
-) -> AnyArray:
+def _length(xp: ModuleType, x: _Point, dS: Values, ds: Values, dZ: Values, dz: Values) -> Values:
     """The longest of some steps that leaves everything positive; exact for the linear functions."""
     fastest = xp.maximum(xp.max(-ds / x.s), xp.max(-dz / x.z))
     steps = STEPS * xp.minimum(1.0, 1.0 / xp.maximum(fastest, 1e-300))
@@ -252,13 +258,11 @@ def _length(
     return xp.where(xp.any(good), steps[xp.argmax(good)], 0.0)
 
 
-def _hessian(
-    xp: ModuleType, p: ConeProgram, inverse: AnyArray, Z: AnyArray, ratio: AnyArray
-) -> AnyArray:
+def _hessian(xp: ModuleType, p: ConeProgram, inverse: Values, Z: Values, ratio: Values) -> Values:
     """The matrix of Newton's equations: information of the data, and barriers of the bounds."""
     K, w, n = p.bodies, p.width, p.drives
     flat = BASIS[:w].reshape(w, 16)
-    own = flat @ _sandwich(xp, inverse[:K], Z[:K]) @ flat.T
+    own = flat[None] @ _sandwich(xp, inverse[:K], Z[:K]) @ flat.T[None]
     count = K * p.rows.shape[-2]
     linear = xp.reshape(ratio[:count], (K, -1))
     own = blocks.symmetric(xp, own) + xp.einsum("kri,kr,krj->kij", p.rows, linear, p.rows)
@@ -275,18 +279,18 @@ def _hessian(
     if p.members.shape[-2]:
         flat = xp.reshape(p.couplings, (*p.members.shape, 16))
         more = flat @ _sandwich(xp, inverse[K:], Z[K:]) @ xp.swapaxes(flat, -1, -2)
-        ones = (p.members[..., None] == xp.arange(H.shape[0])) * 1.0
+        ones = indicators(p.members, H.shape[0])
         H = H + xp.einsum("kia,kij,kjb->ab", ones, blocks.symmetric(xp, more), ones)
     return H + TINY * xp.diag(xp.diag(H))
 
 
-def _sandwich(xp: ModuleType, inverse: AnyArray, Z: AnyArray) -> AnyArray:
+def _sandwich(xp: ModuleType, inverse: Values, Z: Values) -> Values:
     r"""The matrices $M$ with $e^T M g = \mathrm{tr}(E S^{-1} G Z)$ for flattened $E$ and $G$."""
     product = inverse[:, None, :, :, None] * Z[:, :, None, None, :]
     return xp.reshape(product, (-1, 16, 16))
 
 
-def _directions(machine: _Machine, p: ConeProgram, H: AnyArray) -> Callable[[AnyArray], AnyArray]:
+def _directions(machine: _Machine, p: ConeProgram, H: Values) -> Callable[[Values], Values]:
     """Solves Newton's equations, along what may change."""
     solve = machine.factor(H)
     if not p.equal.shape[0]:
@@ -295,7 +299,7 @@ def _directions(machine: _Machine, p: ConeProgram, H: AnyArray) -> Callable[[Any
     bent = xp.stack([solve(row) for row in p.equal], axis=1)
     square = p.equal @ bent
 
-    def along(r: AnyArray) -> AnyArray:
+    def along(r: Values) -> Values:
         free = solve(r)
         return free - bent @ xp.linalg.solve(square, p.equal @ free)
 

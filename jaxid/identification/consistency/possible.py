@@ -7,8 +7,9 @@ import numpy as np
 
 from jaxid.dynamics.model import Model
 from jaxid.identification.consistency.bounds import BodyBounds
-from jaxid.identification.consistency.cone_program import ConeProgram
+from jaxid.identification.consistency.cone_program import ConeProgram, Values
 from jaxid.identification.consistency.pseudo_inertia import ball, inertial_parameters
+from jaxid.robot.robot import AXES
 from jaxid.types import AnyArray, Float
 
 WIDE = 10.0
@@ -20,6 +21,9 @@ NOISE = 1e-3
 NOMINAL_MASS, NOMINAL_RADIUS = 0.05, 0.5
 """Mass and radius of a nominal ball, as shares of the largest ones."""
 LARGEST = 4
+"""Axes whose drives can be coupled."""
+CLOSE = 0.98
+"""Share of a prior's bodies in those of the start."""
 
 
 class Coupling(eqx.Module):
@@ -114,7 +118,7 @@ class PossibleParameters(eqx.Module):
         """Columns in the order of the program's variables."""
         return [*(k for body in self.bodies for k in body), *self.drives]
 
-    def scales(self, xp: ModuleType, A: AnyArray, b: AnyArray) -> AnyArray:
+    def scales(self, xp: ModuleType, A: Values, b: Values) -> Values:
         """Units of the program's variables: zero for drives that are not felt."""
         norms = xp.linalg.norm(A[:, np.array(self.drives, int)], axis=0)
         felt = norms > FELT * xp.max(norms, initial=0.0)
@@ -133,7 +137,7 @@ class PossibleParameters(eqx.Module):
         xp: ModuleType,
         A: Float[AnyArray, "height standard"],
         b: Float[AnyArray, " height"],
-        scale: AnyArray,
+        scale: Values,
         pull: float = 0.0,
         prior: Float[np.ndarray, "bodies 4 4"] | None = None,
     ) -> ConeProgram:
@@ -183,11 +187,11 @@ class PossibleParameters(eqx.Module):
             pull=xp.asarray(float(pull)),
             prior=inner,
             diameters=diameters,
-            scale=xp.asarray(scale),
-            start=self._start(xp, own, b, members, couplings),
+            scale=xp.asarray(scale) + 4.0 * K * pull,
+            start=self._start(xp, own, b, prior),
         )
 
-    def standard(self, xp: ModuleType, A: AnyArray, b: AnyArray, y: AnyArray) -> AnyArray:
+    def standard(self, xp: ModuleType, A: Values, b: Values, y: Values) -> Values:
         """The standard parameters of the program's variables, those without bounds included."""
         order = np.array([*self.order, *self.free])
         p = y * self.scales(xp, A, b)
@@ -197,7 +201,7 @@ class PossibleParameters(eqx.Module):
             p = xp.concatenate([p, inverse @ (F.T @ left)])
         return p[np.argsort(order)]
 
-    def _free(self, xp: ModuleType, A: AnyArray) -> tuple[AnyArray, AnyArray]:
+    def _free(self, xp: ModuleType, A: Values) -> tuple[Values, Values]:
         """Columns without bounds, and the inverse of their products."""
         F = A[:, np.array(self.free, int)]
         norms = xp.linalg.norm(F, axis=0)
@@ -205,6 +209,21 @@ class PossibleParameters(eqx.Module):
         gram = (unit[:, None] * (F.T @ F)) * unit[None]
         inverse = xp.linalg.inv(gram + 1e-13 * np.eye(len(self.free)))
         return F, unit[:, None] * inverse * unit[None]
+
+    @property
+    def bound_names(self) -> tuple[str, ...]:
+        """What the bodies' linear bounds are, in the order of the program's rows."""
+        bounds = self.bounds
+        names = ["largest mass", "sphere"]
+        if np.any(bounds.mass_min):
+            names.append("smallest mass")
+        for side, corner in (("lower", bounds.centre_min), ("upper", bounds.centre_max)):
+            names += [
+                f"{side} {AXES[axis]} of the centre of mass"
+                for axis in range(3)
+                if np.isfinite(corner[:, axis]).any()
+            ]
+        return tuple(names)
 
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
         """The bodies' linear bounds in scaled variables."""
@@ -229,9 +248,7 @@ class PossibleParameters(eqx.Module):
                     offsets.append(np.where(known, 0.0, 1.0))
         return np.stack(rows, axis=1), np.stack(offsets, axis=1)
 
-    def _coupled(
-        self, xp: ModuleType, largest: AnyArray
-    ) -> tuple[AnyArray, np.ndarray, np.ndarray]:
+    def _coupled(self, xp: ModuleType, largest: Values) -> tuple[Values, np.ndarray, np.ndarray]:
         """The further semidefinite matrices in scaled variables, filled up to size four."""
         w = self.width
         first = len(self.bodies) * w
@@ -268,10 +285,11 @@ class PossibleParameters(eqx.Module):
             return np.zeros((0, 0, 4, 4)), np.zeros((0, 0), int), np.zeros((0, 4, 4))
         return xp.stack(found), np.array(members), np.array(fillings)
 
-    def _start(
-        self, xp: ModuleType, A: AnyArray, b: AnyArray, members: np.ndarray, couplings: AnyArray
-    ) -> AnyArray:
-        """Balls around possible centres of mass, as heavy as fits the forces, and some friction."""
+    def _start(self, xp: ModuleType, A: Values, b: Values, prior: np.ndarray | None) -> Values:
+        """Balls around possible centres of mass, as heavy as fits the forces, and some friction.
+
+        Where a prior's bodies satisfy all bounds the start lies close to them.
+        """
         bounds, K, w, n = self.bounds, len(self.bodies), self.width, len(self.drives)
         L, most = np.asarray(bounds.radius), np.asarray(bounds.mass_max)
         centre = bounds.interior / L[:, None]
@@ -291,6 +309,13 @@ class PossibleParameters(eqx.Module):
             )
         mass = xp.asarray(low) + fitting * xp.asarray(1.0 - low)
         bodies = floor + (mass - floor[:, 0])[:, None] * balls
+        if prior is not None and bounds.total_mass is None:
+            given = inertial_parameters(prior)[:, :w] / self.body_scales
+            rows, offsets = self._rows()
+            inside = (np.einsum("kri,ki->kr", rows, given) + offsets >= 0).all(axis=1)
+            inside &= np.linalg.eigvalsh(prior - self.floors)[:, 0] >= 0
+            share = np.where(inside & ~bounds.has_ellipsoid, CLOSE, 0.0)[:, None]
+            bodies = (1.0 - share) * bodies + share * given
         drives = np.full(n, 0.02)
         start = xp.concatenate([xp.ravel(bodies), xp.asarray(drives)])
         for coupling in self.couplings:
@@ -325,7 +350,8 @@ def _couplings(model: Model) -> tuple[Coupling, ...]:
                 own = [k for k in columns if inside[place, place, k] != 0]
                 if not own:
                     raise ValueError(
-                        f"coupled drives are consistent only together with the drives' own columns: add `{kind}()`."
+                        f"coupled drives are consistent only together with the drives' own "
+                        f"columns: add `{kind}()`."
                     )
                 diagonal.append(int(own[0]))
             if len(group) > LARGEST:

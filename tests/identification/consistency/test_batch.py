@@ -1,0 +1,65 @@
+"""Many data sets together, and a single body."""
+
+import arms
+import numpy as np
+import pytest
+
+import jaxid as jid
+from jaxid.identification.consistency.estimator import PhysicallyConsistent
+from jaxid.identification.consistency.interior_point import Outcome, solve_at_once
+from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
+
+TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.RotorInertia(), jid.ConstantOffset())
+
+
+def test_a_batch_is_its_data_sets_one_by_one():
+    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.5), TERMS))
+    factors = [arms.factor(base, seed, 0.2, 100) for seed in range(3)]
+    R, z, rows = (np.array([f[k] for f in factors]) for k in range(3))
+    many = jid.consistent_batch(base, R, z, rows)
+    estimator = PhysicallyConsistent()
+    possible = estimator.possible(base)
+    for k in range(3):
+        data = arms.data(base, k, 0.2, 100)
+        optimum = solve_at_once(estimator.program(np, possible, data))
+        p = possible.standard(np, data.A, data.b, optimum.y)
+        np.testing.assert_allclose(many.parameters[k], base.from_standard(p), rtol=1e-3, atol=1e-4)
+        free = np.linalg.norm(data.b[base.size :])
+        price = np.sqrt(2.0 * optimum.value) / free - 1.0
+        np.testing.assert_allclose(many.prices[k], price, atol=1e-6)
+    assert many.certified.all()
+    bodies = np.asarray(many.standard)[:, :20].reshape(3, 2, 10)
+    assert (share_of_a_body(bodies) > 0).all()
+    with pytest.raises(ValueError, match="`R`, `z` and `rows` must have the shapes"):
+        jid.consistent_batch(base, R[:, :, :-1], z, rows)
+
+
+BODY = np.array([3.0, 0.0, 0.3, 0.6, 0.2, 0.18, 0.06, -0.05, 0.0, 0.0])
+
+
+def test_a_possible_body_stays():
+    bounds = jid.BodyBounds.of(1, mass_max=10.0, radius=0.5)
+    assert share_of_a_body(BODY) > 0
+    found = jid.consistent_body(BODY, 1e-4 * np.eye(10), bounds)
+    np.testing.assert_allclose(found.parameters, BODY, atol=1e-4)
+    assert found.distance < 0.05
+    assert found.outcome is Outcome.CERTIFIED
+
+
+def test_an_impossible_body_moves_as_little_as_its_errors_allow():
+    bounds = jid.BodyBounds.of(1, mass_max=10.0, radius=0.5)
+    wrong = BODY.copy()
+    wrong[6] = -0.02
+    covariance = np.diag([1e-4, *[1e-4] * 3, *[1e-6] * 2, 1e-2, *[1e-6] * 3])
+    found = jid.consistent_body(wrong, covariance, bounds)
+    assert share_of_a_body(found.parameters) > 0
+    assert abs(found.parameters[4] - wrong[4]) < 5e-3
+    assert found.parameters[6] > 0
+    shift = (found.parameters - wrong) / np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.distance, np.linalg.norm(shift), rtol=1e-6)
+
+
+def test_an_undetermined_body_is_refused():
+    bounds = jid.BodyBounds.of(1, mass_max=10.0, radius=0.5)
+    with pytest.raises(ValueError, match="`covariance` must be positive definite"):
+        jid.consistent_body(BODY, np.diag([1.0] * 9 + [-1.0]), bounds)

@@ -1,0 +1,194 @@
+"""The estimator: definite mass matrices, bounds and priors that hold, and what it says."""
+
+import sys
+from pathlib import Path
+
+import arms
+import numpy as np
+import pytest
+
+import jaxid as jid
+from jaxid.identification.consistency.interior_point import MOST
+from jaxid.identification.consistency.possible import nominal_bodies
+from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, share_of_a_body
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from virtual import observations
+
+TERMS = (
+    jid.RigidBodies(),
+    jid.ViscousFriction(),
+    jid.CoulombFriction(),
+    jid.RotorInertia(),
+    jid.ConstantOffset(),
+)
+WEIGHTS = jid.MeasuredForces()
+
+
+def case(robot, terms=TERMS, noise=3.0, samples=150):
+    base = jid.base_parameters(jid.Model(robot, terms))
+    p = arms.truth(base.model, 1)
+    return base, p, observations(base.model, p, samples=samples, noise=noise, seed=1)
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return case(jid.robots.panda())
+
+
+def test_the_mass_matrix_is_definite_where_least_squares_fail(panda):
+    base, _, o = panda
+    free = jid.identify(base, o, jid.WeightedLeastSquares(WEIGHTS))
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
+    assert not jid.validate(free, o).definiteness.positive_definite
+    assert jid.validate(fit, o).definiteness.positive_definite
+    found = fit.consistency
+    assert (found.shares > 0).all()
+    assert (found.bodies[:, 0] > 0).all()
+    assert (found.bodies[:, 0] < found.bounds.mass_max).all()
+    assert found.iterations < MOST
+    weigh = fit.weights**2 * np.array(fit.rows)
+    price = np.sqrt((weigh @ fit.residual_rms**2) / (weigh @ free.residual_rms**2)) - 1
+    np.testing.assert_allclose(found.price, price, rtol=1e-6)
+    assert 0 < found.price < 0.1
+
+
+def test_standard_and_base_parameters_are_one_thing(panda):
+    base, _, o = panda
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
+    np.testing.assert_allclose(base.from_standard(fit.full_parameters), fit.parameters, rtol=1e-9)
+    names = base.model.parameter_names
+    drives = [k for k, name in enumerate(names) if name[:2] in ("fv", "fc", "Ia")]
+    assert (fit.full_parameters[drives] >= 0).all()
+    assert (fit.full_parameters[[k for k, n in enumerate(names) if n[:2] == "fo"]] < 0).any()
+
+
+def test_the_margin_holds_in_every_pose(panda):
+    base, _, o = panda
+    margin = 0.05
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, margin=margin))
+    model = base.model
+    nominal = np.zeros(model.size)
+    balls = inertial_parameters(nominal_bodies(fit.consistency.bounds))
+    nominal[: balls.size] = balls.ravel()
+    q = np.random.default_rng(0).uniform(-3, 3, (200, 7))
+    M = np.asarray(model.mass_matrix(fit.full_parameters - margin * nominal, q))
+    assert np.linalg.eigvalsh(M).min() > 0
+
+
+def test_without_noise_the_truth_is_found():
+    base, p, o = case(jid.robots.planar_arm(2, 0.5), noise=0.0)
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
+    truth = np.asarray(base.from_standard(p))
+    np.testing.assert_allclose(fit.parameters, truth, rtol=1e-4, atol=1e-4)
+    assert fit.consistency.active == ()
+
+
+def test_coupled_drives_are_definite():
+    terms = (*TERMS, jid.CoupledDrives())
+    base, _, o = case(jid.robots.tx40(), terms, noise=6.0)
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
+    p = dict(zip(base.model.parameter_names, fit.full_parameters, strict=True))
+    for own, beside in (("Ia", "Iam"), ("fv", "fvm")):
+        matrix = [[p[f"{own}5"], p[f"{beside}6"]], [p[f"{beside}6"], p[f"{own}6"]]]
+        assert np.linalg.eigvalsh(matrix)[0] >= 0
+    assert jid.validate(fit, o).definiteness.positive_definite
+
+
+def test_coupled_drives_need_their_own_columns():
+    model = jid.Model(jid.robots.tx40(), (jid.RigidBodies(), jid.CoupledDrives()))
+    base = jid.base_parameters(model)
+    with pytest.raises(ValueError, match=r"add `RotorInertia\(\)`"):
+        jid.PhysicallyConsistent().possible(base)
+
+
+def test_seven_parameters_are_bodies_with_principal_axes():
+    terms = (jid.RigidBodies(principal_axes=True), *TERMS[1:])
+    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(3, 0.5), terms))
+    o = observations(base.model, np.full(base.model.size, 0.4), noise=2.0)
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
+    assert (share_of_a_body(fit.consistency.bodies) > 0).all()
+    assert not fit.consistency.bodies[:, 7:].any()
+    assert jid.validate(fit, o).definiteness.positive_definite
+
+
+def test_bounds_hold_and_are_named(panda):
+    base, _, o = panda
+    bounds = jid.BodyBounds.from_geometry(base.model.robot).replace(
+        mass_max=[8, 8, 8, 2, 8, 8, 8], mass_min=0.2, centre_max=[np.inf, 0.01, 0.2], total_mass=20
+    )
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, bounds))
+    m, h = fit.consistency.bodies[:, 0], fit.consistency.bodies[:, 1:4]
+    np.testing.assert_allclose(m.sum(), 20.0, rtol=1e-9)
+    assert (m >= 0.2).all()
+    assert m[3] <= 2.0
+    assert (h[:, 1] <= 0.01 * m).all()
+    said = " ".join(fit.notes)
+    assert "20 kg together" in said
+    assert "masses m1, m2" in said
+    assert "of the centre of mass of body" in " ".join(fit.consistency.active)
+
+
+def test_a_strong_pull_leads_to_its_bodies(panda):
+    base, p, o = panda
+    bodies = p[:70].reshape(7, 10)
+    gaps = []
+    for strength in (1e-2, 1.0, 1e4):
+        pull = jid.EntropicPull(bodies, strength)
+        fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=pull))
+        gaps.append(np.abs(fit.consistency.bodies - bodies).max())
+    assert gaps[0] > gaps[1] > gaps[2]
+    assert gaps[2] < 0.05 * gaps[0]
+
+
+def test_a_pull_gives_the_mass_matrix_a_margin(panda):
+    base, _, o = panda
+    smallest = [
+        jid.validate(
+            jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=pull)), o
+        ).definiteness.smallest
+        for pull in (None, jid.EntropicPull())
+    ]
+    assert smallest[1] > smallest[0] > 0
+
+
+def test_what_is_known_roughly_counts(panda):
+    base, p, o = panda
+    deviations = np.full(base.model.size, np.inf)
+    deviations[0] = 1e-4
+    prior = jid.ParameterPrior(p, deviations)
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, prior=prior))
+    np.testing.assert_allclose(fit.consistency.bodies[0, 0], p[0], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mass_max": 0.0}, "`mass_max` must be positive"),
+        ({"mass_min": 500.0}, "`mass_min` must lie between 0 and `mass_max`"),
+        ({"total_mass": 5000.0}, "`total_mass` must lie between the sums"),
+        ({"centre_min": [0.9, 0.9, 0.9]}, "no centre of mass of body 1"),
+        ({"centre_min": [0.1, 0, 0], "centre_max": [0, 1, 1]}, "`centre_min` must be below"),
+        ({"radius": [1.0, 2.0]}, "`radius` must hold numbers for all bodies"),
+    ],
+)
+def test_bounds_that_no_body_satisfies_are_refused(change, message):
+    bounds = jid.BodyBounds.from_geometry(jid.robots.panda())
+    with pytest.raises(ValueError, match=message):
+        bounds.replace(**change)
+
+
+def test_priors_that_are_no_bodies_are_refused():
+    with pytest.raises(ValueError, match="body 2 is not"):
+        jid.EntropicPull(np.array([[1.0, 0, 0, 0, 1, 1, k, 0, 0, 0] for k in (1.0, 3.0)]))
+
+
+def test_a_search_without_proof_is_an_error_unless_told_otherwise(panda, monkeypatch):
+    base, _, o = panda
+    monkeypatch.setattr("jaxid.identification.consistency.interior_point.MOST", 3)
+    monkeypatch.setattr("jaxid.identification.consistency.estimator.MOST", 3)
+    with pytest.raises(RuntimeError, match="the iterations did not suffice"):
+        jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
+    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, throw=False))
+    assert "did not suffice" in fit.notes[-1]
+    assert fit.consistency.error_bound > 1e-6

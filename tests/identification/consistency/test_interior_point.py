@@ -1,0 +1,127 @@
+"""The optimum against a conic solver, the certificate, and the two machines against each other."""
+
+import arms
+import jax
+import numpy as np
+import pytest
+
+import jaxid as jid
+from jaxid.identification.consistency import interior_point
+from jaxid.identification.consistency.possible import PossibleParameters, nominal_bodies
+
+TERMS = (
+    jid.RigidBodies(),
+    jid.ViscousFriction(),
+    jid.CoulombFriction(),
+    jid.RotorInertia(),
+    jid.ConstantOffset(),
+)
+
+
+def _robot(name):
+    return {
+        "panda": jid.robots.panda,
+        "tx40": jid.robots.tx40,
+        "planar": lambda: jid.robots.planar_arm(2, 0.5),
+        "rail": jid.robots.tx90l_on_rail,
+    }[name]()
+
+
+def _case(name, terms=TERMS, margin=0.0, **bounds):
+    base = jid.base_parameters(jid.Model(_robot(name), terms))
+    wide = jid.BodyBounds.from_geometry(base.model.robot)
+    return base, PossibleParameters.of(base.model, wide.replace(**bounds), margin)
+
+
+def _program(possible, data):
+    return possible.program(np, data.A, data.b, data.scale)
+
+
+CASES = {
+    "a seven-axis arm": (_case("panda"), 0.2),
+    "coupled drives": (_case("tx40", (*TERMS, jid.CoupledDrives())), 0.3),
+    "a rail": (_case("rail"), 0.1),
+    "seven parameters": (_case("planar", (jid.RigidBodies(principal_axes=True), *TERMS[1:])), 0.2),
+    "all bounds": (
+        _case(
+            "planar",
+            mass_min=1.0,
+            mass_max=[30.0, 9.0],
+            centre_min=[0.0, -0.1, -np.inf],
+            centre_max=[0.4, 0.2, 0.3],
+            ellipsoid_centre=[0.2, 0.0, 0.0],
+            ellipsoid_axes=[[0.3, 0.2, 0.2], [np.inf] * 3],
+            total_mass=12.0,
+            margin=0.02,
+        ),
+        0.2,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_optimum_is_a_conic_solvers(name):
+    (base, possible), noise = CASES[name]
+    data = arms.data(base, 3, noise)
+    optimum = interior_point.solve_at_once(_program(possible, data))
+    value, p = arms.conic(possible, data)
+    assert optimum.certified
+    assert optimum.iterations <= 30
+    assert abs(optimum.value - value) <= 1e-6 * value
+    ours = possible.standard(np, data.A, data.b, optimum.y)
+    np.testing.assert_allclose(
+        data.A @ ours, data.A @ p, atol=5e-3 * np.sqrt(value), err_msg="forces of the optimum"
+    )
+
+
+def test_noise_free_forces_are_met_exactly():
+    (base, possible), _ = CASES["a seven-axis arm"]
+    data = arms.data(base, 5, 0.0)
+    optimum = interior_point.solve_at_once(_program(possible, data))
+    assert optimum.certified
+    assert optimum.value < 1e-6 * data.scale
+
+
+def test_the_bound_holds_on_the_way(monkeypatch):
+    (base, possible), _ = CASES["coupled drives"]
+    program = _program(possible, arms.data(base, 7, 0.3))
+    best = interior_point.solve_at_once(program).value
+    for most in (1, 3, 6, 9):
+        monkeypatch.setattr(interior_point, "MOST", most)
+        early = interior_point.solve_at_once(program)
+        assert early.value - best <= early.error * (1 + 1e-9)
+        assert not early.certified
+
+
+def test_the_bound_holds_with_a_pull(monkeypatch):
+    (base, possible), _ = CASES["all bounds"]
+    data = arms.data(base, 7, 0.3)
+    prior = nominal_bodies(possible.bounds)
+    program = possible.program(np, data.A, data.b, data.scale, 3.0, prior)
+    optimum = interior_point.solve_at_once(program)
+    assert optimum.certified
+
+    def objective(y):
+        S = program.matrices(np, y)[: program.bodies] - program.floors
+        away = program.A @ y - program.b
+        return 0.5 * away @ away + 3.0 * np.sum(
+            np.einsum("kab,kab->k", program.prior, S) - np.linalg.slogdet(S)[1]
+        )
+
+    best = objective(optimum.y)
+    for most in (2, 5):
+        monkeypatch.setattr(interior_point, "MOST", most)
+        early = interior_point.solve_at_once(program)
+        assert -1e-6 <= objective(early.y) - best <= early.error * (1 + 1e-9)
+
+
+def test_both_machines_find_the_same():
+    (base, possible), _ = CASES["coupled drives"]
+    programs = [_program(possible, arms.data(base, seed, 0.2)) for seed in range(3)]
+    stacked = jax.tree.map(lambda *x: np.stack(x), *programs)
+    many = interior_point.solve_many(stacked)
+    for k, program in enumerate(programs):
+        one = interior_point.solve_at_once(program)
+        np.testing.assert_allclose(many.value[k], one.value, rtol=1e-6)
+        assert many.certified[k]
+        assert abs(int(many.iterations[k]) - int(one.iterations)) <= 2
