@@ -28,12 +28,12 @@ class ConsistentBatch(eqx.Module):
         iterations: How many it took.
     """
 
-    standard: Float[AnyArray, "datasets standard"]
-    parameters: Float[AnyArray, "datasets base"]
-    prices: Float[AnyArray, " datasets"]
-    error_bounds: Float[AnyArray, " datasets"]
-    certified: Bool[AnyArray, " datasets"]
-    iterations: Int[AnyArray, " datasets"]
+    standard: Float[AnyArray, "*datasets standard"]
+    parameters: Float[AnyArray, "*datasets base"]
+    prices: Float[AnyArray, "*datasets"]
+    error_bounds: Float[AnyArray, "*datasets"]
+    certified: Bool[AnyArray, "*datasets"]
+    iterations: Int[AnyArray, "*datasets"]
 
 
 def consistent_batch(

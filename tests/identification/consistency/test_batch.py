@@ -7,7 +7,11 @@ import pytest
 import jaxid as jid
 from jaxid.identification.consistency.estimator import PhysicallyConsistent
 from jaxid.identification.consistency.interior_point import Outcome, solve_at_once
-from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
+from jaxid.identification.consistency.pseudo_inertia import (
+    ball,
+    inertial_parameters,
+    share_of_a_body,
+)
 
 TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.RotorInertia(), jid.ConstantOffset())
 
@@ -34,7 +38,7 @@ def test_a_batch_is_its_data_sets_one_by_one():
         jid.consistent_batch(base, R[:, :, :-1], z, rows)
 
 
-BODY = np.array([3.0, 0.0, 0.3, 0.6, 0.2, 0.18, 0.06, -0.05, 0.0, 0.0])
+BODY = inertial_parameters(ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.array(0.12)))
 
 
 def test_a_possible_body_stays():
