@@ -23,7 +23,15 @@ from jaxid.dynamics.terms import ViscousFriction as ViscousFriction
 from jaxid.dynamics.transitions import AbstractTransition as AbstractTransition
 from jaxid.dynamics.transitions import HardSign as HardSign
 from jaxid.dynamics.transitions import Tanh as Tanh
+from jaxid.excitation.constraints.clearance import Clearance as Clearance
 from jaxid.excitation.constraints.constraint import AbstractConstraint as AbstractConstraint
+from jaxid.excitation.constraints.forces import JointForces as JointForces
+from jaxid.excitation.constraints.forces import MotorTorques as MotorTorques
+from jaxid.excitation.constraints.forces import NominalForces as NominalForces
+from jaxid.excitation.constraints.tip import TipAcceleration as TipAcceleration
+from jaxid.excitation.constraints.tip import TipSpeed as TipSpeed
+from jaxid.excitation.constraints.tip import Workspace as Workspace
+from jaxid.excitation.constraints.tip import tip_motion as tip_motion
 from jaxid.excitation.criteria import AbstractCriterion as AbstractCriterion
 from jaxid.excitation.criteria import AOptimal as AOptimal
 from jaxid.excitation.criteria import ConditionNumber as ConditionNumber
@@ -125,6 +133,7 @@ from jaxid.robot.robot import Robot as Robot
 from jaxid.robot.robot import Tool as Tool
 from jaxid.robot.urdf import load_urdf as load_urdf
 from jaxid.robot.urdf import urdf_parameters as urdf_parameters
+from jaxid.robot.urdf_collision import fit_capsules as fit_capsules
 from jaxid.simulation.example import write_example as write_example
 from jaxid.simulation.virtual import VirtualRobot as VirtualRobot
 from jaxid.trajectory.files import load_trajectory as load_trajectory

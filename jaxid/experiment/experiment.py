@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
+from jaxid.experiment.collision_tables import build_collision
 from jaxid.experiment.method_tables import (
     build_columns,
     build_decimation,
@@ -31,6 +32,7 @@ from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.parts import estimated_rows
 from jaxid.measurement.read import read_recording
 from jaxid.measurement.recording import Recording
+from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
 
@@ -47,6 +49,8 @@ class Experiment:
         text: Of the file, as it was read.
         robot: What is known.
         model: The effects whose parameters are wanted.
+        collision: What may not touch what; None if the file does not say.
+        clearance: Least distance between what may not touch [m].
         recording: The table of the log's columns; None if the file has none.
         columns: The same as the reader needs them; None if the file has none.
         filter: For motion, forces and columns.
@@ -61,6 +65,8 @@ class Experiment:
     text: str
     robot: Robot
     model: Model
+    collision: CollisionModel | None
+    clearance: float
     recording: RecordingTable | None
     columns: Columns | None
     filter: AbstractFilter
@@ -205,6 +211,7 @@ def load_experiment(path: str | Path) -> Experiment:
     notes = _two_forces(robot)
     with within(path.name, "model"):
         model = Model(robot, build_terms(tables.model, robot))
+    collision = build_collision(tables, robot, path)
     with within(path.name, "recording"):
         columns = build_columns(tables.recording, robot)
     with within(path.name, "filter"):
@@ -221,6 +228,8 @@ def load_experiment(path: str | Path) -> Experiment:
         text=text,
         robot=robot,
         model=model,
+        collision=collision,
+        clearance=0.0 if tables.collision is None else tables.collision.distance,
         recording=tables.recording,
         columns=columns,
         filter=filtering,

@@ -92,6 +92,37 @@ class DrivesTable(_Table, frozen=True):
     rotor_inertia: PerJoint | None = None
 
 
+class CapsuleTable(_Table, frozen=True):
+    """A capsule on the body that a joint moves, or on the ground; a sphere without `end`."""
+
+    name: str
+    body: str
+    start: Vector
+    radius: Positive
+    end: Vector | None = None
+
+
+class BoxTable(_Table, frozen=True):
+    """A box in the world: angles in degrees, lengths in metres."""
+
+    name: str
+    centre: Vector
+    size: Vector
+    rotation: Vector | None = None
+
+
+class CollisionTable(_Table, frozen=True):
+    """What may not touch: shapes of the file, of the URDF or of the library."""
+
+    distance: Positive = 0.03
+    fit: bool = False
+    packages: str | None = None
+    ground: float | None = None
+    capsules: list[CapsuleTable] = []
+    boxes: list[BoxTable] = []
+    pairs: list[tuple[str, str]] | None = None
+
+
 class CoulombTable(_Table, frozen=True):
     """How dry friction passes from one direction of motion to the other."""
 
@@ -188,6 +219,7 @@ class Tables(_Table, frozen=True):
     robot: RobotTable
     limits: LimitsTable | None = None
     drives: DrivesTable | None = None
+    collision: CollisionTable | None = None
     model: ModelTable = ModelTable()
     recording: RecordingTable | None = None
     filter: ButterworthTable | PaperTable | PeriodicTable | None = None

@@ -137,6 +137,30 @@ def urdf_parameters(
     return parameters.ravel()
 
 
+def merged_links(
+    path: str | Path,
+    *,
+    tip: str | None = None,
+    base: str | None = None,
+    snap_tolerance: float = SNAP_TOLERANCE,
+) -> dict[str, tuple[int, np.ndarray, np.ndarray]]:
+    """For each link of a file the body that carries it, and its placement in the body's frame.
+
+    A link on the ground has body -1 and its placement in the frame of the base link.
+
+    Args:
+        path: The file.
+        tip: As in `load_urdf`.
+        base: As in `load_urdf`.
+        snap_tolerance: As in `load_urdf` [rad].
+
+    Raises:
+        FileNotFoundError: If the file does not exist.
+        ValueError: If the file cannot be loaded.
+    """
+    return _merge(UrdfTree(path), base, tip, snap_tolerance).links
+
+
 class _Bodies(NamedTuple):
     """The moving joints and, for each link, its body (-1: ground) and its placement in it."""
 

@@ -1,0 +1,156 @@
+"""Capsules around a URDF's geometry: nothing sticks out, and nothing is much too large."""
+
+import numpy as np
+import pytest
+from forward_kinematics import body_transforms
+
+from jaxid.robot.collision import CollisionModel
+from jaxid.robot.enclose import enclose
+from jaxid.robot.urdf import load_urdf
+from jaxid.robot.urdf_collision import fit_capsules
+
+TEXT = """<robot name="arm">
+  <link name="base">
+    <collision><geometry><cylinder radius="0.2" length="0.4"/></geometry></collision>
+  </link>
+  <joint name="j1" type="revolute">
+    <parent link="base"/><child link="upper"/><origin xyz="0 0 0.4"/><axis xyz="0 0 1"/>
+  </joint>
+  <link name="upper">
+    <collision>
+      <origin xyz="0.3 0 0" rpy="0 1.5707963267948966 0"/>
+      <geometry><cylinder radius="0.05" length="0.6"/></geometry>
+    </collision>
+    <collision><origin xyz="0 0 0.1"/><geometry><sphere radius="0.08"/></geometry></collision>
+  </link>
+  <joint name="flange" type="fixed">
+    <parent link="upper"/><child link="plate"/><origin xyz="0.6 0 0" rpy="0 0 0.3"/>
+  </joint>
+  <link name="plate">
+    <collision><geometry><box size="0.1 0.3 0.02"/></geometry></collision>
+  </link>
+  <joint name="j2" type="revolute">
+    <parent link="plate"/><child link="tool"/><origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
+  </joint>
+  <link name="tool">
+    <collision><geometry>{tool}</geometry></collision>
+  </link>
+</robot>"""
+SPHERE = '<sphere radius="0.03"/>'
+
+
+def written(tmp_path, tool=SPHERE):
+    path = tmp_path / "arm.urdf"
+    path.write_text(TEXT.format(tool=tool))
+    return path
+
+
+def outside(points, start, end, radius):
+    """How far points stick out of a capsule [m]."""
+    axis = np.asarray(end) - start
+    length = axis @ axis
+    along = np.clip((points - start) @ axis / (length if length > 0 else 1.0), 0.0, 1.0)
+    return np.linalg.norm(points - start - along[:, None] * axis, axis=1) - radius
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_all_points_are_inside_and_the_capsule_is_small(seed):
+    random = np.random.default_rng(seed)
+    shape = random.standard_normal((400, 3)) * random.uniform(0.05, 1.0, 3)
+    rotation = np.linalg.qr(random.standard_normal((3, 3)))[0]
+    points = shape @ rotation + random.standard_normal(3)
+    capsule = enclose(points)
+    assert outside(points, *capsule).max() <= 1e-12
+    # Not larger than the sphere about the box of the points, and tight somewhere.
+    centre = 0.5 * (points.max(0) + points.min(0))
+    sphere = np.linalg.norm(points - centre, axis=1).max()
+    assert capsule.volume <= 4 / 3 * np.pi * sphere**3 * (1 + 1e-6)
+    assert outside(points, *capsule).max() >= -1e-6
+
+
+def test_a_capsule_is_found_again():
+    random = np.random.default_rng(9)
+    start, end, radius = np.array([0.1, 0.2, 0.3]), np.array([0.5, -0.1, 0.9]), 0.15
+    direction = random.standard_normal((4000, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    along = random.uniform(size=(4000, 1)).round(1)
+    points = start + along * (end - start) + radius * direction
+    capsule = enclose(points)
+    exact = np.pi * radius**2 * (np.linalg.norm(end - start) + 4 / 3 * radius)
+    assert capsule.volume <= 1.03 * exact
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 8])
+def test_few_or_flat_points(count):
+    points = np.random.default_rng(count).standard_normal((count, 3))
+    points[:, 2] = 0.5
+    assert outside(points, *enclose(points)).max() <= 1e-12
+
+
+def test_capsules_hold_the_geometry_on_its_bodies(tmp_path):
+    path = written(tmp_path)
+    robot = load_urdf(path, base_position=(0.0, 0.0, 1.0))
+    capsules = fit_capsules(path, base_position=(0.0, 0.0, 1.0))
+    names = [c.name for c in capsules]
+    assert names == ["base", "upper", "upper 2", "plate", "tool"]
+    assert [c.body for c in capsules] == [-1, 0, 0, 0, 1]
+    ground, upper, ball, plate, tool = capsules
+    np.testing.assert_allclose([ground.start, ground.end], [[0, 0, 0.8], [0, 0, 1.2]], atol=1e-12)
+    np.testing.assert_allclose(sorted([upper.start[0], upper.end[0]]), [0.0, 0.6], atol=1e-12)
+    np.testing.assert_allclose(ball.start, [0, 0, 0.1], atol=1e-12)
+    assert float(ball.radius) == 0.08
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = signs * [0.05, 0.15, 0.01]
+    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
+    placed = corners @ turn.T + [0.6, 0, 0]
+    assert outside(placed, plate.start, plate.end, plate.radius).max() <= 1e-9
+    assert float(plate.radius) < 0.06
+    np.testing.assert_allclose(tool.start, 0.0, atol=1e-12)
+    model = CollisionModel.of(robot, capsules)
+    assert "base and tool" in model.pair_names
+    # The frames are those of the robot: the upright cylinder is where its joint is.
+    pose = body_transforms(robot, np.zeros(2))
+    np.testing.assert_allclose(pose[0][:3, 3], [0, 0, 1.4], atol=1e-12)
+
+
+def test_a_mesh_is_held_whole(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    meshes = tmp_path / "arm_description" / "meshes"
+    meshes.mkdir(parents=True)
+    mesh = trimesh.creation.cylinder(radius=30.0, height=200.0)
+    mesh.export(meshes / "tool.stl")
+    path = written(
+        tmp_path,
+        '<mesh filename="package://arm_description/meshes/tool.stl" scale="0.001 0.001 0.001"/>',
+    )
+    tool = fit_capsules(path)[-1]
+    points = 0.001 * np.asarray(mesh.vertices)
+    assert outside(points, tool.start, tool.end, tool.radius).max() <= 1e-7
+    assert float(tool.radius) < 0.034
+    (meshes / "tool.stl").rename(meshes / "other.stl")
+    with pytest.raises(FileNotFoundError, match=r"line 25: the mesh .* `packages`"):
+        fit_capsules(path)
+
+
+@pytest.mark.parametrize(
+    ("tool", "message"),
+    [
+        ('<cone radius="1"/>', "line 25: a collision geometry must be .* `cone`"),
+        ("", "is empty"),
+        ('<sphere radius="big"/>', "`radius` must be 1 finite number, but is 'big'"),
+        ('<box size="1 2"/>', "`size` must be 3 finite numbers"),
+    ],
+)
+def test_errors_name_file_and_line(tmp_path, tool, message):
+    with pytest.raises(ValueError, match=message):
+        fit_capsules(written(tmp_path, tool))
+
+
+def test_a_file_without_geometry_is_refused(tmp_path):
+    path = tmp_path / "bare.urdf"
+    path.write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
+        '<parent link="a"/><child link="b"/></joint></robot>'
+    )
+    with pytest.raises(ValueError, match="no collision geometry"):
+        fit_capsules(path)
