@@ -17,6 +17,7 @@ from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import output_folder, refuse_foreign_folder
 from jaxid.experiment.loading import Loaded, load_log
+from jaxid.experiment.mistakes import likely_mistake
 from jaxid.experiment.progress import Stages, stages
 from jaxid.experiment.sanity import negative_friction
 from jaxid.experiment.template import write_template
@@ -179,7 +180,8 @@ def inspect(
     terminal.sentences(console, loaded.notes)
     for log, fit in seen:
         terminal.show_recording(console, log.recording)
-        terminal.show_check(console, loaded.robot, log.check, negative_friction(fit))
+        doubts = (*negative_friction(fit), *likely_mistake(loaded.base, log.observations))
+        terminal.show_check(console, loaded.robot, log.check, doubts)
         console.print()
         terminal.show_rows(console, (log.observations,), fit)
         terminal.show_undetermined(console, fit, loaded.regularised)
@@ -282,7 +284,8 @@ def identify(
     console.print()
     terminal.show_rows(console, fitted, fit)
     terminal.show_undetermined(console, fit, loaded.regularised)
-    terminal.sentences(console, negative_friction(fit), terminal.DOUBTFUL, "!")
+    slips = [f"{o.name}: {said}" for o in fitted for said in likely_mistake(base, o)]
+    terminal.sentences(console, (*negative_friction(fit), *slips), terminal.DOUBTFUL, "!")
     terminal.show_validation(console, loaded.robot, found, len(fitted))
     if beside is not None:
         terminal.show_beside(console, fit, found.errors, beside)

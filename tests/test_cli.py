@@ -233,7 +233,10 @@ def test_inspect_doubts_wrong_units_and_signs(folder, run):
     assert "!" not in sane
     assert "these logs determine all" in sane
     wrong = words(good.replace('time = "t"', 'time = "t"\nangle_unit = "rev"'))
-    assert "outside its range from -2 to 2 rad" in wrong
+    assert "would not if those in the log were" in wrong
+    assert 'radians (`recording.angle_unit` is "rev")' in wrong
+    shifted = words(good.replace('time = "t"', 'time = "t"\nangle_offsets = [3, 0]'))
+    assert "outside its range from -2 to 2 rad: check" in shifted
     assert "but its limit is 6" in wrong
     small = words(good.replace('time = "t"', 'time = "t"\nangle_unit = "deg"'))
     assert "is it the right column and unit?" in small
@@ -242,6 +245,34 @@ def test_inspect_doubts_wrong_units_and_signs(folder, run):
     write_log(folder / "signs.csv", 3, sign=-1.0)
     signs = words(good, "signs.csv")
     assert "friction of joint `joint2` comes out negative" in signs
+
+
+def exchanged(path, log, *columns):
+    """A copy of a log in which two columns have each other's names."""
+    header, rest = log.read_text().split("\n", 1)
+    names = header.strip().split(",")
+    i, j = (names.index(c) for c in columns)
+    names[i], names[j] = names[j], names[i]
+    path.write_text(",".join(names) + "\n" + rest)
+
+
+@pytest.mark.parametrize("command", ["inspect", "identify"])
+def test_a_single_slip_that_explains_a_bad_fit_is_named(folder, run, command):
+    def words(log):
+        code, out, err = run(command, "experiment.toml", log)
+        assert code == 0, err
+        return " ".join(out.split())
+
+    assert "instead of" not in words("a.csv")
+    exchanged(folder / "forces.csv", folder / "a.csv", "tau1", "tau2")
+    said = "the forces of joints `joint1` and `joint2` seem to be exchanged (`recording.forces`)"
+    assert said in words("forces.csv")
+    exchanged(folder / "angles.csv", folder / "a.csv", "q1", "q2")
+    said = "the angles of joints `joint1` and `joint2` seem to be exchanged (`recording.angles`)"
+    assert said in words("angles.csv")
+    write_log(folder / "signs.csv", 3, sign=-1.0)
+    said = "the sign of the force of joint `joint2` seems to be wrong (`recording.force_signs`)"
+    assert said in words("signs.csv")
 
 
 def test_wrapped_angles_are_doubted_by_both_commands(folder, run):

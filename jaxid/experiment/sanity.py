@@ -5,6 +5,13 @@ import dataclasses
 import numpy as np
 
 from jaxid.dynamics.motion import Motion
+from jaxid.experiment.channels import (
+    SLACK,
+    STANDING,
+    rate_doubts,
+    stuck_doubts,
+    unit_doubts,
+)
 from jaxid.identification.fit import Fit
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
@@ -13,12 +20,8 @@ from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
 from jaxid.types import AnyArray, Float
 
-SLACK = 0.02
-"""How far outside a range, relative to it, a log may reach without a word."""
 FAST, STRONG = 1.1, 1.2
 """Parts of the limits above which speeds and forces are doubtful."""
-STANDING = 0.01
-"""Part of a joint's largest speed below which it stands."""
 FRICTION = ("fv", "fc")
 """Parameters that are negative on no robot."""
 SURE = 3.0
@@ -71,7 +74,9 @@ def check_log(robot: Robot, recording: Recording, observations: Observations) ->
     for a, b in observations.segments:
         look.motion(observations.motion[a:b], observations.forces[a:b], observations.sample_time)
     measured = recording.velocities is not None
-    return look.check(robot, not recording.angles_on_motor_side, measured)
+    check = look.check(robot, not recording.angles_on_motor_side, measured)
+    more = (*rate_doubts(recording.sample_time), *stuck_doubts(robot, recording))
+    return dataclasses.replace(check, warnings=(*check.warnings, *more))
 
 
 def check_long_log(robot: Robot, log: LongLog, progress: Progress | None = None) -> LogCheck:
@@ -149,7 +154,10 @@ class _Look:
             all_standing=float(stands.all(axis=1).mean()),
             warnings=(),
         )
-        warnings = [w for j in range(robot.joints) for w in _joint(robot, j, check)]
+        warnings = unit_doubts(robot, check.lowest, check.highest, not jumps)
+        if not warnings:
+            warnings = [w for j in range(robot.joints) for w in _range(robot, j, check)]
+        warnings += [w for j in range(robot.joints) for w in _joint(robot, j, check)]
         # Over a whole log, friction makes a robot consume energy.
         if self._power < -0.05 * np.sqrt(self._forces * self._velocities):
             warnings.append(
@@ -166,17 +174,22 @@ class _Look:
         return dataclasses.replace(check, warnings=tuple(warnings))
 
 
-def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
+def _range(robot: Robot, j: int, check: LogCheck) -> list[str]:
     name, unit, limits = robot.joint_names[j], robot.joint_unit(j), robot.limits
     low, high = float(limits.position_min[j]), float(limits.position_max[j])
     slack = SLACK * (high - low) if np.isfinite(high - low) else 0.0
+    if check.lowest[j] >= low - slack and check.highest[j] <= high + slack:
+        return []
+    return [
+        f"joint `{name}` moves from {check.lowest[j]:.3g} to {check.highest[j]:.3g} {unit}, "
+        f"outside its range from {low:.3g} to {high:.3g} {unit}: check `recording.angle_unit`, "
+        "`side`, `angle_signs` and `angle_offsets`."
+    ]
+
+
+def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
+    name, unit, limits = robot.joint_names[j], robot.joint_unit(j), robot.limits
     said = []
-    if check.lowest[j] < low - slack or check.highest[j] > high + slack:
-        said.append(
-            f"joint `{name}` moves from {check.lowest[j]:.3g} to {check.highest[j]:.3g} {unit}, "
-            f"outside its range from {low:.3g} to {high:.3g} {unit}: check `recording.angle_unit`, "
-            "`side`, `angle_signs` and `angle_offsets`."
-        )
     if check.speed[j] > FAST * limits.velocity[j]:
         said.append(
             f"joint `{name}` reaches {check.speed[j]:.3g} {unit}/s, but its limit is "
