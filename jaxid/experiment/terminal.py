@@ -291,7 +291,8 @@ def show_validation(console: Console, robot: Robot, found: Validation, identific
     for i, errors in enumerate(found.errors):
         table = error_table(errors, robot)
         role = "identification" if i < identification else "verification"
-        heading(console, f"torque errors, {role}: {table.title}")
+        of = errors.name if errors.name == role else f"{errors.name} ({role})"
+        heading(console, f"torque errors of {of}: {percent(errors.relative)} % of the forces")
         table.title = None
         console.print(table)
     console.print()
