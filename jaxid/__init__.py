@@ -55,6 +55,7 @@ from jaxid.identification.consistency.single_body import ConsistentBody as Consi
 from jaxid.identification.consistency.single_body import consistent_body as consistent_body
 from jaxid.identification.devices import factorise_across_processes as factorise_across_processes
 from jaxid.identification.devices import factorise_on_devices as factorise_on_devices
+from jaxid.identification.devices import shards as shards
 from jaxid.identification.essential import EssentialParameters as EssentialParameters
 from jaxid.identification.essential import essential_parameters as essential_parameters
 from jaxid.identification.estimators import AbstractEstimator as AbstractEstimator

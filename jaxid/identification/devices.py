@@ -10,6 +10,7 @@ import functools
 import itertools
 import zlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,10 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
 from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
-from jaxid.identification.factors import Blocks, Factors, JointFactor, factorise
+from jaxid.identification.factors import Blocks, Factors, JointFactor, condensed, factorise
+from jaxid.identification.sharded import sharded
+from jaxid.identification.streaming import Progress
+from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Array, Float, require_float64
 
@@ -29,6 +33,8 @@ AT_ONCE = 8192
 """Samples of a device whose columns are held at once."""
 PATIENCE = 600.0
 """Seconds that a process waits for the others."""
+MOST = 64
+"""Blocks of time that processes hand on at most."""
 _AXIS = "samples"
 _calls = itertools.count()
 
@@ -114,40 +120,59 @@ def _reduced(program: JointRows, mesh: Mesh) -> Callable:
                 new.append(jnp.linalg.qr(jnp.concatenate([R, rows]), mode="r"))
             return new, None
 
-        # Zeros made from the samples vary over the devices as the factors do.
-        zero = q[0, 0, 0, 0] * 0.0
-        start = [jnp.zeros((len(own) + 1, len(own) + 1), q.dtype) + zero for own in program.columns]
+        start = [jnp.zeros((len(own) + 1, len(own) + 1), q.dtype) for own in program.columns]
         found, _ = jax.lax.scan(add, start, tuple(x[0] for x in (q, qd, qdd, forces, counted)))
         return [R[None] for R in found]
 
-    return jax.jit(_sharded(device, mesh, spec))
+    return jax.jit(sharded(device, mesh, (spec,) * 5, spec))
 
 
-def _sharded(function: Callable, mesh: Mesh, spec: PartitionSpec) -> Callable:
-    if hasattr(jax, "shard_map"):
-        return jax.shard_map(function, mesh=mesh, in_specs=(spec,) * 5, out_specs=spec)
-    from jax.experimental.shard_map import shard_map
+def shards(folder: str | Path, pattern: str = "*.parquet") -> tuple[Path, ...]:
+    """The files of a data set that this process reads; all of them in a single process.
 
-    return shard_map(function, mesh=mesh, in_specs=(spec,) * 5, out_specs=spec)
+    Large files are dealt first, each to the process with the fewest bytes so far: alike in all
+    processes, without asking. Open each with `open_log`.
+
+    Args:
+        folder: Of the data set, which all processes see.
+        pattern: Of the files' names.
+
+    Raises:
+        ValueError: If there is no such file.
+    """
+    files = sorted(p for p in Path(folder).glob(pattern) if p.is_file())
+    if not files:
+        raise ValueError(f"`{folder}` holds no file `{pattern}`: check the folder of the data set.")
+    bytes_ = [0] * jax.process_count()
+    own = []
+    for path in sorted(files, key=lambda p: (-p.stat().st_size, p)):
+        process = bytes_.index(min(bytes_))
+        bytes_[process] += path.stat().st_size
+        if process == jax.process_index():
+            own.append(path)
+    return tuple(sorted(own))
 
 
 def factorise_across_processes(
     base: BaseParameters,
-    recordings: Sequence[Observations],
+    recordings: Sequence[Observations | LongLog],
     blocks: int = 10,
-    patience: float = PATIENCE,
+    patience: float | int = PATIENCE,
+    progress: Progress | None = None,
 ) -> Blocks:
-    """Reduces this process's recordings, and joins the factors of all processes.
+    """Reduces this process's recordings, and joins the factors of all processes in a tree.
 
     Call it in every process after `jax.distributed.initialize`; in a program without it, it is
-    `factorise`. Every process gets the same blocks, in the order of the processes: `fit_blocks`
-    gives the same fit everywhere.
+    `factorise`. Processes hand their blocks on in pairs, so that none ever holds more than `MOST`
+    blocks; what is more is joined with its neighbour in time. Every process gets the same blocks,
+    in the order of the processes: `fit_blocks` gives the same fit everywhere.
 
     Args:
         base: The base parameters, the same in all processes.
-        recordings: Of this process alone; none is allowed.
+        recordings: Of this process alone; none is allowed. `shards` deals files out.
         blocks: Number of blocks of time of each recording.
         patience: Time to wait for the other processes [s].
+        progress: Is told now and then which share of long logs is done, of 1.
 
     Raises:
         RuntimeError: If another process is lost during the exchange.
@@ -155,26 +180,59 @@ def factorise_across_processes(
         ValueError: If the processes' base parameters differ.
     """
     require_float64("factors across processes")
-    own = factorise(base, recordings, blocks) if recordings else Blocks(())
+    own = factorise(base, recordings, blocks, progress) if recordings else Blocks(())
     if jax.process_count() == 1:
         return own
     _wait(patience)
-    packed = _packed(own, base)
-    heads = _gathered(np.array([len(packed), zlib.crc32(repr(base.indices).encode())]))
-    if (heads[:, 1] != heads[0, 1]).any():
-        raise ValueError(
-            "`base` differs between the processes: make it from the same robot, terms and version."
-        )
-    most = int(heads[:, 0].max())
-    padded = np.zeros((most, packed.shape[1]))
-    padded[: len(packed)] = packed
-    everyone = _gathered(padded)
-    parts = [
-        _unpacked(row, base)
-        for rows, count in zip(everyone, heads[:, 0], strict=True)
-        for row in rows[: int(count)]
-    ]
-    return Blocks(tuple(parts))
+    try:
+        heads = multihost_utils.process_allgather(np.array([zlib.crc32(_content(base))]))
+        if (heads != heads[0]).any():
+            raise ValueError(
+                "`base` differs between the processes: make it from the same robot, terms and "
+                "version."
+            )
+        return Blocks(tuple(_tree(own.parts, base)))
+    except jax.errors.JaxRuntimeError as error:
+        raise RuntimeError(
+            f"process {jax.process_index()} lost another one while factors were exchanged: look "
+            f"for the first error in the others' logs. ({str(error).splitlines()[0]})"
+        ) from error
+
+
+def _content(base: BaseParameters) -> bytes:
+    """What must be the same in all processes for their factors to fit together."""
+    names = base.model.robot.joint_names, base.model.parameter_names
+    return repr((names, base.indices, np.round(base.kappa, 9).tolist())).encode()
+
+
+def _tree(parts: Sequence[Factors], base: BaseParameters) -> list[Factors]:
+    """The blocks of all processes, gathered in pairs by the first one, and given to all."""
+    count, number = jax.process_count(), jax.process_index()
+    firsts = {d.process_index: d for d in reversed(jax.devices())}
+    mesh = Mesh(np.array([firsts[k] for k in range(count)]), (_AXIS,))
+    held = condensed(parts, MOST)
+    step = 1
+    while step < count:
+        ways = tuple((k, k - step) for k in range(step, count, 2 * step))
+        came = _unpacked(_sent(_packed(held, base), mesh, ways), base)
+        held = condensed([*held, *came], MOST)
+        step *= 2
+    packed = _packed(held if number == 0 else (), base)
+    return _unpacked(np.asarray(multihost_utils.broadcast_one_to_all(packed)), base)
+
+
+def _sent(x: np.ndarray, mesh: Mesh, ways: tuple[tuple[int, int], ...]) -> np.ndarray:
+    """What another process has sent here; zeros if none has."""
+    own = jax.device_put(x[None], mesh.devices[jax.process_index()])
+    sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
+    shape = (mesh.devices.size, *x.shape)
+    everyone = jax.make_array_from_single_device_arrays(shape, sharding, [own])
+    return np.asarray(_sending(mesh, ways)(everyone).addressable_data(0))[0]
+
+
+def _sending(mesh: Mesh, ways: tuple[tuple[int, int], ...]) -> Callable:
+    spec = PartitionSpec(_AXIS)
+    return jax.jit(sharded(lambda x: jax.lax.ppermute(x, _AXIS, ways), mesh, (spec,), spec))
 
 
 def _wait(patience: float) -> None:
@@ -196,38 +254,30 @@ def _wait(patience: float) -> None:
         ) from error
 
 
-def _gathered(x: np.ndarray) -> np.ndarray:
-    """The arrays of all processes, one behind the other."""
-    try:
-        return np.asarray(multihost_utils.process_allgather(x))
-    except jax.errors.JaxRuntimeError as error:
-        raise RuntimeError(
-            f"process {jax.process_index()} lost another one while factors were exchanged: look "
-            f"for the first error in the others' logs. ({str(error).splitlines()[0]})"
-        ) from error
-
-
-def _packed(blocks: Blocks, base: BaseParameters) -> Float[np.ndarray, "blocks numbers"]:
-    """One row of numbers for each block, of a length that all processes know."""
-    rows = []
-    for part in blocks.parts:
-        numbers = []
+def _packed(parts: Sequence[Factors], base: BaseParameters) -> Float[np.ndarray, "most numbers"]:
+    """One row of numbers for each block, behind a one; rows of zeros fill up."""
+    size = sum((len(own) + 1) ** 2 + 1 for own in acting_columns(base))
+    packed = np.zeros((MOST, 1 + size))
+    for row, part in zip(packed, parts, strict=False):
+        numbers = [[1.0]]
         for joint in part.joints:
             width = len(joint.columns) + 1
             R = np.zeros((width, width))
             R[: len(joint.R)] = joint.R
             numbers += [[joint.rows], R.ravel()]
-        rows.append(np.concatenate(numbers))
-    size = sum((len(own) + 1) ** 2 + 1 for own in acting_columns(base))
-    return np.array(rows).reshape(-1, size)
+        row[:] = np.concatenate(numbers)
+    return packed
 
 
-def _unpacked(row: Float[np.ndarray, " numbers"], base: BaseParameters) -> Factors:
-    joints, start = [], 0
-    for own in acting_columns(base):
-        width = len(own) + 1
-        stop = start + 1 + width**2
-        R = row[start + 1 : stop].reshape(width, width)
-        joints.append(JointFactor(own, R, int(row[start])))
-        start = stop
-    return Factors(tuple(joints), base.size)
+def _unpacked(packed: Float[np.ndarray, "most numbers"], base: BaseParameters) -> list[Factors]:
+    found = []
+    for row in packed[packed[:, 0] > 0]:
+        joints, start = [], 1
+        for own in acting_columns(base):
+            width = len(own) + 1
+            stop = start + 1 + width**2
+            R = row[start + 1 : stop].reshape(width, width)
+            joints.append(JointFactor(own, R, int(row[start])))
+            start = stop
+        found.append(Factors(tuple(joints), base.size))
+    return found

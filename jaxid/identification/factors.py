@@ -16,6 +16,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
 from jaxid.identification.kernel import CHUNK as SAMPLES
 from jaxid.identification.reduction import reduced
+from jaxid.identification.sharded import StreamOnDevices, devices
 from jaxid.identification.streaming import Progress, Read, Stream, held, suits
 from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
@@ -105,6 +106,15 @@ class Factors(eqx.Module):
     def force_squares(self) -> Float[np.ndarray, " joints"]:
         """Sum of the squared forces of each joint [N² m² or N²]."""
         return np.array([j.force_square for j in self.joints])
+
+
+def condensed(parts: Sequence[Factors], most: int) -> list[Factors]:
+    """At most so many factors that stand for the same rows: neighbours are joined in pairs."""
+    parts = list(parts)
+    while len(parts) > most:
+        pairs = (parts[k : k + 2] for k in range(0, len(parts), 2))
+        parts = [functools.reduce(lambda x, y: x + y, pair) for pair in pairs]
+    return parts
 
 
 class Blocks(eqx.Module):
@@ -206,6 +216,8 @@ def streamed(
 ) -> list[Factors]:
     """The factors of blocks of time by the compiled loop, for logs of any length.
 
+    All devices of this process share the log; with one, nothing is shared.
+
     Args:
         base: The base parameters.
         observations: What was measured.
@@ -216,7 +228,8 @@ def streamed(
     """
     mask = np.asarray(observations.mask)
     acting = acting_columns(base)
-    triangles = Stream(base, observations, edges, chunk, read, progress).triangles()
+    kind = StreamOnDevices if len(devices()) > 1 else Stream
+    triangles = kind(base, observations, edges, chunk, read, progress).triangles()
     found = []
     for R, (first, last) in zip(triangles, itertools.pairwise(edges), strict=True):
         rows = mask[first:last].sum(axis=0)

@@ -1,18 +1,21 @@
 """Several devices and several processes give what one of them gives."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from virtual import observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.devices import factorise_across_processes, factorise_on_devices
-from jaxid.identification.factors import factorise
+from jaxid.identification.factors import Blocks, condensed, factorise
 from jaxid.identification.identify import fit_blocks
 
 HERE = Path(__file__).resolve().parent
@@ -25,11 +28,12 @@ from virtual import observations, standard_parameters
 from jaxid.identification.devices import factorise_across_processes, factorise_on_devices
 from jaxid.identification.identify import fit_blocks
 
-if len(sys.argv) > 2:
+if len(sys.argv) > 3:
     # Before anything else: making a robot may already start JAX.
-    number = int(sys.argv[3])
+    number, processes = map(int, sys.argv[3].split("/"))
     jax.distributed.initialize(
-        f"127.0.0.1:{sys.argv[2]}", num_processes=2, process_id=number, initialization_timeout=60
+        f"127.0.0.1:{sys.argv[2]}", num_processes=processes, process_id=number,
+        initialization_timeout=60, heartbeat_timeout_seconds=10,
     )
 terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
 base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
@@ -46,6 +50,39 @@ o = recording(0)
 blocks = factorise_on_devices(base, o.motion, o.forces)
 assert len(blocks.parts) == 8
 write(blocks)
+"""
+LONG = """
+assert len(jax.devices()) == int(sys.argv[2])
+from jaxid.identification import kernel, streaming
+streaming.LONG, kernel.PIECE = 1000, 2048
+o = observations(base.model, standard_parameters(base.model), samples=20011, noise=0.3,
+                 filter=jid.ZeroPhaseButterworth(30.0), every=15)
+shares = []
+fit = jid.identify(base, o, jid.LeastSquares(), progress=shares.append)
+assert shares == sorted(shares) and shares[-1] == 1.0
+np.savez(sys.argv[1], p=fit.parameters, s=fit.standard_deviations, rows=fit.rows)
+"""
+SHARDS = """
+from pathlib import Path
+columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
+paths = jid.shards(sys.argv[4])
+assert 1 <= len(paths) <= 3, paths
+logs = [jid.open_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0)) for p in paths]
+write(factorise_across_processes(base, logs, patience=60.0))
+"""
+KILLED = """
+import signal, time
+from jaxid.identification import devices
+if number == 1:
+    def killed(*_):
+        os.kill(os.getpid(), signal.SIGKILL)
+    devices._sent = killed
+start = time.monotonic()
+try:
+    factorise_across_processes(base, [recording(number)], patience=30.0)
+except (RuntimeError, TimeoutError) as error:
+    print("ended:", type(error).__name__, error, flush=True)
+    os._exit(7)
 """
 PROCESSES = """
 # The second process has two recordings, the first one: factors are filled up to the same number.
@@ -69,9 +106,9 @@ def base():
     return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
 
 
-def recording(base, seed):
+def recording(base, seed, samples=1003):
     p = standard_parameters(base.model)
-    return observations(base.model, p, samples=1003, noise=0.3, seed=seed, noise_seed=seed)
+    return observations(base.model, p, samples=samples, noise=0.3, seed=seed, noise_seed=seed)
 
 
 def start(script, *arguments, flags=""):
@@ -123,6 +160,18 @@ def test_eight_devices(base, tmp_path):
     assert_same(tmp_path / "fit.npz", fit)
 
 
+def test_a_long_log_on_three_devices_without_asking(tmp_path):
+    flags = "--xla_force_host_platform_device_count={}"
+    processes = [start(LONG, tmp_path / f"{n}.npz", n, flags=flags.format(n)) for n in (1, 3)]
+    outputs = finish(*processes)
+    assert [p.returncode for p in processes] == [0, 0], "\n\n".join(outputs)
+    one, three = (np.load(tmp_path / f"{n}.npz") for n in (1, 3))
+    size = 1.0 / one["s"]
+    error = np.linalg.norm((one["p"] - three["p"]) * size)
+    assert error < 1e-12 * np.linalg.norm(one["p"] * size)
+    np.testing.assert_array_equal(one["rows"], three["rows"])
+
+
 def test_one_device_by_chunks(base, monkeypatch):
     from jaxid.identification import devices
 
@@ -138,7 +187,7 @@ def test_one_device_by_chunks(base, monkeypatch):
 def test_two_processes(base, tmp_path):
     port = free_port()
     paths = [tmp_path / f"{k}.npz" for k in range(2)]
-    processes = [start(PROCESSES, path, port, k) for k, path in enumerate(paths)]
+    processes = [start(PROCESSES, path, port, f"{k}/2") for k, path in enumerate(paths)]
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0, 0], "\n\n".join(outputs)
     recordings = [recording(base, k) for k in range(3)]
@@ -149,9 +198,56 @@ def test_two_processes(base, tmp_path):
     np.testing.assert_array_equal(a, b)
 
 
+def test_three_processes_read_their_own_shards(base, tmp_path):
+    count = 3
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
+    for k, samples in enumerate((9000, 8000, 3000, 2900, 2800)):
+        o = recording(base, k, samples)
+        arrays = {"q": o.motion.q, "tau": o.forces}
+        frame = {f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(2)}
+        pl.DataFrame(frame).write_parquet(folder / f"{k}.parquet", row_group_size=1000)
+    paths, port = [tmp_path / f"{k}.npz" for k in range(count)], free_port()
+    processes = [start(SHARDS, p, port, f"{k}/{count}", folder) for k, p in enumerate(paths)]
+    outputs = finish(*processes)
+    assert [p.returncode for p in processes] == [0] * count, "\n\n".join(outputs)
+    assert len(jid.shards(folder)) == 5
+    logs = [
+        jid.open_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0))
+        for p in jid.shards(folder)
+    ]
+    fit = jid.identify(base, logs, jid.LeastSquares())
+    for path in paths:
+        assert_same(path, fit)
+        np.testing.assert_array_equal(np.load(path)["p"], np.load(paths[0])["p"])
+
+
+def test_many_blocks_are_joined_in_pairs(base):
+    parts = factorise(base, [recording(base, 0)], 11).parts
+    few = condensed(parts, 4)
+    assert len(few) == 3
+    total, expected = Blocks(tuple(few)).total, Blocks(parts).total
+    np.testing.assert_array_equal(total.rows, expected.rows)
+    for a, b in zip(total.joints, expected.joints, strict=True):
+        np.testing.assert_allclose(a.R.T @ a.R, b.R.T @ b.R, rtol=1e-12, atol=1e-9)
+
+
+def test_a_process_that_is_killed_in_the_exchange_ends_the_others(tmp_path):
+    port = free_port()
+    began = time.monotonic()
+    processes = [start(KILLED, tmp_path / "no.npz", port, f"{k}/2") for k in range(2)]
+    outputs = finish(*processes)
+    assert processes[1].returncode == -signal.SIGKILL
+    # Whichever notices first: the exchange, or JAX's own watch, which ends the process.
+    assert processes[0].returncode not in (0, None), outputs[0]
+    assert "lost another one" in outputs[0] or "unhealthy" in outputs[0].lower(), outputs[0]
+    assert time.monotonic() - began < 90.0
+
+
 def test_a_process_that_dies_ends_the_others(tmp_path):
     port = free_port()
-    processes = [start(LEFT_ALONE, tmp_path / "no.npz", port, k) for k in range(2)]
+    processes = [start(LEFT_ALONE, tmp_path / "no.npz", port, f"{k}/2") for k in range(2)]
     outputs = finish(*processes)
     assert processes[1].returncode == 3
     # Whichever of the two notices first: this package's patience or JAX's own watch.
@@ -170,3 +266,5 @@ def test_refusals(base):
     o = recording(base, 0)
     with pytest.raises(ValueError, match=r"must have the shape \[samples, 2\]"):
         factorise_on_devices(base, o.motion, o.forces[1:])
+    with pytest.raises(ValueError, match="holds no file"):
+        jid.shards(HERE)
