@@ -18,7 +18,7 @@ from jaxid.types import Array, double_precision
 _AXIS = "pieces"
 
 
-def devices() -> list[jax.Device]:
+def devices() -> list:
     """The CPU devices of this process: one, unless JAX was told to make more."""
     return jax.local_devices(backend="cpu")
 
