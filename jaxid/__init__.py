@@ -53,6 +53,7 @@ from jaxid.identification.consistency.priors import ParameterPrior as ParameterP
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia as pseudo_inertia
 from jaxid.identification.consistency.single_body import ConsistentBody as ConsistentBody
 from jaxid.identification.consistency.single_body import consistent_body as consistent_body
+from jaxid.identification.correlated import GeneralisedLeastSquares as GeneralisedLeastSquares
 from jaxid.identification.devices import factorise_across_processes as factorise_across_processes
 from jaxid.identification.devices import factorise_on_devices as factorise_on_devices
 from jaxid.identification.devices import shards as shards
@@ -75,10 +76,15 @@ from jaxid.identification.fit import Trust as Trust
 from jaxid.identification.identify import fit_blocks as fit_blocks
 from jaxid.identification.identify import fit_rows as fit_rows
 from jaxid.identification.identify import identify as identify
+from jaxid.identification.instruments import InstrumentalVariables as InstrumentalVariables
 from jaxid.identification.nonlinear.estimator import NonlinearFriction as NonlinearFriction
 from jaxid.identification.nonlinear.verdict import NonlinearFit as NonlinearFit
 from jaxid.identification.nonlinear.verdict import identify_nonlinear as identify_nonlinear
 from jaxid.identification.opening import open_log as open_log
+from jaxid.identification.robust import AbstractLoss as AbstractLoss
+from jaxid.identification.robust import Huber as Huber
+from jaxid.identification.robust import IterativelyReweighted as IterativelyReweighted
+from jaxid.identification.robust import Tukey as Tukey
 from jaxid.identification.rows import Rows as Rows
 from jaxid.identification.runs.comparison import Comparison as Comparison
 from jaxid.identification.runs.comparison import Verdict as Verdict
@@ -103,6 +109,12 @@ from jaxid.identification.solutions import Truncated as Truncated
 from jaxid.identification.stepwise import Stepwise as Stepwise
 from jaxid.identification.stepwise import StepwiseComparison as StepwiseComparison
 from jaxid.identification.stepwise import identify_stepwise as identify_stepwise
+from jaxid.identification.uncertainty.methods import AbstractUncertainty as AbstractUncertainty
+from jaxid.identification.uncertainty.methods import BlockJackknife as BlockJackknife
+from jaxid.identification.uncertainty.methods import IndependentRows as IndependentRows
+from jaxid.identification.uncertainty.methods import SpectralSandwich as SpectralSandwich
+from jaxid.identification.uncertainty.residuals import ResidualSpectra as ResidualSpectra
+from jaxid.identification.uncertainty.uncertainty import Uncertainty as Uncertainty
 from jaxid.identification.weights import GivenWeights as GivenWeights
 from jaxid.identification.weights import MaximumForces as MaximumForces
 from jaxid.identification.weights import MeasuredForces as MeasuredForces

@@ -172,8 +172,8 @@ def _solved_again(
                 continue
             estimator = WeightedLeastSquares(GivenWeights(one.weights))
             again = fit_blocks(base, Blocks((factors,)), estimator)
-            known = np.isfinite(again.standard_deviations).all()
-            p[k, draw], deviations[k, draw] = again.parameters, again.standard_deviations
+            known = np.isfinite(again.naive_standard_deviations).all()
+            p[k, draw], deviations[k, draw] = again.parameters, again.naive_standard_deviations
             rms[k, draw] = again.residual_rms
             condition[k] = again.condition_numbers.scaled if known else np.inf
             determined[k] = known

@@ -40,6 +40,8 @@ class Estimate(eqx.Module):
         standard: Standard parameters, of an estimator that finds a complete set of them.
         notes: What the user should know, in sentences.
         consistency: How a physically consistent estimate came about.
+        taken: Number of parameters that the rows decide, of which regularised ones are a part;
+            found from `inverse` if None.
     """
 
     base: BaseParameters
@@ -52,6 +54,7 @@ class Estimate(eqx.Module):
     standard: Float[AnyArray, " standard"] | None = None
     notes: tuple[str, ...] = eqx.field(static=True, default=())
     consistency: Consistency | None = None
+    taken: float | None = None
 
     @classmethod
     def solved(
@@ -68,6 +71,7 @@ class Estimate(eqx.Module):
             inverse=decomposition.inverse_information(inverse),
             influence=ByJoint(weights),
             solution=solution,
+            taken=float(np.sum(inverse * np.asarray(decomposition.values) ** 2)),
         )
 
 

@@ -253,6 +253,7 @@ def reduced_rows(
     observations: Observations,
     samples: int = CHUNK,
     read: Read | None = None,
+    wanted: Sequence[tuple[int, int]] | None = None,
 ):
     """Goes through observations by chunks: row range, columns of each joint, and forces.
 
@@ -263,6 +264,7 @@ def reduced_rows(
         observations: What was measured.
         samples: Size of a chunk.
         read: Gives motion and forces of some samples; those of the observations if None.
+        wanted: Ranges of rows; chunks without any of them are left out. All if None.
 
     Yields:
         Slice of the rows; for each joint its columns [rows, columns of the joint]; forces
@@ -270,4 +272,7 @@ def reduced_rows(
     """
     read = held(observations) if read is None else read
     for chunk in observations.chunks(samples):
+        first, last = chunk.rows
+        if wanted is not None and not any(a < last and first < b for a, b in wanted):
+            continue
         yield slice(*chunk.rows), *reduced(base, *read(slice(*chunk.samples)), chunk)

@@ -12,6 +12,8 @@ from jaxid.identification.consistency.consistency import Consistency
 from jaxid.identification.estimators import AbstractEstimator
 from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.solutions import AbstractSpectralSolution
+from jaxid.identification.uncertainty.residuals import ResidualSpectra
+from jaxid.identification.uncertainty.uncertainty import Uncertainty
 from jaxid.types import AnyArray, Float
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
@@ -46,8 +48,7 @@ class Fit(eqx.Module):
     Attributes:
         base: Which combinations of standard parameters they are.
         parameters: The estimates, in the units of `base.units`.
-        covariance: Of the estimates; it takes the rows for independent and is too small where
-            filtered noise makes neighbouring rows alike.
+        uncertainty: Of the estimates, and how it was found.
         weights: Of the joints' rows [1/(N m) or 1/N].
         condition_numbers: Of the observation matrix.
         rows: Number of rows of each joint.
@@ -60,11 +61,13 @@ class Fit(eqx.Module):
         notes: What the user should know, in sentences.
         consistency: How a physically consistent estimate came about, and which bounds decide.
         full_parameters: Standard parameters, of an estimator that finds a complete set of them.
+        residual_spectra: Of each joint's residuals, and whether they are white; None where only
+            factors of the rows were known.
     """
 
     base: BaseParameters
     parameters: Float[AnyArray, " base"]
-    covariance: Float[AnyArray, "base base"]
+    uncertainty: Uncertainty
     weights: Float[AnyArray, " joints"]
     condition_numbers: ConditionNumbers
     rows: tuple[int, ...] = eqx.field(static=True)
@@ -77,11 +80,38 @@ class Fit(eqx.Module):
     notes: tuple[str, ...] = eqx.field(static=True)
     consistency: Consistency | None = None
     full_parameters: Float[AnyArray, " standard"] | None = None
+    residual_spectra: ResidualSpectra | None = None
+
+    @property
+    def covariance(self) -> Float[AnyArray, "base base"]:
+        """Of the estimates; infinite variances where nothing is known."""
+        return self.uncertainty.covariance
 
     @property
     def standard_deviations(self) -> Float[np.ndarray, " base"]:
         """Standard deviations of the estimates; infinite where nothing is known."""
-        return np.sqrt(np.diag(self.covariance))
+        return self.uncertainty.standard_deviations
+
+    @property
+    def naive_standard_deviations(self) -> Float[np.ndarray, " base"]:
+        """What they would be if the rows were independent; filtered rows are not."""
+        return self.uncertainty.naive_standard_deviations
+
+    def intervals(self, level: float = 0.95) -> Float[np.ndarray, "base 2"]:
+        """Intervals that hold the true parameters in a share of cases.
+
+        They tell how far noise can take the estimates, of a model that is right: errors that every
+        recording of this kind would share (a wrong geometry, a missing effect) are not in them.
+
+        Args:
+            level: The share, of 1.
+
+        Raises:
+            ValueError: If `level` is not between 0 and 1.
+        """
+        half = self.uncertainty.half_widths(level)
+        p = np.asarray(self.parameters)
+        return np.stack([p - half, p + half], axis=1)
 
     @property
     def relative_standard_deviations(self) -> Float[np.ndarray, " base"]:

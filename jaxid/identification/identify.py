@@ -13,6 +13,7 @@ from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import NUMERICAL, AbstractSpectralSolution, Decomposition
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
+from jaxid.identification.uncertainty.methods import AbstractUncertainty, SpectralSandwich
 from jaxid.measurement.observations import Observations
 
 
@@ -21,6 +22,7 @@ def identify(
     observations: Observations | LongLog | Sequence[Observations | LongLog],
     estimator: AbstractEstimator | None = None,
     progress: Progress | None = None,
+    uncertainty: AbstractUncertainty | None = None,
 ) -> Fit:
     """Estimates the base parameters from one or several recordings (Eqs. 26-33).
 
@@ -29,7 +31,8 @@ def identify(
         observations: Of one recording, or of several that are fitted together; logs larger than
             memory come from `open_log`.
         estimator: Weighted least squares with the largest forces if None.
-        progress: Is told now and then which share of a long log is done, of 1.
+        progress: Is told now and then which share of a pass over a long log is done, of 1.
+        uncertainty: How standard deviations are found: the spectral sandwich if None.
 
     Returns:
         The estimates; `undetermined` names what these recordings do not determine.
@@ -42,7 +45,7 @@ def identify(
     recordings = (observations,) if single else tuple(observations)
     estimator = WeightedLeastSquares() if estimator is None else estimator
     _check(base, recordings)
-    return fit_rows(Rows.of(base, recordings, progress), estimator)
+    return fit_rows(Rows.of(base, recordings, progress), estimator, uncertainty=uncertainty)
 
 
 def fit_blocks(
@@ -52,6 +55,8 @@ def fit_blocks(
     recordings: tuple[str, ...] = (),
 ) -> Fit:
     """Estimates the base parameters from factors that were made before.
+
+    Standard deviations come from the block jackknife: there are no residuals to look at.
 
     Args:
         base: What can be identified on this robot.
@@ -66,7 +71,10 @@ def fit_blocks(
 
 
 def fit_rows(
-    rows: Rows, estimator: AbstractEstimator, recordings: tuple[str, ...] | None = None
+    rows: Rows,
+    estimator: AbstractEstimator,
+    recordings: tuple[str, ...] | None = None,
+    uncertainty: AbstractUncertainty | None = None,
 ) -> Fit:
     """Estimates the base parameters from rows that were factorised before.
 
@@ -74,6 +82,7 @@ def fit_rows(
         rows: Of one or several recordings.
         estimator: How.
         recordings: Their names; the rows' own if None.
+        uncertainty: How standard deviations are found: the spectral sandwich if None.
 
     Raises:
         ValueError: If there are fewer rows than parameters, weights are not known, or the estimator
@@ -94,14 +103,18 @@ def fit_rows(
     forces = float(np.sqrt(plain.factors.force_squares.sum()))
     R, z = blocks.total.weighted(weights)
     decomposition = Decomposition.of(R, z)
+    naive = _naive(blocks.total, weights, decomposition, estimate)
+    method = SpectralSandwich() if uncertainty is None else uncertainty
+    found, spectra = method(plain, estimate, naive)
     return Fit(
         base=base,
         parameters=p,
-        covariance=_covariance(blocks.total, weights, decomposition, estimate),
+        uncertainty=found,
         weights=weights,
         condition_numbers=_condition_numbers(blocks.total, R),
         rows=tuple(int(n) for n in plain.factors.rows),
         residual_rms=np.sqrt(squares / np.maximum(plain.factors.rows, 1)),
+        residual_spectra=spectra,
         residual=float(np.sqrt(squares.sum()) / forces) if forces > 0 else np.inf,
         undetermined=undetermined_directions(blocks, weights, decomposition),
         estimator=estimator,
@@ -109,7 +122,12 @@ def fit_rows(
         consistency=estimate.consistency,
         full_parameters=None if estimate.standard is None else np.asarray(estimate.standard),
         recordings=tuple(o.name for o in rows.recordings) if recordings is None else recordings,
-        notes=(*base.notes, *_pulled(decomposition, estimate.solution), *estimate.notes),
+        notes=(
+            *base.notes,
+            *_pulled(decomposition, estimate.solution),
+            *estimate.notes,
+            *found.notes,
+        ),
     )
 
 
@@ -125,10 +143,10 @@ def _check(base: BaseParameters, recordings: Sequence[Observations | LongLog]) -
             )
 
 
-def _covariance(
+def _naive(
     factors: Factors, weights: np.ndarray, decomposition: Decomposition, estimate: Estimate
 ) -> np.ndarray:
-    r"""Covariance of the estimates when every joint has a variance of its own.
+    r"""Covariance of the estimates if rows were independent and every joint had its own variance.
 
     The estimates are $B \Theta^T W^2 Q$, so their covariance is
     $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights are not the
@@ -136,9 +154,12 @@ def _covariance(
     """
     s = np.asarray(decomposition.values)
     B = np.asarray(estimate.inverse)
-    R, _ = factors.weighted(weights)
     squares = factors.residual_squares(estimate.parameters)
-    freedom = 1.0 - float(np.sum((R @ B) * R)) / float(factors.rows.sum())
+    taken = estimate.taken
+    if taken is None:
+        R, _ = factors.weighted(weights)
+        taken = float(np.sum((R @ B) * R))
+    freedom = 1.0 - taken / float(factors.rows.sum())
     inner = np.zeros_like(B)
     for joint, w, square in zip(factors.joints, weights, squares, strict=True):
         variance = square / max(joint.rows * freedom, 1.0)

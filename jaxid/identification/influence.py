@@ -20,12 +20,14 @@ class Channel(NamedTuple):
         instruments: $z_t$ [rows, columns]: for least squares the equations themselves.
         equations: $\theta_t$ [rows, columns], weighted.
         disturbance: $u_t$ [rows]: residuals, weighted.
+        counted: Number of rows that count.
     """
 
     columns: tuple[int, ...]
     instruments: np.ndarray
     equations: np.ndarray
     disturbance: np.ndarray
+    counted: int
 
 
 class AbstractInfluence(eqx.Module):
@@ -56,7 +58,9 @@ class ByJoint(AbstractInfluence):
         """One channel for each joint."""
         found = []
         for j, (theta, own) in enumerate(zip(chunk.columns, chunk.acting, strict=True)):
-            rows = np.asarray(self.weights)[j] * np.where(chunk.counted[:, j], 1.0, 0.0)
+            counted = chunk.counted[:, j]
+            rows = np.where(counted, np.asarray(self.weights)[j], 0.0)
             weighted = rows[:, None] * theta
-            found.append(Channel(own, weighted, weighted, rows * residuals[:, j]))
+            disturbance = rows * residuals[:, j]
+            found.append(Channel(own, weighted, weighted, disturbance, int(counted.sum())))
         return found

@@ -25,6 +25,9 @@ from jaxid.robot.robot import Robot
 HELD = 2**26
 """Numbers (half a gigabyte) up to which reduced columns are kept for the next pass."""
 
+Span = tuple[int, int, int]
+"""A recording's number, and the half-open range of some of its rows."""
+
 
 class RowChunk(NamedTuple):
     """Consecutive rows of one block of time, reduced: filtered, decimated, without a known tool.
@@ -46,6 +49,16 @@ class RowChunk(NamedTuple):
     columns: list[np.ndarray]
     forces: np.ndarray
     counted: np.ndarray
+
+    def part(self, own: slice) -> "RowChunk":
+        """Some of the rows, counted from the chunk's first."""
+        start = self.rows.start
+        return self._replace(
+            rows=slice(start + own.start, start + own.stop),
+            columns=[x[own] for x in self.columns],
+            forces=self.forces[own],
+            counted=self.counted[own],
+        )
 
 
 class Rows:
@@ -125,8 +138,11 @@ class Rows:
         self.require_seen("another model")
         return Rows.of(base, self.recordings, self.progress)
 
-    def chunks(self) -> Iterator[RowChunk]:
-        """Goes through all rows, recording by recording, in their order.
+    def chunks(self, spans: Sequence[Span] | None = None) -> Iterator[RowChunk]:
+        """Goes through the rows, recording by recording, in their order.
+
+        Args:
+            spans: What has to be among the rows; everything if None.
 
         Raises:
             ValueError: If only factors are known.
@@ -135,14 +151,16 @@ class Rows:
         if self._held is not None:
             yield from self._held
             return
-        kept: list[RowChunk] | None = []
+        kept: list[RowChunk] | None = [] if spans is None else None
         size, done, blocks = 0, 0, 0
         whole = sum(o.rows for o in self.recordings)
         acting = acting_columns(self.base)
         for number, recording in enumerate(self.recordings):
             observations, read = source(recording)
             mask, edges = np.asarray(observations.mask), block_edges(observations)
-            for rows, columns, forces in reduced_rows(self.base, observations, read=read):
+            wanted = None if spans is None else [(a, b) for k, a, b in spans if k == number]
+            passing = reduced_rows(self.base, observations, read=read, wanted=wanted)
+            for rows, columns, forces in passing:
                 for block, (low, high) in enumerate(itertools.pairwise(edges), blocks):
                     a, b = max(low, rows.start), min(high, rows.stop)
                     if a >= b:
@@ -162,9 +180,11 @@ class Rows:
             blocks += len(edges) - 1
         self._held = kept
 
-    def residuals(self, p: np.ndarray) -> Iterator[tuple[RowChunk, np.ndarray]]:
-        """Goes through all rows with what parameters leave of the forces [rows, joints]."""
-        for chunk in self.chunks():
+    def residuals(
+        self, p: np.ndarray, spans: Sequence[Span] | None = None
+    ) -> Iterator[tuple[RowChunk, np.ndarray]]:
+        """Goes through rows with what parameters leave of the forces [rows, joints]."""
+        for chunk in self.chunks(spans):
             pairs = zip(chunk.columns, chunk.acting, strict=True)
             felt = [theta @ p[list(own)] for theta, own in pairs]
             yield chunk, chunk.forces - np.stack(felt, axis=1)

@@ -22,8 +22,11 @@ from jaxid.measurement.low_pass import (
 )
 from jaxid.types import AnyArray, Float
 
-SETTLED = 1e-2
-"""Part of the impulse response's peak below which the start of a log no longer matters."""
+SETTLED = 1e-4
+"""Part of the impulse response's peak below which the start of a log no longer matters.
+
+At a hundredth, what the ends do to accelerations takes estimates some standard deviations away.
+"""
 
 
 class AbstractFilter(eqx.Module):

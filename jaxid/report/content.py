@@ -103,6 +103,8 @@ def result(
                 "residual": fit.residual,
                 "residual_rms": fit.residual_rms,
                 "covariance": fit.covariance,
+                "jackknife_standard_deviations": fit.uncertainty.jackknife,
+                "residuals": _residuals(fit),
                 "undetermined": [_direction(fit, d) for d in fit.undetermined],
                 "undetermined_above": LARGEST_UNCERTAINTY,
             },
@@ -198,6 +200,23 @@ def _robot(robot: Robot) -> dict[str, Any]:
             "rotation": robot.tip_rotation,
             "offset": robot.tip_offset,
         },
+    }
+
+
+def _residuals(fit: Fit) -> dict[str, Any] | None:
+    """Spectra of the residuals, and whether they are white."""
+    spectra = fit.residual_spectra
+    if spectra is None:
+        return None
+    return {
+        "white": spectra.white,
+        "departure": spectra.departure,
+        "limit": spectra.limit,
+        "slow_share": spectra.slow,
+        "band": spectra.band,
+        "frequency": spectra.frequency,
+        "density": spectra.density,
+        "filter_gain": spectra.gain,
     }
 
 

@@ -42,7 +42,7 @@ def recording(seed):
     return observations(base.model, p, samples=1003, noise=0.3, seed=seed, noise_seed=seed)
 def write(blocks):
     fit = fit_blocks(base, blocks, jid.LeastSquares())
-    np.savez(sys.argv[1], p=fit.parameters, s=fit.standard_deviations, rows=fit.rows)
+    np.savez(sys.argv[1], p=fit.parameters, s=fit.naive_standard_deviations, rows=fit.rows)
 """
 DEVICES = """
 assert len(jax.devices()) == 8
@@ -145,10 +145,10 @@ def free_port():
 
 def assert_same(path, fit):
     found = np.load(path)
-    size = 1.0 / np.asarray(fit.standard_deviations)
+    size = 1.0 / np.asarray(fit.naive_standard_deviations)
     error = np.linalg.norm((found["p"] - fit.parameters) * size)
     assert error < 1e-12 * np.linalg.norm(fit.parameters * size)
-    np.testing.assert_allclose(found["s"], fit.standard_deviations, rtol=1e-10)
+    np.testing.assert_allclose(found["s"], fit.naive_standard_deviations, rtol=1e-10)
     np.testing.assert_array_equal(found["rows"], fit.rows)
 
 

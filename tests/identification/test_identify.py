@@ -70,7 +70,7 @@ def test_residual_variances_find_the_noise_of_each_joint(base):
 
 
 @pytest.mark.parametrize("estimator", [jid.LeastSquares(), WEIGHTED])
-def test_covariance_is_that_of_many_noise_draws(base, estimator):
+def test_naive_covariance_is_that_of_many_draws_of_independent_noise(base, estimator):
     p = standard_parameters(base.model)
     truth = np.asarray(base.from_standard(p))
     draws = [
@@ -78,6 +78,7 @@ def test_covariance_is_that_of_many_noise_draws(base, estimator):
             base,
             observations(base.model, p, samples=120, noise=np.array([0.5, 0.05]), noise_seed=seed),
             estimator,
+            uncertainty=jid.IndependentRows(),
         )
         for seed in range(200)
     ]

@@ -168,7 +168,8 @@ def test_a_run_that_leaves_something_open_still_helps(base, truths):
     before, after = (np.sqrt(np.diag(r.covariance)) for r in (one, updated))
     k = base.names.index("fv1")
     assert after[k] < 0.95 * before[k]
-    assert np.median(after / before) < 1.1
+    # Both are estimates from the residuals' spectra, and scatter by a tenth and more.
+    assert np.median(after / before) < 1.25
 
 
 def test_a_run_comes_back_from_its_file_exactly(base, truths, tmp_path):

@@ -57,7 +57,8 @@ def test_the_figure_shows_both_intervals(fit, warm):
 def test_what_a_report_holds_is_read_back(tmp_path, fit, validation):
     covariance = np.array(fit.covariance)
     covariance[0, 0] = np.inf
-    fit = dataclasses.replace(fit, covariance=covariance)
+    unknown = dataclasses.replace(fit.uncertainty, covariance=covariance)
+    fit = dataclasses.replace(fit, uncertainty=unknown)
     write_report(tmp_path / "cold", fit, validation.errors[:1], (), validation.definiteness, {})
     found = read_estimates(tmp_path / "cold")
     assert found.label == "cold"

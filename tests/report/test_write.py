@@ -86,7 +86,8 @@ def test_numbers_come_back_exactly(tmp_path, fit, validation, quick):
 def test_what_is_not_finite_is_null(tmp_path, fit, validation, quick):
     covariance = np.array(fit.covariance)
     covariance[0, 0] = np.inf
-    report(tmp_path, dataclasses.replace(fit, covariance=covariance), validation)
+    unknown = dataclasses.replace(fit.uncertainty, covariance=covariance)
+    report(tmp_path, dataclasses.replace(fit, uncertainty=unknown), validation)
     found = load(tmp_path)
     assert found["base_parameters"][0]["standard_deviation"] is None
     assert found["settings"]["slow"] == [0.1, None]

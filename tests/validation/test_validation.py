@@ -5,6 +5,7 @@ import pytest
 
 import jaxid as jid
 from jaxid.identification.fit import ConditionNumbers
+from jaxid.identification.uncertainty.uncertainty import Uncertainty
 from jaxid.validation.definiteness import definiteness, position_range
 from jaxid.validation.errors import TorqueErrors
 
@@ -69,7 +70,7 @@ def fit_of(parameters):
     return jid.Fit(
         base=base,
         parameters=np.array(parameters),
-        covariance=np.eye(2),
+        uncertainty=Uncertainty.given(np.eye(2)),
         weights=np.ones(2),
         condition_numbers=ConditionNumbers(1.0, 1.0, 1.0),
         rows=(1, 1),
@@ -99,7 +100,7 @@ def test_an_arm_of_real_bodies_has_a_definite_mass_matrix():
     body = [2.0, 0.02, 0.01, 0.04, 0.03, 0.03, 0.02, 0.0, 0.0, 0.0]
     p = np.asarray(base.from_standard(np.tile(body, 7)))
     fit = fit_of((1.0, 1.0))
-    arm = jid.Fit(**{**vars(fit), "base": base, "parameters": p, "covariance": np.eye(base.size)})
+    arm = jid.Fit(**{**vars(fit), "base": base, "parameters": p})
     found = definiteness(arm, poses=200)
     assert found.positive_definite
     flipped = jid.Fit(**{**vars(arm), "parameters": -p})

@@ -142,10 +142,11 @@ def identify_nonlinear(
         Rows.of(with_slopes(chosen, shapes, fit.parameters), recordings), estimator.linear
     )
     covariance, size = np.asarray(whole.covariance), base.size
+    own = whole.uncertainty.of_first(size)
     return NonlinearFit(
         fit=dataclasses.replace(
             fit,
-            covariance=covariance[:size, :size],
+            uncertainty=own,
             estimator=estimator,
             notes=(*fit.notes, *not_converged(found)),
         ),

@@ -10,6 +10,7 @@ from scipy import stats
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.fit import Fit
+from jaxid.identification.uncertainty.uncertainty import Uncertainty
 from jaxid.types import AnyArray, Float
 
 
@@ -109,7 +110,7 @@ def _words(name: str) -> str:
 
 def freedom_of(fit: Fit) -> Float[np.ndarray, " base"]:
     """Degrees of freedom of a fit's standard deviations."""
-    return np.full(fit.base.size, np.inf)
+    return np.asarray(fit.uncertainty.freedom)
 
 
 def with_covariance(
@@ -119,6 +120,5 @@ def with_covariance(
     freedom: Float[AnyArray, " base"],
 ) -> Fit:
     """A fit with estimates and an uncertainty that were found in another way."""
-    return dataclasses.replace(
-        fit, parameters=np.asarray(parameters), covariance=np.asarray(covariance)
-    )
+    found = Uncertainty(np.asarray(covariance), np.asarray(freedom), np.asarray(covariance))
+    return dataclasses.replace(fit, parameters=np.asarray(parameters), uncertainty=found)

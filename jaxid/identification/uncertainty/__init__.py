@@ -1,0 +1,1 @@
+"""How far estimates can be trusted: spectral sandwich, block jackknife, residual spectra."""

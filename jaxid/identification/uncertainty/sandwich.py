@@ -1,0 +1,143 @@
+r"""The spectral sandwich: variances of estimates from rows whose errors are correlated in time.
+
+An estimate is linear in the errors, $\hat p_i - p_i = \sum_{jt} P_{ijt} e_{jt}$, so its variance
+is $\sum_{jf} K_{ijf} \phi_j(f)$ with $K = |FFT_t P|^2 / N$ and the spectrum $\phi_j$ of the errors.
+The periodogram of the residuals is smoothed over a window of lines and divided by what the fit has
+left of it, $1 - h_{jf}$ with the leverage $h$ of each line.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.identification.uncertainty.spectra import Lines
+
+NARROWEST, RELATIVE = 0.25, 0.3
+"""Half of a window's width: at least the first [Hz], and this share of its frequency."""
+FEWEST = 4
+"""Lines to either side that a window holds at least, of short recordings."""
+LEAST_LEFT = 0.02
+"""Smallest share of a window's power that a fit is taken to leave."""
+
+
+class Variances(NamedTuple):
+    """What the spectral sandwich finds.
+
+    Attributes:
+        covariance: Of the estimates [base, base].
+        freedom: Degrees of freedom of each variance (Satterthwaite).
+        white: Variances from the same lines if the errors were independent from row to row.
+    """
+
+    covariance: np.ndarray
+    freedom: np.ndarray
+    white: np.ndarray
+
+
+class Windows:
+    """Sums over windows of lines, and their transposes, of several kinds of stretches together.
+
+    Args:
+        lines: Of every kind of stretch.
+    """
+
+    def __init__(self, lines: Sequence[Lines]):
+        frequency = np.concatenate([x.frequency for x in lines])
+        self._order = np.argsort(frequency, kind="stable")
+        f = frequency[self._order]
+        longest = max(x.length * x.row_time for x in lines)
+        half = np.maximum(np.maximum(NARROWEST, FEWEST / longest), RELATIVE * f)
+        self._low = np.searchsorted(f, f - half * (1 + 1e-9), side="left")
+        self._high = np.searchsorted(f, f + half * (1 + 1e-9), side="right")
+        # Both ends of a window rise with its middle: the windows that hold a line are neighbours.
+        places = np.arange(len(f))
+        self._first = np.searchsorted(self._high, places, side="right")
+        self._last = np.searchsorted(self._low, places, side="right")
+
+    def sums(self, x: np.ndarray) -> np.ndarray:
+        """For each line the sum over its window, along the last axis."""
+        return self._between(x, self._low, self._high)
+
+    def transposed(self, x: np.ndarray) -> np.ndarray:
+        """For each line the sum over the windows that hold it, along the last axis."""
+        return self._between(x, self._first, self._last)
+
+    def _between(self, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        sums = np.cumsum(x[..., self._order], axis=-1)
+        sums = np.concatenate([np.zeros((*x.shape[:-1], 1)), sums], axis=-1)
+        out = np.empty(x.shape)
+        out[..., self._order] = sums[..., high] - sums[..., low]
+        return out
+
+
+class SpectralTable:
+    r"""The sandwich as one linear map, $var_i = \sum_{jg} C_{ijg} I_{jg}$, made once for a design.
+
+    Attributes:
+        map: $C$ [base, channels x lines].
+    """
+
+    def __init__(self, lines: Sequence[Lines]):
+        self._lines = lines
+        self._windows = Windows(lines)
+        half = np.concatenate([0.5 * x.multiplicity for x in lines])
+        left = np.concatenate([x.exposure[:, None] - x.leverage for x in lines], axis=1)
+        there = np.concatenate(
+            [np.broadcast_to(x.exposure[:, None], x.leverage.shape) for x in lines], axis=1
+        )
+        least = LEAST_LEFT * self._windows.sums(half * there)
+        self._left = np.maximum(self._windows.sums(half * left), np.maximum(least, 1e-300))
+        energy = np.concatenate([x.energy for x in lines], axis=2)
+        C = half * self._windows.transposed(energy / self._left)
+        self.map = C.reshape(len(C), -1)
+        # A line's power is that of as many draws as there are stretches: its square overstates.
+        scatter = np.sqrt(2.0 / (half * (1.0 + np.maximum(there, 1.0))))
+        self._scatter = np.broadcast_to(scatter, C.shape[1:]).ravel()
+
+    def density(self, power: np.ndarray) -> np.ndarray:
+        """The errors' spectrum at each line, from the residuals' periodogram."""
+        half = np.concatenate([0.5 * x.multiplicity for x in self._lines])
+        return self._windows.sums(half * power) / self._left
+
+    def __call__(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Variances and their degrees of freedom.
+
+        Args:
+            power: Periodograms of the residuals, [draws, channels, lines] or without draws.
+        """
+        flat = power.reshape(*power.shape[:-2], -1)
+        variance = flat @ self.map.T
+        scatter = (flat * self._scatter) ** 2 @ (self.map**2).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            freedom = np.where(scatter > 0, 4.0 * variance**2 / scatter, np.inf)
+        return variance, freedom
+
+
+def sandwich(lines: Sequence[Lines]) -> Variances:
+    """The covariance of an estimate from the lines of its stretches."""
+    table = SpectralTable(lines)
+    power = np.concatenate([x.power for x in lines], axis=1)
+    variance, freedom = table(power)
+    density = np.split(table.density(power), np.cumsum([len(x.frequency) for x in lines])[:-1], 1)
+    rough = np.zeros((len(variance), len(variance)))
+    for x, phi in zip(lines, density, strict=True):
+        count = np.bincount(x.bins)
+        for c, own in enumerate(phi):
+            mean = np.bincount(x.bins, own) / count
+            rough += np.einsum("k,kab->ab", mean, x.correlated[:, c])
+    size = np.sqrt(np.maximum(np.diag(rough), 1e-300))
+    deviation = np.sqrt(np.maximum(variance, 0.0))
+    covariance = rough / size / size[:, None] * deviation * deviation[:, None]
+    covariance[np.diag_indices(len(variance))] = deviation**2
+    return Variances(covariance, np.maximum(freedom, 1.0), _white(lines))
+
+
+def _white(lines: Sequence[Lines]) -> np.ndarray:
+    """Variances for errors that are independent from row to row, and of a joint's own size."""
+    power = sum(np.sum(x.multiplicity * x.power, axis=1) for x in lines)
+    rows = sum(x.length * x.exposure for x in lines)
+    taken = sum(np.sum(x.multiplicity * x.leverage, axis=1) for x in lines)
+    share = np.sum(taken) / max(np.sum(rows), 1.0)
+    level = power / np.maximum(rows * (1.0 - share), 1.0)
+    return np.sum([np.einsum("icf,c->i", x.energy, level) for x in lines], axis=0)

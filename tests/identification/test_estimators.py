@@ -1,0 +1,206 @@
+"""The family of estimators: laws for all members, and what each is for."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import optimize
+from virtual import dense, observations, standard_parameters
+
+import jaxid as jid
+from jaxid.identification import rows as rows_module
+from jaxid.trajectory.trajectory import AbstractTrajectory
+
+MEASURED = jid.MeasuredForces()
+
+
+class Known(AbstractTrajectory):
+    """A motion that is known at the samples of `virtual.motion`."""
+
+    motion_: jid.Motion
+    dt: float
+
+    @property
+    def duration(self):
+        return self.dt * (len(self.motion_.q) - 1)
+
+    def motion(self, t):
+        places = np.round(np.asarray(t) / self.dt).astype(int)
+        return self.motion_[places]
+
+
+@pytest.fixture(scope="module")
+def base():
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
+    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+
+
+@pytest.fixture(scope="module")
+def noisy(base):
+    p = standard_parameters(base.model)
+    return observations(base.model, p, noise=np.array([0.5, 0.1]))
+
+
+def members(o):
+    return (
+        jid.LeastSquares(),
+        jid.WeightedLeastSquares(MEASURED),
+        jid.WeightedLeastSquares(jid.ResidualVariances()),
+        jid.IterativelyReweighted(jid.Huber(), MEASURED),
+        jid.IterativelyReweighted(jid.Tukey(), MEASURED),
+        jid.GeneralisedLeastSquares(),
+        jid.InstrumentalVariables((Known(o.motion, o.sample_time),), MEASURED),
+    )
+
+
+def with_forces(o, change):
+    forces = np.array(o.forces)
+    change(forces)
+    return dataclasses.replace(o, forces=forces)
+
+
+@pytest.mark.parametrize("k", range(7))
+def test_every_estimator_finds_the_truth_without_noise(base, k):
+    p = standard_parameters(base.model)
+    o = observations(base.model, p)
+    fit = jid.identify(base, o, members(o)[k])
+    np.testing.assert_allclose(fit.parameters, base.from_standard(p), rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("k", range(7))
+def test_every_estimator_follows_its_forces_and_judges_itself(base, noisy, k):
+    """Twice the forces, twice the parameters and their deviations; rows held or not, the same."""
+    fit = jid.identify(base, noisy, members(noisy)[k])
+    double = with_forces(noisy, lambda f: np.multiply(f, 2.0, out=f))
+    other = jid.identify(base, double, members(noisy)[k])
+    np.testing.assert_allclose(other.parameters, 2 * np.asarray(fit.parameters), rtol=1e-4)
+    np.testing.assert_allclose(other.standard_deviations, 2 * fit.standard_deviations, rtol=1e-3)
+    truth = np.asarray(base.from_standard(standard_parameters(base.model)))
+    z = (np.asarray(fit.parameters) - truth) / fit.standard_deviations
+    assert np.sqrt(np.mean(z**2)) < 2.0
+    assert 0.5 < np.median(fit.uncertainty.ratios) < 2.0
+
+
+@pytest.mark.parametrize("k", range(7))
+def test_every_estimator_goes_through_logs_that_are_not_held(base, noisy, k, monkeypatch):
+    whole = jid.identify(base, noisy, members(noisy)[k])
+    monkeypatch.setattr(rows_module, "HELD", 0)
+    short = rows_module.reduced_rows
+
+    def in_parts(base, o, **options):
+        return short(base, o, samples=70, **options)
+
+    monkeypatch.setattr(rows_module, "reduced_rows", in_parts)
+    parts = jid.identify(base, noisy, members(noisy)[k])
+    np.testing.assert_allclose(parts.parameters, whole.parameters, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(parts.standard_deviations, whole.standard_deviations, rtol=1e-6)
+
+
+@pytest.mark.parametrize("k", range(3, 7))
+def test_what_needs_rows_refuses_factors(base, noisy, k):
+    blocks = jid.factorise(base, [noisy])
+    with pytest.raises(ValueError, match="needs the rows themselves, but only their factors"):
+        jid.fit_blocks(base, blocks, members(noisy)[k])
+
+
+@pytest.mark.parametrize("loss", [jid.Huber(), jid.Tukey()])
+def test_a_loss_is_consistent_with_itself(loss):
+    x = np.linspace(-8, 8, 4001)
+    felt = x * loss.share(x)
+    np.testing.assert_allclose(np.gradient(felt, x)[1:-1], loss.slope(x)[1:-1], atol=0.6)
+    smooth = np.abs(np.abs(x) - loss.limit) > 0.01
+    np.testing.assert_allclose(np.gradient(felt, x)[smooth], loss.slope(x)[smooth], atol=5e-3)
+    # 95 % of the precision of least squares where the noise is normal.
+    density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+    slope, square = (np.trapezoid(y * density, x) for y in (loss.slope(x), felt**2))
+    assert slope**2 / square == pytest.approx(0.95, abs=0.002)
+
+
+def test_huber_minimises_its_loss(base, noisy):
+    """scipy's least squares with the same scales as an oracle."""
+    o = with_forces(noisy, lambda f: np.add(f[::17], 5.0, out=f[::17]))
+    estimator = jid.IterativelyReweighted(jid.Huber(), MEASURED, tolerance=1e-9)
+    fit = jid.identify(base, o, estimator)
+    theta, forces, joint = dense(base, o)
+    r = forces - theta @ fit.parameters
+    scale = np.array([1.4826 * np.median(np.abs(r[joint == j])) for j in range(2)])[joint]
+    size = np.asarray(fit.weights)[joint] * scale
+    c = jid.Huber().limit
+
+    def residuals(p):
+        x = np.abs((forces - theta @ p) / scale)
+        return size * np.sqrt(np.where(x <= c, x**2, 2 * c * x - c**2))
+
+    start = np.linalg.lstsq(theta, forces, rcond=None)[0]
+    found = optimize.least_squares(residuals, start, xtol=1e-15, ftol=1e-15, gtol=1e-12)
+    np.testing.assert_allclose(fit.parameters, found.x, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(("loss", "gain"), [(jid.Huber(), 3.0), (jid.Tukey(), 5.0)])
+def test_outliers_do_little(base, loss, gain):
+    p = standard_parameters(base.model)
+    truth = np.asarray(base.from_standard(p))
+    o = observations(base.model, p, samples=1500, noise=np.array([0.5, 0.1]))
+    wild = np.random.default_rng(5).random(1500) < 0.05
+    o = with_forces(o, lambda f: np.add(f, np.where(wild[:, None], [20.0, 4.0], 0.0), out=f))
+    plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
+    fit = jid.identify(base, o, jid.IterativelyReweighted(loss, MEASURED))
+    size = plain.naive_standard_deviations
+    errors = [np.linalg.norm((f.parameters - truth) / size) for f in (fit, plain)]
+    assert gain * errors[0] < errors[1]
+    assert fit.notes == ()
+
+
+def test_correlated_joints_are_solved_as_numpy_does(base):
+    p = standard_parameters(base.model)
+    mask = np.random.default_rng(2).random((400, 2)) < 0.8
+    o = observations(base.model, p, mask=mask)
+    S = np.array([[1.0, 0.9 * 0.3], [0.9 * 0.3, 0.09]])
+    noise = np.random.default_rng(3).standard_normal((400, 2)) @ np.linalg.cholesky(S).T
+    o = with_forces(o, lambda f: np.add(f, noise, out=f))
+    fit = jid.identify(base, o, jid.GeneralisedLeastSquares(iterations=4))
+    theta, forces, joint = dense(base, o)
+    r = np.full((400, 2), np.nan)
+    r[mask] = forces - theta @ fit.parameters
+    both = mask.all(axis=1)
+    pair = np.mean(r[both, 0] * r[both, 1])
+    found = np.array([[np.nanmean(r[:, 0] ** 2), pair], [pair, np.nanmean(r[:, 1] ** 2)]])
+    np.testing.assert_allclose(found, S, rtol=0.15)
+    time = np.broadcast_to(np.arange(400)[:, None], (400, 2))[mask]
+    V = np.where(time[:, None] == time, found[joint[:, None], joint], 0.0)
+    expected = np.linalg.solve(
+        theta.T @ np.linalg.solve(V, theta), theta.T @ np.linalg.solve(V, forces)
+    )
+    np.testing.assert_allclose(fit.parameters, expected, rtol=1e-4, atol=1e-4)
+    plain = jid.identify(base, o, jid.WeightedLeastSquares(jid.ResidualVariances()))
+    assert np.median(fit.standard_deviations / plain.standard_deviations) < 0.9
+
+
+def test_instruments_take_the_bias_of_noisy_columns_away(base):
+    # Without tanh: what noise does to the mean of such a column, no instrument takes away.
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.ConstantOffset())
+    base = jid.base_parameters(jid.Model(base.model.robot, terms))
+    p = standard_parameters(base.model)
+    truth = np.asarray(base.from_standard(p))
+    clean = observations(base.model, p, samples=3000, noise=0.1)
+    errors = {"plain": [], "instruments": []}
+    reference = Known(clean.motion, clean.sample_time)
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        noise = [s * random.standard_normal((3000, 2)) for s in (0.003, 0.1, 1.5)]
+        m = clean.motion
+        o = dataclasses.replace(
+            clean, motion=jid.Motion(m.q + noise[0], m.qd + noise[1], m.qdd + noise[2])
+        )
+        plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
+        fit = jid.identify(base, o, jid.InstrumentalVariables((reference,), MEASURED))
+        errors["plain"].append(plain.parameters - truth)
+        errors["instruments"].append(fit.parameters - truth)
+    # Means over the draws, in units of what chance lets them scatter.
+    bias = {
+        k: np.mean(e, axis=0) / (np.std(e, axis=0, ddof=1) / np.sqrt(12)) for k, e in errors.items()
+    }
+    assert np.sqrt(np.mean(bias["instruments"] ** 2)) < 1.6
+    assert np.sqrt(np.mean(bias["plain"] ** 2)) > 6.0
+    with pytest.raises(ValueError, match="must hold one trajectory, or one for each of 1 record"):
+        jid.identify(base, clean, jid.InstrumentalVariables((reference, reference), MEASURED))

@@ -1,0 +1,260 @@
+"""The spectral sandwich against its definition, and against the scatter of many draws."""
+
+import numpy as np
+import pytest
+from scipy import signal, special
+from virtual import dense, observations, standard_parameters
+
+import jaxid as jid
+from jaxid.dynamics.machine import in_numpy
+from jaxid.identification.uncertainty import stretches
+from jaxid.identification.uncertainty.sandwich import (
+    FEWEST,
+    NARROWEST,
+    RELATIVE,
+    SpectralTable,
+    sandwich,
+)
+from jaxid.identification.uncertainty.spectra import lines_of
+
+ESTIMATOR = jid.WeightedLeastSquares(jid.MeasuredForces())
+
+
+@pytest.fixture(scope="module")
+def base():
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
+    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+
+
+def found_lines(base, recordings):
+    rows = jid.Rows.of(base, recordings)
+    e = ESTIMATOR(rows)
+    return lines_of(rows, e.influence, e.inverse, e.parameters)[0], e
+
+
+def by_definition(base, o, weights):
+    """The prototype's formulas written out with dense matrices, for one recording."""
+    theta, forces, _ = dense(base, o)
+    n = base.model.robot.joints
+    A = (weights[:, None] * theta.reshape(-1, n, base.size)).reshape(-1, base.size)
+    y = (forces.reshape(-1, n) * weights).ravel()
+    inverse = np.linalg.inv(A.T @ A)
+    P, r = (A @ inverse).reshape(-1, n, base.size), (y - A @ (inverse @ A.T @ y)).reshape(-1, n)
+    N = len(r)
+    f = np.fft.rfftfreq(N, o.row_time)
+    m = np.full(len(f), 2.0)
+    m[0] = 1.0
+    if N % 2 == 0:
+        m[-1] = 1.0
+    Pf, Af = np.fft.rfft(P, axis=0), np.fft.rfft(A.reshape(-1, n, base.size), axis=0)
+    h = np.real(np.sum(Pf.conj() * Af, axis=2)) / N
+    power = np.abs(np.fft.rfft(r, axis=0)) ** 2 / N
+    half = np.maximum(np.maximum(NARROWEST, FEWEST / (N * o.row_time)), RELATIVE * f)
+    within = (np.abs(f[:, None] - f) <= half[:, None] * (1 + 1e-9)) * m / 2
+    phi = (within @ power) / (within @ (1 - h))
+    weighted = Pf * np.sqrt(m / N)[:, None, None]
+    covariance = np.einsum("fji,fj,fjk->ik", weighted, phi, weighted.conj()).real
+    C = np.einsum("fji,fg,fj->ijg", np.abs(weighted) ** 2, within, 1 / (within @ (1 - h)))
+    x = C * power.T
+    scatter = np.sum(x**2 * 2 / m, axis=(1, 2))
+    return covariance, 4 * np.sum(x, axis=(1, 2)) ** 2 / scatter
+
+
+@pytest.mark.parametrize("samples", [400, 401])
+def test_the_sandwich_is_its_definition(base, samples):
+    o = observations(base.model, standard_parameters(base.model), samples=samples, noise=0.4)
+    lines, e = found_lines(base, [o])
+    covariance, freedom = by_definition(base, o, np.asarray(e.weights))
+    got = sandwich(lines)
+    np.testing.assert_allclose(np.diag(got.covariance), np.diag(covariance), rtol=1e-8)
+    np.testing.assert_allclose(got.freedom, freedom, rtol=1e-8)
+    size = np.sqrt(np.diag(covariance))
+    # Pairs of parameters see the spectrum in bins.
+    np.testing.assert_allclose(
+        got.covariance / size / size[:, None], covariance / size / size[:, None], atol=0.03
+    )
+    assert np.linalg.eigvalsh(got.covariance / size / size[:, None])[0] > 0
+
+
+def coloured(random, shape, memory, dt):
+    kept = np.exp(-dt / memory)
+    start = kept * random.standard_normal((shape[0], 1, shape[2]))
+    white = random.standard_normal(shape)
+    return signal.lfilter([np.sqrt(1 - kept**2)], [1, -kept], white, axis=1, zi=start)[0]
+
+
+def coverage(base, recordings, memory, draws, seed=0):
+    """Share of draws in which the 95 % interval holds the truth, by parameter; naive likewise."""
+    random = np.random.default_rng(seed)
+    lines, e = found_lines(base, recordings)
+    table = SpectralTable(lines)
+    w = np.asarray(e.weights)
+    rows = jid.Rows.of(base, recordings)
+    error, parts = np.zeros((draws, base.size)), []
+    for o, chunks in zip(recordings, by_recording(rows), strict=True):
+        A = np.zeros((o.rows, len(w), base.size))
+        for chunk in chunks:
+            for j, own in enumerate(chunk.acting):
+                A[chunk.rows, j, list(own)] = w[j] * chunk.counted[:, j, None] * chunk.columns[j]
+        noise = w * coloured(random, (draws, o.rows, len(w)), memory, o.row_time)
+        noise = noise * np.asarray(o.mask)
+        error += np.einsum("dtj,tjk->dk", noise, A) @ np.asarray(e.inverse)
+        parts.append((o, A, noise))
+    power = 0.0
+    naive = 0.0
+    count = sum(np.asarray(o.mask).sum(axis=0) for o in recordings)
+    for o, A, noise in parts:
+        r = (noise - np.einsum("tjk,dk->dtj", A, error)) * np.asarray(o.mask)
+        naive = naive + np.sum(r**2, axis=1) / count
+        for a, b in o.row_segments:
+            spectrum = np.abs(np.fft.rfft(r[:, a:b], axis=1)) ** 2 / (b - a)
+            power = power + np.moveaxis(spectrum, 1, 2)
+    variance, freedom = table(power)
+    quantile = special.stdtrit(np.maximum(freedom, 1), 0.975)
+    honest = np.mean(np.abs(error) <= quantile * np.sqrt(variance), axis=0)
+    squares = sum(np.einsum("tjk->jk", (A @ np.asarray(e.inverse)) ** 2) for _, A, _ in parts)
+    return honest, np.mean(np.abs(error) <= 1.96 * np.sqrt(naive @ squares), axis=0)
+
+
+def by_recording(rows):
+    found = [[] for _ in rows.recordings]
+    for chunk in rows.chunks():
+        found[chunk.recording].append(chunk)
+    return found
+
+
+def moved(samples, seed=0):
+    """Sinusoids of 0.17 to 0.61 Hz, at 50 Hz."""
+    random = np.random.default_rng(seed)
+    t = 0.02 * np.arange(samples)[:, None]
+    q, qd, qdd = (np.zeros((samples, 2)) for _ in range(3))
+    for w in 2 * np.pi * np.array([0.17, 0.29, 0.47, 0.61]):
+        a, phase = random.uniform(0.2, 0.6, 2), random.uniform(0, 6, 2)
+        q += a * np.sin(w * t + phase)
+        qd += a * w * np.cos(w * t + phase)
+        qdd -= a * w**2 * np.sin(w * t + phase)
+    return jid.Motion(q, qd, qdd)
+
+
+def long_one(base, *, segments=None, mask=None, seed=0, samples=1000):
+    """20 s at 50 Hz: what is left of a fast log."""
+    o = observations(base.model, standard_parameters(base.model), samples=samples)
+    m, p = moved(samples, seed), standard_parameters(base.model)
+    changed = {
+        "sample_time": 0.02,
+        "time": 0.02 * np.arange(samples),
+        "motion": m,
+        "forces": in_numpy(base.model, base.model.forces, m.q, m.qd, m.qdd, shared=(p,)),
+        "filter": jid.ZeroPhaseButterworth(20.0, force_cutoff=np.inf, margin=0.0),
+    }
+    if segments is not None:
+        changed["segments"] = segments
+    if mask is not None:
+        changed["mask"] = mask
+    return jid.Observations(**{**vars(o), **changed})
+
+
+SLOW = np.abs(moved(1000).qd) > 0.3
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        [{}],
+        [{"seed": 1}, {"seed": 2}],
+        [{"segments": ((0, 500), (500, 1000))}],
+        [{"mask": SLOW}],
+    ],
+    ids=["one", "two recordings", "a gap", "slow rows left out"],
+)
+@pytest.mark.parametrize("memory", [1e-6, 0.3])
+def test_intervals_hold_the_truth_as_often_as_they_say(base, options, memory):
+    recordings = [long_one(base, **x) for x in options]
+    honest, naive = coverage(base, recordings, memory, 1000)
+    assert abs(honest.mean() - 0.95) < 0.015
+    assert honest.min() > 0.9
+    assert honest.max() < 0.99
+    if memory == 0.3:
+        assert naive.mean() < 0.6
+
+
+def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
+    o = long_one(base, samples=24000)
+    noise = coloured(np.random.default_rng(3), (1, 24000, 2), 0.3, 0.02)[0]
+    o = jid.Observations(**{**vars(o), "forces": o.forces + noise})
+    whole = jid.identify(base, o, ESTIMATOR)
+    monkeypatch.setattr(stretches, "LONGEST_ROWS", 1500)
+    divided = jid.identify(base, o, ESTIMATOR)
+    np.testing.assert_allclose(divided.standard_deviations, whole.standard_deviations, rtol=0.06)
+    monkeypatch.setattr(stretches, "SEEN", 8000)
+    some = jid.identify(base, o, ESTIMATOR)
+    np.testing.assert_allclose(some.standard_deviations, whole.standard_deviations, rtol=0.15)
+    assert np.median(whole.uncertainty.ratios) > 2
+
+
+def test_intervals_by_the_fit(base):
+    o = long_one(base)
+    noise = np.random.default_rng(0).standard_normal((1000, 2))
+    fit = jid.identify(base, jid.Observations(**{**vars(o), "forces": o.forces + noise}), ESTIMATOR)
+    low, high = fit.intervals(0.9).T
+    quantile = special.stdtrit(fit.uncertainty.freedom, 0.95)
+    np.testing.assert_allclose(high - low, 2 * quantile * fit.standard_deviations)
+    np.testing.assert_allclose(0.5 * (low + high), fit.parameters)
+    assert (np.diff(fit.intervals(0.99)) > np.diff(fit.intervals(0.9))).all()
+    # Rows that are independent: all three say about the same.
+    assert 0.8 < np.median(fit.uncertainty.ratios) < 1.2
+    crosscheck = fit.uncertainty.jackknife / fit.standard_deviations
+    assert 0.6 < np.median(crosscheck) < 1.6
+    with pytest.raises(ValueError, match="`level` must lie between 0 and 1"):
+        fit.intervals(95.0)
+
+
+@pytest.mark.parametrize(
+    "method", [jid.SpectralSandwich(), jid.BlockJackknife(), jid.IndependentRows()]
+)
+def test_every_way_gives_a_whole_uncertainty(base, method):
+    p = standard_parameters(base.model)
+    fit = jid.identify(base, observations(base.model, p, noise=0.3), ESTIMATOR, uncertainty=method)
+    u = fit.uncertainty
+    assert u.covariance.shape == u.naive_covariance.shape == (base.size, base.size)
+    assert (u.freedom >= 1).all()
+    assert np.linalg.eigvalsh(u.covariance).min() > 0
+    assert np.isfinite(u.half_widths()).all()
+    still = jid.identify(
+        base, observations(base.model, p, noise=0.3, still=(1,)), ESTIMATOR, uncertainty=method
+    )
+    assert np.isinf(still.standard_deviations[base.names.index("fv2")])
+
+
+def test_factors_alone_are_judged_by_blocks(base):
+    o = observations(base.model, standard_parameters(base.model), noise=0.3)
+    blocks = jid.factorise(base, [o], 12)
+    fit = jid.fit_blocks(base, blocks, ESTIMATOR)
+    left_out = np.array(
+        [
+            np.linalg.lstsq(*blocks.without(k).weighted(fit.weights), rcond=None)[0]
+            for k in range(12)
+        ]
+    )
+    expected = np.sqrt(11 / 12 * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0))
+    np.testing.assert_allclose(fit.standard_deviations, expected, rtol=1e-7)
+    assert (fit.uncertainty.freedom == 11).all()
+    assert any("blocks of time that were left out in turn" in note for note in fit.notes)
+    one = jid.fit_blocks(base, jid.factorise(base, [o], 1), ESTIMATOR)
+    np.testing.assert_array_equal(one.standard_deviations, one.naive_standard_deviations)
+    assert any("only one block of time" in note for note in one.notes)
+
+
+def test_residuals_are_told_white_or_not(base):
+    o = long_one(base)
+    white = np.random.default_rng(0).standard_normal((1000, 2))
+    slow = coloured(np.random.default_rng(1), (1, 1000, 2), 0.3, 0.02)[0]
+    noise = np.stack([white[:, 0], slow[:, 1]], axis=1)
+    spectra = jid.identify(
+        base, jid.Observations(**{**vars(o), "forces": o.forces + noise}), ESTIMATOR
+    ).residual_spectra
+    assert spectra.white == (True, False)
+    assert spectra.slow[1] > 0.5 > 0.2 > spectra.slow[0]
+    # One-sided densities: their area is the variance.
+    area = np.trapezoid(spectra.density, spectra.frequency, axis=1)
+    np.testing.assert_allclose(area, [1.0, 0.8], rtol=0.1)
