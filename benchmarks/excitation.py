@@ -1,0 +1,242 @@
+"""What designs of excitation motions reach, and what they cost.
+
+Robot: rail + TX90L, rigid bodies (seven parameters each: 44 base parameters; ten: 57), viscous and
+Coulomb friction, rotors; joint limits as in `jid.robots.tx90l_on_rail()`. Five harmonics at
+0.8 rad/s, 800 samples of one period without its end point, noise 1 % of the largest forces, 32
+starts. Violation: largest relative excess of position, velocity and acceleration on 8000 points.
+
+* cond: the condition number of the unweighted information (Eq. 36), by JAX alone and polished.
+* gain: standard deviations of weighted least squares of random motions over those of the designed
+  one: geometric mean over the parameters, mean over 15 random motions (`random_fourier_series`,
+  seeds 0 to 14, at full reach).
+* panda: D-optimal designs of the Panda, limits of its library entry.
+* gradients: of the criteria by scaled numbers, against central differences, relative to the
+  gradient's norm (largest component difference), at a random motion.
+* step: one value and gradient against forward differences of the same function, 800 samples.
+* batch: starts per second of one evaluation of value and gradient, and of a whole search.
+
+Statistics over the keys: median and best. CPU seconds are those of the process, compile included.
+
+    python benchmarks/excitation.py cond d7 d10 panda gradients step batch [--keys 3] [--quick]
+"""
+
+import argparse
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxid as jid
+from jaxid.excitation.information import information
+from jaxid.excitation.limits import JointLimits
+from jaxid.excitation.plan import CRITERIA, deviations
+from jaxid.excitation.problem import Context, Problem
+from jaxid.excitation.search import LEGS, Search, random_starts
+from jaxid.trajectory.basis import FourierBasis
+
+RANDOM = range(15)
+
+
+def base_of(principal_axes):
+    terms = (
+        jid.RigidBodies(principal_axes=principal_axes),
+        jid.ViscousFriction(),
+        jid.CoulombFriction(),
+        jid.RotorInertia(),
+    )
+    return jid.base_parameters(jid.Model(jid.robots.tx90l_on_rail(), terms=terms))
+
+
+def violation(plan):
+    own, duration = plan.limits.limits, plan.limits.basis.duration
+    motion = plan.trajectory.motion(np.arange(8000) * duration / 8000)
+    q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
+    half = (own.position_max - own.position_min) / 2
+    return max(
+        ((q - own.position_max) / half).max(),
+        ((own.position_min - q) / half).max(),
+        (np.abs(qd) / own.velocity - 1).max(),
+        (np.abs(qdd) / own.acceleration - 1).max(),
+    )
+
+
+def gain_over_random(plan):
+    base, weights = plan.base, 1 / np.asarray(plan.noise)
+    logs = []
+    for seed in RANDOM:
+        series = jid.random_fourier_series(base.model.robot, omega=0.8, reach=1.0, seed=seed)
+        motion = series.motion(plan.limits.basis.times(plan.samples))
+        random = deviations(information(base, motion, weights).weighted)
+        logs.append(np.mean(np.log(random / plan.standard_deviations)))
+    return float(np.exp(np.mean(logs)))
+
+
+def designed(base, criterion, keys, measure, polish, starts):
+    found = []
+    for key in keys:
+        wall, cpu = time.perf_counter(), time.process_time()
+        plan = jid.design_excitation(
+            base,
+            criterion=criterion,
+            starts=starts,
+            polish=polish,
+            key=jax.random.key(key),
+        )
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        found.append(measure(plan))
+        print(
+            f"  key {key}, polish {polish}: {found[-1]:.6g}, violation {violation(plan):.1e}, "
+            f"wall {wall:.1f} s, CPU {cpu:.1f} s with compile",
+            flush=True,
+        )
+    return found
+
+
+def report(name, found, best):
+    print(f"{name}: median {np.median(found):.5g}, best {best(found):.5g}", flush=True)
+
+
+def cond(keys, starts):
+    base = base_of(True)
+    for polish in (0, 4):
+        found = designed(
+            base,
+            jid.ConditionNumber(),
+            keys,
+            lambda p: np.linalg.cond(p.information.plain),
+            polish,
+            starts,
+        )
+        report(f"cond, polish {polish}", found, min)
+
+
+def d_optimal(principal_axes, keys, starts):
+    base = base_of(principal_axes)
+    for polish in (0, 4):
+        found = designed(base, jid.DOptimal(), keys, gain_over_random, polish, starts)
+        report(f"D gain, {base.size} base parameters, polish {polish}", found, max)
+
+
+def panda(keys, starts):
+    base = jid.base_parameters(jid.Model(jid.robots.panda()))
+    for criterion in (jid.DOptimal(), jid.ConditionNumber()):
+        found = designed(
+            base, criterion, keys, lambda p, c=criterion: c.value(p.information), 0, starts
+        )
+        report(f"Panda, {criterion.name}, JAX alone", found, min)
+
+
+def problem_of(base, criterion):
+    robot = base.model.robot
+    limits = JointLimits.of(robot, FourierBasis(5, 0.8))
+    return Problem(
+        base,
+        limits,
+        criterion,
+        (),
+        weights=100 / np.asarray(robot.max_forces),
+        prior=np.zeros((base.size, base.size)),
+        sizes=1 / np.sqrt(np.arange(1, base.size + 1)),
+        measured=800,
+    )
+
+
+def gradients():
+    base = base_of(True)
+    for criterion in CRITERIA:
+        for sharpness in (8.0, None) if criterion.extreme else (None,):
+            problem = problem_of(base, criterion)
+            evaluate = jax.jit(problem.objective(64))
+            y = np.asarray(random_starts(problem.limits, jax.random.key(1), 1))
+            context = Context(sharpness, np.zeros((1, 1, 0)), 1.0)
+            g = np.asarray(evaluate(y, context)[1])[0]
+            h, slopes = 1e-5, np.zeros_like(g)
+            for k in range(len(g)):
+                e = np.zeros_like(y)
+                e[0, k] = h
+                # Fourth order: rounding and truncation both stay below what is asked.
+                near, far = (
+                    [float(evaluate(y + s * m * e, context)[0][0]) for s in (1, -1)] for m in (1, 2)
+                )
+                slopes[k] = (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
+            error = np.linalg.norm(slopes - g) / np.linalg.norm(g)
+            print(f"{criterion.name}, sharpness {sharpness}: {error:.1e}", flush=True)
+
+
+def step():
+    problem = problem_of(base_of(True), jid.ConditionNumber())
+    evaluate = jax.jit(problem.objective(800))
+    context = Context(8.0, np.zeros((1, 1, 0)), 1.0)
+    value = jax.jit(lambda y: problem.objective(800)(y, context)[0])
+    y = random_starts(problem.limits, jax.random.key(1), 1)
+    size = y.shape[1]
+
+    def exact():
+        return jax.block_until_ready(evaluate(y, context))
+
+    def differences():
+        f = value(y)
+        return [float((value(y.at[0, k].add(1e-6)) - f)[0]) for k in range(size)]
+
+    times = {}
+    for run in (exact, differences):
+        run()
+        times[run.__name__] = []
+    for _ in range(7):
+        for run in (exact, differences):
+            start = time.perf_counter()
+            run()
+            times[run.__name__].append(time.perf_counter() - start)
+    a, b = (np.median(times[k]) for k in ("exact", "differences"))
+    print(f"step: exact {1e3 * a:.2f} ms, forward differences {1e3 * b:.1f} ms: {b / a:.0f}x")
+
+
+def batch(sizes):
+    problem = problem_of(base_of(True), jid.DOptimal())
+    iterations = sum(leg.stage.iterations for leg in LEGS)
+    for starts in sizes:
+        search = Search(problem, starts)
+        wall = time.perf_counter()
+        state = search.begin(jax.random.key(0))
+        state = search.advance(state)
+        compiled = time.perf_counter() - wall
+        wall, cpu = time.perf_counter(), time.process_time()
+        while state.leg < search.legs:
+            state = search.advance(state)
+        rest = 1 - LEGS[0].stage.iterations / iterations
+        wall, cpu = (time.perf_counter() - wall) / rest, (time.process_time() - cpu) / rest
+        print(
+            f"batch of {starts}: {starts / wall:.2f} starts per second of {iterations} iterations "
+            f"({wall:.2f} s, CPU {cpu:.2f} s, compile and first leg {compiled:.1f} s)",
+            flush=True,
+        )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("parts", nargs="*", default=["cond", "d7"])
+    parser.add_argument("--keys", type=int, default=3)
+    parser.add_argument("--starts", type=int, default=32)
+    parser.add_argument("--quick", action="store_true")
+    asked = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    keys, starts = range(asked.keys), asked.starts
+    if asked.quick:
+        keys, starts, asked.parts = range(1), 2, ["d7"]
+    sizes = (1, 8, 64) if jax.default_backend() == "cpu" else (64, 512, 4096)
+    parts = {
+        "cond": lambda: cond(keys, starts),
+        "d7": lambda: d_optimal(True, keys, starts),
+        "d10": lambda: d_optimal(False, keys, starts),
+        "panda": lambda: panda(keys, starts),
+        "gradients": gradients,
+        "step": step,
+        "batch": lambda: batch(sizes),
+    }
+    for part in asked.parts:
+        parts[part]()
+
+
+if __name__ == "__main__":
+    main()
