@@ -1,4 +1,4 @@
-"""The command line: `jaxid init`, `inspect`, `identify`, `compare` and `example`."""
+"""The command line: `jaxid init`, `inspect`, `excite`, `identify`, `compare` and `example`."""
 
 import dataclasses
 import importlib.metadata
@@ -13,12 +13,13 @@ from rich.text import Text
 from typer.core import TyperCommand
 
 from jaxid.experiment import terminal
+from jaxid.experiment.excite import design
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import output_folder, refuse_foreign_folder
 from jaxid.experiment.loading import Loaded, load_log
 from jaxid.experiment.mistakes import likely_mistake
-from jaxid.experiment.progress import Stages, stages
+from jaxid.experiment.progress import Stages, designing, stages
 from jaxid.experiment.sanity import negative_friction
 from jaxid.experiment.template import write_template
 from jaxid.identification.fit import Fit
@@ -31,6 +32,7 @@ from jaxid.measurement.observations import Observations
 from jaxid.program.cache import keep_compiled
 from jaxid.report.compared_files import read_estimates, write_comparison
 from jaxid.report.content import Beside
+from jaxid.report.excitation import write_pictures
 from jaxid.report.write import write_report
 from jaxid.validation.validate import validate
 
@@ -193,6 +195,40 @@ def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fi
     progress = stage.through(log.recording.samples)
     fit = estimate(experiment.base, log.observations, experiment.estimator, progress)
     return log, fit
+
+
+@app.command()
+def excite(
+    experiment: ExperimentFile,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
+    ] = Path("trajectory.csv"),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where a design was stopped.")
+    ] = False,
+) -> None:
+    """Design the motion to record, within the limits of the joints.
+
+    Beside the table lie the trajectory itself (.json), pictures of joints and end-effector in a
+    folder, and the state of the design until it is done. Ctrl-C keeps the best motion so far.
+    """
+    console = _console()
+    loaded = load_experiment(experiment)
+    state = output.with_suffix(".state.npz")
+    with designing(console) as tell:
+        plan = design(loaded, tell, state, resume)
+    plan.to_csv(output)
+    plan.save(output.with_suffix(".json"))
+    pictures = write_pictures(output.with_suffix(""), plan)
+    if not plan.interrupted:
+        state.unlink(missing_ok=True)
+    terminal.show_plan(console, plan)
+    terminal.show_files(
+        console,
+        output.parent,
+        [output.name, output.with_suffix(".json").name]
+        + [str(p.relative_to(output.parent)) for p in pictures],
+    )
 
 
 @app.command(cls=SpreadVerify)

@@ -19,7 +19,7 @@ from jaxid.experiment.method_tables import (
 )
 from jaxid.experiment.reading import read_tables
 from jaxid.experiment.robot_tables import build_robot, within
-from jaxid.experiment.tables import RecordingTable
+from jaxid.experiment.tables import ExcitationTable, RecordingTable
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.opening import open_log
 from jaxid.identification.solutions import Complete, CrossValidated
@@ -58,6 +58,7 @@ class Experiment:
         slow: Speeds below which rows do not count [rad/s or m/s]; None if all count.
         estimator: How rows become parameters.
         regularised: Whether the estimator keeps small what the logs do not decide.
+        excitation: The table of the motion to design.
         notes: What was assumed where the file says nothing, in sentences.
     """
 
@@ -74,6 +75,7 @@ class Experiment:
     slow: Float[np.ndarray, " joints"] | None
     estimator: LeastSquares | WeightedLeastSquares
     regularised: bool
+    excitation: ExcitationTable
     notes: tuple[str, ...]
 
     @functools.cached_property
@@ -237,5 +239,6 @@ def load_experiment(path: str | Path) -> Experiment:
         slow=slow,
         estimator=estimator,
         regularised=tables.estimator.ridge is not None or tables.estimator.truncate is not None,
+        excitation=tables.excitation,
         notes=tuple(notes),
     )

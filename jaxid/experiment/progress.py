@@ -1,12 +1,13 @@
 """How far a command is: its stages, and the samples of a long log with their speed."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
+from jaxid.excitation.design import DesignProgress
 from jaxid.identification.streaming import Progress as Told
 
 
@@ -65,3 +66,23 @@ def stages(console: Console, total: int) -> Iterator[Stages]:
     quiet = not console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
         yield Stages(progress, total)
+
+
+@contextmanager
+def designing(console: Console) -> Iterator[Callable[[DesignProgress], None]]:
+    """A progress bar of a design with the best value so far; nothing elsewhere than in a terminal.
+
+    Args:
+        console: Where it stands.
+    """
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+        task = progress.add_task("preparing", total=1.0)
+
+        def tell(now: DesignProgress) -> None:
+            kept = "" if now.feasible else ", limits not yet kept"
+            text = f"{now.doing}, best so far {now.best:.5g}{kept}"
+            progress.update(task, description=text, completed=now.share)
+
+        yield tell

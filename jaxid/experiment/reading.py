@@ -37,6 +37,7 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "recording": tables.RecordingTable,
     "rows": tables.RowsTable,
     "estimator": tables.EstimatorTable,
+    "excitation": tables.ExcitationTable,
 }
 
 

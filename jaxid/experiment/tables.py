@@ -213,6 +213,27 @@ class EstimatorTable(_Table, frozen=True):
     ridge: Share | Literal["cross_validated"] | None = None
 
 
+class ExcitationTable(_Table, frozen=True):
+    """The motion to design."""
+
+    criterion: Literal[
+        "d_optimal",
+        "a_optimal",
+        "e_optimal",
+        "condition_number",
+        "weighted_condition_number",
+        "scaled_condition_number",
+    ] = "d_optimal"
+    harmonics: Count = 5
+    omega: Positive = 0.8
+    rest: bool = False
+    samples: Annotated[int, Meta(ge=2)] = 800
+    noise: PerJoint | None = None
+    starts: Count = 32
+    polish: Annotated[int, Meta(ge=0)] = 4
+    seed: Annotated[int, Meta(ge=0)] = 0
+
+
 class Tables(_Table, frozen=True):
     """The whole file."""
 
@@ -225,6 +246,7 @@ class Tables(_Table, frozen=True):
     filter: ButterworthTable | PaperTable | PeriodicTable | None = None
     rows: RowsTable = RowsTable()
     estimator: EstimatorTable = EstimatorTable()
+    excitation: ExcitationTable = ExcitationTable()
 
 
 FILTERS = {

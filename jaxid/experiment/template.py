@@ -22,6 +22,7 @@ _TEMPLATE = """\
 #
 #   jaxid inspect  {file}                      what can be identified
 #   jaxid inspect  {file} log.csv              is this log sane?
+#   jaxid excite   {file} -o trajectory.csv    the motion to record
 #   jaxid identify {file} log.csv -o report/   parameters and torque errors
 
 [robot]
@@ -130,6 +131,21 @@ kind = "weighted"                     # or "least_squares": every newton metre c
 # ridge = "cross_validated"           # pulls what the logs hardly decide towards zero, as much as
 #                                     # serves left-out parts of the logs best; or a share like 0.01
 # truncate = 0.01                     # leave out directions below this share of the best one
+
+# The motion that `jaxid excite` designs, within the limits above.
+[excitation]
+criterion = "d_optimal"               # smallest deviations on the whole; or a_optimal, e_optimal,
+#                                     # condition_number (the paper's, Eq. 36),
+#                                     # weighted_condition_number, scaled_condition_number
+harmonics = 5                         # of the Fourier series
+omega = 0.8                           # its ground frequency [rad/s]
+rest = false                          # true: start and stop at rest
+samples = 800                         # that one run will measure
+# noise = {ones}        # standard deviation of the forces' noise [N m or N];
+#                                     # by default 1 % of the largest forces
+starts = 32                           # random motions to start from
+polish = 4                            # how many of the best are polished
+seed = 0                              # of the random motions
 """
 
 

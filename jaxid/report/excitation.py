@@ -1,0 +1,87 @@
+"""What a design has found: tables for the terminal, and files."""
+
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from jaxid.excitation.plan import VAGUE, ExcitationPlan
+from jaxid.files import written_whole
+from jaxid.report.motion_figures import joint_figure, tip_figure
+from jaxid.report.numbers import aligned, percent, significant
+from jaxid.report.style import save
+from jaxid.report.tables import plain_table
+from jaxid.types import double_precision
+
+JOINTS, TIP = "joints.png", "end_effector.png"
+
+
+def criteria_table(plan: ExcitationPlan) -> Table:
+    """All criteria of a random motion and of the designed one."""
+    table = plain_table("criteria: smaller is better")
+    table.add_column("criterion")
+    table.add_column("random motion", justify="right", no_wrap=True)
+    table.add_column("this motion", justify="right", no_wrap=True)
+    for row in plan.criteria:
+        chosen = "bold" if row.name == plan.criterion.name else ""
+        numbers = (significant(row.before), significant(row.after))
+        table.add_row(*(Text(text, style=chosen) for text in (row.name, *numbers)))
+    return table
+
+
+def deviation_table(plan: ExcitationPlan) -> Table:
+    """Standard deviations to expect of every base parameter, before the experiment."""
+    base, relative = plan.base, plan.relative_deviations
+    table = plain_table("standard deviations to expect")
+    table.add_column("#", justify="right", style="dim")
+    table.add_column("parameter", overflow="fold")
+    table.add_column("±", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("better than random", justify="right", no_wrap=True)
+    if relative is not None:
+        table.add_column("± [%]", justify="right", no_wrap=True)
+    deviations = aligned([significant(float(s)) for s in plan.standard_deviations])
+    gains = aligned([f"{gain:.2f}x" for gain in plan.gains])
+    for k, name in enumerate(base.names):
+        row = [str(k + 1), Text(name), deviations[k], base.units[k], gains[k]]
+        if relative is not None:
+            style = "red" if relative[k] > VAGUE else ""
+            row.append(Text(percent(float(relative[k])), style=style))
+        table.add_row(*row)
+    return table
+
+
+def use_table(plan: ExcitationPlan) -> Table:
+    """Share of each limit that the motion uses, for all times."""
+    table = plain_table("use of the limits [%]")
+    table.add_column("joint")
+    kinds = ("range", "speed", "acceleration", "jerk")
+    use = plan.use
+    shown = [k for k in range(4) if (use[k] > 0).any()]
+    for k in shown:
+        table.add_column(kinds[k], justify="right", no_wrap=True)
+    for j, name in enumerate(plan.base.model.robot.joint_names):
+        table.add_row(Text(name), *(f"{100 * use[k, j]:.1f}" for k in shown))
+    return table
+
+
+def write_pictures(folder: Path, plan: ExcitationPlan) -> list[Path]:
+    """Draws the joints and the end-effector (Figs. 3, 4); the files appear together.
+
+    Args:
+        folder: Where they shall lie.
+        plan: With the motion.
+    """
+    robot, duration = plan.base.model.robot, float(plan.limits.basis.duration)
+    time = np.linspace(0.0, duration, 801)
+    with double_precision():
+        motion = plan.trajectory.motion(time)
+    figures = {
+        JOINTS: joint_figure(robot, plan.limits.limits, time, motion),
+        TIP: tip_figure(robot, time, motion),
+    }
+    with written_whole(folder) as staging:
+        for name, figure in figures.items():
+            save(figure, staging / name)
+    return [folder / name for name in figures]
