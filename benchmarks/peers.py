@@ -38,7 +38,7 @@ def compiled(function, *arrays):
 
 
 def packed_columns(model, motion):
-    """The non-constant entries of the regressor, one array over the samples for each."""
+    """The varying entries of the regressor, compiled however few the samples, and their program."""
     from jaxid.dynamics.machine import program_of
     from jaxid.program import lower
 
@@ -52,20 +52,14 @@ def packed_columns(model, motion):
     return program, compiled(entries, *(x.T for x in motion))
 
 
-def dense_matrix(program, entries, joints, samples):
-    """The whole matrix [joints x samples, columns] in Fortran's order, from the packed entries."""
-    import numpy as np
+def packed_regressor(model, motion):
+    """The regressor without its zeros, as a call that blocks."""
+    import jax
 
-    (columns,) = program.output_shapes
-    places = [k for k, x in enumerate(program.outputs) if not isinstance(x, float)]
+    import jaxid as jid
 
-    def matrix():
-        out = np.zeros((columns[1], joints, samples))
-        for k, values in zip(places, entries(), strict=True):
-            out[k % columns[1], k // columns[1]] = values
-        return out.reshape(columns[1], joints * samples).T
-
-    return matrix
+    rows = jid.Motion(*map(jax.numpy.asarray, motion))
+    return lambda: jax.block_until_ready(model.packed_regressor(rows))
 
 
 def per_sample(times, samples):
@@ -102,14 +96,17 @@ def with_friction(samples, turns):
     terms = (jid.RigidBodies(), jid.ViscousFriction(), friction, jid.RotorInertia())
     model = jid.Model(robot, terms)
     q, qd, qdd = state = motion(n, samples)
-    program, packed = packed_columns(model, state)
-    matrix = dense_matrix(program, packed, n, samples)
+    packed = packed_regressor(model, state)
+
+    def matrix():
+        return packed().matrix()
+
     rows = jid.Motion(*map(jax.numpy.asarray, state))
     cases = {
         "packed": packed,
         "matrix": matrix,
         "public": lambda: jax.block_until_ready(model.regressor(rows)),
-        "fill": fill(sum(not isinstance(x, float) for x in program.outputs), samples),
+        "fill": fill(len(packed().values), samples),
     }
     if absent is None:
         from figaroh.tools.regressor import build_regressor_basic
@@ -143,20 +140,22 @@ def one_core(samples, turns):
     from pinocchio_loop import Bodies, Loop, in_our_order
 
     import jaxid as jid
+    from jaxid.dynamics.machine import program_of
 
     robot = jid.robots.panda()
     n = robot.joints
     model = jid.Model(robot, (jid.RigidBodies(),))
     state = motion(n, samples)
     bodies = Bodies(n)
-    program, packed = packed_columns(model, state)
-    nonzero = sum(not isinstance(x, float) for x in program.outputs)
+    packed = packed_regressor(model, state)
+    nonzero = len(packed().values)
+    counts = program_of(model, model.columns, (n,), (n,), (n,)).counts
     forces = forces_of(model, bodies.parameters.ravel(), state)
     cases = {"regressor": packed, "forces": forces, "fill": fill(nonzero, samples)}
     notes = []
     try:
         loop = Loop(robot, bodies, *state)
-        matrix = dense_matrix(program, packed, n, samples)()
+        matrix = packed().matrix()
         theirs = in_our_order(loop.regressors(), n).swapaxes(0, 1).reshape(n * samples, -1)
         np.testing.assert_allclose(matrix, theirs, atol=1e-9)
         np.testing.assert_allclose(np.stack(forces()).T, loop.torques(), atol=1e-9)
@@ -172,7 +171,7 @@ def one_core(samples, turns):
 
     rate = timing.flop_rate()
     floor = times["fill"]
-    work = program.counts.multiplications + program.counts.additions
+    work = counts.multiplications + counts.additions
     recipe = (
         f"Panda, ten parameters per body = 70 columns, {nonzero} non-zero entries, N = {samples}, "
         f"one core, median of {turns} turns; floors: warm fill {per_sample(floor, samples)}, "

@@ -9,6 +9,7 @@ from jaxid.dynamics.friction import StribeckFriction as StribeckFriction
 from jaxid.dynamics.friction import TemperatureScaled as TemperatureScaled
 from jaxid.dynamics.model import Model as Model
 from jaxid.dynamics.motion import Motion as Motion
+from jaxid.dynamics.packed import PackedRegressor as PackedRegressor
 from jaxid.dynamics.rank import GramSchmidt as GramSchmidt
 from jaxid.dynamics.rank import SingularValues as SingularValues
 from jaxid.dynamics.terms import AbstractTerm as AbstractTerm

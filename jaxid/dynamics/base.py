@@ -15,6 +15,7 @@ from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.observation import observation_matrix
+from jaxid.dynamics.packed import PackedRegressor
 from jaxid.dynamics.rank import (
     AbstractRankMethod,
     Dependence,
@@ -107,6 +108,16 @@ class BaseParameters(Hashable):
         r"""The base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
         self.model.check(motion.q)
         return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
+
+    def packed_regressor(self, motion: Motion) -> PackedRegressor:
+        r"""The stacked base regressor of many samples without its zeros (Eqs. 23, 26).
+
+        Raises:
+            ValueError: If the motion does not have one axis of samples, or JAX is tracing the
+                robot's geometry.
+        """
+        self.model.check(motion.q)
+        return PackedRegressor.of(self, self.columns, motion)
 
     def from_standard(
         self, p: Float[AnyArray, "*batch standard"] | Sequence[Any]

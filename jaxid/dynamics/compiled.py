@@ -3,9 +3,9 @@
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.machine import in_numpy, program_of
+from jaxid.dynamics.machine import in_numpy, machines, program_of
 from jaxid.dynamics.motion import Motion
-from jaxid.program import evaluate_packed
+from jaxid.dynamics.packed import PackedRegressor
 from jaxid.types import AnyArray, Float
 
 
@@ -17,15 +17,10 @@ def regressor_rows(
     The other columns are zero for every motion: a joint feels only the bodies beyond it.
     """
     n = (base.model.robot.joints,)
-    program = program_of(base, base.columns, n, n, n)
-    packed = evaluate_packed(program, *(x.T for x in _arrays(motion)))
-    rows = []
-    for joint, columns in enumerate(acting_columns(base)):
-        row = np.empty((motion.q.shape[0], len(columns)), order="F")
-        for place, k in enumerate(columns):
-            row[:, place] = packed[joint * base.size + k]
-        rows.append(row)
-    return rows
+    machine = machines(base, base.columns, n, n, n)
+    result = machine.packed(False, *(x.T for x in _arrays(motion)))
+    packed = PackedRegressor.of_result(result, motion.q.shape[0])
+    return [packed.rows(joint).T for joint in range(packed.joints)]
 
 
 def acting_columns(base: BaseParameters) -> list[tuple[int, ...]]:

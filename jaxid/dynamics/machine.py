@@ -9,7 +9,7 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import as_array, content, is_traced
-from jaxid.program import Program, evaluate, lower, trace
+from jaxid.program import Program, evaluate, evaluate_packed, lower, trace
 from jaxid.types import AnyArray, Array, Numbers
 
 FEW = 4096
@@ -32,6 +32,37 @@ class Machines:
         self.program = program
         lowered = lower(program)
         self.compiled = jax.jit(lambda *arrays: lowered.dense(*arrays))
+        first = {x: k for k, x in reversed(list(enumerate(program.outputs)))}
+        numbers = {x: k for k, x in enumerate(y for y in first if isinstance(y, int))}
+        self.entries = tuple(numbers[x] if isinstance(x, int) else x for x in program.outputs)
+        self._distinct = [first[x] for x in numbers]
+        self._compiled_packed = jax.jit(lambda *arrays: self._chosen(lowered(*arrays)))
+
+    def packed(self, compiled: bool, *arrays: AnyArray) -> "Packed":
+        """The entries that vary, each one once, evaluated in NumPy or compiled."""
+        if compiled:
+            values = self._compiled_packed(*arrays)
+        else:
+            values = self._chosen(evaluate_packed(self.program, *arrays))
+        return Packed(self.program.output_shapes, self.entries, tuple(values))
+
+    def _chosen(self, outputs: list) -> list:
+        return [outputs[k] for k in self._distinct]
+
+
+class Packed(NamedTuple):
+    """What a program computes, without its zeros and repetitions.
+
+    Attributes:
+        shapes: Of the outputs.
+        entries: For each entry of each output, in order, the number of its array, or the constant
+            that it always is.
+        values: The arrays, batch last.
+    """
+
+    shapes: tuple[tuple[int, ...], ...]
+    entries: tuple[int | float, ...]
+    values: tuple[AnyArray, ...]
 
 
 _machines: OrderedDict[tuple, Machines] = OrderedDict()
@@ -102,6 +133,26 @@ def on_samples(
         out = machine.compiled(*arguments)
     out = jnp.moveaxis(jnp.broadcast_to(out, (*out.shape[:-1], count)), -1, 0)
     return jnp.reshape(out, (*batch, *out.shape[1:]))
+
+
+def packed_on_samples(owner: eqx.Module, definition: Callable, *samples: AnyArray) -> Packed:
+    """Applies a method for one sample to rows of samples; zeros and repetitions are left out.
+
+    Raises:
+        ValueError: If JAX is tracing the model's own numbers, as a gradient with respect to the
+            geometry does: which entries are zero is then unknown.
+    """
+    if is_traced(owner):
+        raise ValueError(
+            "a packed regressor needs a robot whose geometry is known, but JAX is tracing it: use "
+            "`regressor` there."
+        )
+    machine = machines(owner, definition, *(x.shape[1:] for x in samples))
+    arguments = [x.T for x in samples]
+    compiled = samples[0].shape[0] > FEW or is_traced(arguments)
+    if not compiled:
+        arguments = [np.asarray(x, np.float64) for x in arguments]
+    return machine.packed(compiled, *arguments)
 
 
 def in_numpy(

@@ -12,6 +12,7 @@ from jaxid.arrays import Hashable, as_array, namespace
 from jaxid.dynamics import projection
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.packed import PackedRegressor
 from jaxid.dynamics.terms import (
     AbstractTerm,
     CoulombFriction,
@@ -131,6 +132,21 @@ class Model(Hashable):
         """
         self.check(motion.q)
         return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
+
+    def packed_regressor(self, motion: Motion) -> PackedRegressor:
+        r"""The stacked regressor $\bar\Theta$ of many samples without its zeros (Eq. 26).
+
+        Several times as fast as `regressor`, whose dense matrix costs more than what is in it.
+
+        Args:
+            motion: Joint motion [samples, joints].
+
+        Raises:
+            ValueError: If the motion does not have one axis of samples, or JAX is tracing the
+                robot's geometry.
+        """
+        self.check(motion.q)
+        return PackedRegressor.of(self, self.columns, motion)
 
     def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""The generalized forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).

@@ -16,7 +16,7 @@ from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
 from jaxid.types import AnyArray, Array, Bool, Float
 
-AT_ONCE = 4096
+AT_ONCE = 2048
 """Samples whose columns are held at once."""
 WELL_CONDITIONED = 1e4
 """Condition number, with columns of length one, up to which products of rows are accurate enough;
