@@ -20,7 +20,7 @@ def regressor_rows(
     machine = machines(base, base.columns, n, n, n)
     result = machine.packed(False, *(x.T for x in _arrays(motion)))
     packed = PackedRegressor.of_result(result, motion.q.shape[0])
-    return [packed.rows(joint).T for joint in range(packed.joints)]
+    return [np.asarray(packed.rows(joint)).T for joint in range(packed.joints)]
 
 
 def acting_columns(base: BaseParameters) -> list[tuple[int, ...]]:

@@ -137,7 +137,7 @@ class PackedRegressor(eqx.Module):
             placed = np.zeros((len(R), self.columns))
             placed[:, self.acting(j)] = w[j] * R
             stacked.append(placed)
-        return np.linalg.qr(np.concatenate(stacked), mode="r")
+        return np.asarray(np.linalg.qr(np.concatenate(stacked), mode="r"))
 
     def matrix(self) -> Float[np.ndarray, "rows columns"]:
         """The whole matrix in Fortran's order: all samples of joint 1, then of joint 2 and so on.
