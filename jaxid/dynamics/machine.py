@@ -32,8 +32,9 @@ class Machines:
         self.program = program
         lowered = lower(program)
         self.compiled = jax.jit(lambda *arrays: lowered.dense(*arrays))
-        first = {x: k for k, x in reversed(list(enumerate(program.outputs)))}
-        numbers = {x: k for k, x in enumerate(y for y in first if isinstance(y, int))}
+        varying = [(k, x) for k, x in enumerate(program.outputs) if isinstance(x, int)]
+        first = {x: k for k, x in reversed(varying)}
+        numbers = {x: k for k, x in enumerate(first)}
         self.entries = tuple(numbers[x] if isinstance(x, int) else x for x in program.outputs)
         self._distinct = [first[x] for x in numbers]
         self._compiled_packed = jax.jit(lambda *arrays: self._chosen(lowered(*arrays)))

@@ -126,9 +126,9 @@ def test_data_sets_that_determine_too_little_are_marked_and_solved_like_alone(ba
 def test_nearly_dependent_columns_are_as_accurate_as_alone(base):
     sets = some_sets(base, 2)
     for o in sets:
-        o.motion.q[:] *= 1e-6
-        o.motion.qd[:] *= 1e-6
-        o.motion.qdd[:] *= 1e-6
+        o.motion.q[:] *= 3e-5
+        o.motion.qd[:] *= 3e-5
+        o.motion.qdd[:] *= 3e-5
     fit = identify_batch(base, *stacked(sets))
     one = jid.identify(base, sets[0])
     assert one.condition_numbers.scaled > normal_equations.WELL_CONDITIONED
