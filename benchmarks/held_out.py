@@ -53,6 +53,10 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
     yield "LS", jid.identify(base, train, jid.LeastSquares()), ""
     variances = jid.WeightedLeastSquares(jid.ResidualVariances())
     yield "WLS, residual variances", jid.identify(base, train, variances), ""
+    for remark, pull in (("", None), ("entropic pull", jid.EntropicPull())):
+        consistent = jid.identify(base, train, jid.PhysicallyConsistent(pull=pull))
+        price = f"price {100 * consistent.consistency.price:.1f} %"
+        yield "physically consistent", consistent, ", ".join(filter(None, (remark, price)))
     stepwise = jid.identify(base, train, jid.Stepwise())
     yield "axis by axis", stepwise, ""
     essential = jid.essential_parameters(wls, train)

@@ -45,6 +45,7 @@ from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
 from jaxid.identification.batches import identify_batch as identify_batch
 from jaxid.identification.bootstrap import bootstrap as bootstrap
 from jaxid.identification.consistency.batch import ConsistentBatch as ConsistentBatch
+from jaxid.identification.consistency.batch import ConsistentSolver as ConsistentSolver
 from jaxid.identification.consistency.batch import consistent_batch as consistent_batch
 from jaxid.identification.consistency.bounds import BodyBounds as BodyBounds
 from jaxid.identification.consistency.consistency import Consistency as Consistency

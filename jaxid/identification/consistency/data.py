@@ -18,7 +18,7 @@ class Data(eqx.Module):
         A: Matrix.
         b: Right-hand side.
         noise: The standard deviation that is the unit.
-        scale: What the sum of squares is about in the end, halved.
+        scale: Half the number of rows: what half the squares are about in the end.
     """
 
     A: Float[AnyArray, "*batch height standard"]
@@ -55,5 +55,4 @@ def whitened(
     freedom = xp.maximum(xp.asarray(rows - base.size, float), 1.0)
     square = xp.maximum((left @ left) / freedom, NOISE**2 * (z @ z) / (freedom + base.size))
     noise = xp.sqrt(xp.where(square > 0, square, 1.0))
-    scale = 0.5 * (freedom + (z @ z) / noise**2 * 1e-12)
-    return Data((R @ combination(base)) / noise, z / noise, noise, scale)
+    return Data((R @ combination(base)) / noise, z / noise, noise, 0.5 * xp.asarray(rows, float))

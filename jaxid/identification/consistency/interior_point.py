@@ -38,8 +38,6 @@ MOST = 50
 PATIENCE = 4
 """Iterations without a better bound after which the search ends."""
 TINY = 1e-14
-TOGETHER = 16
-"""Data sets that are solved in step."""
 
 
 class Outcome(enum.Enum):
@@ -130,12 +128,6 @@ def solve_compiled(program: ConeProgram) -> Optimum:
         _first(_JAX, program),
     )
     return _optimum(program, state)
-
-
-@jax.jit
-def solve_many(programs: ConeProgram) -> Optimum:
-    """Solves many programs of one shape, along the first axis of everything."""
-    return jax.lax.map(solve_compiled, programs, batch_size=TOGETHER)
 
 
 def _optimum(program: ConeProgram, state: _State) -> Optimum:

@@ -45,8 +45,10 @@ def data(base: jid.BaseParameters, seed: int, noise: float = 0.05, samples: int 
     return whitened(np, base, R, z, rows)
 
 
-def conic(possible: PossibleParameters, data: Data) -> tuple[float, np.ndarray]:
-    """Smallest half squares, and the parameters, by CLARABEL, written down in SI units anew."""
+def conic_problem(
+    possible: PossibleParameters, data: Data
+) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
+    """The fit as a conic program, written down in SI units anew; its variables and their units."""
     bounds = possible.bounds
     size = data.A.shape[1]
     norms = np.linalg.norm(data.A, axis=0)
@@ -94,6 +96,11 @@ def conic(possible: PossibleParameters, data: Data) -> tuple[float, np.ndarray]:
     if bounds.total_mass is not None:
         constraints.append(cp.sum(p[[c[0] for c in possible.bodies]]) == bounds.total_mass)
     objective = 0.5 * cp.sum_squares((data.A * unit) @ y - data.b)
-    problem = cp.Problem(cp.Minimize(objective), constraints)
+    return cp.Problem(cp.Minimize(objective), constraints), y, unit
+
+
+def conic(possible: PossibleParameters, data: Data) -> tuple[float, np.ndarray]:
+    """Smallest half squares, and the parameters, by CLARABEL."""
+    problem, y, unit = conic_problem(possible, data)
     problem.solve(cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
     return float(problem.value), unit * np.asarray(y.value)

@@ -1,6 +1,7 @@
 """Many data sets together, and a single body."""
 
 import arms
+import jax
 import numpy as np
 import pytest
 
@@ -36,6 +37,19 @@ def test_a_batch_is_its_data_sets_one_by_one():
     assert (share_of_a_body(bodies) > 0).all()
     with pytest.raises(ValueError, match="`R`, `z` and `rows` must have the shapes"):
         jid.consistent_batch(base, R[:, :, :-1], z, rows)
+
+
+def test_a_solver_is_a_function_of_arrays():
+    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.5), TERMS))
+    R, z, rows, _ = arms.factor(base, 0, 0.2, 100)
+    estimator = PhysicallyConsistent(margin=0.1)
+    solver = jid.ConsistentSolver(base, estimator)
+    assert solver == jid.ConsistentSolver(base, PhysicallyConsistent(margin=0.1))
+    assert solver != jid.ConsistentSolver(base)
+    one = jax.jit(solver)(R, z, rows)
+    many = jid.consistent_batch(base, R[None], z[None], np.array([rows]), estimator)
+    np.testing.assert_allclose(one.standard, many.standard[0], rtol=1e-6, atol=1e-9)
+    assert one.parameters.shape == (base.size,)
 
 
 BODY = inertial_parameters(ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.array(0.12)))

@@ -63,6 +63,15 @@ def test_standard_and_base_parameters_are_one_thing(panda):
     assert (fit.full_parameters[[k for k, n in enumerate(names) if n[:2] == "fo"]] < 0).any()
 
 
+def test_factors_of_a_log_in_parts_are_enough(panda):
+    base, _, o = panda
+    estimator = jid.PhysicallyConsistent(WEIGHTS)
+    whole = jid.identify(base, o, estimator)
+    parts = jid.fit_blocks(base, jid.factorise(base, o.split(0.5)), estimator)
+    np.testing.assert_allclose(parts.parameters, whole.parameters, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(parts.consistency.price, whole.consistency.price, atol=1e-6)
+
+
 def test_the_margin_holds_in_every_pose(panda):
     base, _, o = panda
     margin = 0.05

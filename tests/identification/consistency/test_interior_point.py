@@ -119,7 +119,7 @@ def test_both_machines_find_the_same():
     (base, possible), _ = CASES["coupled drives"]
     programs = [_program(possible, arms.data(base, seed, 0.2)) for seed in range(3)]
     stacked = jax.tree.map(lambda *x: np.stack(x), *programs)
-    many = interior_point.solve_many(stacked)
+    many = jax.vmap(interior_point.solve_compiled)(stacked)
     for k, program in enumerate(programs):
         one = interior_point.solve_at_once(program)
         np.testing.assert_allclose(many.value[k], one.value, rtol=1e-6)
