@@ -54,7 +54,8 @@ class ByAxis(AbstractInfluence):
             weighted = rows[:, None] * theta
             own = np.array([k in self.decided[j] for k in acting], bool)
             instruments = np.where(own, weighted, 0.0)
-            found.append(Channel(acting, instruments, weighted, rows * residuals[:, j]))
+            counted = int(np.count_nonzero(chunk.counted[:, j]))
+            found.append(Channel(acting, instruments, weighted, rows * residuals[:, j], counted))
         return found
 
 

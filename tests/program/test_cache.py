@@ -61,14 +61,14 @@ def test_the_second_process_compiles_nothing(tmp_path, monkeypatch):
     assert where == str(folder)
     assert hits == 0
     assert misses > 0
-    files = sorted(folder.iterdir())
-    assert files
+    stored = {f.name for f in folder.glob("*-cache")}
+    assert stored
     _, hits, _, stderr = run(folder)
-    assert hits >= 1
+    # A busy machine may take so long for a trivial operation that this is stored too, but what
+    # has been stored once is never compiled again.
+    assert hits >= len(stored)
     assert stderr == ""
-    assert [f.name for f in sorted(folder.iterdir()) if f.suffix != ".tmp"] == [
-        f.name for f in files
-    ]
+    assert stored <= {f.name for f in folder.iterdir()}
 
 
 def test_it_can_be_moved_and_turned_off(untouched, tmp_path, monkeypatch):
