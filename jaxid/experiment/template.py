@@ -153,8 +153,8 @@ seed = 0                              # of the random motions
 # fit = true                            # capsules around the geometry of the URDF's links
 # packages = "."                        # folder of what the URDF calls `package://`
 # ground = 0.0                          # height of the floor [m]
-# capsules = [{{ name = "gun", body = "joint1", start = [0, 0, 0], end = [0, 0, 0.3], radius = 0.1 }}]
-# boxes = [{{ name = "table", centre = [0.8, 0, 0.2], size = [0.6, 1, 0.4], rotation = [0, 0, 45] }}]
+# capsules = [{{ name = "gun", body = "joint1", start = [0, 0, 0], end = [0, 0, 1], radius = 0.1 }}]
+# boxes = [{{ name = "table", centre = [0.8, 0, 0.2], size = [1, 1, 1], rotation = [0, 0, 45] }}]
 # pairs = [["gun", "table"]]        # by default all that the joints can bring together
 """
 
