@@ -80,6 +80,8 @@ from jaxid.identification.identify import fit_rows as fit_rows
 from jaxid.identification.identify import identify as identify
 from jaxid.identification.instruments import InstrumentalVariables as InstrumentalVariables
 from jaxid.identification.nonlinear.estimator import NonlinearFriction as NonlinearFriction
+from jaxid.identification.nonlinear.temperature import TemperatureLaw as TemperatureLaw
+from jaxid.identification.nonlinear.temperature import temperature_law as temperature_law
 from jaxid.identification.nonlinear.verdict import NonlinearFit as NonlinearFit
 from jaxid.identification.nonlinear.verdict import identify_nonlinear as identify_nonlinear
 from jaxid.identification.opening import open_log as open_log

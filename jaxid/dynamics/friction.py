@@ -187,6 +187,6 @@ class TemperatureScaled(AbstractTerm):
 
     @property
     def shapes(self):
-        """Those of the term, and `rate1`, … [1/K]."""
+        """Those of the term, and `rate1`, … [1/K] if asked for: one recording does not tell."""
         inner = (s.below("term") for s in self.term.shapes)
-        return (*inner, Shape("rate", ("1/K", "1/K"), ("rate",)))
+        return (*inner, Shape("rate", ("1/K", "1/K"), ("rate",), wanted=False))

@@ -131,7 +131,9 @@ def test_it_pays_where_friction_is_nonlinear_and_only_there():
     whole = jid.identify_nonlinear(START, o, NonlinearFriction(WLS), linear=linear)
     assert whole.held_out.pays
     assert whole.held_out.gain > 0.3
-    assert whole.better is whole.fit
+    assert whole.better.base is whole.fit.base
+    assert whole.better.notes[-2] == str(whole.held_out)
+    assert "vs3 = 0.1" in whole.better.notes[-1]
     assert "nonlinear friction pays: it leaves" in str(whole.held_out)
 
     plain = model(0.03)
@@ -140,7 +142,8 @@ def test_it_pays_where_friction_is_nonlinear_and_only_there():
     whole = jid.identify_nonlinear(START, o, NonlinearFriction(WLS), linear=linear)
     assert not whole.held_out.pays
     assert abs(whole.held_out.gain) < 0.05
-    assert whole.better is whole.linear
+    assert whole.better.base is whole.linear.base
+    assert whole.better.notes[-1] == str(whole.held_out)
     assert "nonlinear friction does not pay" in str(whole.held_out)
 
 
@@ -169,3 +172,26 @@ def test_what_cannot_be_searched_is_refused():
     blocks = factorise(START, [observations(samples=300)])
     with pytest.raises(ValueError, match="needs the rows themselves"):
         jid.fit_blocks(START, blocks, NonlinearFriction(WLS))
+
+
+def test_friction_falls_with_temperature_as_fits_at_several_tell():
+    rates = np.array([0.01, 0.02, 0.03])
+    dry = (jid.RigidBodies(), jid.CoulombFriction(), jid.ConstantOffset())
+    base = jid.base_parameters(jid.Model(ROBOT, (*dry, jid.ViscousFriction())))
+    fits = []
+    for seed, temperature in enumerate((15.0, 30.0, 45.0)):
+        warm = jid.TemperatureScaled(jid.ViscousFriction(), rates, temperature)
+        truth = jid.Model(ROBOT, (*dry, warm))
+        p = virtual.standard_parameters(truth, seed=4)
+        o = virtual.observations(truth, p, samples=600, noise=0.3, noise_seed=seed)
+        fits.append(jid.identify(base, o, WLS))
+    law = jid.temperature_law(fits, (15.0, 30.0, 45.0), jid.ViscousFriction())
+    assert law.names == ("fv1", "fv2", "fv3")
+    assert (np.abs(law.rates - rates) < 4 * law.rate_deviations).all()
+    assert law.rate_deviations.max() < 0.005
+    assert (np.abs(law.values - p[-3:]) < 4 * law.value_deviations).all()
+    np.testing.assert_array_equal(law.term.rate, law.rates)
+    with pytest.raises(ValueError, match="at least two different"):
+        jid.temperature_law(fits, (15.0, 15.0, 15.0), jid.ViscousFriction())
+    with pytest.raises(ValueError, match="must have one parameter for each joint"):
+        jid.temperature_law(fits, (15.0, 30.0, 45.0), jid.StribeckFriction())

@@ -102,8 +102,23 @@ class NonlinearFit(eqx.Module):
 
     @property
     def better(self) -> Fit:
-        """The nonlinear fit if it pays, otherwise the linear one."""
-        return self.fit if self.held_out.pays else self.linear
+        """The nonlinear fit if it pays, otherwise the linear one; its notes say why."""
+        if not self.held_out.pays:
+            return dataclasses.replace(self.linear, notes=(*self.linear.notes, str(self.held_out)))
+        return dataclasses.replace(
+            self.fit, notes=(*self.fit.notes, str(self.held_out), self.sentence)
+        )
+
+    @property
+    def sentence(self) -> str:
+        """The shapes with their standard deviations, in words."""
+        shown = ", ".join(
+            f"{name} = {value:.3g} ± {deviation:.2g} {unit}"
+            for name, unit, value, deviation in zip(
+                self.names, self.units, self.shapes, self.shape_deviations, strict=True
+            )
+        )
+        return f"shapes of friction: {shown}."
 
 
 def identify_nonlinear(
