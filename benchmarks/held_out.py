@@ -53,6 +53,9 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
     yield "LS", jid.identify(base, train, jid.LeastSquares()), ""
     variances = jid.WeightedLeastSquares(jid.ResidualVariances())
     yield "WLS, residual variances", jid.identify(base, train, variances), ""
+    for loss in (jid.Huber(), jid.Tukey()):
+        robust = jid.identify(base, train, jid.IterativelyReweighted(loss))
+        yield f"IRLS, {type(loss).__name__}", robust, ""
     for remark, pull in (("", None), ("entropic pull", jid.EntropicPull())):
         consistent = jid.identify(base, train, jid.PhysicallyConsistent(pull=pull))
         price = f"price {100 * consistent.consistency.price:.1f} %"
@@ -68,7 +71,8 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
         verdict = f"{-100 * found.held_out.gain:+.0f} ± {100 * found.held_out.gain_deviation:.0f} %"
         pays = "pays" if found.held_out.pays else "does not pay"
         yield f"{name}, as found", found.fit, f"{pays}: {verdict}"
-        yield f"{name}, where they pay", found.better, ""
+        if not found.held_out.pays:
+            yield f"{name}, what is kept", found.better, "the linear model"
 
 
 def table(name: str, *, quick: bool) -> list[str]:

@@ -17,7 +17,7 @@ from jaxid.experiment.excite import design
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import output_folder, refuse_foreign_folder
-from jaxid.experiment.loading import Loaded, load_log
+from jaxid.experiment.loading import Loaded, choose, load_log, observe_all
 from jaxid.experiment.mistakes import likely_mistake
 from jaxid.experiment.progress import Stages, designing, stages
 from jaxid.experiment.sanity import negative_friction
@@ -173,9 +173,11 @@ def inspect(
     console = _console()
     loaded = load_experiment(experiment)
     paths = logs or []
-    with _stages(1 + 3 * len(paths)) as stage:
+    choices = len(paths) + 1 if loaded.candidates else 0
+    with _stages(1 + choices + 3 * len(paths)) as stage:
         stage("finding base parameters")
         _ = loaded.base.expressions
+        loaded, _ = choose(loaded, paths, stage)
         seen = [_look(loaded, path, stage) for path in paths]
     terminal.show_robot(console, loaded)
     terminal.show_base(console, loaded.base)
@@ -273,8 +275,10 @@ def identify(
     refuse_foreign_folder(output, force)
     loaded = load_experiment(experiment)
     others = verify or []
-    with _stages(4 + 2 * (len(logs) + len(others))) as stage:
-        fitted, checked, said, doubts = _observe_all(loaded, logs, others, stage)
+    choices = len(logs) + 1 if loaded.candidates else 0
+    with _stages(4 + choices + 2 * (len(logs) + len(others))) as stage:
+        loaded, choice = choose(loaded, logs, stage, split)
+        fitted, checked, said, doubts = observe_all(loaded, logs, others, stage)
         if split is not None:
             parts = [o.split(split) for o in fitted]
             percent = f"{100 * split:g}"
@@ -284,13 +288,16 @@ def identify(
         base = loaded.base
         stage("factorising the rows")
         rows = Rows.of(base, fitted, stage.through(sum(map(_samples, fitted))))
-        fit = fit_rows(rows, loaded.estimator)
+        fit = loaded.fit(rows, stage.through(sum(map(_samples, fitted))))
         stage("predicting torques")
         through = stage.through(max(map(_samples, [*fitted, *checked])))
         found = validate(fit, [*fitted, *checked], progress=through)
         beside = None
-        if loaded.regularised or fit.undetermined:
-            beside = Beside.of(fit_rows(rows, loaded.other_estimator), [*fitted, *checked])
+        if loaded.regularised or loaded.single_axes is not None or fit.undetermined:
+            same = rows if fit.base is base else Rows.of(fit.base, fitted)
+            other = fit_rows(same, loaded.other_estimator)
+            ways = None if loaded.single_axes is None else ("axis by axis", "at once")
+            beside = Beside.of(other, [*fitted, *checked], ways)
         stage("writing the report")
         logs_said = [*(n for o in (*fitted, *checked) for n in o.notes), *said]
         files = write_report(
@@ -311,6 +318,7 @@ def identify(
             },
             (*loaded.notes, *dict.fromkeys(logs_said), *doubts),
             beside,
+            choice,
         )
     terminal.show_robot(console, loaded)
     console.print()
@@ -360,21 +368,6 @@ def compare(
         files = write_comparison(output, found, (first, second))
     terminal.show_comparison(console, found)
     terminal.show_files(console, output, [p.name for p in files])
-
-
-def _observe_all(experiment: Experiment, logs: list[Path], others: list[Path], stage: Stages):
-    """Reads all logs, and doubts them; equal names take their folders' in front."""
-    paths = [*logs, *others]
-    stems = [p.stem for p in paths]
-    observed, said, doubts = [], [], []
-    for path in paths:
-        twice = stems.count(path.stem) > 1
-        name = f"{path.resolve().parent.name}/{path.stem}" if twice else None
-        log = load_log(experiment, path, stage, name)
-        observed.append(log.observations)
-        said += log.notes
-        doubts += [f"{log.recording.name}: {warning}" for warning in log.check.warnings]
-    return observed[: len(logs)], observed[len(logs) :], said, doubts
 
 
 def _named(observations: Observations | LongLog, name: str) -> Observations | LongLog:

@@ -439,7 +439,7 @@ def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch)
     def shapes(*args, **kwargs):
         return np.zeros(3) + np.zeros(4)
 
-    monkeypatch.setattr(cli, "fit_rows", shapes)
+    monkeypatch.setattr(cli, "validate", shapes)
     monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
     with pytest.raises(ValueError, match="broadcast"):
         cli.main()
@@ -608,3 +608,43 @@ def test_excite_refuses_what_does_not_fit(folder, run):
     path.write_text(EXPERIMENT + EXCITATION.replace("rest", "resting"))
     refused(run("excite", path), "`excitation.resting` is no known key", "did you mean `rest`")
     assert listing(folder).count("trajectory.csv") == 0
+
+
+def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, run):
+    text = EXPERIMENT.replace("cutoff = 10", "cutoff = [2.0, 10.0, 20.0]")
+    (folder / "experiment.toml").write_text(text)
+    code, out, err = run("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
+    assert code == 0, err
+    said = " ".join(out.split())
+    assert re.search(r"a cut-off of (10|20) Hz predicts unseen parts of the log best", said)
+    assert "2 Hz" in said
+    assert "filter.png" in result(folder)["files"]
+    assert (folder / "report" / "filter.png").stat().st_size > 5000
+
+
+def test_nonlinear_friction_is_kept_where_it_pays(folder, run):
+    """The logs have an epsilon of 0.01 rad/s; a file that says 0.2 is put right."""
+    extra = "[model.coulomb]\nepsilon = 0.2\n[estimator]\nnonlinear_friction = true\n"
+    (folder / "experiment.toml").write_text(EXPERIMENT + extra)
+    code, out, err = run("identify", "experiment.toml", "a.csv", "b.csv", "--verify", "c.csv")
+    assert code == 0, err
+    said = " ".join(out.split())
+    assert "nonlinear friction pays" in said
+    assert re.search(r"eps2 = 0.01\d* ±", said)
+    assert result(folder)["errors"]["verification"][0]["relative"] < 0.01
+
+
+def test_axis_by_axis_stands_beside_at_once(folder, run):
+    extra = '[estimator]\nkind = "stepwise"\n'
+    (folder / "experiment.toml").write_text(EXPERIMENT + extra)
+    code, out, err = run("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
+    assert code == 0, err
+    assert re.search(r"this fit \(axis by axis\) +at once", out)
+    content = result(folder)
+    assert content["beside"]["way"] == "at once"
+    own, other = content["errors"]["verification"][0], content["beside"]["errors"][-1]
+    assert own["relative"] != other["relative"]
+    (folder / "experiment.toml").write_text(EXPERIMENT + extra + "single_axes = ['a.csv']\n")
+    refused(run("identify", "experiment.toml", "b.csv"), "`single_axes` must hold motions of one")
+    (folder / "experiment.toml").write_text(EXPERIMENT + extra + "ridge = 0.1\n")
+    refused(run("identify", "experiment.toml", "b.csv"), "`ridge` does not go with")

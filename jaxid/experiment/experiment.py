@@ -8,12 +8,16 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import AbstractTerm
 from jaxid.experiment.collision_tables import build_collision
 from jaxid.experiment.method_tables import (
+    build_candidates,
     build_columns,
     build_decimation,
     build_estimator,
     build_filter,
+    build_linear_terms,
+    build_single_axes,
     build_slow,
     build_terms,
 )
@@ -21,10 +25,18 @@ from jaxid.experiment.reading import read_tables
 from jaxid.experiment.robot_tables import build_robot, within
 from jaxid.experiment.tables import ExcitationTable, RecordingTable
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
+from jaxid.identification.filter_choice import FilterCandidate
+from jaxid.identification.fit import Fit
+from jaxid.identification.identify import fit_rows
+from jaxid.identification.nonlinear.estimator import NonlinearFriction
+from jaxid.identification.nonlinear.verdict import identify_nonlinear
 from jaxid.identification.opening import open_log
+from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import Complete, CrossValidated
+from jaxid.identification.stepwise import Stepwise
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
+from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
 from jaxid.measurement.filters import AbstractFilter
@@ -58,6 +70,9 @@ class Experiment:
         slow: Speeds below which rows do not count [rad/s or m/s]; None if all count.
         estimator: How rows become parameters.
         regularised: Whether the estimator keeps small what the logs do not decide.
+        single_axes: Logs of single axes if axes are identified one by one; None if at once.
+        linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
+        candidates: Filters to choose from; none if the file names one.
         excitation: The table of the motion to design.
         notes: What was assumed where the file says nothing, in sentences.
     """
@@ -75,6 +90,9 @@ class Experiment:
     slow: Float[np.ndarray, " joints"] | None
     estimator: LeastSquares | WeightedLeastSquares
     regularised: bool
+    single_axes: tuple[Path, ...] | None
+    linear: tuple[AbstractTerm, ...] | None
+    candidates: tuple[FilterCandidate, ...]
     excitation: ExcitationTable
     notes: tuple[str, ...]
 
@@ -88,10 +106,32 @@ class Experiment:
         """What the estimator is compared with where logs do not determine everything.
 
         Plain least squares beside an estimator that keeps undecided parameters small, and the
-        other way round.
+        other way round; identification at once beside axis by axis.
         """
+        if self.single_axes is not None:
+            return self.estimator
         other = Complete() if self.regularised else CrossValidated()
         return dataclasses.replace(self.estimator, solution=other)
+
+    def fit(self, rows: Rows, progress: Progress | None = None) -> Fit:
+        """Estimates: axis by axis, or with nonlinear friction, where the file asks for it.
+
+        Args:
+            rows: To identify with.
+            progress: Is told which share of a search is done, of 1.
+        """
+        if self.single_axes is not None:
+            alone = tuple(self.observe(self.read(log)) for log in self.single_axes)
+            weights = np.asarray(self.estimator(rows).weights)
+            return fit_rows(rows, Stepwise(alone, GivenWeights(weights)))
+        if self.linear is None:
+            return fit_rows(rows, self.estimator)
+        linear = base_parameters(Model(self.robot, self.linear))
+        estimator = NonlinearFriction(self.estimator)
+        found = identify_nonlinear(
+            self.base, rows.recordings, estimator, linear=linear, progress=progress
+        )
+        return found.better
 
     def read(self, log: str | Path) -> Recording:
         """Reads a log as the file's table `[recording]` says.
@@ -219,12 +259,16 @@ def load_experiment(path: str | Path) -> Experiment:
     with within(path.name, "filter"):
         filtering, said = build_filter(tables.filter)
         notes += said
+        candidates = build_candidates(tables.filter, tables.rows)
+    nonlinear = tables.estimator.nonlinear_friction
+    linear = build_linear_terms(tables.model, robot) if nonlinear else None
     with within(path.name, "rows"):
         decimation = build_decimation(tables.rows)
         slow = build_slow(tables.rows, robot)
     with within(path.name, "estimator"):
         estimator, said = build_estimator(tables.estimator, robot)
         notes += said
+        single_axes = build_single_axes(tables.estimator, path)
     return Experiment(
         path=path,
         text=text,
@@ -239,6 +283,9 @@ def load_experiment(path: str | Path) -> Experiment:
         slow=slow,
         estimator=estimator,
         regularised=tables.estimator.ridge is not None or tables.estimator.truncate is not None,
+        single_axes=single_axes,
+        linear=linear,
+        candidates=candidates,
         excitation=tables.excitation,
         notes=tuple(notes),
     )

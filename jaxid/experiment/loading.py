@@ -1,11 +1,14 @@
 """Logs as a command needs them: short ones as a whole, long ones part by part."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.progress import Stages
+from jaxid.experiment.robot_tables import within
 from jaxid.experiment.sanity import LogCheck, check_log, check_long_log
+from jaxid.identification.filter_choice import FilterChoice, choose_filter
 from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
@@ -69,3 +72,73 @@ def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None)
         return Loaded(log, log, check)
     note = f"{log.name}: torque errors and figures take one of every {every} of its {log.rows} rows"
     return Loaded(log, log, check, (note,))
+
+
+def choose(
+    experiment: Experiment, logs: Sequence[Path], stage: Stages, split: float | None = None
+) -> tuple[Experiment, FilterChoice | None]:
+    """The experiment with the filter that suits some logs best, and why it was chosen.
+
+    Args:
+        experiment: Unchanged where its file names one filter.
+        logs: Those to identify with.
+        stage: Is told what is done.
+        split: First part of each log to identify with, of 1; the rest stays unseen here too.
+
+    Raises:
+        ValueError: If a log and a filter do not go together, or a log is long.
+    """
+    if not experiment.candidates or not logs:
+        return experiment, None
+    long = [log.name for log in logs if experiment.is_long(log)]
+    if long:
+        raise ValueError(
+            f"{experiment.path.name}: `filter.cutoff` is a list, but `{long[0]}` is long: choose "
+            "with a short part of it, and give that one number for the whole."
+        )
+    recordings = []
+    for log in logs:
+        stage(f"reading {log.name}")
+        whole = experiment.read(log)
+        recordings.append(whole if split is None else whole.split(split)[0])
+    stage("choosing the filter")
+    with within(experiment.path.name, "filter` and `rows"):
+        choice = choose_filter(
+            experiment.base,
+            recordings,
+            experiment.candidates,
+            estimator=experiment.estimator,
+            slow=experiment.slow,
+            progress=stage.through(len(experiment.candidates) * sum(r.samples for r in recordings)),
+        )
+    notes = (*experiment.notes, str(choice))
+    chosen = dataclasses.replace(experiment, filter=choice.filter, candidates=(), notes=notes)
+    return chosen, choice
+
+
+def observe_all(
+    experiment: Experiment, logs: Sequence[Path], others: Sequence[Path], stage: Stages
+) -> tuple[list[Observations | LongLog], list[Observations | LongLog], list[str], list[str]]:
+    """Reads all logs, and doubts them; equal names take their folders' in front.
+
+    Args:
+        experiment: Whose logs they are.
+        logs: Those to identify with.
+        others: Those to verify with.
+        stage: Is told what is done.
+
+    Returns:
+        What the filter makes of the first and of the others; how they were read, and doubts, in
+        sentences.
+    """
+    paths = [*logs, *others]
+    stems = [p.stem for p in paths]
+    observed, said, doubts = [], [], []
+    for path in paths:
+        twice = stems.count(path.stem) > 1
+        name = f"{path.resolve().parent.name}/{path.stem}" if twice else None
+        log = load_log(experiment, path, stage, name)
+        observed.append(log.observations)
+        said += log.notes
+        doubts += [f"{log.recording.name}: {warning}" for warning in log.check.warnings]
+    return observed[: len(logs)], observed[len(logs) :], said, doubts

@@ -1,7 +1,11 @@
 """The tables `[model]`, `[recording]`, `[filter]`, `[rows]` and `[estimator]` become objects."""
 
+from pathlib import Path
+
+import msgspec
 import numpy as np
 
+from jaxid.dynamics.friction import StribeckFriction
 from jaxid.dynamics.terms import (
     AbstractTerm,
     AsymmetricCoulombFriction,
@@ -26,6 +30,7 @@ from jaxid.experiment.tables import (
     RowsTable,
 )
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
+from jaxid.identification.filter_choice import FilterCandidate
 from jaxid.identification.solutions import (
     AbstractSolution,
     Complete,
@@ -64,8 +69,7 @@ def build_terms(table: ModelTable, robot: Robot) -> tuple[AbstractTerm, ...]:
     if table.viscous:
         terms.append(ViscousFriction())
     if table.coulomb is not False:
-        dry = AsymmetricCoulombFriction if coulomb.asymmetric else CoulombFriction
-        terms.append(dry(transition))
+        terms.append(_dry(coulomb, transition, robot))
     if table.rotor_inertia:
         terms.append(RotorInertia())
     # An offset is half of what two levels of dry friction can say already.
@@ -76,6 +80,27 @@ def build_terms(table: ModelTable, robot: Robot) -> tuple[AbstractTerm, ...]:
     if table.springs:
         terms.append(LinearSpring())
     return tuple(terms)
+
+
+def build_linear_terms(table: ModelTable, robot: Robot) -> tuple[AbstractTerm, ...]:
+    """The terms of the same model with Coulomb's law in place of Stribeck's."""
+    if isinstance(table.coulomb, CoulombTable):
+        coulomb = msgspec.structs.replace(table.coulomb, stribeck=None)
+        table = msgspec.structs.replace(table, coulomb=coulomb)
+    return build_terms(table, robot)
+
+
+def _dry(table: CoulombTable, transition: AbstractTransition, robot: Robot) -> AbstractTerm:
+    if table.stribeck is None:
+        dry = AsymmetricCoulombFriction if table.asymmetric else CoulombFriction
+        return dry(transition)
+    if table.asymmetric:
+        raise ValueError(
+            "give `coulomb.stribeck` or `coulomb.asymmetric`, but not both: one level for each "
+            "direction has no Stribeck effect here."
+        )
+    speed = _number_or_each(robot, "coulomb.stribeck", table.stribeck)
+    return StribeckFriction(speed, transition=transition)
 
 
 def coupled(robot: Robot) -> bool:
@@ -190,15 +215,31 @@ def build_filter(
             )
             return ZeroPhaseButterworth(CUTOFF), [said]
         case ButterworthTable():
-            return ZeroPhaseButterworth(
-                table.cutoff, table.order, table.force_cutoff, table.margin
-            ), []
+            return _butterworth(table)[0], []
         case PaperTable():
             return PaperFilter(table.velocity, table.acceleration, table.margin), []
         case PeriodicTable():
             return PeriodicFourier(
                 table.period, table.harmonics, table.force_harmonics, table.order, table.margin
             ), []
+
+
+def _butterworth(table: ButterworthTable) -> list[ZeroPhaseButterworth]:
+    """One filter, or one for each cut-off of a list."""
+    cutoffs = table.cutoff if isinstance(table.cutoff, list) else [table.cutoff]
+    if not cutoffs:
+        raise ValueError("`cutoff` must be a number, or a list to choose from, but is empty.")
+    return [ZeroPhaseButterworth(f, table.order, table.force_cutoff, table.margin) for f in cutoffs]
+
+
+def build_candidates(
+    table: ButterworthTable | PaperTable | PeriodicTable | None, rows: RowsTable
+) -> tuple[FilterCandidate, ...]:
+    """The filters to choose from, where the file lists cut-offs; none where it names one."""
+    if not isinstance(table, ButterworthTable) or not isinstance(table.cutoff, list):
+        return ()
+    decimation = build_decimation(rows)
+    return tuple(FilterCandidate(filter, decimation) for filter in _butterworth(table))
 
 
 def build_decimation(table: RowsTable) -> AbstractDecimation:
@@ -256,6 +297,26 @@ def build_estimator(
         )
         return WeightedLeastSquares(ResidualVariances(), solution), [said]
     return WeightedLeastSquares(MaximumForces(), solution), []
+
+
+def build_single_axes(table: EstimatorTable, path: Path) -> tuple[Path, ...] | None:
+    """Logs of single axes, for identification axis by axis; None where it is at once.
+
+    Raises:
+        ValueError: If keys do not go together.
+    """
+    if table.kind != "stepwise":
+        if table.single_axes is not None:
+            raise ValueError(
+                '`single_axes` belongs to `kind = "stepwise"`: leave it out, or change `kind`.'
+            )
+        return None
+    for key in ("ridge", "truncate"):
+        if getattr(table, key) is not None:
+            raise ValueError(f'`{key}` does not go with `kind = "stepwise"`: leave it out.')
+    if table.nonlinear_friction:
+        raise ValueError('`nonlinear_friction` does not go with `kind = "stepwise"`: choose one.')
+    return tuple(path.parent / log for log in table.single_axes or ())
 
 
 def _solution(table: EstimatorTable) -> AbstractSolution:

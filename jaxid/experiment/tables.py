@@ -130,6 +130,7 @@ class CoulombTable(_Table, frozen=True):
     dead_zone: Magnitude | list[Magnitude] = 0.0
     hard: bool = False
     asymmetric: bool = False
+    stribeck: Positive | list[Positive] | None = None
 
 
 class ModelTable(_Table, frozen=True):
@@ -172,7 +173,7 @@ class RecordingTable(_Table, frozen=True):
 class ButterworthTable(_Table, frozen=True, tag="butterworth", tag_field="kind"):
     """A Butterworth low-pass without phase, then differences."""
 
-    cutoff: Positive
+    cutoff: Positive | list[Positive]
     order: Count = 4
     force_cutoff: Positive | None = None
     margin: Magnitude | None = None
@@ -207,10 +208,12 @@ class RowsTable(_Table, frozen=True):
 class EstimatorTable(_Table, frozen=True):
     """How the rows become parameters."""
 
-    kind: Literal["weighted", "least_squares"] = "weighted"
+    kind: Literal["weighted", "least_squares", "stepwise"] = "weighted"
     weights: Literal["maximum_forces", "residual_variances"] | None = None
     truncate: Share | None = None
     ridge: Share | Literal["cross_validated"] | None = None
+    nonlinear_friction: bool = False
+    single_axes: list[str] | None = None
 
 
 class ExcitationTable(_Table, frozen=True):

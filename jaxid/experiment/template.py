@@ -75,6 +75,8 @@ epsilon = 0.01                        # speed of the smooth transition [rad/s or
 dead_zone = 0.0                       # no dry friction below this speed [rad/s or m/s]; or a list
 hard = false                          # true: a sign instead of tanh(speed / epsilon)
 asymmetric = false                    # true: one level for each direction (and no `offset`)
+# stribeck = 0.1                      # friction falls from a static level about this speed
+#                                     # [rad/s or m/s]; or a list
 
 # Which columns of a log hold what. Logs are CSV (any separator), Parquet, NPZ or MAT files.
 # Columns are patterns ("{{}}" stands for the joint's number), lists of names, or positions from 0.
@@ -103,7 +105,8 @@ side = "joint"                        # "motor": the log is of the motors, befor
 # From angles to velocities and accelerations; forces and regressor columns are filtered alike.
 [filter]
 kind = "butterworth"                  # a low-pass, forward and backward, then differences
-cutoff = {cutoff}                     # about five times the highest frequency of the motion [Hz]
+cutoff = {cutoff}                     # about five times the highest frequency of the motion [Hz];
+#                                     # or a list: the one that predicts unseen parts best is taken
 order = 4                             # of one direction
 # force_cutoff = inf                  # of forces and columns [Hz], like `cutoff` by default;
 #                                     # inf: only decimation limits their band
@@ -125,12 +128,17 @@ every = 1                             # every n-th sample, of signals below half
 # slow = 0.05                         # rows below this speed do not count [rad/s or m/s]; or a list
 
 [estimator]
-kind = "weighted"                     # or "least_squares": every newton metre counts the same
+kind = "weighted"                     # or "least_squares": every newton metre counts the same;
+#                                     # "stepwise": axis by axis from the wrist inward
 # weights = "maximum_forces"          # joints count by their largest forces (Eq. 30); or
 #                                     # "residual_variances": by what the model leaves unexplained
 # ridge = "cross_validated"           # pulls what the logs hardly decide towards zero, as much as
 #                                     # serves left-out parts of the logs best; or a share like 0.01
 # truncate = 0.01                     # leave out directions below this share of the best one
+# single_axes = ["axis1.csv"]         # of "stepwise": logs beside this file in which one axis moves
+#                                     # alone: friction comes from them
+# nonlinear_friction = true           # finds `epsilon` and `stribeck` of each joint too, and keeps
+#                                     # them if they predict unseen parts of the logs better
 
 # The motion that `jaxid excite` designs, within the limits above.
 [excitation]

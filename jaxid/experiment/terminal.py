@@ -320,8 +320,9 @@ def show_beside(console: Console, fit: Fit, errors: Sequence[TorqueErrors], besi
     table = plain_table("")
     table.title = None
     table.add_column("recording")
-    table.add_column(f"this fit ({solution_name(fit.solution)})", justify="right")
-    table.add_column(solution_name(beside.solution), justify="right")
+    own, another = beside.ways or (solution_name(fit.solution), solution_name(beside.solution))
+    table.add_column(f"this fit ({own})", justify="right")
+    table.add_column(another, justify="right")
     for own, other in zip(errors, beside.errors, strict=True):
         shares = (float(np.mean(e.rms_relative)) for e in (own, other))
         table.add_row(own.name, *(percent(share) for share in shares))

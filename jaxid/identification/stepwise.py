@@ -138,11 +138,15 @@ class Stepwise(AbstractEstimator):
 
 
 def friction_parameters(base: BaseParameters) -> set[int]:
-    """Base parameters whose columns depend on speeds alone, offsets included."""
+    """Base parameters whose columns depend on speeds alone.
+
+    Offsets are none of them: in the motion of one axis they look like its weight.
+    """
     motion, other = (random_motion(base.model, 20, seed) for seed in (0, 1))
     a = in_numpy(base, base.columns, motion.q, motion.qd, motion.qdd)
     b = in_numpy(base, base.columns, other.q, motion.qd, other.qdd)
-    return {k for k in range(base.size) if np.array_equal(a[:, :, k], b[:, :, k])}
+    speed_alone = [np.array_equal(a[:, :, k], b[:, :, k]) for k in range(base.size)]
+    return {k for k in np.flatnonzero(speed_alone).tolist() if np.ptp(a[:, :, k], axis=0).any()}
 
 
 def _independent(R: Float[np.ndarray, "height columns"], size: float | None = None) -> list[int]:

@@ -32,15 +32,22 @@ class Beside:
     Attributes:
         solution: The way.
         errors: What it leaves on the same recordings.
+        ways: Names of the fit's own way and of this one; those of the solutions if None.
     """
 
     solution: AbstractSpectralSolution
     errors: tuple[TorqueErrors, ...]
+    ways: tuple[str, str] | None = None
 
     @classmethod
-    def of(cls, fit: Fit, observations: Sequence[Observations | LongLog]) -> "Beside":
+    def of(
+        cls,
+        fit: Fit,
+        observations: Sequence[Observations | LongLog],
+        ways: tuple[str, str] | None = None,
+    ) -> "Beside":
         """Judges another fit on some recordings."""
-        return cls(fit.solution, tuple(torque_errors(fit, o) for o in observations))
+        return cls(fit.solution, tuple(torque_errors(fit, o) for o in observations), ways)
 
 
 def plain(value: Any) -> Any:
@@ -121,6 +128,7 @@ def result(
             },
             "beside": beside
             and {
+                "way": beside.ways and beside.ways[1],
                 "solution": str(beside.solution),
                 "errors": [_errors(e, robot) for e in beside.errors],
             },

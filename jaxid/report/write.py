@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxid.files import written_whole
+from jaxid.identification.filter_choice import FilterChoice
 from jaxid.identification.fit import Fit
 from jaxid.report.bars import error_figure
 from jaxid.report.content import Beside, parameters, result
 from jaxid.report.estimates import parameter_figure
+from jaxid.report.filters import filter_figure
 from jaxid.report.style import save
 from jaxid.report.torques import torque_figure
 from jaxid.validation.definiteness import Definiteness
@@ -30,6 +32,7 @@ def write_report(
     settings: Mapping[str, Any],
     notes: tuple[str, ...] = (),
     beside: Beside | None = None,
+    choice: FilterChoice | None = None,
 ) -> list[Path]:
     """Writes `result.json`, `parameters.csv` and the figures, all of them or nothing.
 
@@ -45,6 +48,7 @@ def write_report(
         settings: How the result came about, for the record.
         notes: What the reader should know, in sentences.
         beside: Another way to solve the same equations.
+        choice: Of the filter, where it was left to the logs.
 
     Returns:
         The files.
@@ -56,6 +60,7 @@ def write_report(
     named = _file_names(identification, verification)
     content = result(fit, identification, verification, definiteness, settings, notes, beside)
     names = ["result.json", "parameters.csv", "errors.png", "parameters.png"]
+    names += ["filter.png"] if choice is not None else []
     names += [file for file, _, _ in named]
     content["files"] = names
     with written_whole(folder) as staging:
@@ -63,6 +68,8 @@ def write_report(
         write_csv(staging / "parameters.csv", parameters(fit))
         save(error_figure(identification, verification, robot), staging / "errors.png")
         save(parameter_figure(fit), staging / "parameters.png")
+        if choice is not None:
+            save(filter_figure(choice), staging / "filter.png")
         for file, role, errors in named:
             title = errors.name if errors.name == role else f"{errors.name} ({role})"
             save(torque_figure(errors, robot, title), staging / file)

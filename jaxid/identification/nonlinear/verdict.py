@@ -1,6 +1,7 @@
 """Nonlinear friction beside linear: uncertainties of both, and whether it pays on data unseen."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -123,7 +124,7 @@ class NonlinearFit(eqx.Module):
 
 def identify_nonlinear(
     base: BaseParameters,
-    observations: Observations | LongLog | list[Observations] | tuple[Observations, ...],
+    observations: Observations | LongLog | Sequence[Observations | LongLog],
     estimator: NonlinearFriction | None = None,
     *,
     linear: BaseParameters | None = None,
