@@ -61,7 +61,7 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
         yield f"IRLS, {type(loss).__name__}", robust, ""
     for remark, pull in (("", None), ("entropic pull", jid.EntropicPull())):
         consistent = jid.identify(base, train, jid.PhysicallyConsistent(pull=pull))
-        price = f"price {100 * consistent.consistency.price:.1f} %"
+        price = f"price {consistent.consistency.price:.1%}"
         yield "physically consistent", consistent, ", ".join(filter(None, (remark, price)))
     stepwise = jid.identify(base, train, jid.Stepwise())
     yield "axis by axis", stepwise, ""
@@ -71,7 +71,7 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
         return
     for name, other in (("epsilons", base), ("Stribeck", stribeck(base))):
         found = jid.identify_nonlinear(other, train, linear=base)
-        verdict = f"{-100 * found.held_out.gain:+.0f} ± {100 * found.held_out.gain_deviation:.0f} %"
+        verdict = f"{-found.held_out.gain:+.0%} ± {found.held_out.gain_deviation:.0%}"
         pays = "pays" if found.held_out.pays else "does not pay"
         yield f"{name}, as found", found.fit, f"{pays}: {verdict}"
         if not found.held_out.pays:
