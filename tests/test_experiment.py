@@ -439,7 +439,7 @@ REFUSALS = [
     (ARM + "[rows]\nslow = -1", "`rows.slow` must be at least 0, but is -1."),
     (
         ARM + "[estimator]\nkind = 'wls'",
-        '`estimator.kind` must be "weighted" or "least_squares", b',
+        '`estimator.kind` must be "weighted", "least_squares" or',
     ),
     (
         ARM + "[estimator]\nweights = 'maximum_forces'",
