@@ -330,6 +330,7 @@ def identify(
     terminal.show_undetermined(console, fit, loaded.regularised)
     slips = [f"{o.name}: {said}" for o in fitted for said in likely_mistake(base, o)]
     terminal.sentences(console, (*negative_friction(fit), *slips), terminal.DOUBTFUL, "!")
+    terminal.show_consistency(console, loaded.robot, fit)
     terminal.show_validation(console, loaded.robot, found, len(fitted))
     if beside is not None:
         terminal.show_beside(console, fit, found.errors, beside)

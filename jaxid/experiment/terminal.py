@@ -22,6 +22,7 @@ from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
+from jaxid.report.bodies import body_table, consistency_facts
 from jaxid.report.compared import comparison_table, group_table
 from jaxid.report.content import Beside
 from jaxid.report.excitation import criteria_table, deviation_table, use_table
@@ -286,6 +287,15 @@ def show_fit(console: Console, fit: Fit) -> None:
     names.overflow, names.no_wrap = "ellipsis", True
     names.max_width = max(SHORTEST, console.width - others - GAP)
     show_table(console, table)
+
+
+def show_consistency(console: Console, robot: Robot, fit: Fit) -> None:
+    """The bodies of a physically consistent estimate, what it costs, and which bounds decide."""
+    if fit.consistency is None:
+        return
+    show_table(console, body_table(fit.consistency, robot.joint_names))
+    console.print()
+    facts(console, consistency_facts(fit.consistency))
 
 
 def show_validation(console: Console, robot: Robot, found: Validation, identification: int) -> None:

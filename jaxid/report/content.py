@@ -17,6 +17,7 @@ from jaxid.identification.runs.estimates import groups
 from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
+from jaxid.report.bodies import consistency_content
 from jaxid.robot.robot import Robot
 from jaxid.validation.definiteness import Definiteness
 from jaxid.validation.errors import TorqueErrors, torque_errors
@@ -115,6 +116,7 @@ def result(
                 "undetermined": [_direction(fit, d) for d in fit.undetermined],
                 "undetermined_above": LARGEST_UNCERTAINTY,
             },
+            "consistency": consistency_content(fit),
             "errors": {
                 "identification": [_errors(e, robot) for e in identification],
                 "verification": [_errors(e, robot) for e in verification],

@@ -72,7 +72,7 @@ class PhysicallyConsistent(AbstractEstimator):
         if self.throw and outcome is not Outcome.CERTIFIED:
             raise RuntimeError(
                 f"no physically consistent estimate with a proof: {outcome.value} The bound is "
-                f"{float(optimum.error / program.scale):.1e} of the objective."
+                f"{float(optimum.error / max(optimum.value, program.scale)):.1e} of the objective."
             )
         p = possible.standard(np, data.A, data.b, optimum.y)
         estimate = np.asarray(rows.base.from_standard(p))
