@@ -29,14 +29,13 @@ MASSES = (80.0, 40.0, 25.0, 20.0, 8.0, 4.0, 1.0)
 AXES = (0, 4, 6)
 
 
-def virtual(model, trial):
+def virtual(true, trial):
     """The robot of one trial, whose parameters are known."""
     import numpy as np
 
-    import jaxid as jid
     from jaxid.simulation.virtual import VirtualRobot, random_bodies
 
-    robot, rng = model.robot, np.random.default_rng([trial, 0])
+    robot, rng = true.robot, np.random.default_rng([trial, 0])
     most = np.asarray(robot.max_forces)
 
     def about(values):
@@ -45,7 +44,6 @@ def virtual(model, trial):
     bodies = random_bodies(robot, about(np.array(MASSES)), rng)
     drives = [about(0.02 * most), about(0.03 * most), about(0.005 * most)]
     offsets = 0.01 * most * rng.uniform(-1.0, 1.0, robot.joints)
-    true = jid.Model(robot, (*model.terms, jid.ConstantOffset()))
     return VirtualRobot(
         model=true,
         parameters=np.concatenate([bodies.ravel(), *drives, offsets]),
@@ -58,12 +56,12 @@ def virtual(model, trial):
     )
 
 
-def recorded(robot, true, trial, which):
+def recorded(robot, arm, trial, which):
     """Observations of one of the two motions of a trial."""
     import jaxid as jid
 
     trajectory = jid.random_fourier_series(robot, omega=0.6, reach=0.9, seed=2 * trial + which)
-    log = true.measure(
+    log = arm.measure(
         trajectory,
         duration=DURATION,
         sample_time=SAMPLE_TIME,
@@ -82,6 +80,7 @@ def trials(count):
     robot = jid.robots.tx90l_on_rail()
     terms = jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia()
     base = jid.base_parameters(jid.Model(robot, terms))
+    true = jid.Model(robot, (*terms, jid.ConstantOffset()))
     estimators = {
         "unweighted": jid.LeastSquares(),
         "weighted": jid.WeightedLeastSquares(),
@@ -91,8 +90,8 @@ def trials(count):
     errors = {name: [] for name in estimators}
     shown = {}
     for trial in range(count):
-        true = virtual(base.model, trial)
-        seen, unseen = (recorded(robot, true, trial, which) for which in (0, 1))
+        arm = virtual(true, trial)
+        seen, unseen = (recorded(robot, arm, trial, which) for which in (0, 1))
         blocks = jid.factorise(base, (seen,))
         for name, estimator in estimators.items():
             fit = jid.fit_blocks(base, blocks, estimator)
