@@ -10,7 +10,7 @@ offset (1 %), white noise (2 %) and noise with a memory of 0.1 s (1 %).
 
 Data: each trial draws a truth and two random Fourier motions of 20 s at 100 Hz within the limits,
 one to identify with and one to verify with. Filter: zero-phase Butterworth at 8 Hz, for columns
-too; 20 rows/s. Keys: [trial, 0] truth, [trial, 1] noise, 2 trial and 2 trial + 1 motions.
+too; 20 rows/s. Keys: [trial, 0] truth, 2 trial and 2 trial + 1 motions and noise.
 
 Estimators: unweighted (W = I, Fig. 6), weighted with the largest forces (Eq. 30, Fig. 7), and
 physically consistent with the same weights, default bounds and no margin. Statistic: share of the
