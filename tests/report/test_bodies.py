@@ -24,7 +24,7 @@ def consistent():
     p[[0, 1, 6, 5, 10, 11, 16, 15]] = [2.0, 0.4, 0.11, 0.11, 1.0, 0.2, 0.06, 0.06]
     # Friction that drives: the bound at zero decides.
     p[-2:] = [0.3, -0.3]
-    forces = np.asarray(model.inverse_dynamics(p, motion))
+    forces = np.array(model.inverse_dynamics(p, motion))
     forces += np.random.default_rng(0).normal(0.0, 0.05, forces.shape)
     log = jid.Recording.of(np.asarray(motion.q), forces, time=t)
     o = jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0))
