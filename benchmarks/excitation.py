@@ -10,14 +10,16 @@ starts. Violation: largest relative excess of position, velocity and acceleratio
   one: geometric mean over the parameters, mean over 15 random motions (`random_fourier_series`,
   seeds 0 to 14, at full reach).
 * panda: D-optimal designs of the Panda, limits of its library entry.
-* gradients: of the criteria by scaled numbers, against central differences, relative to the
-  gradient's norm (largest component difference), at a random motion.
+* gradients, constraints: by scaled numbers at a random motion, against central differences of
+  fourth order of values that NumPy computes from singular values (criteria) or of the same values
+  (constraints, each value by itself at 7 instants): norm of the difference over the gradient's.
 * step: one value and gradient against forward differences of the same function, 800 samples.
 * batch: starts per second of one evaluation of value and gradient, and of a whole search.
 
-Statistics over the keys: median and best. CPU seconds are those of the process, compile included.
+Statistics over the keys: median and best. CPU seconds are those of the process; the first key's
+compile, the others find what was compiled.
 
-    python benchmarks/excitation.py cond d7 d10 panda gradients step batch [--keys 3] [--quick]
+    python benchmarks/excitation.py cond d7 d10 panda gradients constraints step batch [--quick]
 """
 
 import argparse
@@ -27,11 +29,13 @@ import jax
 import numpy as np
 
 import jaxid as jid
+from jaxid.dynamics.compiled import acting_columns, regressor_rows
 from jaxid.excitation.information import information
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import CRITERIA, deviations
 from jaxid.excitation.problem import Context, Problem
 from jaxid.excitation.search import LEGS, Search, random_starts
+from jaxid.excitation.spectral import log_condition, log_largest_inverse
 from jaxid.trajectory.basis import FourierBasis
 
 RANDOM = range(15)
@@ -86,7 +90,7 @@ def designed(base, criterion, keys, measure, polish, starts):
         found.append(measure(plan))
         print(
             f"  key {key}, polish {polish}: {found[-1]:.6g}, violation {violation(plan):.1e}, "
-            f"wall {wall:.1f} s, CPU {cpu:.1f} s with compile",
+            f"wall {wall:.1f} s, CPU {cpu:.1f} s",
             flush=True,
         )
     return found
@@ -96,9 +100,9 @@ def report(name, found, best):
     print(f"{name}: median {np.median(found):.5g}, best {best(found):.5g}", flush=True)
 
 
-def cond(keys, starts):
+def cond(keys, starts, polished):
     base = base_of(True)
-    for polish in (0, 4):
+    for polish in (0, polished):
         found = designed(
             base,
             jid.ConditionNumber(),
@@ -110,9 +114,9 @@ def cond(keys, starts):
         report(f"cond, polish {polish}", found, min)
 
 
-def d_optimal(principal_axes, keys, starts):
+def d_optimal(principal_axes, keys, starts, polished):
     base = base_of(principal_axes)
-    for polish in (0, 4):
+    for polish in (0, polished):
         found = designed(base, jid.DOptimal(), keys, gain_over_random, polish, starts)
         report(f"D gain, {base.size} base parameters, polish {polish}", found, max)
 
@@ -126,23 +130,70 @@ def panda(keys, starts):
         report(f"Panda, {criterion.name}, JAX alone", found, min)
 
 
-def problem_of(base, criterion):
+def problem_of(base, criterion, constraints=()):
     robot = base.model.robot
     limits = JointLimits.of(robot, FourierBasis(5, 0.8))
+    random = limits.numbers(np.asarray(random_starts(limits, jax.random.key(0), 1))[0])
+    motion = limits.basis.trajectory(random).motion(limits.basis.times(800))
+    weights = 100 / np.asarray(robot.max_forces)
     return Problem(
         base,
         limits,
         criterion,
-        (),
-        weights=100 / np.asarray(robot.max_forces),
+        constraints,
+        weights=weights,
         prior=np.zeros((base.size, base.size)),
-        sizes=1 / np.sqrt(np.arange(1, base.size + 1)),
+        sizes=1 / np.sqrt(np.diag(information(base, motion, weights).weighted)),
         measured=800,
     )
 
 
+def differences(value, y, h):
+    """Central differences of fourth order: neither rounding nor truncation matters."""
+    slopes = []
+    for k in range(len(y)):
+        e = np.zeros_like(y)
+        e[k] = h
+        near, far = (value(y + m * e) - value(y - m * e) for m in (1, 2))
+        slopes.append((8 * near - far) / (12 * h))
+    return np.array(slopes).T
+
+
+def logs_of(problem, criterion, y, samples):
+    """Logarithms of the eigenvalues that a criterion looks at: from singular values, in NumPy.
+
+    The information has the square of the regressor's condition number, so that differences of its
+    own eigenvalues would drown in rounding.
+    """
+    motion = problem.basis.trajectory(problem.limits.numbers(y)).motion(
+        problem.basis.times(samples)
+    )
+    rows = regressor_rows(problem.base, motion)
+    theta = np.zeros((len(rows), samples, problem.base.size))
+    for joint, (own, part) in enumerate(zip(acting_columns(problem.base), rows, strict=True)):
+        theta[joint, :, list(own)] = part.T
+    if criterion.weighted:
+        theta = problem.weights[:, None, None] * theta
+    theta = np.sqrt(problem.measured / samples) * theta.reshape(-1, problem.base.size)
+    if criterion == jid.ScaledConditionNumber():
+        theta = theta / np.linalg.norm(theta, axis=0)
+    if criterion in (jid.AOptimal(), jid.EOptimal()):
+        theta = theta * problem.sizes
+    return 2 * np.log(np.linalg.svd(theta, compute_uv=False)[::-1])
+
+
+def of_logs(criterion, logs, sharpness):
+    if criterion == jid.DOptimal():
+        return -0.5 * np.mean(logs)
+    if criterion == jid.AOptimal():
+        return 0.5 * np.log(np.mean(np.exp(-logs)))
+    if criterion == jid.EOptimal():
+        return 0.5 * float(log_largest_inverse(logs, sharpness))
+    return float(log_condition(logs, sharpness))
+
+
 def gradients():
-    base = base_of(True)
+    base, worst = base_of(True), 0.0
     for criterion in CRITERIA:
         for sharpness in (8.0, None) if criterion.extreme else (None,):
             problem = problem_of(base, criterion)
@@ -150,17 +201,33 @@ def gradients():
             y = np.asarray(random_starts(problem.limits, jax.random.key(1), 1))
             context = Context(sharpness, np.zeros((1, 1, 0)), 1.0)
             g = np.asarray(evaluate(y, context)[1])[0]
-            h, slopes = 1e-5, np.zeros_like(g)
-            for k in range(len(g)):
-                e = np.zeros_like(y)
-                e[0, k] = h
-                # Fourth order: rounding and truncation both stay below what is asked.
-                near, far = (
-                    [float(evaluate(y + s * m * e, context)[0][0]) for s in (1, -1)] for m in (1, 2)
-                )
-                slopes[k] = (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
-            error = np.linalg.norm(slopes - g) / np.linalg.norm(g)
+
+            def value(z, problem=problem, criterion=criterion, sharpness=sharpness):
+                return of_logs(criterion, logs_of(problem, criterion, z, 64), sharpness)
+
+            error = np.linalg.norm(differences(value, y[0], 1e-4) - g) / np.linalg.norm(g)
+            worst = max(worst, error)
             print(f"{criterion.name}, sharpness {sharpness}: {error:.1e}", flush=True)
+    print(f"worst: {worst:.1e}")
+
+
+def constraint_gradients():
+    base = base_of(True)
+    nominal = jid.NominalForces.of(base, np.random.default_rng(0).uniform(0.5, 2.0, base.size))
+    for constraint in (
+        jid.Clearance(jid.robots.tx90l_on_rail_collision()),
+        jid.TipSpeed(1.0),
+        jid.TipAcceleration(5.0),
+        jid.Workspace.of([-1.0, -1.0, 0.0], [1.0, 1.0, 1.5]),
+        jid.JointForces(nominal),
+    ):
+        problem = problem_of(base, jid.DOptimal(), (constraint,))
+        y = np.asarray(random_starts(problem.limits, jax.random.key(1), 1))[0]
+        values = jax.jit(lambda z, p=problem: p.constrained(z[None], 7)[0].ravel())
+        exact = np.asarray(jax.jit(jax.jacrev(values))(y))
+        found = differences(lambda z, f=values: np.asarray(f(z)), y, 1e-4)
+        errors = np.linalg.norm(found - exact, axis=1) / np.linalg.norm(exact, axis=1)
+        print(f"{type(constraint).__name__}, {len(errors)} values: {errors.max():.1e}", flush=True)
 
 
 def step():
@@ -174,20 +241,20 @@ def step():
     def exact():
         return jax.block_until_ready(evaluate(y, context))
 
-    def differences():
+    def forward():
         f = value(y)
         return [float((value(y.at[0, k].add(1e-6)) - f)[0]) for k in range(size)]
 
     times = {}
-    for run in (exact, differences):
+    for run in (exact, forward):
         run()
         times[run.__name__] = []
     for _ in range(7):
-        for run in (exact, differences):
+        for run in (exact, forward):
             start = time.perf_counter()
             run()
             times[run.__name__].append(time.perf_counter() - start)
-    a, b = (np.median(times[k]) for k in ("exact", "differences"))
+    a, b = (np.median(times[k]) for k in ("exact", "forward"))
     print(f"step: exact {1e3 * a:.2f} ms, forward differences {1e3 * b:.1f} ms: {b / a:.0f}x")
 
 
@@ -217,19 +284,22 @@ def main():
     parser.add_argument("parts", nargs="*", default=["cond", "d7"])
     parser.add_argument("--keys", type=int, default=3)
     parser.add_argument("--starts", type=int, default=32)
+    parser.add_argument("--polish", type=int, default=4, help="beside 0: JAX alone")
     parser.add_argument("--quick", action="store_true")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    jid.keep_compiled()
     keys, starts = range(asked.keys), asked.starts
     if asked.quick:
-        keys, starts, asked.parts = range(1), 2, ["d7"]
+        keys, starts, asked.polish, asked.parts = range(1), 2, 1, ["d7"]
     sizes = (1, 8, 64) if jax.default_backend() == "cpu" else (64, 512, 4096)
     parts = {
-        "cond": lambda: cond(keys, starts),
-        "d7": lambda: d_optimal(True, keys, starts),
-        "d10": lambda: d_optimal(False, keys, starts),
+        "cond": lambda: cond(keys, starts, asked.polish),
+        "d7": lambda: d_optimal(True, keys, starts, asked.polish),
+        "d10": lambda: d_optimal(False, keys, starts, asked.polish),
         "panda": lambda: panda(keys, starts),
         "gradients": gradients,
+        "constraints": constraint_gradients,
         "step": step,
         "batch": lambda: batch(sizes),
     }

@@ -13,7 +13,7 @@ from rich.text import Text
 from typer.core import TyperCommand
 
 from jaxid.experiment import terminal
-from jaxid.experiment.excite import design
+from jaxid.experiment.excite import design, side_by_side, write
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import output_folder, refuse_foreign_folder
@@ -21,6 +21,7 @@ from jaxid.experiment.loading import Loaded, choose, load_log, observe_all
 from jaxid.experiment.mistakes import likely_mistake
 from jaxid.experiment.progress import Stages, designing, stages
 from jaxid.experiment.sanity import negative_friction
+from jaxid.experiment.show_excited import show_excited, show_side_by_side
 from jaxid.experiment.template import write_template
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
@@ -32,7 +33,6 @@ from jaxid.measurement.observations import Observations
 from jaxid.program.cache import keep_compiled
 from jaxid.report.compared_files import read_estimates, write_comparison
 from jaxid.report.content import Beside
-from jaxid.report.excitation import write_pictures
 from jaxid.report.write import write_report
 from jaxid.validation.validate import validate
 
@@ -208,29 +208,31 @@ def excite(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where a design was stopped.")
     ] = False,
+    all_criteria: Annotated[
+        bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
+    ] = False,
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
-    Beside the table lie the trajectory itself (.json), pictures of joints and end-effector in a
-    folder, and the state of the design until it is done. Ctrl-C keeps the best motion so far.
+    Beside the table lie the trajectory itself (.json), the same for ROS (.ros.yaml), pictures of
+    joints and end-effector in a folder, and the state of the design until it is done. Ctrl-C keeps
+    the best motion so far.
     """
     console = _console()
     loaded = load_experiment(experiment)
     state = output.with_suffix(".state.npz")
     with designing(console) as tell:
-        plan = design(loaded, tell, state, resume)
-    plan.to_csv(output)
-    plan.save(output.with_suffix(".json"))
-    pictures = write_pictures(output.with_suffix(""), plan)
-    if not plan.interrupted:
+        excited = design(loaded, tell, state, resume)
+    written = write(excited, output)
+    if not excited.plan.interrupted:
         state.unlink(missing_ok=True)
-    terminal.show_plan(console, plan)
-    terminal.show_files(
-        console,
-        output.parent,
-        [output.name, output.with_suffix(".json").name]
-        + [str(p.relative_to(output.parent)) for p in pictures],
-    )
+    show_excited(console, excited)
+    if all_criteria:
+        with designing(console) as tell:
+            plans = side_by_side(loaded, tell)
+        show_side_by_side(console, plans)
+    names = [str(path.relative_to(output.parent)) for path in written]
+    terminal.show_files(console, output.parent, names)
 
 
 @app.command(cls=SpreadVerify)

@@ -572,44 +572,6 @@ def test_a_bar_says_how_fast_and_how_long_still():
     assert "factorising" in shown
 
 
-EXCITATION = """\
-[excitation]
-harmonics = 2
-starts = 2
-polish = 0
-rest = true
-samples = 100
-"""
-
-
-def test_excite_writes_motion_and_pictures_and_says_what_to_expect(folder, run):
-    path = folder / "experiment.toml"
-    path.write_text(EXPERIMENT + EXCITATION)
-    code, out, err = run("excite", path, "-o", "plan/motion.csv")
-    assert code == 0, err
-    assert listing(folder / "plan") == [
-        "motion",
-        "motion.csv",
-        "motion.json",
-        "motion/end_effector.png",
-        "motion/joints.png",
-    ]
-    table = np.loadtxt(folder / "plan" / "motion.csv", delimiter=",", skiprows=1)
-    assert table.shape == (101, 7)
-    np.testing.assert_allclose(table[[0, -1], 3:], 0.0, atol=1e-12)
-    for said in ("criteria: smaller", "D: mean axis", "deviations to expect", "use of the limits"):
-        assert said in out
-
-
-def test_excite_refuses_what_does_not_fit(folder, run):
-    path = folder / "experiment.toml"
-    path.write_text(EXPERIMENT + EXCITATION.replace("harmonics = 2", "harmonics = 1"))
-    refused(run("excite", path), "excitation", "`harmonics` must be at least 2")
-    path.write_text(EXPERIMENT + EXCITATION.replace("rest", "resting"))
-    refused(run("excite", path), "`excitation.resting` is no known key", "did you mean `rest`")
-    assert listing(folder).count("trajectory.csv") == 0
-
-
 def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, run):
     text = EXPERIMENT.replace("cutoff = 10", "cutoff = [2.0, 10.0, 20.0]")
     (folder / "experiment.toml").write_text(text)

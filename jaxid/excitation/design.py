@@ -17,6 +17,7 @@ from jaxid.excitation.problem import Problem
 from jaxid.excitation.search import Best, Search, Searched, random_starts
 from jaxid.excitation.state import fingerprint, load_state, save_state
 from jaxid.robot.limits import Limits
+from jaxid.robot.robot import Robot
 from jaxid.trajectory.basis import AbstractBasis, FourierBasis
 from jaxid.types import AnyArray, Float, PRNGKeyArray, require_float64
 
@@ -96,7 +97,7 @@ def design_excitation(
             if None. The weights of the criterion are its inverse, like the estimator's.
         prior: Information of earlier experiments in the same noise, the inverse of their
             covariance: the design adds to it.
-        nominal: Base parameters as far as they are known, for relative deviations.
+        nominal: Base parameters as far as they are known, NaN where not, for relative deviations.
         samples: Measured samples of one run of the motion.
         progress: Is told after each step how far the design is.
         state: File in which the design keeps its state, so that it can be resumed.
@@ -115,7 +116,7 @@ def design_excitation(
     key = jax.random.key(0) if key is None else key
     _check(base, criterion, starts, polish, samples, prior)
     robot = base.model.robot
-    noise = NOISE * np.asarray(robot.max_forces) if noise is None else np.asarray(noise, float)
+    noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
     if noise.shape != (robot.joints,) or not (noise > 0).all():
         raise ValueError(
             f"`noise` must hold one positive number for each joint ({robot.joints}), "
@@ -138,6 +139,15 @@ def design_excitation(
     if throw and not plan.feasible:
         raise ValueError("no motion was found that keeps all limits: " + "; ".join(plan.diagnosis))
     return plan
+
+
+def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
+    """Standard deviations of the forces' noise where none are given [N m or N].
+
+    Args:
+        robot: With its largest forces.
+    """
+    return NOISE * np.asarray(robot.max_forces)
 
 
 def _check(base, criterion, starts, polish, samples, prior) -> None:

@@ -23,7 +23,7 @@ from jaxid.excitation.information import Information
 from jaxid.excitation.limits import JointLimits
 from jaxid.trajectory.files import save_trajectory, write_csv
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import AnyArray, Float, double_precision
+from jaxid.types import AnyArray, Bool, Float, double_precision
 
 CRITERIA = (
     ConditionNumber(),
@@ -70,7 +70,7 @@ class ExcitationPlan(eqx.Module):
         noise: Standard deviation of the forces' noise by joint, which is assumed [N m or N].
         samples: Measured samples of one run.
         findings: Of the constraints beside joint limits.
-        nominal: Base parameters as far as they are known before, or None.
+        nominal: Base parameters as far as they are known before, NaN where not; or None.
         interrupted: Whether the design was stopped before its end.
     """
 
@@ -117,10 +117,10 @@ class ExcitationPlan(eqx.Module):
 
     @property
     def relative_deviations(self) -> Float[np.ndarray, " base"] | None:
-        """Standard deviations over the nominal parameters, if those are known."""
+        """Standard deviations over the nominal parameters, if those are known; NaN where not."""
         if self.nominal is None:
             return None
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             return self.standard_deviations / np.abs(np.asarray(self.nominal))
 
     @property
@@ -137,14 +137,20 @@ class ExcitationPlan(eqx.Module):
     def undetermined(self) -> tuple[str, ...]:
         """Base parameters that this motion cannot determine, each by the name that leads it.
 
-        Those that take part in a combination that leaves no trace in the forces, and those whose
-        deviation is above half of their nominal value.
+        They take part in a combination that leaves no trace in the forces.
         """
-        vague = np.zeros(self.base.size, bool) | ~np.isfinite(self.standard_deviations)
+        return self._named(~np.isfinite(self.standard_deviations))
+
+    @property
+    def vague(self) -> tuple[str, ...]:
+        """Other base parameters whose deviation is above half of their nominal value."""
         relative = self.relative_deviations
-        if relative is not None:
-            vague |= relative > VAGUE
-        return tuple(name for name, bad in zip(self.base.names, vague, strict=True) if bad)
+        if relative is None:
+            return ()
+        return self._named((relative > VAGUE) & np.isfinite(self.standard_deviations))
+
+    def _named(self, chosen: Bool[np.ndarray, " base"]) -> tuple[str, ...]:
+        return tuple(name for name, k in zip(self.base.names, chosen, strict=True) if k)
 
     def to_csv(self, path: str | Path, *, sample_time: float | None = None) -> None:
         """Writes the motion as a table of samples; see `write_csv`.

@@ -1,36 +1,56 @@
-"""From the table `[excitation]` to a design."""
+"""Designs the motion of an experiment file, and makes of it what a robot can play."""
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from jaxid.excitation.criteria import (
-    AbstractCriterion,
-    AOptimal,
-    ConditionNumber,
-    DOptimal,
-    EOptimal,
-    ScaledConditionNumber,
-    WeightedConditionNumber,
-)
-from jaxid.excitation.design import DesignProgress, design_excitation
+from jaxid.excitation.constraints.constraint import Finding
+from jaxid.excitation.design import DesignProgress, assumed_noise, design_excitation
+from jaxid.excitation.plan import CRITERIA as ALL
 from jaxid.excitation.plan import ExcitationPlan
+from jaxid.experiment.excitation_tables import (
+    CRITERIA,
+    build_basis,
+    build_constraints,
+    build_nominal,
+    build_prior,
+)
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.robot_tables import within
+from jaxid.files import written_whole
+from jaxid.report.excitation import write_pictures
 from jaxid.trajectory.basis import FourierBasis
-from jaxid.trajectory.rest import RestToRestBasis
+from jaxid.trajectory.files import save_trajectory, write_csv
+from jaxid.trajectory.leads import with_leads
+from jaxid.trajectory.ros import write_ros_yaml
+from jaxid.trajectory.trajectory import AbstractTrajectory
+from jaxid.types import double_precision
 
-CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
-    "d_optimal": DOptimal,
-    "a_optimal": AOptimal,
-    "e_optimal": EOptimal,
-    "condition_number": ConditionNumber,
-    "weighted_condition_number": WeightedConditionNumber,
-    "scaled_condition_number": ScaledConditionNumber,
-}
-"""What `excitation.criterion` may be."""
+FEW = 8
+"""Starts of the designs that only show what a criterion buys."""
+STEP = 0.01
+"""Time between the samples at which leads are checked [s]."""
+
+
+class Excited(NamedTuple):
+    """A designed motion as a robot can play it.
+
+    Attributes:
+        plan: The design.
+        played: The motion from standstill to standstill where that could be had.
+        window: Times of it between which lies the designed motion [s].
+        broken: Constraints that do not hold on the way into the motion or out of it.
+        refused: Why there is no way into the motion, or an empty text.
+    """
+
+    plan: ExcitationPlan
+    played: AbstractTrajectory
+    window: tuple[float, float]
+    broken: tuple[Finding, ...]
+    refused: str
 
 
 def design(
@@ -38,7 +58,7 @@ def design(
     progress: Callable[[DesignProgress], None],
     state: Path,
     resume: bool,
-) -> ExcitationPlan:
+) -> Excited:
     """Designs the motion that the experiment file asks for.
 
     Args:
@@ -50,19 +70,109 @@ def design(
     Raises:
         ValueError: If the table does not fit the robot, or no motion keeps all limits.
     """
-    table = experiment.excitation
     with within(experiment.path.name, "excitation"):
-        kind = RestToRestBasis if table.rest else FourierBasis
-        return design_excitation(
+        plan = design_excitation(
             experiment.base,
-            basis=kind(table.harmonics, table.omega),
-            criterion=CRITERIA[table.criterion](),
-            starts=table.starts,
-            polish=min(table.polish, table.starts),
-            key=jax.random.key(table.seed),
-            noise=None if table.noise is None else np.array(table.noise),
-            samples=table.samples,
+            criterion=CRITERIA[experiment.excitation.criterion](),
+            polish=min(experiment.excitation.polish, experiment.excitation.starts),
+            starts=experiment.excitation.starts,
             progress=progress,
             state=state,
             resume=resume,
+            **_settings(experiment),
         )
+    return _played(experiment, plan)
+
+
+def side_by_side(
+    experiment: Experiment, progress: Callable[[DesignProgress], None]
+) -> list[ExcitationPlan]:
+    """Designs by every criterion, from few starts and without polishing.
+
+    Args:
+        experiment: With its table `[excitation]`, or the defaults.
+        progress: Is told how far the designs are.
+    """
+    found, starts = [], min(FEW, experiment.excitation.starts)
+    for number, criterion in enumerate(ALL):
+
+        def tell(now: DesignProgress, number: int = number) -> None:
+            share = (number + now.share) / len(ALL)
+            doing = f"criterion {number + 1} of {len(ALL)}, {now.doing}"
+            progress(now._replace(share=share, doing=doing))
+
+        with within(experiment.path.name, "excitation"):
+            plan = design_excitation(
+                experiment.base,
+                criterion=criterion,
+                starts=starts,
+                polish=0,
+                progress=tell,
+                throw=False,
+                **_settings(experiment, bool(criterion.weighted)),
+            )
+        found.append(plan)
+        if plan.interrupted:
+            break
+    return found
+
+
+def write(excited: Excited, output: Path) -> list[Path]:
+    """Writes table, trajectory, ROS message and pictures; returns the files.
+
+    Args:
+        excited: The motion.
+        output: Of the table; the others lie beside it.
+    """
+    plan, played = excited.plan, excited.played
+    robot, step = plan.base.model.robot, float(plan.limits.basis.duration) / plan.samples
+    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.yaml"]
+    with double_precision(), written_whole(output.parent) as folder:
+        write_csv(played, robot, folder / names[0], sample_time=step)
+        save_trajectory(jax.tree.map(np.asarray, played), folder / names[1])
+        write_ros_yaml(played, robot, folder / names[2], sample_time=step)
+    return [output.parent / n for n in names] + write_pictures(output.with_suffix(""), plan, played)
+
+
+def _settings(experiment: Experiment, weighted: bool = True) -> dict:
+    """What all designs of one experiment have in common."""
+    table, robot = experiment.excitation, experiment.robot
+    noise = assumed_noise(robot) if table.noise is None else np.array(table.noise)
+    nominal = build_nominal(experiment)
+    return {
+        "basis": build_basis(table),
+        "constraints": build_constraints(experiment, nominal),
+        "key": jax.random.key(table.seed),
+        "noise": noise,
+        "nominal": None if nominal is None else nominal.parameters,
+        "prior": build_prior(experiment, noise) if weighted else None,
+        "samples": table.samples,
+    }
+
+
+def _played(experiment: Experiment, plan: ExcitationPlan) -> Excited:
+    motion, table, refused = plan.trajectory, experiment.excitation, ""
+    window, broken = (0.0, float(plan.limits.basis.duration)), ()
+    if table.leads and not table.rest:
+        robot = experiment.robot.replace(limits=plan.limits.limits)
+        series = FourierBasis(table.harmonics, table.omega).trajectory(plan.numbers)
+        try:
+            motion = with_leads(series, robot)
+        except ValueError as error:
+            refused = str(error)
+        else:
+            begin, end = (float(t) for t in motion.window)
+            window, broken = (begin, end), _broken(experiment, motion)
+    return Excited(plan, motion, window, broken, refused)
+
+
+def _broken(experiment: Experiment, motion: AbstractTrajectory) -> tuple[Finding, ...]:
+    """Constraints that a motion with its leads does not keep."""
+    robot, found = experiment.robot, []
+    constraints = build_constraints(experiment, build_nominal(experiment))
+    if constraints:
+        with double_precision():
+            samples = motion.sample(STEP)[1]
+            for constraint in constraints:
+                found += constraint.describe(robot, np.asarray(constraint(robot, samples)))
+    return tuple(f for f in found if f.value > 0)

@@ -23,7 +23,7 @@ from jaxid.experiment.method_tables import (
 )
 from jaxid.experiment.reading import read_tables
 from jaxid.experiment.robot_tables import build_robot, within
-from jaxid.experiment.tables import ExcitationTable, RecordingTable
+from jaxid.experiment.tables import ExcitationTable, RecordingTable, RobotTable
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.filter_choice import FilterCandidate
 from jaxid.identification.fit import Fit
@@ -59,6 +59,7 @@ class Experiment:
     Attributes:
         path: Of the file.
         text: Of the file, as it was read.
+        source: The table of the robot.
         robot: What is known.
         model: The effects whose parameters are wanted.
         collision: What may not touch what; None if the file does not say.
@@ -79,6 +80,7 @@ class Experiment:
 
     path: Path
     text: str
+    source: RobotTable
     robot: Robot
     model: Model
     collision: CollisionModel | None
@@ -272,6 +274,7 @@ def load_experiment(path: str | Path) -> Experiment:
     return Experiment(
         path=path,
         text=text,
+        source=tables.robot,
         robot=robot,
         model=model,
         collision=collision,

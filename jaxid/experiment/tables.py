@@ -235,6 +235,13 @@ class ExcitationTable(_Table, frozen=True):
     starts: Count = 32
     polish: Annotated[int, Meta(ge=0)] = 4
     seed: Annotated[int, Meta(ge=0)] = 0
+    leads: bool = True
+    nominal: str | None = None
+    earlier: list[str] = []
+    force_margin: Annotated[float, Meta(ge=0, lt=1)] | None = None
+    tip_speed: Positive | None = None
+    tip_acceleration: Positive | None = None
+    workspace: tuple[Vector, Vector] | None = None
 
 
 class Tables(_Table, frozen=True):

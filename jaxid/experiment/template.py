@@ -148,12 +148,19 @@ criterion = "d_optimal"               # smallest deviations on the whole; or a_o
 harmonics = 5                         # of the Fourier series
 omega = 0.8                           # its ground frequency [rad/s]
 rest = false                          # true: start and stop at rest
+leads = true                          # a way into the periodic motion from standstill, and out
 samples = 800                         # that one run will measure
 # noise = {ones}        # standard deviation of the forces' noise [N m or N];
 #                                     # by default 1 % of the largest forces
 starts = 32                           # random motions to start from
 polish = 4                            # how many of the best are polished
 seed = 0                              # of the random motions
+# nominal = "report"                  # an earlier result of `jaxid identify`, to compare with
+# earlier = ["trajectory.json"]       # motions whose logs will be used together with this one's
+# force_margin = 0.1                  # keep 10 % of the largest forces free, by nominal parameters
+# tip_speed = 1.5                     # of the end-effector [m/s]
+# tip_acceleration = 10.0             # [m/s²]
+# workspace = [[-1.0, -1.0, 0.1], [1.0, 1.0, 1.5]]    # box for the end-effector: two corners [m]
 
 # What may not touch while the motion of `jaxid excite` runs.
 # [collision]

@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxid.dynamics.base import BaseParameters, Identifiability
-from jaxid.excitation.plan import ExcitationPlan
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.sanity import LogCheck
 from jaxid.identification.excited import LARGEST_UNCERTAINTY, UndeterminedDirection
@@ -25,7 +24,6 @@ from jaxid.measurement.recording import Recording
 from jaxid.report.bodies import body_table, consistency_facts
 from jaxid.report.compared import comparison_table, group_table
 from jaxid.report.content import Beside
-from jaxid.report.excitation import criteria_table, deviation_table, use_table
 from jaxid.report.numbers import MISSING, aligned, percent, significant
 from jaxid.report.tables import error_table, joint_table, parameter_table, plain_table
 from jaxid.robot.robot import Robot
@@ -369,28 +367,3 @@ def show_comparison(console: Console, comparison: Comparison) -> None:
             f"change, about {(1 - level) * tested:.2g} look so",
         ],
     )
-
-
-def show_plan(console: Console, plan: ExcitationPlan) -> None:
-    """A designed motion: criteria, what to expect, use of the limits, what stays open."""
-    for table in (criteria_table(plan), deviation_table(plan), use_table(plan)):
-        console.print()
-        show_table(console, table)
-    sentences(console, [str(f) for f in plan.findings])
-    if plan.limits.limits.assumed:
-        assumed = ", ".join(plan.limits.limits.assumed)
-        sentences(console, [f"limits that nobody published, assumed: {assumed}."])
-    if plan.undetermined:
-        sentences(
-            console,
-            [f"this motion does not determine: {', '.join(plan.undetermined)}."],
-            DOUBTFUL,
-            "!",
-        )
-    if plan.interrupted:
-        sentences(
-            console,
-            ["the design was stopped: `--resume` goes on where it was."],
-            DOUBTFUL,
-            "!",
-        )

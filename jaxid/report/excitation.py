@@ -1,5 +1,6 @@
 """What a design has found: tables for the terminal, and files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxid.report.motion_figures import joint_figure, tip_figure
 from jaxid.report.numbers import aligned, percent, significant
 from jaxid.report.style import save
 from jaxid.report.tables import plain_table
+from jaxid.trajectory.trajectory import AbstractTrajectory
 from jaxid.types import double_precision
 
 JOINTS, TIP = "joints.png", "end_effector.png"
@@ -27,6 +29,26 @@ def criteria_table(plan: ExcitationPlan) -> Table:
         chosen = "bold" if row.name == plan.criterion.name else ""
         numbers = (significant(row.before), significant(row.after))
         table.add_row(*(Text(text, style=chosen) for text in (row.name, *numbers)))
+    return table
+
+
+def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
+    """What minimising each criterion does to all of them, and to the standard deviations."""
+    table = plain_table("what each criterion buys: motions that make one of them small")
+    table.add_column("#", justify="right", style="dim")
+    table.add_column("criterion")
+    table.add_column("random", justify="right", no_wrap=True)
+    for number in range(len(plans)):
+        table.add_column(f"by #{number + 1}", justify="right", no_wrap=True)
+    for k, row in enumerate(plans[0].criteria):
+        cells = [Text(significant(plan.criteria[k].after)) for plan in plans]
+        if k < len(cells):
+            cells[k].stylize("bold")
+        table.add_row(str(k + 1), Text(row.name), significant(row.before), *cells)
+    means = (np.exp(np.mean(np.log(plan.gains))) for plan in plans)
+    table.add_row(
+        "", Text("deviations, times smaller than random"), "1", *(f"{m:.2f}" for m in means)
+    )
     return table
 
 
@@ -66,17 +88,20 @@ def use_table(plan: ExcitationPlan) -> Table:
     return table
 
 
-def write_pictures(folder: Path, plan: ExcitationPlan) -> list[Path]:
+def write_pictures(
+    folder: Path, plan: ExcitationPlan, played: AbstractTrajectory | None = None
+) -> list[Path]:
     """Draws the joints and the end-effector (Figs. 3, 4); the files appear together.
 
     Args:
         folder: Where they shall lie.
         plan: With the motion.
+        played: The motion with its leads, to be drawn in its place.
     """
-    robot, duration = plan.base.model.robot, float(plan.limits.basis.duration)
-    time = np.linspace(0.0, duration, 801)
+    robot, shown = plan.base.model.robot, plan.trajectory if played is None else played
     with double_precision():
-        motion = plan.trajectory.motion(time)
+        time = np.linspace(0.0, float(shown.duration), 801)
+        motion = shown.motion(time)
     figures = {
         JOINTS: joint_figure(robot, plan.limits.limits, time, motion),
         TIP: tip_figure(robot, time, motion),

@@ -1,11 +1,11 @@
 """Figures of a motion: its joints against their limits, and its end-effector (Figs. 3, 4)."""
 
-import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxid.dynamics.motion import Motion
+from jaxid.excitation.constraints.tip import tip_motion
 from jaxid.report.style import (
     BLUE,
     GREY,
@@ -17,7 +17,6 @@ from jaxid.report.style import (
     house_style,
     new_figure,
 )
-from jaxid.robot.kinematics import tip_placement
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 from jaxid.types import AnyArray, Float, double_precision
@@ -39,7 +38,7 @@ def joint_figure(
     """
     with house_style():
         figure = new_figure(WIDTH, ROW * robot.joints + HEADING)
-        heading(figure, f"{robot.name}: motion of the joints")
+        heading(figure, f"{robot.name}: motion of the joints (dashed: limits)")
         panels = figure.subplots(robot.joints, 3, sharex=True, squeeze=False)
         bounds = (
             (limits.position_min, limits.position_max),
@@ -66,16 +65,17 @@ def tip_figure(robot: Robot, time: Float[AnyArray, " samples"], motion: Motion) 
         time: Of the samples [s].
         motion: At the samples.
     """
-    position, velocity, acceleration = tip_path(robot, motion)
-    speed, rate = np.linalg.norm(velocity, axis=1), np.linalg.norm(acceleration, axis=1)
+    with double_precision():
+        position, *rates = (np.asarray(x) for x in tip_motion(robot, motion))
+    speed, rate = (np.linalg.norm(x, axis=1) for x in rates)
     with house_style():
         figure = new_figure(WIDTH, 3 * 1.6 + HEADING)
         heading(figure, f"{robot.name}: motion of the end-effector")
         panels = figure.subplots(3, 1, sharex=True)
         for k, (name, color) in enumerate(zip("xyz", (BLUE, VERMILION, GREY), strict=True)):
             panels[0].plot(time, position[:, k], color=color, linewidth=1.0, label=name)
-        panels[0].legend(loc="upper right", ncols=3)
-        caption(panels[0], "position", "[m]")
+        panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3)
+        caption(panels[0], "position [m]", "")
         for axes, values, name, unit in (
             (panels[1], speed, "speed", "m/s"),
             (panels[2], rate, "acceleration", "m/s²"),
@@ -84,25 +84,6 @@ def tip_figure(robot: Robot, time: Float[AnyArray, " samples"], motion: Motion) 
             caption(axes, name, f"up to {values.max():.3g} {unit}")
         _time_axis(panels[-1:], time)
     return figure
-
-
-def tip_path(
-    robot: Robot, motion: Motion
-) -> tuple[
-    Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]
-]:
-    """Position [m], velocity [m/s] and acceleration [m/s²] of the end-effector."""
-
-    def velocity(q, qd):
-        return jax.jvp(lambda x: tip_placement(robot, x)[1], (q,), (qd,))
-
-    def one(q, qd, qdd):
-        (r, v), (_, a) = jax.jvp(velocity, (q, qd), (qd, qdd))
-        return r, v, a
-
-    with double_precision():
-        r, v, a = jax.jit(jax.vmap(one))(motion.q, motion.qd, motion.qdd)
-    return np.asarray(r), np.asarray(v), np.asarray(a)
 
 
 def _time_axis(panels: np.ndarray, time: Float[AnyArray, " samples"]) -> None:

@@ -1,0 +1,185 @@
+"""`jaxid excite`: what it writes and says, that it can be killed, and what it refuses."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from jaxid import cli
+from jaxid.excitation.plan import CRITERIA
+from jaxid.experiment.excite import side_by_side
+from jaxid.experiment.experiment import load_experiment
+
+PENDULUM = """\
+<robot name="pendulum">
+  <link name="stand"/>
+  <link name="rod">
+    <inertial><origin xyz="0.4 0 0"/><mass value="2"/>
+      <inertia ixx="0.01" iyy="0.11" izz="0.11" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="hinge" type="revolute">
+    <parent link="stand"/><child link="rod"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="1.5" velocity="2" effort="12"/>
+  </joint>
+</robot>
+"""
+EXPERIMENT = """\
+[robot]
+urdf = "pendulum.urdf"
+[limits]
+acceleration = [4]
+[excitation]
+harmonics = 2
+starts = 2
+polish = 1
+samples = 100
+seed = 5
+"""
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A folder with a robot and its designed motion."""
+    folder = tmp_path_factory.mktemp("excite")
+    (folder / "pendulum.urdf").write_text(PENDULUM)
+    (folder / "experiment.toml").write_text(EXPERIMENT)
+    return folder
+
+
+@pytest.fixture
+def run(written, monkeypatch, capsys):
+    """Runs a command line in this process: exit code, stdout and stderr."""
+    monkeypatch.chdir(written)
+    monkeypatch.setenv("COLUMNS", "100")
+
+    def run(*args):
+        monkeypatch.setattr(sys, "argv", ["jaxid", *map(str, args)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        out, err = capsys.readouterr()
+        return stopped.value.code, out, err
+
+    return run
+
+
+def listing(folder):
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*"))
+
+
+def table(path):
+    return np.loadtxt(path, delimiter=",", skiprows=1)
+
+
+def with_keys(folder, name, *keys):
+    path = folder / name
+    path.write_text(EXPERIMENT + "\n".join(keys) + "\n")
+    return path
+
+
+def test_writes_the_motion_and_says_what_to_expect(written, run):
+    code, out, err = run("excite", "experiment.toml", "-o", "plan/motion.csv")
+    assert code == 0, err
+    assert listing(written / "plan") == [
+        "motion",
+        "motion.csv",
+        "motion.json",
+        "motion.ros.yaml",
+        "motion/end_effector.png",
+        "motion/joints.png",
+    ]
+    t, q, qd, qdd = table(written / "plan" / "motion.csv").T
+    np.testing.assert_allclose([qd[0], qdd[0], qd[-1], qdd[-1]], 0.0, atol=1e-12)
+    assert q.min() >= -2
+    assert q.max() <= 1.5
+    assert 1.5 < np.abs(qd).max() <= 2
+    assert np.abs(qdd).max() <= 4
+    assert t[-1] > 2 * np.pi / 0.8
+    for said in (
+        "criteria: smaller is better",
+        "D: mean axis",
+        "standard deviations to expect",
+        "± [%]",
+        "use of the limits [%]",
+        "is in the designed motion from",
+    ):
+        assert said in out
+
+
+def test_a_killed_design_goes_on_to_the_same_motion(written, run):
+    arguments = ["excite", "experiment.toml", "-o", "killed/motion.csv"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from jaxid.cli import main; main()", *arguments],
+        cwd=written,
+        stdout=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    state = written / "killed" / "motion.state.npz"
+    until = time.monotonic() + 120
+    while not state.exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert listing(written / "killed") == ["motion.state.npz"]
+    code, _, err = run(*arguments, "--resume")
+    assert code == 0, err
+    assert not state.exists()
+    same = [(written / folder / "motion.json").read_text() for folder in ("plan", "killed")]
+    assert same[0] == same[1]
+
+
+def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written, run):
+    # The angle turns about y: the rod points ahead at zero, and holding it there takes 7.8 N m.
+    def largest_force(folder):
+        _, q, _, qdd = table(written / folder / "motion.csv").T
+        return np.abs((0.11 + 2 * 0.4**2) * qdd - 2 * 0.4 * 9.81 * np.cos(q)).max()
+
+    keys = ("force_margin = 0.5", 'earlier = ["plan/motion.json"]', "leads = false")
+    path = with_keys(written, "weak.toml", *keys)
+    code, out, err = run("excite", path, "-o", "weak/motion.csv")
+    assert code == 0, err
+    assert largest_force("weak") <= 6.0 < 7.5 < largest_force("plan")
+    assert "the force of joint `hinge` keeps its limit" in out
+
+
+def test_an_impossible_motion_is_diagnosed(written, run):
+    path = with_keys(written, "far.toml", "workspace = [[-0.1, -0.1, 2.0], [0.1, 0.1, 3.0]]")
+    code, out, err = run("excite", path, "-o", "far/motion.csv")
+    assert (code, out) == (2, "")
+    assert err.startswith("jaxid: far.toml: `excitation`: no motion was found")
+    assert "-z of the end-effector exceeds its limit by 2 m" in err
+    assert "far/motion.csv" not in listing(written)
+
+
+def test_every_criterion_can_be_compared(written, run, monkeypatch):
+    monkeypatch.setattr("jaxid.experiment.excite.ALL", CRITERIA[:2])
+    told = []
+    plans = side_by_side(load_experiment(written / "experiment.toml"), told.append)
+    assert [plan.criterion.name for plan in plans] == [c.name for c in CRITERIA[:2]]
+    for k, plan in enumerate(plans):
+        assert plan.criteria[k].after <= 1.001 * min(p.criteria[k].after for p in plans)
+    assert told[-1].share == 1.0
+    assert "criterion 2 of 2" in told[-1].doing
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
+        ("rest = true", "`harmonics` must be at least"),
+        ("noise = [1, 2]", "`noise` must hold one positive number for each joint (1)"),
+        ('nominal = "nowhere"', "holds no `result.json`"),
+        ('earlier = ["nowhere.json"]', "nowhere.json"),
+    ],
+)
+def test_refuses_what_does_not_fit(written, run, key, said):
+    text = EXPERIMENT.replace("harmonics = 2", "harmonics = 1")
+    (written / "wrong.toml").write_text(text + key + "\n")
+    code, out, err = run("excite", "wrong.toml")
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert said in err
+    assert "trajectory.csv" not in listing(written)
