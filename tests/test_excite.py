@@ -1,16 +1,20 @@
 """`jaxid excite`: what it writes and says, that it can be killed, and what it refuses."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 
+import jax
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from jaxid import cli
 from jaxid.excitation.plan import CRITERIA
+from jaxid.experiment.excitation_tables import build_nominal
 from jaxid.experiment.excite import side_by_side
 from jaxid.experiment.experiment import load_experiment
 
@@ -43,11 +47,15 @@ seed = 5
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """A folder with a robot and its designed motion."""
+    """A folder with a robot; what is compiled for it is kept from test to test."""
     folder = tmp_path_factory.mktemp("excite")
     (folder / "pendulum.urdf").write_text(PENDULUM)
     (folder / "experiment.toml").write_text(EXPERIMENT)
-    return folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAXID_CACHE_DIR", str(tmp_path_factory.mktemp("compiled")))
+        yield folder
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
 
 
 @pytest.fixture
@@ -152,6 +160,40 @@ def test_an_impossible_motion_is_diagnosed(written, run):
     assert err.startswith("jaxid: far.toml: `excitation`: no motion was found")
     assert "-z of the end-effector exceeds its limit by 2 m" in err
     assert "far/motion.csv" not in listing(written)
+
+
+def test_earlier_results_are_nominal(written):
+    experiment = load_experiment(with_keys(written, "after.toml", 'nominal = "report"'))
+    base = experiment.base
+    rows = [
+        {"name": n, "expression": n, "unit": u, "estimate": 1.0 + k}
+        for k, (n, u) in enumerate(zip(base.names, base.units, strict=True))
+    ]
+    covariance = (0.01 * np.eye(base.size)).tolist()
+    content = {
+        "schema": "jaxid-result/1",
+        "base_parameters": rows,
+        "fit": {"covariance": covariance},
+    }
+    (written / "report").mkdir()
+    result = written / "report" / "result.json"
+    result.write_text(json.dumps(content))
+    found = build_nominal(experiment)
+    np.testing.assert_array_equal(found.parameters, 1.0 + np.arange(base.size))
+    np.testing.assert_array_equal(found.covariance, covariance)
+    rows[0]["name"] = "other"
+    result.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="are not the"):
+        build_nominal(experiment)
+
+
+def test_a_urdf_claims_inertias_and_knows_no_friction(written):
+    experiment = load_experiment(written / "experiment.toml")
+    found = build_nominal(experiment)
+    known = dict(zip(experiment.base.names, found.parameters, strict=True))
+    assert known["mx1"] == pytest.approx(0.8)
+    assert np.isnan(known["fv1"])
+    assert found.covariance is None
 
 
 def test_every_criterion_can_be_compared(written, run, monkeypatch):
