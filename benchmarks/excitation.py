@@ -175,11 +175,15 @@ def logs_of(problem, criterion, y, samples):
     if criterion.weighted:
         theta = problem.weights[:, None, None] * theta
     theta = np.sqrt(problem.measured / samples) * theta.reshape(-1, problem.base.size)
-    if criterion == jid.ScaledConditionNumber():
-        theta = theta / np.linalg.norm(theta, axis=0)
+    lengths = np.ones(problem.base.size)
+    if criterion in (jid.ScaledConditionNumber(), jid.DOptimal()):
+        lengths = np.linalg.norm(theta, axis=0)
+        theta = theta / lengths
     if criterion in (jid.AOptimal(), jid.EOptimal()):
         theta = theta * problem.sizes
-    return 2 * np.log(np.linalg.svd(theta, compute_uv=False)[::-1])
+    logs = 2 * np.log(np.linalg.svd(theta, compute_uv=False)[::-1])
+    # The determinant factors, and keeps more digits without the columns' lengths.
+    return logs + 2 * np.mean(np.log(lengths)) if criterion == jid.DOptimal() else logs
 
 
 def of_logs(criterion, logs, sharpness):
@@ -226,7 +230,9 @@ def constraint_gradients():
         values = jax.jit(lambda z, p=problem: p.constrained(z[None], 7)[0].ravel())
         exact = np.asarray(jax.jit(jax.jacrev(values))(y))
         found = differences(lambda z, f=values: np.asarray(f(z)), y, 1e-4)
-        errors = np.linalg.norm(found - exact, axis=1) / np.linalg.norm(exact, axis=1)
+        sizes = np.linalg.norm(exact, axis=1)
+        # What a motion does not change has no gradient to compare with.
+        errors = np.linalg.norm(found - exact, axis=1) / np.maximum(sizes, 1e-6 * sizes.max())
         print(f"{type(constraint).__name__}, {len(errors)} values: {errors.max():.1e}", flush=True)
 
 
