@@ -15,7 +15,7 @@ joints: what weighted least squares minimise. "relative" is the norm of all erro
 all forces. "moving" is the weighted error of the rows of the rest in which some joint moves: the
 TX40 stands still at the end. "of WLS" compares with weighted least squares.
 
-    python benchmarks/held_out.py            # both robots, all rows
+    python benchmarks/held_out.py            # both robots, all rows; or one: `held_out.py ur10`
     python benchmarks/held_out.py --quick    # the UR10, without the rows that search
 """
 
@@ -110,7 +110,8 @@ def main() -> None:
     if not DATA.is_dir():
         print("measured data (../shared/data beside the project) are not here")
         return
-    for name in ("ur10",) if quick else LOGS:
+    named = [name for name in LOGS if name in sys.argv]
+    for name in named or (("ur10",) if quick else LOGS):
         print("\n".join(table(name, quick=quick)), end="\n\n", flush=True)
 
 
