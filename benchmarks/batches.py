@@ -1,4 +1,4 @@
-"""Many data sets in one call against a loop in NumPy; one log on several devices.
+"""Many data sets in one call against a loop in NumPy.
 
     python benchmarks/batches.py [--quick] [--json FILE]
 
@@ -9,11 +9,7 @@ few data sets of each loop; what is compared is the time for one data set. BLAS 
 """
 
 import argparse
-import json
 import os
-import subprocess
-import sys
-import time
 
 import timing
 from timing import Row, hand_over, interleaved
@@ -137,63 +133,15 @@ def against_loops(datasets, samples, turns):
     return found
 
 
-def on_devices(samples, turns):
-    """Seconds for one log on this process's devices, printed for the process that asked."""
-    import jax
-
-    from jaxid.identification.devices import factorise_on_devices
-
-    base = seven_axes()
-    n = base.model.robot.joints
-    whole = motions(1, samples, n)[0]
-    forces = whole.q
-    _, first = timing.elapsed(lambda: factorise_on_devices(base, whole, forces))
-    seconds = []
-    for _ in range(turns):
-        start = time.perf_counter()
-        factorise_on_devices(base, whole, forces)
-        seconds.append(time.perf_counter() - start)
-    seconds.sort()
-    print(json.dumps([len(jax.devices()), seconds[len(seconds) // 2], first]))
-
-
-def scaling(samples, turns, quick):
-    """The same log on one and on two devices, each with a core of its own."""
-    found = {}
-    for devices in (1, 2):
-        command = [sys.executable, __file__, "--devices", str(devices), *["--quick"] * quick]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        count, median, first = json.loads(done.stdout.splitlines()[-1])
-        found[count] = median
-        print(f"{count} device(s): {median:.3f} s for {samples} samples, first call {first:.1f} s")
-    return Row(
-        "16",
-        "one log on two devices of a core each, against one",
-        f"Panda with friction, {samples} samples, triangular factors, median of {turns} calls, one "
-        "process after the other: a busy machine shows here",
-        "",
-        f"{found[1] / found[2]:.2f}x ({found[1]:.2f} s against {found[2]:.2f} s)",
-    )
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer data sets and samples")
     parser.add_argument("--json", help="where to write the rows")
-    parser.add_argument("--devices", type=int, help="only one log on so many devices")
     options = parser.parse_args()
-    datasets, log = (128, 20_000) if options.quick else (1000, 100_000)
-    timing.pin_to(options.devices or 2)
+    timing.pin_to(2)
     for name in timing.THREADS:
         os.environ[name] = "1"
-    if options.devices:
-        count = f"--xla_force_host_platform_device_count={options.devices}"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}".strip()
-        on_devices(log, 5)
-        return
-    rows = against_loops(datasets, 800, 5)
-    rows.append(scaling(log, 5, options.quick))
-    hand_over(rows, options.json)
+    hand_over(against_loops(128 if options.quick else 1000, 800, 5), options.json)
 
 
 if __name__ == "__main__":

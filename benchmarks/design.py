@@ -15,10 +15,10 @@ def packed_rows(base):
 
     from jaxid.dynamics.compiled import acting_columns
     from jaxid.dynamics.machine import program_of
-    from jaxid.program import lower
+    from jaxid.program import Reversible, lower
 
     n = (base.model.robot.joints,)
-    lowered = lower(program_of(base, base.columns, n, n, n))
+    lowered = Reversible(lower(program_of(base, base.columns, n, n, n)))
     columns = acting_columns(base)
 
     def rows(motion):

@@ -1,17 +1,28 @@
-"""Plots of the regressor's cost: against the number of samples, and of joints.
+"""What a sample costs, against the number of samples, of joints, and of devices.
 
     python benchmarks/scaling.py [--quick] [--json FILE]
 
-Writes `benchmarks/scaling.png` (with `--quick`, nothing). From 16 384 samples on, ours goes
-through chunks of that size, as one would through a long recording.
+Writes `benchmarks/scaling.png` (with `--quick`, nothing). Samples and joints: the regressor on one
+core, ten parameters for each body, in a process of its own; from 16 384 samples on, ours goes
+through chunks of that size, as one would through a long recording. Devices: `identify` of one log
+with every sample a row, on as many of JAX's CPU devices, a process for each number; a core for each
+device as far as there are cores. Medians.
 """
 
 import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
 
 import timing
-from timing import REPOSITORY, Row, hand_over, interleaved
+from timing import HERE, Row, hand_over, interleaved
 
 CHUNK = 16384
+LOG = 400_000
+DEVICES = (1, 2, 4, 8)
 SAMPLES = (1, 30, 1000, 16_384, 131_072, 1_048_576)
 JOINTS = (2, 4, 7, 12, 20, 30)
 PYTHON_UP_TO, CPP_UP_TO = 1000, 131_072
@@ -137,49 +148,187 @@ def by_joints(sizes, samples, turns):
     return curves(points(), turns), compiling
 
 
-def plot(samples, joints, compiling, path):
+def identified(samples, turns):
+    """Of one log on this process's devices: devices, seconds, scaled estimates."""
+    import jax
+    import numpy as np
+    from batches import motions, seven_axes
+
+    import jaxid as jid
+
+    base = seven_axes()
+    motion = motions(1, samples, base.model.robot.joints)[0]
+    random = np.random.default_rng(1)
+    forces = np.asarray(base.inverse_dynamics(random.normal(size=base.size), motion))
+    forces = forces + 0.1 * random.normal(size=forces.shape)
+    log = jid.Observations(
+        time=np.arange(samples) * 1e-3,
+        motion=motion,
+        forces=forces,
+        mask=np.ones(forces.shape, bool),
+        filter=jid.ZeroPhaseButterworth(400.0, force_cutoff=np.inf, margin=0.0),
+        decimation=jid.Subsample(1),
+        segments=((0, samples),),
+        sample_time=1e-3,
+    )
+
+    def identify():
+        return jid.identify(base, log, jid.LeastSquares(), uncertainty=jid.IndependentRows())
+
+    fit = identify()
+    seconds = interleaved({"identify": identify}, turns)["identify"].median
+    scaled = np.asarray(fit.parameters) / np.asarray(fit.standard_deviations)
+    return len(jax.devices()), seconds, scaled.tolist()
+
+
+def by_devices(numbers, samples, turns):
+    """Nanoseconds per sample for each number of devices, and how far estimates are apart."""
+    import numpy as np
+
+    found, scaled = [], []
+    for devices in numbers:
+        given = ["--devices", str(devices), "--samples", str(samples), "--turns", str(turns)]
+        done = subprocess.run([sys.executable, __file__, *given], capture_output=True, text=True)
+        if done.returncode:
+            sys.exit(f"{devices} devices: {done.stderr[-2000:]}")
+        count, seconds, estimates = json.loads(done.stdout.splitlines()[-1])
+        found.append((count, seconds / samples * 1e9))
+        scaled.append(np.array(estimates))
+        print(f"{count} device(s): {seconds:.3f} s for {samples} samples", flush=True)
+    away = max(np.linalg.norm(x - scaled[0]) / np.linalg.norm(scaled[0]) for x in scaled)
+    return found, float(away)
+
+
+# Colours that people with any colour vision tell apart (Okabe and Ito), and marks beside them.
+STYLES = {
+    "jaxid, compiled": ("#0072B2", "o-"),
+    "jaxid, NumPy": ("#56B4E9", "v--"),
+    "Pinocchio, C++ loop": ("#D55E00", "s-"),
+    "Pinocchio, Python loop": ("#CC79A7", "^--"),
+}
+
+
+def plot(samples, joints, compiling, devices, path):
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
-    for axes, found in ((left, samples), (right, joints)):
-        for name in sorted({*samples, *joints}):
+    plt.rcParams["font.size"] = 11
+    figure, panels = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
+    (first, second), (third, fourth) = panels
+    for axes, found in ((first, samples), (second, joints)):
+        for name, (colour, style) in STYLES.items():
             if name in found:
-                axes.plot(*zip(*found[name], strict=True), "o-", label=name)
-        axes.set_yscale("log")
+                axes.plot(*zip(*found[name], strict=True), style, color=colour, label=name)
+        axes.set(yscale="log", ylabel="regressor, time per sample [ns]")
+    first.set(xscale="log", xlabel="samples in a call", title="seven joints, one core")
+    first.legend()
+    second.set(xlabel="joints", title="serial arms, 2048 samples, one core")
+    third.plot(*zip(*compiling, strict=True), "o-", color="#0072B2")
+    third.set(xlabel="joints", ylabel="trace and compile, once [s]", ylim=(0, None))
+    third.set_title("serial arms, one core")
+    numbers, costs = zip(*devices, strict=True)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    ideal = [costs[0] / min(n, cores or 1) for n in numbers]
+    fourth.plot(numbers, costs, "o-", color="#0072B2", label="`identify`, measured")
+    fourth.plot(numbers, ideal, ":", color="black", label=f"ideal on {cores} cores")
+    fourth.set(xscale="log", xlabel="CPU devices", ylabel="time per sample [ns]", ylim=(0, None))
+    fourth.set_title(f"{LOG} samples, seven joints with friction")
+    fourth.set_xticks(numbers)
+    fourth.xaxis.set_major_formatter(ScalarFormatter())
+    fourth.xaxis.set_minor_formatter(NullFormatter())
+    fourth.legend()
+    for axes in panels.flat:
         axes.grid(True, which="major", alpha=0.3)
-    left.set(xscale="log", xlabel="samples", ylabel="regressor, ns per sample")
-    left.set_title("seven joints, one core")
-    left.legend()
-    right.set(xlabel="joints")
-    right.set_title("serial arms, 2048 samples, one core")
-    seconds = right.twinx()
-    seconds.plot(*zip(*compiling, strict=True), "k:", label="trace + compile")
-    seconds.set(ylabel="trace + compile [s]", ylim=(0, None))
-    seconds.legend(loc="lower right")
     figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def on_one_core(quick):
+    """Cost against samples and joints, and compile times."""
+    if quick:
+        return by_samples((1, 100), 5), *by_joints((2, 3), 256, 5)
+    return by_samples(SAMPLES, 5), *by_joints(JOINTS, 2048, 5)
+
+
+def elsewhere(quick):
+    """The same from a process of its own, since it is pinned to one core."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "curves.json"
+        given = ["--one-core", str(path), *["--quick"] * quick]
+        if subprocess.run([sys.executable, "-u", __file__, *given]).returncode:
+            sys.exit("the curves on one core were not measured")
+        return json.loads(path.read_text())
+
+
+def table(samples, joints, compiling, devices, away):
+    """The rows of all curves."""
+    ten = "ten parameters per body, one core, median of 5 turns"
+
+    def line(points, unit="ns"):
+        return ", ".join(f"{x}: {y:.0f} {unit}" for x, y in points)
+
+    rows = [
+        Row("9a", f"regressor by samples, {name}", f"Panda, {ten}", "-", line(points))
+        for name, points in samples.items()
+    ]
+    rows += [
+        Row("9b", f"regressor by joints, {name}", f"arms, {ten}, N = 2048", "-", line(points))
+        for name, points in joints.items()
+    ]
+    rows.append(
+        Row(
+            "9c",
+            "trace + compile of the regressor by joints",
+            "serial arms, one core",
+            "-",
+            "; ".join(f"{n}: {seconds:.1f} s" for n, seconds in compiling),
+        )
+    )
+    rows.append(
+        Row(
+            "9d",
+            "`identify` by devices, per sample",
+            "Panda with friction, every sample a row, a core for each device as far as there are "
+            f"cores; estimates of all are {away:.0e} apart (columns of length one)",
+            "the same to 1e-12",
+            line(devices),
+            away <= 1e-12,
+        )
+    )
+    return rows
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few points, no plot")
     parser.add_argument("--json", help="where to write the rows")
+    parser.add_argument("--one-core", help=argparse.SUPPRESS)
+    parser.add_argument("--devices", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--samples", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--turns", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    timing.pin_to(1)
+    if options.devices:
+        timing.pin_to(options.devices)
+        for name in timing.THREADS:
+            os.environ[name] = "1"
+        count = f"--xla_force_host_platform_device_count={options.devices}"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}".strip()
+        print(json.dumps(identified(options.samples, options.turns)))
+        return
+    if options.one_core:
+        timing.pin_to(1)
+        Path(options.one_core).write_text(json.dumps(on_one_core(options.quick)))
+        return
+    samples, joints, compiling = elsewhere(options.quick)
     if options.quick:
-        by_samples((1, 100), 5)
-        _, compiling = by_joints((2, 3), 256, 5)
+        devices, away = by_devices((1, 2), 110_000, 3)
     else:
-        samples = by_samples(SAMPLES, 5)
-        joints, compiling = by_joints(JOINTS, 2048, 5)
-        plot(samples, joints, compiling, REPOSITORY / "benchmarks/scaling.png")
-        for name, points in (*samples.items(), *joints.items()):
-            print(name, ", ".join(f"{x}: {ns:.0f} ns" for x, ns in points))
-    said = "; ".join(f"{n}: {seconds:.1f} s" for n, seconds in compiling)
-    what = "trace + compile of the regressor by joints"
-    hand_over([Row("9", what, "serial arms, one core", "-", said)], options.json)
+        devices, away = by_devices(DEVICES, LOG, 5)
+        plot(samples, joints, compiling, devices, HERE / "scaling.png")
+    hand_over(table(samples, joints, compiling, devices, away), options.json)
 
 
 if __name__ == "__main__":

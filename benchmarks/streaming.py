@@ -1,31 +1,33 @@
 """How fast, how small and how accurate is the identification from long logs?
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/streaming.py [--quick] [--disk SAMPLES]
+    python benchmarks/streaming.py [--quick] [--disk SAMPLES] [--json FILE]
 
 A seven-axis arm at 1 kHz in float64: every sample a row; forces and columns filtered (zero phase,
 20 Hz) and every 25th a row; the first against a loop over Pinocchio's regressor in NumPy,
 interleaved with it; the second from a Parquet file, whose reading overlaps with the computing.
 Medians of warm runs; compiling is told apart. Memory is the growth of the process's resident set
-during a warm run. Ratios count; absolute times depend on the machine.
+during warm runs. The log on disk is one motion of 500 000 samples again and again. Ratios count;
+absolute times depend on the machine.
 """
 
 import argparse
 import math
 import os
 import statistics
-import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Before NumPy is imported: chunks run in parallel, and threads of BLAS would get in their way.
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["JAX_PLATFORMS"] = "cpu"
 
 import jax
 import numpy as np
 import polars as pl
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+import timing
+from timing import Row, hand_over
 
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
@@ -119,7 +121,7 @@ def timed(run, *arguments):
 
 
 def identification(base, o):
-    return jid.identify(base, o, jid.LeastSquares())
+    return jid.identify(base, o, jid.LeastSquares(), uncertainty=jid.IndependentRows())
 
 
 def whole(base, o):
@@ -179,32 +181,38 @@ def peer(model, base, o):
     return np.linalg.solve(R, Q.T @ np.asarray(o.forces).ravel())
 
 
-def case(name, base, o, repetitions):
+def case(number, name, base, o, repetitions, most, memory=math.inf):
+    """The row of a log in memory: seconds, and memory beyond the inputs [MB]."""
     first, _ = timed(whole, base, o)
-    times = [timed(identification, base, o)[0] for _ in range(repetitions)]
+    identification(base, o)
     with Peak() as peak:
-        fit = identification(base, o)
+        runs = [timed(identification, base, o) for _ in range(repetitions)]
+    times, fit = [seconds for seconds, _ in runs], runs[-1][1]
     median = statistics.median(times)
-    print(
-        f"{name}: median {median:.2f} s, best {min(times):.2f} s, first {first:.1f} s (it compiles)"
-        f"\n    memory beyond the inputs {peak.megabytes:.0f} MB, rows {fit.rows[0]}, residual "
-        f"{100 * fit.residual:.3f} %"
+    asked = f"<= {most:g} s" + (f", <= {memory:g} MB" if memory < math.inf else "")
+    return Row(
+        number,
+        f"{len(o.time)} samples in memory to base parameters, {name}",
+        f"rail + TX90L, {base.size} base parameters with friction and rotors, naive covariance, "
+        f"two cores, median of {repetitions} runs; {fit.rows[0]} rows; the first run, which "
+        f"compiles, {first:.1f} s",
+        asked,
+        f"{median:.2f} s (best {min(times):.2f} s), {peak.megabytes:.0f} MB beyond the inputs",
+        median <= most and peak.megabytes <= memory,
     )
 
 
 def written(base, samples, folder):
     """A Parquet file of one motion after the other, never held as a whole."""
-    step, parts = min(samples, 500_000), []
-    for k, start in enumerate(range(0, samples, step)):
-        motion, forces = virtual_log(base, min(step, samples - start))
-        arrays = {"q": motion.q, "tau": forces}
-        columns = {f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(x.shape[1])}
-        parts.append(folder / f"part{k}.parquet")
-        pl.DataFrame(columns).write_parquet(parts[-1], row_group_size=65536)
-    path = folder / "log.parquet"
-    pl.scan_parquet(parts).sink_parquet(path, row_group_size=65536)
-    for part in parts:
-        part.unlink()
+    step = min(samples, 500_000)
+    motion, forces = virtual_log(base, step)
+    arrays = {"q": motion.q, "tau": forces}
+    columns = {f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(x.shape[1])}
+    part, path = folder / "part.parquet", folder / "log.parquet"
+    pl.DataFrame(columns).write_parquet(part, row_group_size=65536)
+    whole_log = pl.concat([pl.scan_parquet(part)] * -(-samples // step)).head(samples)
+    whole_log.sink_parquet(path, row_group_size=65536)
+    part.unlink()
     return path
 
 
@@ -215,24 +223,28 @@ def from_disk(base, samples, repetitions):
         path = written(base, samples, Path(name))
         log = open_log(path, columns, base.model.robot, smooth, every)
         part = slice(100_000 // 2, 100_000 // 2 + 65536)
-        timed(identification, base, log)
         reading = [timed(log.read, part)[0] * samples / 65536 for _ in range(5)]
         motion, forces = log.read(slice(0, min(samples, 200_000)))
         held = filtered(motion, forces)
+        timed(identification, base, held)
         computing = [
             timed(identification, base, held)[0] * samples / len(forces) for _ in range(repetitions)
         ]
-        times = [timed(identification, base, log)[0] for _ in range(repetitions)]
         with Peak() as peak:
-            identification(base, log)
-        larger = max(statistics.median(reading), statistics.median(computing))
-        print(
-            f"{samples} samples from Parquet ({path.stat().st_size / 1e6:.0f} MB): median "
-            f"{statistics.median(times):.2f} s; reading and filtering alone "
-            f"{statistics.median(reading):.2f} s, computing alone "
-            f"{statistics.median(computing):.2f} s: {statistics.median(times) / larger:.2f} of the "
-            f"larger\n    memory {peak.megabytes:.0f} MB"
-        )
+            times = [timed(identification, base, log)[0] for _ in range(repetitions)]
+        size = path.stat().st_size / 1e6
+    median, read, computed = map(statistics.median, (times, reading, computing))
+    ratio = median / max(read, computed)
+    return Row(
+        "14",
+        f"{samples} samples from Parquet on disk, 20 Hz, every 25th a row",
+        f"rail + TX90L, {base.size} base parameters, a file of {size:.0f} MB, two cores, median of "
+        f"{repetitions} runs; reading and filtering alone {read:.2f} s, computing alone "
+        f"{computed:.2f} s, both by a part of the log",
+        "<= 1.2 x the larger of reading and computing, <= 1000 MB",
+        f"{ratio:.2f} x the larger ({median:.2f} s), {peak.megabytes:.0f} MB",
+        ratio <= 1.2 and peak.megabytes <= 1000,
+    )
 
 
 def against_pinocchio(base, motion, forces, samples, repetitions):
@@ -249,34 +261,65 @@ def against_pinocchio(base, motion, forces, samples, repetitions):
     norms = np.linalg.norm(R, axis=0)
     away = np.linalg.norm(norms * (np.linalg.lstsq(R, z)[0] - p)) / np.linalg.norm(norms * p)
     a, b = statistics.median(own), statistics.median(other)
-    print(
-        f"{samples} samples: {a:.3f} s, NumPy and Pinocchio {b:.2f} s, {b / a:.0f} times as long; "
-        f"estimates differ by {away:.1e}"
+    ratio = statistics.median(y / x for x, y in zip(own, other, strict=True))
+    return Row(
+        "11",
+        f"{samples} samples in memory to base parameters, against NumPy + Pinocchio",
+        f"rail + TX90L, {base.size} base parameters, every sample a row; the loop is in Python, "
+        f"then a QR; median of {repetitions} turns; estimates differ by {away:.0e}",
+        ">= 25x",
+        f"{ratio:.0f}x ({a:.3f} s against {b:.2f} s)",
+        ratio >= 25,
+    )
+
+
+def accuracy(base, motion, forces):
+    """The largest distance from a dense QR, filtered and not."""
+    found = []
+    for name, prepare in (("every sample a row", unfiltered), ("20 Hz, every 25th", filtered)):
+        o = prepare(motion, forces)
+        away, condition = distance(base, o, *dense(base, o))
+        found.append((away, f"{name} {away:.1e} (condition number {condition:.0f})"))
+    worst = max(away for away, _ in found)
+    return Row(
+        "12",
+        "estimates from long logs, distance from a dense QR",
+        f"rail + TX90L, {base.size} base parameters, {len(forces)} samples, columns of length one",
+        "<= 1e-12",
+        "; ".join(words for _, words in found),
+        worst <= 1e-12,
     )
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="fewer samples and repetitions")
-    jax.config.update("jax_enable_x64", True)
     parser.add_argument("--disk", type=int, help="samples of the Parquet file")
+    parser.add_argument("--json", help="where to write the rows")
     given = parser.parse_args()
+    timing.pin_to(2)
+    jax.config.update("jax_enable_x64", True)
     quick = given.quick
-    samples, checked, looped, repetitions = (
-        (120_000, 10_000, 5_000, 3) if quick else (1_000_000, 100_000, 200_000, 5)
+    samples, checked, looped, on_disk, repetitions = (
+        (120_000, 10_000, 5_000, 200_000, 3)
+        if quick
+        else (1_000_000, 100_000, 200_000, 10_000_000, 5)
     )
     base = jid.base_parameters(jid.Model(jid.robots.tx90l_on_rail()))
     motion, forces = virtual_log(base, samples)
-    print(f"jax {jax.__version__}, {os.cpu_count()} cores, {samples} samples, {base.size} columns")
-    case("every sample a row", base, unfiltered(motion, forces), repetitions)
-    case("20 Hz, every 25th a row", base, filtered(motion, forces), repetitions)
-    for name, prepare in (("every sample", unfiltered), ("filtered", filtered)):
-        o = prepare(motion[:checked], forces[:checked])
-        away, condition = distance(base, o, *dense(base, o))
-        print(f"{name}: {away:.1e} from a dense QR (condition number {condition:.0f})")
-    against_pinocchio(base, motion, forces, looped, repetitions)
+    rows = [
+        case("10", "every sample a row", base, unfiltered(motion, forces), repetitions, 1.0, 50.0),
+        case("13", "20 Hz, every 25th a row", base, filtered(motion, forces), repetitions, 4.0),
+        accuracy(base, motion[:checked], forces[:checked]),
+    ]
+    absent = timing.missing("pinocchio")
+    if absent is None:
+        rows.insert(1, against_pinocchio(base, motion, forces, looped, 3))
+    else:
+        print(absent)
     del motion, forces
-    from_disk(base, given.disk or (200_000 if quick else 10_000_000), 1 if not quick else 3)
+    rows.append(from_disk(base, given.disk or on_disk, 1 if quick else 3))
+    hand_over(rows, given.json)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import program_of
-from jaxid.program import Lowered, evaluate_packed, lower
+from jaxid.program import Lowered, Reversible, evaluate_packed, lower
 from jaxid.types import AnyArray, Array, Float
 
 
@@ -21,7 +21,7 @@ class JointRows(eqx.Module):
         size: Number of base parameters.
     """
 
-    lowered: Lowered
+    lowered: Lowered | Reversible
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)
 
@@ -38,6 +38,13 @@ class JointRows(eqx.Module):
         """The rows of the base regressor of a robot whose geometry is known."""
         n = (base.model.robot.joints,)
         return cls.of(base, base.columns, n, n, n)
+
+    @property
+    def for_gradients(self) -> "JointRows":
+        """The same rows for `grad` and `vjp`, which JAX then traces faster; not for `jvp`."""
+        if isinstance(self.lowered, Reversible):
+            return self
+        return JointRows(Reversible(self.lowered), self.columns, self.size)
 
     def __call__(self, *arrays: AnyArray) -> list[Float[Array, "*batch columns samples"]]:
         """The columns of each joint.

@@ -61,7 +61,7 @@ class InformationMap(eqx.Module):
     ) -> "InformationMap":
         """Evaluates a motion at few samples, and counts them as if all had been measured."""
         motion = basis.rows(basis.times(evaluated))[:3]
-        rows = JointRows.of_base(base)
+        rows = JointRows.of_base(base).for_gradients
         return cls(rows, motion, measured / evaluated, weights, prior, sizes)
 
     def __call__(self, x: Float[AnyArray, "starts joints variables"]) -> Information:

@@ -5,6 +5,7 @@ equal expressions; what is left is a straight line of operations, a `Program`.
 `lower` runs it in JAX, `evaluate` in NumPy, `to_c` writes it down in C.
 """
 
+from jaxid.program.adjoint import Reversible as Reversible
 from jaxid.program.c import to_c as to_c
 from jaxid.program.evaluate import evaluate as evaluate
 from jaxid.program.evaluate import evaluate_packed as evaluate_packed

@@ -1,7 +1,7 @@
 """A scalar program as a fused XLA computation on batch-last arrays."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from jaxid.program.program import Program
 from jaxid.program.sincos import sine_cosine as polynomial_sine_cosine
 from jaxid.types import AnyArray, Array
 
-_JAX: dict[Operation, Callable] = {
+ELEMENTWISE: dict[Operation, Callable] = {
     Operation.ADD: lambda x, y: x + y,
     Operation.SUBTRACT: lambda x, y: x - y,
     Operation.MULTIPLY: lambda x, y: x * y,
@@ -48,8 +48,22 @@ _JAX: dict[Operation, Callable] = {
     Operation.EXPONENTIAL_MINUS_ONE: jnp.expm1,
     Operation.LOGARITHM_OF_ONE_PLUS: jnp.log1p,
 }
-_CIRCULAR = (Operation.SINE, Operation.COSINE)
+CIRCULAR = (Operation.SINE, Operation.COSINE)
 SineCosine = Callable[[Array], tuple[Array, Array]]
+
+
+class Values(NamedTuple):
+    """Everything that a program has computed.
+
+    Attributes:
+        nodes: For each node its array.
+        pairs: Sines and cosines by their angles' positions.
+        anchor: What the fences hold on to.
+    """
+
+    nodes: list[Array]
+    pairs: dict[int, tuple[Array, Array]]
+    anchor: Array
 
 
 class Lowered(eqx.Module):
@@ -74,16 +88,19 @@ class Lowered(eqx.Module):
             For each entry of each output, in order, an array of the batch's shape, or
             the constant that the entry always is.
         """
+        values = self.run(self.entries(*arrays), ELEMENTWISE).nodes
+        return [values[x] if isinstance(x, int) else x for x in self.program.outputs]
+
+    def entries(self, *arrays: AnyArray) -> list[Array]:
+        """The inputs with their own axes made one, and with the whole batch behind."""
         batch = self.program.batch_shape([np.shape(x) for x in arrays])
         dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
         if not jnp.issubdtype(dtype, jnp.floating):
             raise ValueError(f"A program computes with real numbers, but got arrays of {dtype}.")
-        entries = [
+        return [
             _entries(jnp.asarray(x, dtype), shape, batch)
             for x, shape in zip(arrays, self.program.input_shapes, strict=True)
         ]
-        values = self._run(entries, np.dtype(dtype))
-        return [values[x] if isinstance(x, int) else x for x in self.program.outputs]
 
     def dense(self, *arrays: AnyArray) -> Any:
         """Computes the outputs in the structure of the traced function, batch axes last.
@@ -94,8 +111,15 @@ class Lowered(eqx.Module):
         batch = self.program.batch_shape([np.shape(x) for x in arrays])
         return unpack(self.program, packed, batch, jnp.result_type(*arrays, float))
 
-    def _run(self, entries: list[Array], dtype: np.dtype) -> list[Array]:
+    def run(self, entries: list[Array], operations: dict[Operation, Callable]) -> Values:
+        """Computes all nodes.
+
+        Args:
+            entries: Of each input, its entries first.
+            operations: How each kind of operation is done.
+        """
         nodes = self.program.nodes
+        dtype = entries[0].dtype if entries else jnp.result_type(float)
         source = next((x for x in entries if x.size), jnp.zeros((1,), dtype))
         fence = self.fence
         anchor = fence.anchor(source[(0,) * source.ndim])
@@ -111,7 +135,7 @@ class Lowered(eqx.Module):
             if node.operation is Operation.INPUT:
                 number, entry = node.place
                 values.append(entries[number][entry])
-            elif node.operation in _CIRCULAR:
+            elif node.operation in CIRCULAR:
                 (angle,) = node.uses
                 if angle not in pairs:
                     pairs[angle] = circular(values[angle], anchor)
@@ -120,9 +144,42 @@ class Lowered(eqx.Module):
                 operands = [values[x] if isinstance(x, int) else x for x in node.operands]
                 if node.operation is Operation.SELECT:
                     operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
-                value = _JAX[node.operation](*operands)
+                value = operations[node.operation](*operands)
                 values.append(fence(value, anchor) if position in self.fenced else value)
-        return values
+        return Values(values, pairs, anchor)
+
+
+def primitives(like: Array) -> dict[Operation, Callable]:
+    """The operations with JAX's own primitives for the arithmetic.
+
+    They skip what array operators do about types and shapes: a program is traced in a fraction of
+    the time. Only where nothing is differentiated, since JAX differentiates operators faster.
+
+    Args:
+        like: Some array of the batch's shape.
+    """
+    numbers: dict[bytes, Array] = {}
+
+    def whole(x: Array | float) -> Array:
+        """A number as an array, made once."""
+        if not isinstance(x, float):
+            return x
+        # Plus and minus zero are equal, but not the same.
+        bits = np.float64(x).tobytes()
+        if bits not in numbers:
+            numbers[bits] = jax.lax.full_like(like, x)
+        return numbers[bits]
+
+    def on_arrays(primitive: Callable) -> Callable:
+        return lambda *operands: primitive(*map(whole, operands))
+
+    return ELEMENTWISE | {
+        Operation.ADD: on_arrays(jax.lax.add),
+        Operation.SUBTRACT: on_arrays(jax.lax.sub),
+        Operation.MULTIPLY: on_arrays(jax.lax.mul),
+        Operation.DIVIDE: on_arrays(jax.lax.div),
+        Operation.NEGATE: on_arrays(jax.lax.neg),
+    }
 
 
 def lower(
@@ -166,7 +223,7 @@ def _entries(x: Array, shape: tuple[int, ...], batch: tuple[int, ...]) -> Array:
 
 def _input_angles(program: Program) -> list[int]:
     """Positions of the inputs of which a sine or a cosine is taken."""
-    angles = {n.uses[0]: None for n in program.nodes if n.operation in _CIRCULAR}
+    angles = {n.uses[0]: None for n in program.nodes if n.operation in CIRCULAR}
     return [k for k in angles if program.nodes[k].operation is Operation.INPUT]
 
 
