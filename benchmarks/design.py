@@ -9,27 +9,12 @@ import numpy as np
 HARMONICS, SAMPLES, OMEGA = 5, 800, 2 * np.pi / 10
 
 
-def packed_rows(base):
+def joint_rows(base):
     """A function of a motion: for each joint its rows [columns that act on it, samples]."""
-    import jax.numpy as jnp
+    from jaxid.dynamics.joint_rows import JointRows
 
-    from jaxid.dynamics.compiled import acting_columns
-    from jaxid.dynamics.machine import program_of
-    from jaxid.program import Reversible, lower
-
-    n = (base.model.robot.joints,)
-    lowered = Reversible(lower(program_of(base, base.columns, n, n, n)))
-    columns = acting_columns(base)
-
-    def rows(motion):
-        entries = lowered(motion.q.T, motion.qd.T, motion.qdd.T)
-        samples = motion.q.shape[0]
-        return [
-            jnp.stack([jnp.broadcast_to(entries[j * base.size + k], (samples,)) for k in acting])
-            for j, acting in enumerate(columns)
-        ]
-
-    return rows, columns
+    rows = JointRows.of_base(base).for_gradients
+    return lambda motion: rows(motion.q.T, motion.qd.T, motion.qdd.T), rows.columns
 
 
 def gram_product():
@@ -48,7 +33,7 @@ def design_cost(base, series):
     import jaxid as jid
     from jaxid.trajectory.fourier import FourierSeries
 
-    rows, columns = packed_rows(base)
+    rows, columns = joint_rows(base)
     gram = gram_product()
     # t is fixed, so sines and cosines of the base motion are constants.
     t = np.linspace(0.0, 2 * np.pi / OMEGA, SAMPLES, endpoint=False)

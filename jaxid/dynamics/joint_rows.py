@@ -52,6 +52,9 @@ class JointRows(eqx.Module):
         Args:
             arrays: The definition's arguments, batch and samples last.
         """
+        if isinstance(self.lowered, Reversible):
+            groups = [[j * self.size + k for k in own] for j, own in enumerate(self.columns)]
+            return self.lowered.stacked(tuple(map(tuple, groups)), *arrays)
         batch = jnp.shape(arrays[0])[1:]
         packed = self.lowered(*arrays)
         dtype = jnp.result_type(*arrays)

@@ -72,6 +72,27 @@ def test_single_precision_broadcasting_and_no_samples():
     assert_close(pulled(Reversible(lowered), q[:, :0], p[:, :0])[1], (q[:, :0], p[:, :0]))
 
 
+@pytest.mark.parametrize("batch", [(), (5,), (2, 5)], ids=str)
+def test_stacked_entries(batch):
+    lowered = lower(trace(chain, (3,), (3,)))
+    x = [jnp.asarray(a) for a in samples(5, batch)]
+    size = len(lowered.program.outputs)
+    groups = (tuple(range(size)), (size - 1, 0, 0), ())
+    axis = max(len(batch) - 1, 0)
+
+    def one_by_one(*x):
+        packed = [jnp.broadcast_to(y, batch) for y in lowered(*x)]
+        arrays = [jnp.stack([packed[k] for k in group], axis) for group in groups[:2]]
+        return [*arrays, jnp.zeros((*batch[:axis], 0, *batch[axis:]))]
+
+    def both(function):
+        values, pull = jax.vjp(function, *x)
+        return values, pull([jnp.cos(y) for y in values])
+
+    found = jax.jit(lambda: both(lambda *x: Reversible(lowered).stacked(groups, *x)))()
+    assert_close(found, jax.jit(lambda: both(one_by_one))())
+
+
 def test_results_that_never_vary():
     lowered = lower(trace(lambda q: jnp.stack([0.0 * q[0], 0.0 * q[1] + 2.0]), (3,)))
     assert Reversible(lowered)(np.ones((3, 4))) == [0.0, 2.0]
