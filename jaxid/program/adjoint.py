@@ -40,7 +40,7 @@ class Reversible(eqx.Module):
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
         """Computes the packed result, as `Lowered` does."""
         entries, varying = self.lowered.entries(*arrays), _varying(self.program)
-        values = _values(self.lowered, entries) if varying else []
+        values: Any = _values(self.lowered, entries) if varying else []
         found = dict(zip(varying, values, strict=True))
         return [found[x] if isinstance(x, int) else x for x in self.program.outputs]
 
@@ -54,7 +54,8 @@ class Reversible(eqx.Module):
         Returns:
             For each group an array whose last axis but one counts its entries.
         """
-        return _stacked(self.lowered, groups, self.lowered.entries(*arrays))
+        stacked: Any = _stacked(self.lowered, groups, self.lowered.entries(*arrays))
+        return stacked
 
 
 def _varying(program: Program) -> list[int]:

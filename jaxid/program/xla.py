@@ -160,7 +160,7 @@ def primitives(like: Array) -> dict[Operation, Callable]:
     """
     numbers: dict[bytes, Array] = {}
 
-    def whole(x: Array | float) -> Array:
+    def whole(x: Any) -> Array:
         """A number as an array, made once."""
         if not isinstance(x, float):
             return x
