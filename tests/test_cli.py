@@ -439,7 +439,7 @@ def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch)
     def shapes(*args, **kwargs):
         return np.zeros(3) + np.zeros(4)
 
-    monkeypatch.setattr(cli, "validate", shapes)
+    monkeypatch.setattr("jaxid.cli.commands.validate", shapes)
     monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
     with pytest.raises(ValueError, match="broadcast"):
         cli.main()

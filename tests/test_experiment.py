@@ -521,7 +521,7 @@ def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):
 def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     text = write_template(tmp_path / "arm.urdf", folder=tmp_path)
-    tool = r"^# (?=\[(robot.tool|collision)\]|mass = |centre_of_mass = )"
+    tool = r"^# (?=\[(robot.tool|load|collision)\]|mass = |centre_of_mass = )"
     text = re.sub(tool, "", text, flags=re.M)
     path = tmp_path / "experiment.toml"
     keys = dict.fromkeys(re.findall(r"^# ?(\w+) = ", text, flags=re.M))

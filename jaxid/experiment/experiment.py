@@ -22,7 +22,7 @@ from jaxid.experiment.method_tables import (
     build_terms,
 )
 from jaxid.experiment.reading import read_tables
-from jaxid.experiment.robot_tables import build_robot, within
+from jaxid.experiment.robot_tables import build_load, build_robot, within
 from jaxid.experiment.tables import ExcitationTable, RecordingTable, RobotTable
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.filter_choice import FilterCandidate
@@ -39,13 +39,15 @@ from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
+from jaxid.measurement.delay import remove_delay
 from jaxid.measurement.filters import AbstractFilter
 from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.parts import estimated_rows
 from jaxid.measurement.read import read_recording
 from jaxid.measurement.recording import Recording
+from jaxid.measurement.survey import NeedsMemory
 from jaxid.robot.collision import CollisionModel
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import Robot, Tool
 from jaxid.types import Float
 
 LONG = 500_000
@@ -66,6 +68,7 @@ class Experiment:
         clearance: Least distance between what may not touch [m].
         recording: The table of the log's columns; None if the file has none.
         columns: The same as the reader needs them; None if the file has none.
+        load: What is on the robot in some logs only, and known; None if the file does not say.
         filter: For motion, forces and columns.
         decimation: For forces and columns.
         slow: Speeds below which rows do not count [rad/s or m/s]; None if all count.
@@ -87,6 +90,7 @@ class Experiment:
     clearance: float
     recording: RecordingTable | None
     columns: Columns | None
+    load: Tool | None
     filter: AbstractFilter
     decimation: AbstractDecimation
     slow: Float[np.ndarray, " joints"] | None
@@ -160,13 +164,15 @@ class Experiment:
                 f"{self.robot.joints} joints: "
                 "name one column for each joint, or choose another robot (`robot.tip`)."
             )
-        if table.start is None and table.stop is None:
-            return recording
         with within(self.path.name, "recording"):
-            return recording.crop(
-                -np.inf if table.start is None else table.start,
-                np.inf if table.stop is None else table.stop,
-            )
+            if table.start is not None or table.stop is not None:
+                recording = recording.crop(
+                    -np.inf if table.start is None else table.start,
+                    np.inf if table.stop is None else table.stop,
+                )
+            if table.force_delay:
+                recording = remove_delay(recording, table.force_delay)
+        return recording
 
     def observe(self, recording: Recording) -> Observations:
         """Filters a recording and makes rows of it, as the tables `[filter]` and `[rows]` say.
@@ -194,6 +200,8 @@ class Experiment:
         """
         log = Path(log)
         table, columns = self._columns_of(log)
+        if table.force_delay:
+            raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
         return open_log(
             log,
             columns,
@@ -258,6 +266,10 @@ def load_experiment(path: str | Path) -> Experiment:
     collision = build_collision(tables, robot, path)
     with within(path.name, "recording"):
         columns = build_columns(tables.recording, robot)
+    load = None
+    if tables.load is not None:
+        with within(path.name, "load"):
+            load = build_load(robot, tables.load)
     with within(path.name, "filter"):
         filtering, said = build_filter(tables.filter)
         notes += said
@@ -281,6 +293,7 @@ def load_experiment(path: str | Path) -> Experiment:
         clearance=0.0 if tables.collision is None else tables.collision.distance,
         recording=tables.recording,
         columns=columns,
+        load=load,
         filter=filtering,
         decimation=decimation,
         slow=slow,

@@ -6,9 +6,14 @@ import stat
 import sys
 from pathlib import Path
 
-from jaxid.report import compared_files, content
+from jaxid.report import compared_files, content, found
 
-WRITTEN = (("result.json", content.SCHEMA), ("comparison.json", compared_files.SCHEMA))
+WRITTEN = (
+    ("result.json", content.SCHEMA),
+    ("comparison.json", compared_files.SCHEMA),
+    ("payload.json", found.PAYLOAD),
+    ("gains.json", found.GAINS),
+)
 """Files by which earlier results are known, and their schemas."""
 
 
@@ -38,8 +43,8 @@ def _is_report(folder: Path) -> bool:
 
 def _has(path: Path, schema: str) -> bool:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        return str(found["schema"]).startswith(schema.split("/")[0])
+        held = json.loads(path.read_text(encoding="utf-8"))
+        return str(held["schema"]).startswith(schema.split("/")[0])
     except (OSError, ValueError, KeyError, TypeError):
         return False
 

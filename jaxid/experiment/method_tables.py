@@ -138,7 +138,13 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
             "give `time` (the column of the time stamps) or `sample_time` [s] (rows equally far "
             f"apart): {came}."
         )
-    for name in ("torque_constants", "angle_signs", "force_signs", "angle_offsets"):
+    for name in (
+        "torque_constants",
+        "angle_signs",
+        "force_signs",
+        "angle_offsets",
+        "force_gains",
+    ):
         each(robot, name, getattr(table, name))
     forces_side = table.side if table.forces_side is None else table.forces_side
     if table.side == "joint":
@@ -164,6 +170,7 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
         angle_signs=table.angle_signs,
         force_signs=table.force_signs,
         angle_offsets=table.angle_offsets,
+        force_gains=table.force_gains,
         angles_on_motor_side=table.side == "motor",
         forces_on_motor_side=forces_side == "motor",
     )

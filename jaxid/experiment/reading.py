@@ -35,6 +35,8 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "model": tables.ModelTable,
     "model.coulomb": tables.CoulombTable,
     "recording": tables.RecordingTable,
+    "load": tables.ToolTable,
+    "load.inertia": tables.InertiaTable,
     "rows": tables.RowsTable,
     "estimator": tables.EstimatorTable,
     "excitation": tables.ExcitationTable,

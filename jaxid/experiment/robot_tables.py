@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import equinox as eqx
 import numpy as np
@@ -61,7 +62,7 @@ def build_robot(tables: Tables, path: Path) -> Robot:
         robot = robot.replace(name=table.name)
     if table.tool is not None:
         with within(file, "robot.tool"):
-            robot = _with_tool(robot, table.tool)
+            robot = robot.replace(tool=build_load(robot, table.tool))
     if tables.limits is not None:
         with within(file, "limits"):
             robot = robot.replace(limits=_limits(robot, tables.limits))
@@ -150,21 +151,26 @@ def _from_rows(table: RobotTable, rows: list[DhRow], R, position, tolerance: flo
     )
 
 
-def _with_tool(robot: Robot, table: ToolTable) -> Robot:
+def build_load(robot: Robot, table: ToolTable) -> Tool:
+    """A known load, in the frame of the body that carries it.
+
+    Raises:
+        ValueError: If no joint has the name that is given, or no such load could exist.
+    """
     J = None
     if table.inertia is not None:
         i = table.inertia
         J = [[i.xx, i.xy, i.xz], [i.xy, i.yy, i.yz], [i.xz, i.yz, i.zz]]
     if table.body is None:
-        return robot.with_tool(mass=table.mass, centre_of_mass=table.centre_of_mass, inertia=J)
+        loaded = robot.with_tool(mass=table.mass, centre_of_mass=table.centre_of_mass, inertia=J)
+        return cast(Tool, loaded.tool)
     if table.body not in robot.joint_names:
         raise ValueError(
             f"`body` must be the name of the joint that moves it ({_shown(robot.joint_names)}), "
             f'but is "{table.body}".'
         )
     body = robot.joint_names.index(table.body)
-    tool = Tool.of(body, mass=table.mass, centre_of_mass=table.centre_of_mass, inertia=J)
-    return robot.replace(tool=tool)
+    return Tool.of(body, mass=table.mass, centre_of_mass=table.centre_of_mass, inertia=J)
 
 
 def _limits(robot: Robot, table: LimitsTable) -> Limits:

@@ -44,7 +44,7 @@ class InertiaTable(_Table, frozen=True):
 
 
 class ToolTable(_Table, frozen=True):
-    """A known load: it is subtracted, not identified."""
+    """A known load: as `[robot.tool]` it is subtracted; `[load]` is on the robot in some logs."""
 
     mass: Positive
     centre_of_mass: Vector
@@ -161,6 +161,8 @@ class RecordingTable(_Table, frozen=True):
     angle_signs: list[Sign] | None = None
     force_signs: list[Sign] | None = None
     angle_offsets: PerJoint | None = None
+    force_gains: list[Positive] | None = None
+    force_delay: float = 0.0
     side: Side = "joint"
     forces_side: Side | None = None
     forces_file: str | None = None
@@ -253,6 +255,7 @@ class Tables(_Table, frozen=True):
     collision: CollisionTable | None = None
     model: ModelTable = ModelTable()
     recording: RecordingTable | None = None
+    load: ToolTable | None = None
     filter: ButterworthTable | PaperTable | PeriodicTable | None = None
     rows: RowsTable = RowsTable()
     estimator: EstimatorTable = EstimatorTable()

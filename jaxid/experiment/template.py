@@ -54,6 +54,13 @@ urdf = {urdf}    # as seen from the folder of this file
 #                                     # about the centre of mass [kg m²]; a point mass if left out
 # body = {last}    # in the frame of the body that this joint moves, instead
 
+# A known load that is on the robot in some logs only: `jaxid gains` finds the drives' true forces.
+# [load]
+# mass = 5.0                          # [kg]; the other keys are those of [robot.tool]
+# centre_of_mass = [0.0, 0.0, 0.1]    # [m]
+# inertia = {{ xx = 2e-2, yy = 2e-2, zz = 1e-2, xy = 0.0, xz = 0.0, yz = 0.0 }}
+# body = {last}
+
 # The joints: {joints_said}.
 [limits]                              # one number for each joint; inf: unlimited
 {limits}
@@ -94,6 +101,8 @@ force_unit = {force_unit}
 # angle_signs = {signs}               # +1 or -1 for each joint; velocities alike
 # force_signs = {signs}               # +1 or -1 for each joint
 # angle_offsets = {zeros}             # added to the angles [rad or m]
+# force_gains = {ones}   # true forces over those of the log: `jaxid gains` finds them
+# force_delay = 0.001                 # forces stand in the log so much later than angles [s]
 side = "joint"                        # "motor": the log is of the motors, before the gears
 # forces_side = "motor"               # if the forces are on another side than the angles
 # forces_file = "torques.csv"         # if the forces lie in another file, beside the log; "{{}}"

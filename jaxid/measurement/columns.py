@@ -45,7 +45,8 @@ class Columns(eqx.Module):
     of the column of a single joint, or of a whole array (samples x joints) in NPZ and MAT files.
 
     Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and forces
-    `sign * torque constant * unit * value`; one unit serves all joints, or there is one for each.
+    `sign * gain * torque constant * unit * value`; one unit serves all joints, or there is one for
+    each.
 
     Attributes:
         angles: Joint or motor angles.
@@ -62,6 +63,7 @@ class Columns(eqx.Module):
         angle_signs: +1 or -1 for each joint, for the angles and velocities.
         force_signs: +1 or -1 for each joint.
         angle_offsets: Added to the angles [rad or m].
+        force_gains: True forces over those of the log, as a known load tells them, of 1.
         angles_on_motor_side: Whether angles and velocities are the motors', before the gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.
     """
@@ -89,6 +91,7 @@ class Columns(eqx.Module):
     angle_offsets: tuple[float, ...] | None = eqx.field(
         static=True, converter=_numbers, default=None
     )
+    force_gains: tuple[float, ...] | None = eqx.field(static=True, converter=_numbers, default=None)
     angles_on_motor_side: bool = eqx.field(static=True, default=False)
     forces_on_motor_side: bool = eqx.field(static=True, default=False)
 
@@ -118,6 +121,10 @@ class Columns(eqx.Module):
             signs = getattr(self, name)
             if signs is not None and any(abs(s) != 1 for s in signs):
                 raise ValueError(f"`{name}` must be +1 or -1 for each joint, but is {signs}.")
+        if self.force_gains is not None and not all(0 < g < np.inf for g in self.force_gains):
+            raise ValueError(
+                f"`force_gains` must be positive for each joint, but is {self.force_gains}."
+            )
         current = any(u.quantity is Quantity.CURRENT for u in _each(self.force_unit))
         if current != (self.torque_constants is not None):
             raise ValueError(
@@ -145,6 +152,7 @@ class Columns(eqx.Module):
         """Factors from the numbers in the log to forces [N m or N]."""
         scale = _factors("force_unit", self.force_unit, joints)
         scale = scale * _per_joint("force_signs", self.force_signs, joints, 1.0)
+        scale = scale * _per_joint("force_gains", self.force_gains, joints, 1.0)
         return scale * _per_joint("torque_constants", self.torque_constants, joints, 1.0)
 
 

@@ -11,6 +11,8 @@ from typing import Any
 from jaxid.files import written_whole
 from jaxid.identification.filter_choice import FilterChoice
 from jaxid.identification.fit import Fit
+from jaxid.identification.runs.run import Run
+from jaxid.identification.runs.update import save_run
 from jaxid.report.bars import error_figure
 from jaxid.report.content import Beside, parameters, result
 from jaxid.report.estimates import parameter_figure
@@ -21,6 +23,10 @@ from jaxid.validation.definiteness import Definiteness
 from jaxid.validation.errors import TorqueErrors
 
 LONGEST_NAME = 80
+RUN = "run.npz"
+"""File of a report that keeps what its logs have told, to add, compare and combine later."""
+OWN = r"torque_[A-Za-z0-9._-]+\.png|run\.npz|filter\.png"
+"""Files that not every report has; those of an earlier one go."""
 
 
 def write_report(
@@ -33,8 +39,9 @@ def write_report(
     notes: tuple[str, ...] = (),
     beside: Beside | None = None,
     choice: FilterChoice | None = None,
+    run: Run | None = None,
 ) -> list[Path]:
-    """Writes `result.json`, `parameters.csv` and the figures, all of them or nothing.
+    """Writes `result.json`, `parameters.csv`, `run.npz` and the figures, all of them or nothing.
 
     A folder that is there already keeps its other files; figures of recordings that an earlier
     report left in it go.
@@ -49,6 +56,7 @@ def write_report(
         notes: What the reader should know, in sentences.
         beside: Another way to solve the same equations.
         choice: Of the filter, where it was left to the logs.
+        run: What the recordings have told, for later runs; no `run.npz` if None.
 
     Returns:
         The files.
@@ -62,6 +70,7 @@ def write_report(
     names = ["result.json", "parameters.csv", "errors.png", "parameters.png"]
     names += ["filter.png"] if choice is not None else []
     names += [file for file, _, _ in named]
+    names += [RUN] if run is not None else []
     content["files"] = names
     with written_whole(folder) as staging:
         write_json(staging / "result.json", content)
@@ -70,6 +79,8 @@ def write_report(
         save(parameter_figure(fit), staging / "parameters.png")
         if choice is not None:
             save(filter_figure(choice), staging / "filter.png")
+        if run is not None:
+            save_run(staging / RUN, run)
         for file, role, errors in named:
             title = errors.name if errors.name == role else f"{errors.name} ({role})"
             save(torque_figure(errors, robot, title), staging / file)
@@ -119,11 +130,11 @@ def safe_name(name: str) -> str:
 
 
 def _earlier(folder: Path) -> set[str]:
-    """Figures of recordings that an earlier report in this folder says it has written."""
+    """What an earlier report in this folder says it has written, and not every report has."""
     try:
         content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
         if not str(content["schema"]).startswith("jaxid-result/"):
             return set()
-        return {f for f in content["files"] if re.fullmatch(r"torque_[A-Za-z0-9._-]+\.png", f)}
+        return {f for f in content["files"] if re.fullmatch(OWN, f)}
     except (OSError, ValueError, KeyError, TypeError):
         return set()

@@ -95,8 +95,8 @@ def identify_drive_gains(
             friction and offsets.
 
     Raises:
-        ValueError: If the runs have different base parameters, motors turn more than one axis, or
-            the load tells nothing about some gain.
+        ValueError: If the runs have different base parameters, motors turn more than one axis, the
+            robot has a known tool, or the load tells nothing about some gain.
     """
     runs = (unloaded, loaded)
     require_same_base(runs)
@@ -107,6 +107,11 @@ def identify_drive_gains(
         raise ValueError(
             f"motors of `{robot.name}` turn more than one axis, so that joints have no gains of "
             "their own: gains can be identified for independent drives only."
+        )
+    if robot.tool is not None:
+        raise ValueError(
+            f"`{robot.name}` has a known tool, whose forces were subtracted from those of nominal "
+            "gains: leave it out of the robot (`tool=None`), for its mass is found with the others."
         )
     own = own_parameters(base, varying, None)
     maps = state_maps(base.size, own, 2)

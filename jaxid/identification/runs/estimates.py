@@ -120,5 +120,9 @@ def with_covariance(
     freedom: Float[AnyArray, " base"],
 ) -> Fit:
     """A fit with estimates and an uncertainty that were found in another way."""
-    found = Uncertainty(np.asarray(covariance), np.asarray(freedom), np.asarray(covariance))
-    return dataclasses.replace(fit, parameters=np.asarray(parameters), uncertainty=found)
+    known = fit.uncertainty
+    found = Uncertainty(np.asarray(covariance), np.asarray(freedom), known.naive_covariance)
+    notes = tuple(note for note in fit.notes if note not in known.notes)
+    return dataclasses.replace(
+        fit, parameters=np.asarray(parameters), uncertainty=found, notes=notes
+    )

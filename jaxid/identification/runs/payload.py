@@ -9,14 +9,19 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.terms import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.identification.consistency.bounds import BodyBounds
+from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
+from jaxid.identification.consistency.single_body import consistent_body
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
-from jaxid.robot.robot import Tool
+from jaxid.robot.robot import Robot, Tool
 from jaxid.types import AnyArray, Array, Float
 
 TEN = len(INERTIAL_NAMES)
+LOOSE = 1e-2
+"""Bound of the error of half a squared distance, relative to it, that is good enough."""
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
 CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
 
@@ -31,6 +36,8 @@ class Payload(eqx.Module):
         estimate: What the forces say, whether such a body could exist or not.
         covariance: Of the estimate.
         freedom: Degrees of freedom of its standard deviations.
+        distance: From the estimate to the parameters, in standard deviations: below 4 nothing
+            unusual; NaN where the runs do not determine all ten.
     """
 
     body: int = eqx.field(static=True)
@@ -38,6 +45,7 @@ class Payload(eqx.Module):
     estimate: Float[AnyArray, "10"]
     covariance: Float[AnyArray, "10 10"]
     freedom: Float[AnyArray, "10"]
+    distance: float
 
     @property
     def mass(self) -> float:
@@ -76,7 +84,11 @@ class Payload(eqx.Module):
         """Mass, centre of mass, and moments of inertia about it, with their uncertainty."""
         p = jnp.asarray(self.parameters)
         J = np.asarray(jax.jacfwd(_central)(p))
-        covariance = J @ np.asarray(self.covariance) @ J.T
+        C = np.asarray(self.covariance)
+        unknown = ~np.isfinite(np.diag(C))
+        covariance = J @ np.where(np.isfinite(C), C, 0.0) @ J.T
+        lost = np.any(J[:, unknown] != 0.0, axis=1)
+        covariance[lost, lost] = np.inf
         return self._named(CENTRAL_NAMES, CENTRAL_UNITS, np.asarray(_central(p)), covariance)
 
     def _named(self, names, units, parameters, covariance) -> Estimates:
@@ -93,7 +105,12 @@ class Payload(eqx.Module):
 
 
 def identify_payload(
-    unloaded: Run, loaded: Run, *, body: int | None = None, varying: Sequence[str] | None = None
+    unloaded: Run,
+    loaded: Run,
+    *,
+    body: int | None = None,
+    varying: Sequence[str] | None = None,
+    bounds: BodyBounds | None = None,
 ) -> Payload:
     """Identifies a payload from a run without it and a run with it.
 
@@ -107,10 +124,13 @@ def identify_payload(
         body: Index of the body that carries it; that of the end-effector if None.
         varying: Names of base parameters that may differ between the runs beside the payload. If
             None, friction and offsets: they change with load and temperature.
+        bounds: What is known of the payload: `BodyBounds.of(1, mass_max=..., radius=...)`. If None,
+            wide ones from the robot's reach, which count only if the estimate could not exist.
 
     Raises:
         ValueError: If the runs have different base parameters, or the model does not have ten
             parameters for the body.
+        RuntimeError: If no body within the bounds was proved to be the nearest.
     """
     runs = (unloaded, loaded)
     require_same_base(runs)
@@ -121,7 +141,32 @@ def identify_payload(
     maps[1][:, -TEN:] = body_columns(base, body)
     found = tied(runs, maps)
     p, C = np.asarray(found.parameters)[-TEN:], np.asarray(found.covariance)[-TEN:, -TEN:]
-    return Payload(body, p, p, C, np.asarray(found.freedom)[-TEN:])
+    possible, distance = _possible(p, C, base.model.robot, bounds)
+    return Payload(body, possible, p, C, np.asarray(found.freedom)[-TEN:], distance)
+
+
+def _possible(
+    estimate: Float[np.ndarray, "10"],
+    covariance: Float[np.ndarray, "10 10"],
+    robot: Robot,
+    bounds: BodyBounds | None,
+) -> tuple[Float[np.ndarray, "10"], float]:
+    """The nearest parameters of a body that could exist, and how far they are."""
+    if not np.isfinite(covariance).all():
+        return estimate, np.nan
+    if bounds is None:
+        if share_of_a_body(estimate) >= 0:
+            return estimate, 0.0
+        wide = BodyBounds.from_geometry(robot)
+        bounds = BodyBounds.of(1, mass_max=np.max(wide.mass_max), radius=np.max(wide.radius))
+    # Estimates that are known too well, as those of noiseless data, leave no digits for a proof.
+    found = consistent_body(estimate, covariance, bounds, throw=False)
+    if not found.error_bound <= LOOSE * (1.0 + found.distance**2):
+        raise RuntimeError(
+            "no body that could exist was proved to be the nearest to the payload's estimate, "
+            f"whose mass is {estimate[0]:.4g} kg: are the runs those of the same robot?"
+        )
+    return found.parameters, found.distance
 
 
 def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:

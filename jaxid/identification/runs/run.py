@@ -13,11 +13,15 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_blocks, fit_rows
 from jaxid.identification.rows import Rows
 from jaxid.identification.runs.estimates import freedom_of, with_covariance
+from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import AbstractWeights, GivenWeights, MaximumForces
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Float
+
+ROUNDING = 1e-7
+"""Difference of predicted forces, relative to the forces, up to which estimates are the same."""
 
 
 class Run(eqx.Module):
@@ -74,9 +78,32 @@ class Run(eqx.Module):
         recordings = (observations,) if single else tuple(observations)
         rows = Rows.of(base, recordings, progress)
         chosen = MaximumForces() if weights is None else weights
-        fit = fit_rows(rows, WeightedLeastSquares(chosen))
+        return cls._fitted(rows, fit_rows(rows, WeightedLeastSquares(chosen)), name)
+
+    @classmethod
+    def of_rows(cls, rows: Rows, fit: Fit, name: str | None = None) -> "Run":
+        """What rows tell that a fit has seen.
+
+        Where the fit's estimates are not weighted least squares, as those of robust, regularised or
+        consistent estimators, the run's are found anew, with the same weights.
+
+        Args:
+            rows: Of one or several recordings.
+            fit: What was made of them.
+            name: Of the run; those of its recordings if None.
+        """
+        R, z = rows.blocks.total.weighted(np.asarray(fit.weights))
+        decomposition = Decomposition.of(R, z)
+        plain = decomposition.solve(Complete().inverse(decomposition.values))
+        same = fit.base.names == rows.base.names and is_same(R, z, plain, fit.parameters)
+        if not same:
+            fit = fit_rows(rows, WeightedLeastSquares(GivenWeights(np.asarray(fit.weights))))
+        return cls._fitted(rows, fit, name)
+
+    @classmethod
+    def _fitted(cls, rows: Rows, fit: Fit, name: str | None) -> "Run":
         return cls(
-            base=base,
+            base=rows.base,
             blocks=rows.blocks,
             weights=np.asarray(fit.weights),
             parameters=np.asarray(fit.parameters),
@@ -84,6 +111,17 @@ class Run(eqx.Module):
             freedom=freedom_of(fit),
             name=", ".join(fit.recordings) if name is None else name,
             recordings=fit.recordings,
+        )
+
+    def tells(self, fit: Fit) -> bool:
+        """Whether a fit's estimates are those of this run, up to rounding.
+
+        Args:
+            fit: Of the same rows.
+        """
+        R, z = self.factor
+        return fit.base.names == self.base.names and is_same(
+            R, z, np.asarray(self.parameters), fit.parameters
         )
 
     @property
@@ -114,6 +152,24 @@ class Run(eqx.Module):
             for part in self.blocks.parts
         )
         return dataclasses.replace(self, blocks=Blocks(parts), weights=np.asarray(weights))
+
+
+def is_same(
+    R: Float[np.ndarray, "height base"],
+    z: Float[np.ndarray, " height"],
+    first: Float[AnyArray, " base"],
+    second: Float[AnyArray, " base"],
+) -> bool:
+    """Whether two sets of estimates predict the same forces, up to rounding.
+
+    Args:
+        R: Factor of the weighted rows.
+        z: Its right-hand side.
+        first: Some estimates.
+        second: Others.
+    """
+    apart = np.linalg.norm(R @ (np.asarray(first) - np.asarray(second)))
+    return bool(apart <= ROUNDING * np.linalg.norm(z))
 
 
 def require_same_base(runs: Sequence[Run]) -> None:

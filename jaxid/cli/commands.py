@@ -1,25 +1,27 @@
-"""The command line: `jaxid init`, `inspect`, `excite`, `identify`, `compare` and `example`."""
+"""The commands `jaxid init`, `example`, `inspect`, `excite`, `identify`; what all run through."""
 
 import dataclasses
+import functools
 import importlib.metadata
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
 import jax
 import typer
-from rich.console import Console
 from rich.text import Text
-from typer.core import TyperCommand
 
+from jaxid.cli import runs
+from jaxid.cli.options import ExperimentFile, Force, SpreadLogs, open_console, open_stages
 from jaxid.experiment import terminal
 from jaxid.experiment.excite import design, side_by_side, write
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import output_folder, refuse_foreign_folder
+from jaxid.experiment.lateness import delay_doubts
 from jaxid.experiment.loading import Loaded, choose, load_log, observe_all
 from jaxid.experiment.mistakes import likely_mistake
-from jaxid.experiment.progress import Stages, designing, stages
+from jaxid.experiment.progress import Stages, designing
+from jaxid.experiment.runs import earlier_run, is_report
 from jaxid.experiment.sanity import negative_friction
 from jaxid.experiment.show_excited import show_excited, show_side_by_side
 from jaxid.experiment.template import write_template
@@ -27,18 +29,16 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.rows import Rows
-from jaxid.identification.runs.comparison import Comparison
+from jaxid.identification.runs.run import Run
+from jaxid.identification.runs.update import update
 from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
 from jaxid.program.cache import keep_compiled
-from jaxid.report.compared_files import read_estimates, write_comparison
 from jaxid.report.content import Beside
 from jaxid.report.write import write_report
 from jaxid.validation.validate import validate
 
 DISTRIBUTION = "jaxid-robotics"
-WIDTH = 100
-"""Of what is written where there is no terminal."""
 
 app = typer.Typer(
     name="jaxid",
@@ -48,34 +48,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-ExperimentFile = Annotated[
-    Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
-]
-
-Force = Annotated[
-    bool, typer.Option("--force", help="Write into a folder that holds other files too.")
-]
-
-
-class SpreadVerify(TyperCommand):
-    """Takes `--verify b.csv c.csv` for `--verify b.csv --verify c.csv`; `--verify=b.csv` alike.
-
-    Otherwise the second log would silently be used to identify.
-    """
-
-    def parse_args(self, ctx, args):
-        """Repeats the option before each log that follows it."""
-        spread, verifying = [], False
-        for arg in args:
-            if arg == "--verify":
-                verifying = True
-            elif arg.startswith("-"):
-                verifying = arg.startswith("--verify=")
-                spread.append(arg)
-            else:
-                spread += ["--verify", arg] if verifying else [arg]
-        return super().parse_args(ctx, spread)
 
 
 def main() -> None:
@@ -87,15 +59,8 @@ def main() -> None:
     except (ValueError, OSError, RuntimeError) as error:
         if not is_for_the_user(error):
             raise
-        _console(stderr=True).print(Text(f"jaxid: {sentence(error)}"), soft_wrap=True)
+        open_console(stderr=True).print(Text(f"jaxid: {sentence(error)}"), soft_wrap=True)
         raise SystemExit(2) from None
-
-
-def _console(stderr: bool = False) -> Console:
-    console = Console(stderr=stderr, highlight=False)
-    if not console.is_terminal and "COLUMNS" not in console._environ:
-        console.width = WIDTH
-    return console
 
 
 @app.callback(invoke_without_command=True)
@@ -107,7 +72,7 @@ def _options(
             shown = importlib.metadata.version(DISTRIBUTION)
         except importlib.metadata.PackageNotFoundError:
             shown = "(not installed)"
-        _console().print(Text(f"jaxid {shown}"))
+        open_console().print(Text(f"jaxid {shown}"))
         raise typer.Exit
 
 
@@ -143,8 +108,8 @@ def example(
     """
     from jaxid.simulation.example import write_example
 
-    console = _console()
-    with _stages(1) as stage:
+    console = open_console()
+    with open_stages(1) as stage:
         stage("simulating")
         files = write_example(folder, seed=seed)
     for file in files:
@@ -170,11 +135,11 @@ def inspect(
     Joints, motors and limits; base parameters and what becomes of each standard parameter; ranges,
     speeds and forces of each log beside the limits, and what the log does not determine.
     """
-    console = _console()
+    console = open_console()
     loaded = load_experiment(experiment)
     paths = logs or []
     choices = len(paths) + 1 if loaded.candidates else 0
-    with _stages(1 + choices + 3 * len(paths)) as stage:
+    with open_stages(1 + choices + 4 * len(paths)) as stage:
         stage("finding base parameters")
         _ = loaded.base.expressions
         loaded, _ = choose(loaded, paths, stage)
@@ -182,21 +147,24 @@ def inspect(
     terminal.show_robot(console, loaded)
     terminal.show_base(console, loaded.base)
     terminal.sentences(console, loaded.notes)
-    for log, fit in seen:
+    for log, fit, mistakes in seen:
         terminal.show_recording(console, log.recording)
-        doubts = (*negative_friction(fit), *likely_mistake(loaded.base, log.observations))
+        doubts = (*negative_friction(fit), *mistakes)
         terminal.show_check(console, loaded.robot, log.check, doubts)
         console.print()
         terminal.show_rows(console, (log.observations,), fit)
         terminal.show_undetermined(console, fit, loaded.regularised)
 
 
-def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fit]:
+def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fit, tuple[str, ...]]:
     log = load_log(experiment, path, stage)
     stage(f"factorising {path.name}")
     progress = stage.through(log.recording.samples)
-    fit = estimate(experiment.base, log.observations, experiment.estimator, progress)
-    return log, fit
+    base, observations = experiment.base, log.observations
+    fit = estimate(base, observations, experiment.estimator, progress)
+    stage(f"looking for slips in {path.name}")
+    slips = likely_mistake(base, observations)
+    return log, fit, slips or delay_doubts(base, observations, fit)
 
 
 @app.command()
@@ -218,7 +186,7 @@ def excite(
     joints and end-effector in a folder, and the state of the design until it is done. Ctrl-C keeps
     the best motion so far.
     """
-    console = _console()
+    console = open_console()
     loaded = load_experiment(experiment)
     state = output.with_suffix(".state.npz")
     with designing(console) as tell:
@@ -235,12 +203,16 @@ def excite(
     terminal.show_files(console, output.parent, names)
 
 
-@app.command(cls=SpreadVerify)
+@app.command(cls=SpreadLogs)
 def identify(
     experiment: ExperimentFile,
     logs: Annotated[
         list[Path],
-        typer.Argument(help="Logs to identify with, fitted together.", metavar="LOG"),
+        typer.Argument(
+            help="Logs to identify with, fitted together; the folder of an earlier report stands "
+            "for the logs it was made of.",
+            metavar="LOG",
+        ),
     ],
     verify: Annotated[
         list[Path] | None,
@@ -265,7 +237,7 @@ def identify(
 
     With their uncertainty, what the logs do not determine, torque errors and figures.
     """
-    console = _console()
+    console = open_console()
     if split is not None and not 0 < split < 1:
         raise ValueError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
     twice = {p.resolve() for p in logs} & {p.resolve() for p in verify or []}
@@ -277,8 +249,15 @@ def identify(
     refuse_foreign_folder(output, force)
     loaded = load_experiment(experiment)
     others = verify or []
+    given, logs = logs, [p for p in logs if not is_report(p)]
+    reports = [p for p in given if is_report(p)]
+    if not logs:
+        raise ValueError(
+            "folders of earlier reports stand for their logs, but at least one log must be given "
+            "as a file, for torque errors and figures."
+        )
     choices = len(logs) + 1 if loaded.candidates else 0
-    with _stages(4 + choices + 2 * (len(logs) + len(others))) as stage:
+    with open_stages(4 + choices + 2 * (len(logs) + len(others))) as stage:
         loaded, choice = choose(loaded, logs, stage, split)
         fitted, checked, said, doubts = observe_all(loaded, logs, others, stage)
         if split is not None:
@@ -291,11 +270,15 @@ def identify(
         stage("factorising the rows")
         rows = Rows.of(base, fitted, stage.through(sum(map(_samples, fitted))))
         fit = loaded.fit(rows, stage.through(sum(map(_samples, fitted))))
+        run = Run.of_rows(rows, fit)
+        if reports:
+            fit, run = _together(loaded, reports, fit, run)
         stage("predicting torques")
         through = stage.through(max(map(_samples, [*fitted, *checked])))
         found = validate(fit, [*fitted, *checked], progress=through)
         beside = None
-        if loaded.regularised or loaded.single_axes is not None or fit.undetermined:
+        doubtful = loaded.regularised or loaded.single_axes is not None or fit.undetermined
+        if doubtful and not reports:
             same = rows if fit.base is base else Rows.of(fit.base, fitted)
             other = fit_rows(same, loaded.other_estimator)
             ways = None if loaded.single_axes is None else ("axis by axis", "at once")
@@ -311,7 +294,7 @@ def identify(
             {
                 "experiment": str(experiment),
                 "experiment_text": loaded.text,
-                "identification": [str(p) for p in logs],
+                "identification": [str(p) for p in given],
                 "verification": [str(p) for p in others],
                 "split": split,
                 "filter": str(loaded.filter),
@@ -321,6 +304,7 @@ def identify(
             (*loaded.notes, *dict.fromkeys(logs_said), *doubts),
             beside,
             choice,
+            run,
         )
     terminal.show_robot(console, loaded)
     console.print()
@@ -339,38 +323,16 @@ def identify(
     terminal.show_files(console, output, [p.name for p in files])
 
 
-@app.command()
-def compare(
-    first: Annotated[
-        Path, typer.Argument(help="Report of one run, like that of the cold robot.", metavar="COLD")
-    ],
-    second: Annotated[
-        Path, typer.Argument(help="Report of another run of the same robot.", metavar="WARM")
-    ],
-    level: Annotated[
-        float, typer.Option("--level", metavar="L", help="Confidence of the decisions, of 1.")
-    ] = 0.95,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of table and figure.")
-    ] = Path("comparison"),
-    force: Force = False,
-) -> None:
-    """Decide which parameters have changed between two runs.
-
-    Each argument is a folder that `jaxid identify` has written.
-    """
-    console = _console()
-    if first.resolve() == second.resolve():
-        raise ValueError(f"`{first}` is given twice: compare two different runs.")
-    refuse_foreign_folder(output, force)
-    twins = first.resolve().name == second.resolve().name
-    cold, warm = (read_estimates(path, str(path) if twins else None) for path in (first, second))
-    found = Comparison.of(cold, warm, level)
-    with _stages(1) as stage:
-        stage("drawing")
-        files = write_comparison(output, found, (first, second))
-    terminal.show_comparison(console, found)
-    terminal.show_files(console, output, [p.name for p in files])
+def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -> tuple[Fit, Run]:
+    """A run with what earlier reports know, as if all logs had been fitted at once."""
+    if not run.tells(fit):
+        raise ValueError(
+            f"{experiment.path.name}: earlier reports can be added to plain least squares only, "
+            f"but the estimator is {fit.estimator}: leave `[estimator]` out, or give the logs "
+            "themselves."
+        )
+    whole = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), run])
+    return whole.fit, whole
 
 
 def _named(observations: Observations | LongLog, name: str) -> Observations | LongLog:
@@ -383,9 +345,6 @@ def _samples(observations: Observations | LongLog) -> int:
     return len(source(observations)[0].time)
 
 
-def _stages(total: int) -> AbstractContextManager[Stages]:
-    return stages(_console(stderr=True), total)
-
-
-if __name__ == "__main__":
-    main()
+app.command()(runs.compare)
+app.command(cls=SpreadLogs)(runs.payload)
+app.command(cls=SpreadLogs)(runs.gains)

@@ -1,0 +1,4 @@
+"""The command line: what `jaxid …` does."""
+
+from jaxid.cli.commands import app as app
+from jaxid.cli.commands import main as main

@@ -1,0 +1,235 @@
+"""Commands for several runs of one robot: `jaxid compare`, `payload` and `gains`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from jaxid.cli.options import ExperimentFile, Force, open_console, open_stages
+from jaxid.experiment import terminal
+from jaxid.experiment.experiment import Experiment, load_experiment
+from jaxid.experiment.folder import refuse_foreign_folder
+from jaxid.experiment.loading import choose
+from jaxid.experiment.runs import is_report, read_run
+from jaxid.identification.runs.comparison import Comparison
+from jaxid.identification.runs.drive_gains import identify_drive_gains
+from jaxid.identification.runs.payload import Payload, identify_payload
+from jaxid.identification.runs.run import Run
+from jaxid.report.compared_files import read_estimates, write_comparison
+from jaxid.report.found import GAINS, PAYLOAD, estimate_table, write_found
+from jaxid.report.numbers import significant
+
+Unloaded = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Logs without the load, or folders of reports on such logs.", metavar="LOG"
+    ),
+]
+Loaded = Annotated[
+    list[Path],
+    typer.Option("--loaded", metavar="LOG...", help="Logs with the load, or folders of reports."),
+]
+UNUSUAL = 4.0
+"""Distance of an estimate from what could exist, in standard deviations, that needs a word."""
+
+
+def compare(
+    first: Annotated[
+        Path, typer.Argument(help="Report of one run, like that of the cold robot.", metavar="COLD")
+    ],
+    second: Annotated[
+        Path, typer.Argument(help="Report of another run of the same robot.", metavar="WARM")
+    ],
+    level: Annotated[
+        float, typer.Option("--level", metavar="L", help="Confidence of the decisions, of 1.")
+    ] = 0.95,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of table and figure.")
+    ] = Path("comparison"),
+    force: Force = False,
+) -> None:
+    """Decide which parameters have changed between two runs.
+
+    Each argument is a folder that `jaxid identify` has written.
+    """
+    console = open_console()
+    if first.resolve() == second.resolve():
+        raise ValueError(f"`{first}` is given twice: compare two different runs.")
+    refuse_foreign_folder(output, force)
+    twins = first.resolve().name == second.resolve().name
+    cold, warm = (read_estimates(path, str(path) if twins else None) for path in (first, second))
+    found = Comparison.of(cold, warm, level)
+    with open_stages(1) as stage:
+        stage("drawing")
+        files = write_comparison(output, found, (first, second))
+    terminal.show_comparison(console, found)
+    terminal.show_files(console, output, [p.name for p in files])
+
+
+def payload(
+    experiment: ExperimentFile,
+    logs: Unloaded,
+    loaded: Loaded,
+    body: Annotated[
+        str | None,
+        typer.Option(
+            "--body", metavar="JOINT", help="The joint that moves the body with the payload."
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the result.")
+    ] = Path("payload"),
+    force: Force = False,
+) -> None:
+    """Find a payload's mass, centre of mass and moments of inertia.
+
+    From logs without it and logs with it. Friction may differ between them.
+    """
+    refuse_foreign_folder(output, force)
+    described = load_experiment(experiment)
+    carrier = _body(described, body)
+    pair, doubts = _pair(described, logs, loaded)
+    found = identify_payload(*pair, body=carrier)
+    name = described.robot.joint_names[found.body]
+    content = {
+        "body": name,
+        "mass": found.mass,
+        "centre_of_mass": found.centre_of_mass,
+        "inertia": found.inertia,
+        "estimate": found.estimate,
+        "distance": found.distance,
+    }
+    sources = {"unloaded": logs, "loaded": loaded}
+    files = write_found(output, PAYLOAD, [found.estimates, found.central], content, sources)
+    console = open_console()
+    said = f"payload on the body of `{name}`, in its frame; moments about the centre of mass"
+    terminal.heading(console, said)
+    console.print(estimate_table(found.central))
+    console.print()
+    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
+    _show_possible(console, found)
+    _show_lines(
+        console, "to subtract it from other logs, in the experiment file:", _tool(found, name)
+    )
+    terminal.show_files(console, output, [p.name for p in files])
+
+
+def gains(
+    experiment: ExperimentFile,
+    logs: Unloaded,
+    loaded: Loaded,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the result.")
+    ] = Path("gains"),
+    force: Force = False,
+) -> None:
+    """Find the drives' true forces, like torque constants, with a load that is known.
+
+    From logs without it and logs with it; the table `[load]` of the experiment file describes it.
+    """
+    refuse_foreign_folder(output, force)
+    described = load_experiment(experiment)
+    if described.load is None:
+        raise ValueError(
+            f"{described.path.name}: the table `[load]` is missing: `mass`, `centre_of_mass` and "
+            "`inertia` of what is on the robot in the logs behind `--loaded`."
+        )
+    pair, doubts = _pair(described, logs, loaded)
+    found = identify_drive_gains(*pair, described.load)
+    key, values = _corrected(described, np.asarray(found.gains))
+    sources = {"unloaded": logs, "loaded": loaded}
+    files = write_found(output, GAINS, [found.estimates], {key: values}, sources)
+    console = open_console()
+    terminal.heading(console, "true forces over those of the logs")
+    console.print(estimate_table(found.estimates))
+    console.print()
+    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
+    shown = ", ".join(significant(v, 5) for v in values)
+    lines = ["[recording]", f"{key} = [{shown}]"]
+    _show_lines(console, "to use them, in the experiment file:", lines)
+    terminal.show_files(console, output, [p.name for p in files])
+
+
+def _pair(
+    experiment: Experiment, logs: list[Path], loaded: list[Path]
+) -> tuple[tuple[Run, Run], list[str]]:
+    twice = {p.resolve() for p in logs} & {p.resolve() for p in loaded}
+    if twice:
+        raise ValueError(
+            f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
+        )
+    files = [p for p in (*logs, *loaded) if not is_report(p)]
+    choices = len(files) + 1 if experiment.candidates else 0
+    with open_stages(3 + choices + 2 * len(files)) as stage:
+        stage("finding base parameters")
+        _ = experiment.base
+        experiment, _ = choose(experiment, files, stage)
+        without, first = read_run(experiment, logs, stage, "unloaded")
+        laden, second = read_run(experiment, loaded, stage, "loaded")
+    return (without, laden), [*first, *second]
+
+
+def _body(experiment: Experiment, joint: str | None) -> int | None:
+    names = experiment.robot.joint_names
+    if joint is None:
+        return None
+    if joint not in names:
+        raise ValueError(f"`--body` must be one of {', '.join(names)}, but is `{joint}`.")
+    return names.index(joint)
+
+
+def _show_possible(console: Console, found: Payload) -> None:
+    if not np.isfinite(found.distance):
+        text = (
+            "the logs do not determine all ten parameters of the payload: move the joints that "
+            "carry it in more poses, faster, and alike in both runs."
+        )
+        terminal.sentences(console, [text], terminal.BAD, "✗")
+    elif found.distance == 0:
+        text = "such a body could exist."
+        terminal.sentences(console, [text], terminal.GOOD, "✓")
+    else:
+        text = (
+            "the estimate itself belongs to no body: these are the parameters of the nearest one "
+            f"that could exist, {found.distance:.2g} standard deviations away."
+        )
+        usual = found.distance < UNUSUAL
+        terminal.sentences(
+            console, [text], "" if usual else terminal.DOUBTFUL, "·" if usual else "!"
+        )
+
+
+def _tool(found: Payload, joint: str) -> list[str]:
+    def listed(values: np.ndarray) -> str:
+        return ", ".join(f"{v:.6g}" for v in values)
+
+    J = found.inertia
+    keys = ("xx", "yy", "zz", "xy", "xz", "yz")
+    entries = (J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2])
+    inertia = ", ".join(f"{k} = {v:.6g}" for k, v in zip(keys, entries, strict=True))
+    return [
+        "[robot.tool]",
+        f'body = "{joint}"',
+        f"mass = {found.mass:.6g}",
+        f"centre_of_mass = [{listed(found.centre_of_mass)}]",
+        f"inertia = {{ {inertia} }}",
+    ]
+
+
+def _corrected(experiment: Experiment, gains: np.ndarray) -> tuple[str, list[float]]:
+    """The key of the file that makes forces true, and its values."""
+    columns = experiment.columns
+    if columns is not None and columns.torque_constants is not None:
+        return "torque_constants", (np.array(columns.torque_constants) * gains).tolist()
+    known = 1.0 if columns is None or columns.force_gains is None else columns.force_gains
+    return "force_gains", (np.array(known) * gains).tolist()
+
+
+def _show_lines(console: Console, text: str, lines: list[str]) -> None:
+    console.print()
+    console.print(Text(text, style="dim"))
+    for line in lines:
+        console.print(Text(line), soft_wrap=True)

@@ -1,0 +1,65 @@
+"""Runs as a command needs them: from logs, or from what reports keep of theirs."""
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxid.experiment.experiment import Experiment
+from jaxid.experiment.loading import load_log
+from jaxid.experiment.progress import Stages
+from jaxid.identification.identify import fit_rows
+from jaxid.identification.rows import Rows
+from jaxid.identification.runs.run import Run
+from jaxid.identification.runs.update import load_run, update
+from jaxid.identification.streaming_log import source
+from jaxid.report.write import RUN
+
+
+def is_report(path: Path) -> bool:
+    """Whether a path stands for the logs that a report was made of."""
+    return path.is_dir()
+
+
+def earlier_run(experiment: Experiment, folder: Path) -> Run:
+    """What a report keeps of the logs that it was made of.
+
+    Args:
+        experiment: Whose robot and model they must be of.
+        folder: That `jaxid identify` has written.
+
+    Raises:
+        ValueError: If it keeps nothing, or of another robot or model.
+    """
+    path = folder / RUN
+    if not path.is_file():
+        raise ValueError(
+            f"`{folder}` is a folder, but holds no `{RUN}`: name a log, or the folder of a report "
+            "that `jaxid identify` has written."
+        )
+    return load_run(path, experiment.base)
+
+
+def read_run(
+    experiment: Experiment, paths: Sequence[Path], stage: Stages, name: str
+) -> tuple[Run, list[str]]:
+    """Logs, and reports that stand for theirs, as one run; and doubts about the logs.
+
+    Args:
+        experiment: Whose logs they are.
+        paths: Of logs, and of folders of reports.
+        stage: Is told what is done.
+        name: Of the run.
+
+    Raises:
+        ValueError: If a log is not as the experiment's file says, or a folder holds no report.
+    """
+    earlier = [earlier_run(experiment, path) for path in paths if is_report(path)]
+    logs = [load_log(experiment, path, stage) for path in paths if not is_report(path)]
+    doubts = [f"{log.recording.name}: {said}" for log in logs for said in log.check.warnings]
+    if logs:
+        observed = [log.observations for log in logs]
+        stage(f"factorising the rows, {name}")
+        through = stage.through(sum(len(source(o)[0].time) for o in observed))
+        rows = Rows.of(experiment.base, observed, through)
+        earlier.append(Run.of_rows(rows, fit_rows(rows, experiment.estimator)))
+    return functools.reduce(update, earlier), doubts

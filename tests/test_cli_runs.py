@@ -1,0 +1,207 @@
+"""Several runs on the command line: added, with a payload, with a known load, with a delay."""
+
+import json
+import os
+import re
+
+import numpy as np
+import pytest
+from test_cli import EXPERIMENT, folder, refused, result, run, write_log  # noqa: F401
+
+import jaxid as jid
+from jaxid.dynamics.machine import in_numpy
+from jaxid.experiment.experiment import load_experiment
+
+SPATIAL = """\
+[robot]
+name = "spatial"
+convention = "modified"
+dh = [
+  { alpha = 0.0, a = 0.0, d = 0.3 },
+  { alpha = -90.0, a = 0.1, d = 0.0 },
+  { alpha = -90.0, a = 0.4, d = 0.1 },
+]
+[limits]
+force = [60, 80, 20]
+velocity = [3, 3, 3]
+[model]
+rotor_inertia = false
+[recording]
+angles = "q{}"
+forces = "tau{}"
+time = "t"
+[filter]
+kind = "butterworth"
+cutoff = 10
+[rows]
+every = 4
+"""
+LOAD = """\
+[load]
+mass = 3
+centre_of_mass = [0.02, -0.03, 0.12]
+body = "joint3"
+inertia = { xx = 0.012, yy = 0.015, zz = 0.008, xy = 0.001, yz = -0.0005 }
+"""
+GAINS = np.array([1.2, 0.85, 1.05])
+
+
+def write(path, model, p, seed, gains=1.0, late=0.0):
+    """Ten seconds of a random motion with a little noise."""
+    trajectory = jid.random_fourier_series(model.robot, omega=1.2, seed=seed)
+    t = np.arange(0.0, 10.0, 0.005)
+    felt = trajectory.motion(t - late)
+    forces = in_numpy(model, model.forces, felt.q, felt.qd, felt.qdd, shared=(p,))
+    forces = forces + np.random.default_rng(seed).normal(0.0, [0.1, 0.1, 0.03], forces.shape)
+    table = np.column_stack([t, trajectory.motion(t).q, forces / gains])
+    header = "t,q1,q2,q3,tau1,tau2,tau3"
+    np.savetxt(path, table, "%.7f", ",", header=header, comments="")
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory):
+    """Logs without and with a load, by true and by nominal gains."""
+    place = tmp_path_factory.mktemp("workshop")
+    (place / "experiment.toml").write_text(SPATIAL)
+    (place / "load.toml").write_text(SPATIAL + LOAD)
+    described = load_experiment(place / "load.toml")
+    model = described.model
+    random = np.random.default_rng(0)
+    p = random.uniform(0.2, 1.0, model.size)
+    loaded = p.copy()
+    loaded[20:30] += described.load.parameters
+    loaded[[model.parameter_names.index(f"fv{j}") for j in (1, 2, 3)]] *= 1.3
+    for k, (name, own) in enumerate((("empty", p), ("loaded", loaded))):
+        write(place / f"{name}.csv", model, own, k + 1)
+        write(place / f"{name}_nominal.csv", model, own, k + 1, GAINS)
+    write(place / "late.csv", model, p, 1, late=0.012)
+    return place
+
+
+@pytest.fixture
+def shop(workshop, tmp_path, monkeypatch):
+    """A folder to write into beside the logs."""
+    for path in workshop.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    return tmp_path
+
+
+def pasted(out, first):
+    """The lines for the experiment file that a command has printed, from one on."""
+    lines = out.splitlines()
+    start = lines.index(first)
+    return "\n".join(lines[start : lines.index("", start)]) + "\n"
+
+
+def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
+    code, out, err = run("payload", "experiment.toml", "empty.csv", "--loaded", "loaded.csv")
+    assert (code, err) == (0, "")
+    assert set(os.listdir("payload")) == {"payload.json", "payload.csv"}
+    found = json.loads((shop / "payload" / "payload.json").read_text(encoding="utf-8"))
+    assert found["body"] == "joint3"
+    assert abs(found["mass"] / 3.0 - 1.0) < 0.01
+    np.testing.assert_allclose(found["centre_of_mass"], [0.02, -0.03, 0.12], atol=3e-3)
+    assert [row["name"] for row in found["parameters"]][10:13] == ["m", "x", "y"]
+    assert "could exist" in out
+    (shop / "tool.toml").write_text(SPATIAL + pasted(out, "[robot.tool]"))
+    tool = load_experiment("tool.toml").robot.tool
+    np.testing.assert_allclose(tool.inertia, found["inertia"], rtol=1e-4)
+    assert run("identify", "experiment.toml", "empty.csv", "-o", "a")[0] == 0
+    assert run("identify", "tool.toml", "loaded.csv", "-o", "b")[0] == 0
+    code, out, _ = run("compare", "a", "b")
+    changed = [line for line in out.splitlines() if line.rstrip().endswith("  changed")]
+    assert {re.sub("  .*", "", line.strip()) for line in changed} >= {"viscous friction"}
+    assert not any("rigid bodies" in line for line in changed)
+
+
+def test_reports_stand_for_their_logs(shop, run):  # noqa: F811
+    for name in ("empty", "loaded"):
+        assert run("identify", "experiment.toml", f"{name}.csv", "-o", name)[0] == 0
+        assert "run.npz" in result(shop, name)["files"]
+    assert run("payload", "experiment.toml", "empty", "--loaded", "loaded", "-o", "p")[0] == 0
+    assert run("payload", "experiment.toml", "empty.csv", "--loaded=loaded.csv", "-o", "q")[0] == 0
+    one, other = (
+        json.loads((shop / place / "payload.json").read_text(encoding="utf-8")) for place in "pq"
+    )
+    np.testing.assert_allclose(one["estimate"], other["estimate"], rtol=1e-9, atol=1e-12)
+    assert refused(
+        run("payload", "experiment.toml", "empty", "--loaded", "empty/"),
+        "`empty` is given both without and with the load",
+    )
+
+
+def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
+    logs = ("empty_nominal.csv", "--loaded", "loaded_nominal.csv")
+    assert refused(run("gains", "experiment.toml", *logs), "the table `[load]` is missing")
+    code, out, err = run("gains", "load.toml", *logs)
+    assert (code, err) == (0, "")
+    found = json.loads((shop / "gains" / "gains.json").read_text(encoding="utf-8"))
+    np.testing.assert_allclose(found["force_gains"], GAINS, rtol=0.02)
+    line = pasted(out, "[recording]").splitlines()[1]
+    text = SPATIAL.replace('time = "t"', f'time = "t"\n{line}')
+    (shop / "true.toml").write_text(text)
+    forces = load_experiment("true.toml").read("empty_nominal.csv").forces
+    expected = load_experiment("experiment.toml").read("empty.csv").forces
+    np.testing.assert_allclose(forces, expected, rtol=0.02, atol=1e-3)
+    wrong = text.replace(line, "force_gains = [1, -1, 1]")
+    (shop / "wrong.toml").write_text(wrong)
+    assert refused(run("inspect", "wrong.toml"), "`recording.force_gains[1]` must be positive")
+    (shop / "tool.toml").write_text(SPATIAL + LOAD + LOAD.replace("[load]", "[robot.tool]"))
+    assert refused(run("gains", "tool.toml", *logs), "has a known tool")
+
+
+def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
+    _, out, _ = run("inspect", "experiment.toml", "empty.csv")
+    assert "force_delay" not in out
+    _, out, _ = run("inspect", "experiment.toml", "late.csv")
+    found = re.search(r"`force_delay = ([0-9.]+)`", " ".join(out.split()))
+    assert found, out
+    assert abs(float(found[1]) - 0.012) < 3e-4
+    cured = SPATIAL.replace('time = "t"', f'time = "t"\nforce_delay = {found[1]}')
+    (shop / "cured.toml").write_text(cured)
+    code, out, _ = run("inspect", "cured.toml", "late.csv")
+    assert code == 0
+    assert "a delay of the forces of 12" in " ".join(out.split())
+    assert "force_delay" not in out
+
+
+def test_a_report_takes_later_logs(folder, run):  # noqa: F811
+    assert run("identify", "experiment.toml", "a.csv", "-o", "first")[0] == 0
+    assert run("identify", "experiment.toml", "a.csv", "b.csv", "-o", "all")[0] == 0
+    code, _, err = run("identify", "experiment.toml", "first/", "b.csv", "-o", "both")
+    assert (code, err) == (0, "")
+    added, together = result(folder, "both"), result(folder, "all")
+    for one, other in zip(added["base_parameters"], together["base_parameters"], strict=True):
+        assert one["estimate"] == pytest.approx(other["estimate"], rel=1e-9, abs=1e-12)
+    assert added["fit"]["recordings"] == ["a", "b"]
+    assert added["fit"]["rows"] == together["fit"]["rows"]
+    assert added["settings"]["identification"] == ["first", "b.csv"]
+    assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
+    assert run("identify", "experiment.toml", "both", "c.csv", "-o", "three")[0] == 0
+    assert result(folder, "three")["fit"]["recordings"] == ["a", "b", "c"]
+
+
+def test_folders_that_hold_no_run_are_refused(folder, run):  # noqa: F811
+    assert run("identify", "experiment.toml", "a.csv", "-o", "first")[0] == 0
+    (folder / "other").mkdir()
+    assert refused(
+        run("identify", "experiment.toml", "other", "b.csv"), "`other`", "holds no `run.npz`"
+    )
+    assert refused(run("identify", "experiment.toml", "first"), "at least one log")
+    (folder / "ridge.toml").write_text(EXPERIMENT + "[estimator]\nridge = 0.1\n")
+    assert refused(run("identify", "ridge.toml", "first", "b.csv"), "to plain least squares only")
+    (folder / "spring.toml").write_text(EXPERIMENT + "[model]\nsprings = true\n")
+    assert refused(run("identify", "spring.toml", "first", "b.csv"), "run of other base parameters")
+    write_log(folder / "d.csv", 7)
+    assert refused(
+        run("payload", "experiment.toml", "a.csv", "--loaded", "d.csv", "--body", "elbow"),
+        "`--body` must be one of joint1, joint2",
+    )
+
+
+def test_a_payload_of_which_only_a_part_is_seen(folder, run):  # noqa: F811
+    code, out, err = run("payload", "experiment.toml", "a.csv", "--loaded", "b.csv")
+    assert (code, err) == (0, "")
+    assert "do not determine all ten parameters" in " ".join(out.split())
