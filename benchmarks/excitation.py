@@ -203,7 +203,7 @@ def gradients():
             problem = problem_of(base, criterion)
             evaluate = jax.jit(problem.objective(64))
             y = np.asarray(random_starts(problem.limits, jax.random.key(1), 1))
-            context = Context(sharpness, np.zeros((1, 1, 0)), 1.0)
+            context = Context(sharpness, np.zeros((1, 0), int))
             g = np.asarray(evaluate(y, context)[1])[0]
 
             def value(z, problem=problem, criterion=criterion, sharpness=sharpness):
@@ -239,7 +239,7 @@ def constraint_gradients():
 def step():
     problem = problem_of(base_of(True), jid.ConditionNumber())
     evaluate = jax.jit(problem.objective(800))
-    context = Context(8.0, np.zeros((1, 1, 0)), 1.0)
+    context = Context(8.0, np.zeros((1, 0), int))
     value = jax.jit(lambda y: problem.objective(800)(y, context)[0])
     y = random_starts(problem.limits, jax.random.key(1), 1)
     size = y.shape[1]

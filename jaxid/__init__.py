@@ -160,6 +160,7 @@ from jaxid.trajectory.fourier import FourierSeries as FourierSeries
 from jaxid.trajectory.fourier import random_fourier_series as random_fourier_series
 from jaxid.trajectory.leads import WithLeads as WithLeads
 from jaxid.trajectory.leads import with_leads as with_leads
+from jaxid.trajectory.leads_basis import LeadsBasis as LeadsBasis
 from jaxid.trajectory.rest import RestToRest as RestToRest
 from jaxid.trajectory.rest import RestToRestBasis as RestToRestBasis
 from jaxid.trajectory.ros import joint_trajectory as joint_trajectory

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -170,25 +170,36 @@ def _check(base, criterion, starts, polish, samples, prior) -> None:
         )
 
 
+_last: list[tuple[Any, Search, Polish]] = []
+
+
+def _tools(problem: Problem, starts: int, digest: str) -> tuple[Search, Polish]:
+    """What solves a problem; the last ones are kept, for designs that differ in their keys only."""
+    parts = problem.base, problem.limits, problem.criterion, problem.constraints
+    identity = digest, jax.tree.structure(parts)
+    if not _last or _last[0][0] != identity:
+        _last[:] = [(identity, Search(problem, starts), Polish(problem))]
+    return _last[0][1:]
+
+
 class _Design:
     """The steps of a design, one after the other."""
 
     def __init__(self, problem, starts, polish, progress, path):
-        self._problem, self._progress, self._path = problem, progress, path
-        self._search = Search(problem, starts)
-        self._polish = Polish(problem)
-        self._polished = min(polish, starts)
-        self._starts = starts
+        self._progress, self._path = progress, path
+        self._polished, self._starts = min(polish, starts), starts
+        p = problem
+        self._digest = fingerprint(
+            (p.base, p.limits, p.criterion, p.constraints, p.weights, p.prior),
+            [type(x).__name__ for x in (p.criterion, p.basis, *p.constraints)],
+            (repr(p.basis), p.measured, starts),
+        )
+        self._search, self._polish = _tools(problem, starts, self._digest)
+        self._problem = self._search.problem
 
     def run(self, key: PRNGKeyArray, resume: bool) -> tuple[_State, bool]:
         """All steps; the last state, and whether Ctrl-C has ended them."""
-        p = self._problem
-        digest = fingerprint(
-            (p.base, p.limits, p.criterion, p.constraints, p.weights, p.prior),
-            [type(x).__name__ for x in (p.criterion, p.basis, *p.constraints)],
-            (repr(p.basis), p.measured, self._starts, self._polished),
-            jax.random.key_data(key),
-        )
+        digest = fingerprint(self._digest, self._polished, jax.random.key_data(key))
         searched = self._search.begin(key)
         state = _State(searched, searched.best.order(), 0, searched.best)
         if resume and self._path is not None and self._path.is_file():

@@ -159,7 +159,8 @@ class ExcitationPlan(eqx.Module):
             path: Of the CSV file.
             sample_time: Largest time between two samples [s]; that of the experiment if None.
         """
-        step = float(self.limits.basis.duration) / self.samples
+        start, then = self.limits.basis.times(self.samples)[:2]
+        step = float(then - start)
         with double_precision():
             write_csv(
                 self.trajectory,

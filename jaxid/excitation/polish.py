@@ -7,14 +7,12 @@ to the solver; after each run new peaks are added. The same for constraints.
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from jaxid.dynamics.motion import Motion
 from jaxid.excitation.limits import CERTIFIED, Grid, held_within
-from jaxid.excitation.problem import Context, Problem
-from jaxid.types import AnyArray, Array, Float
+from jaxid.excitation.problem import CHECKED, MARGIN, Context, Problem
+from jaxid.types import AnyArray, Float
 
 SEEN = 100
 """Samples on which a motion is judged."""
@@ -26,14 +24,12 @@ NEW = 0.97
 """Share of a limit from which a later peak is added."""
 CLOSED = 1.003
 """Peaks up to which the exchange has nothing left to add."""
-FINE = 1024
-"""Instants at which constraints are looked for peaks."""
+STEADY = 32
+"""Instants at which all constraints always belong to the problem."""
 WITHIN = 0.3
 """Relative distance from which a constraint's peak is given to the solver."""
 BATCH = 64
 """Instants whose constraints are differentiated in one call."""
-MARGIN = 2e-4
-"""Relative distance that is kept from constraints, for what happens between instants."""
 ROUNDS = ((8.0, 60, 5), (None, 60, 4))
 """Sharpness, iterations of a run, and most runs."""
 
@@ -49,27 +45,13 @@ class Polish:
         self._problem = problem
         limits = problem.limits
         self._fine = limits.grid(CERTIFIED)
-        plain = Problem(
-            problem.base,
-            limits,
-            problem.criterion,
-            (),
-            weights=problem.weights,
-            prior=problem.prior,
-            sizes=problem.sizes,
-            measured=problem.measured,
-        )
-        objective = plain.objective(SEEN)
-        none = np.zeros((1, 1, 0))
-        self._smooth = jax.jit(lambda y, p: objective(y[None], Context(p, none, 1.0)))
-        self._exact = jax.jit(lambda y: objective(y[None], Context(None, none, 1.0)))
+        objective, none = problem.objective(SEEN), np.zeros((1, 0), int)
+        self._smooth = jax.jit(lambda y, p: objective(y[None], Context(p, none)))
+        self._exact = jax.jit(lambda y: objective(y[None], Context(None, none)))
         self._restore = jax.jit(
             lambda y: held_within(self._fine, limits.still, y, self._fine.bound)
         )
-        times = problem.basis.times(FINE)
-        self._rows = problem.basis.rows(times)[:3]
-        self._values = jax.jit(lambda y: problem.constrained(y[None], FINE)[0])
-        self._local = jax.jit(self._locally)
+        self._local = jax.jit(problem.constrained)
 
     def __call__(self, start: Float[AnyArray, " scaled"]) -> Float[np.ndarray, " scaled"]:
         """A better motion, or the same."""
@@ -121,24 +103,6 @@ class Polish:
             options={"maxiter": iterations, "ftol": 1e-5},
         )
 
-    def _locally(self, y: Array, instants: Array) -> tuple[Array, Array]:
-        """Constraints at some instants, and their derivatives by the scaled numbers."""
-        x = self._problem.limits.numbers(y)
-        rows = jnp.asarray(self._rows)[:, instants]
-        q, qd, qdd = (part @ x.T for part in rows)
-
-        def one(q, qd, qdd):
-            return self._problem.constrained_motion(Motion(q, qd, qdd))
-
-        values = jax.vmap(one)(q, qd, qdd)
-        by_motion = jax.vmap(jax.jacrev(one, argnums=(0, 1, 2)))(q, qd, qdd)
-        scale = np.asarray(self._problem.limits.scale)
-        by_numbers = sum(
-            jnp.einsum("tvj,tk,jk->tvjk", J, part, scale)
-            for J, part in zip(by_motion, rows, strict=True)
-        )
-        return values, jnp.reshape(by_numbers, (*values.shape, -1))
-
 
 class _Exchange:
     """Rows of the joints' limits that the solver sees."""
@@ -185,7 +149,11 @@ class _Instants:
 
     def __init__(self, polish: Polish):
         self._polish = polish
-        self._chosen: set[tuple[int, int]] = set()
+        self._chosen = {
+            (instant, value)
+            for instant in range(0, CHECKED, CHECKED // STEADY)
+            for value in range(polish._problem.entries)
+        }
         self._last: tuple[bytes, np.ndarray, np.ndarray] | None = None
 
     def __len__(self) -> int:
@@ -193,11 +161,11 @@ class _Instants:
 
     def worst(self, y: np.ndarray) -> float:
         """The largest excess at all instants."""
-        return float(np.max(self._polish._values(y)))
+        return float(np.max(self._polish._problem.checked(y)))
 
     def add(self, y: np.ndarray) -> None:
         """Adds the peaks of a motion."""
-        values = np.asarray(self._polish._values(y))
+        values = np.asarray(self._polish._problem.checked(y))
         peaks = (values >= np.roll(values, 1, 0)) & (values >= np.roll(values, -1, 0))
         found = np.argwhere(peaks & (values > -WITHIN))
         self._chosen |= {(int(t), int(v)) for t, v in found}

@@ -12,14 +12,21 @@ from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Finding
 from jaxid.excitation.criteria import AbstractCriterion
 from jaxid.excitation.information import Information, InformationMap, information
+from jaxid.excitation.interior_point import Evaluation, each_start
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.spectral import Sharpness
-from jaxid.types import AnyArray, Array, Float
+from jaxid.types import AnyArray, Array, Float, Int
 
 SEEN = 64
 """Samples on which a motion is judged while it is searched."""
-CHECKED = 4000
+CHECKED = 8160
 """Samples on which constraints are checked."""
+WATCHED = 48
+"""Samples at which constraints are always watched during the search."""
+PEAKS = 4
+"""Further instants for each value of the constraints: its highest peaks between those samples."""
+MARGIN = 1e-3
+"""Relative distance that is kept from constraints, for what happens between instants."""
 
 
 class Context(NamedTuple):
@@ -27,13 +34,11 @@ class Context(NamedTuple):
 
     Attributes:
         sharpness: Of smooth extremes of eigenvalues.
-        multipliers: Of the constraints' values at the samples, for each start.
-        weight: Of constraints that are not kept.
+        instants: At which constraints are watched, of those that are checked.
     """
 
     sharpness: Sharpness
-    multipliers: Float[AnyArray, "starts samples values"]
-    weight: Float[AnyArray, ""] | float
+    instants: Int[AnyArray, "starts instants"]
 
 
 class Problem:
@@ -69,7 +74,9 @@ class Problem:
         self.constraints = constraints
         self.weights, self.prior, self.sizes = weights, prior, sizes
         self.measured, self.seen = measured, seen
-        self._check = jax.jit(lambda x: self._constrained(x, CHECKED))
+        self._all_rows = self.basis.rows(self.basis.instants(CHECKED))[:3]
+        self._check = jax.jit(self._constrained)
+        self._peaks = jax.jit(lambda y: jax.lax.map(self._highest, y))
 
     def information(self, x: Float[AnyArray, "joints variables"]) -> Information:
         """The information of one run, exact."""
@@ -100,8 +107,19 @@ class Problem:
         """Values that all constraints have together, at one sample."""
         return sum(len(c.entries(self.robot)) for c in self.constraints)
 
+    @property
+    def conditions(self) -> int:
+        """How many values of constraints a search keeps from being positive."""
+        return (WATCHED + PEAKS) * self.entries
+
+    def peaks(self, y: Float[AnyArray, "starts scaled"]) -> Int[Array, "starts instants"]:
+        """The instants at which constraints of these motions must be watched."""
+        if not self.constraints:
+            return jnp.zeros((len(y), 0), int)
+        return self._peaks(jnp.asarray(y))
+
     def objective(self, samples: int | None = None) -> Callable:
-        """Values and gradients of some starts at once: criterion and unkept constraints.
+        """Values and gradients of some starts at once: the criterion.
 
         Args:
             samples: On which motions are judged.
@@ -109,11 +127,10 @@ class Problem:
         Returns:
             From scaled numbers [starts, scaled] and a `Context` to values and gradients.
         """
-        samples = self.seen if samples is None else samples
         informed = InformationMap.of(
             self.base,
             self.basis,
-            evaluated=samples,
+            evaluated=self.seen if samples is None else samples,
             measured=self.measured,
             weights=self.weights,
             prior=self.prior,
@@ -121,17 +138,12 @@ class Problem:
         )
 
         def total(y: Array, context: Context) -> Array:
-            x = self.limits.numbers(y)
-            seen = informed(x)
+            seen = informed(self.limits.numbers(y))
 
             def judged(plain: Array, weighted: Array) -> Array:
                 return self.criterion(Information(plain, weighted, self.sizes), context.sharpness)
 
-            values = jax.vmap(judged)(jnp.asarray(seen.plain), jnp.asarray(seen.weighted))
-            if self.constraints:
-                excess = jax.vmap(lambda one: self._constrained(one, samples))(x)
-                values = values + _augmented(excess, context)
-            return values
+            return jax.vmap(judged)(jnp.asarray(seen.plain), jnp.asarray(seen.weighted))
 
         def value_and_gradient(y: Array, context: Context) -> tuple[Array, Array]:
             values, pull = jax.vjp(lambda z: total(z, context), y)
@@ -139,23 +151,66 @@ class Problem:
 
         return value_and_gradient
 
-    def constrained(self, y: Float[Array, "starts scaled"], samples: int) -> Array:
-        """All constraints' values of some starts [starts, samples, values]."""
-        return jax.vmap(lambda one: self._constrained(self.limits.numbers(one), samples))(y)
+    def evaluation(self) -> Callable[[Array, Context], Evaluation]:
+        """The criterion and the constraints of some starts at once, with their derivatives."""
+        objective, count = self.objective(), self.entries
+        steady = np.arange(WATCHED * count)
+        # At its peaks a value alone counts: the others have their own.
+        peaks = (
+            WATCHED * count + np.arange(PEAKS * count) * count + np.repeat(np.arange(count), PEAKS)
+        )
+        chosen = np.concatenate([steady, peaks])
 
-    def _constrained(self, x: AnyArray, samples: int) -> Array:
-        q, qd, qdd = self.basis.rows(self.basis.times(samples))[:3]
+        def evaluated(y: Array, context: Context) -> Evaluation:
+            free = Evaluation.free(*objective(y, context))
+            if not self.constraints:
+                return free
+            excess, slopes = each_start(self.constrained, y, context.instants)
+            starts, size = y.shape
+            return free._replace(
+                excess=excess.reshape(starts, -1)[:, chosen] + MARGIN,
+                slopes=slopes.reshape(starts, -1, size)[:, chosen],
+            )
+
+        return evaluated
+
+    def constrained(
+        self, y: Float[Array, " scaled"], instants: Int[AnyArray, " instants"]
+    ) -> tuple[Float[Array, "instants values"], Float[Array, "instants values scaled"]]:
+        """All constraints of one motion at some of the checked instants, and their derivatives."""
+        rows = jnp.asarray(self._all_rows)[:, instants]
+        x = self.limits.numbers(y)
+        q, qd, qdd = (part @ x.T for part in rows)
+
+        def one(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+            value = self._values(Motion(q, qd, qdd))
+            return value, value
+
+        jacobian = jax.jacrev(one, argnums=(0, 1, 2), has_aux=True)
+        by_motion, values = jax.vmap(jacobian)(q, qd, qdd)
+        scale = np.asarray(self.limits.scale)
+        slopes = sum(
+            jnp.einsum("tvj,tk,jk->tvjk", J, part, scale)
+            for J, part in zip(by_motion, rows, strict=True)
+        )
+        return values, jnp.reshape(slopes, (*values.shape, y.shape[-1]))
+
+    def checked(self, y: Float[AnyArray, " scaled"]) -> Float[np.ndarray, "checked values"]:
+        """All constraints of one motion at all checked instants."""
+        return np.asarray(self._check(self.limits.numbers(np.asarray(y))))
+
+    def _highest(self, y: Float[Array, " scaled"]) -> Int[Array, " instants"]:
+        """Equidistant instants, and the highest peaks of each value."""
+        values = self._constrained(self.limits.numbers(y)).T
+        peak = (values >= jnp.roll(values, 1, 1)) & (values >= jnp.roll(values, -1, 1))
+        found = jax.lax.top_k(jnp.where(peak, values, -jnp.inf), PEAKS)[1]
+        steady = np.arange(0, CHECKED, CHECKED // WATCHED)
+        return jnp.concatenate([jnp.asarray(steady, found.dtype), found.reshape(-1)])
+
+    def _constrained(self, x: AnyArray) -> Float[Array, "checked values"]:
+        """All constraints of one motion at all checked instants."""
         x = jnp.asarray(x)
-        motion = Motion(q @ x.T, qd @ x.T, qdd @ x.T)
-        return self.constrained_motion(motion)
+        return self._values(Motion(*(part @ x.T for part in self._all_rows)))
 
-    def constrained_motion(self, motion: Motion) -> Float[Array, "*batch values"]:
-        """All constraints' values of a motion, sample by sample."""
+    def _values(self, motion: Motion) -> Float[Array, "*batch values"]:
         return jnp.concatenate([c(self.robot, motion) for c in self.constraints], axis=-1)
-
-
-def _augmented(excess: Float[Array, "starts samples values"], context: Context) -> Array:
-    """The augmented Lagrangian's share of constraints: their mean over the samples."""
-    m, rho = context.multipliers, context.weight
-    pushed = jnp.maximum(0.0, m + rho * excess)
-    return jnp.sum(pushed**2 - m**2, axis=(1, 2)) / (2 * rho * excess.shape[1])

@@ -18,12 +18,6 @@ GRID = 64
 """Rows of each order by which limits are kept during the search."""
 GROWTH = 1.05
 """Most by which a motion is enlarged to meet its limits in the end."""
-FIRST_WEIGHT = 30.0
-"""Weight of constraints that are not kept, at the start."""
-LAST_WEIGHT = 3e4
-"""The largest it becomes."""
-HEAVIER = 3.0
-"""Its growth with every leg within the limits."""
 TIGHT = 0.998
 """Share of the limits within which legs end: what is left is for rounding."""
 
@@ -58,6 +52,9 @@ LEGS = (
 )
 """Relaxed limits, then the limits; once more a little relaxed; sharper in the end."""
 
+SETTLING = (Leg(Stage(TIGHT, 1e-4, 1e-6, 50), 20.0, True),) * 3
+"""What follows where there are constraints, whose peaks move between instants."""
+
 
 class Best(NamedTuple):
     """The best motion of each start so far, certified to keep the joints' limits.
@@ -82,8 +79,6 @@ class Searched(NamedTuple):
     """What a search knows between two legs."""
 
     state: State
-    multipliers: Float[AnyArray, "starts samples values"]
-    weight: Float[AnyArray, ""]
     leg: int
     first: Float[AnyArray, " starts"]
     best: Best
@@ -95,51 +90,48 @@ class Search:
     Args:
         problem: What is to be found.
         starts: Number of starts.
+
+    Attributes:
+        problem: The same.
     """
 
     def __init__(self, problem: Problem, starts: int):
-        self._problem, self._starts = problem, starts
+        self.problem, self._starts = problem, starts
+        self._legs = LEGS + SETTLING if problem.constraints else LEGS
         limits = problem.limits
-        self._solver = InteriorPoint(problem.objective(), limits.grid(GRID), limits.still)
+        self._solver = InteriorPoint(problem.evaluation(), limits.grid(GRID), limits.still)
         self._fine = limits.grid(CERTIFIED)
         growth = 1.0 if problem.constraints else GROWTH
         self._restore = jax.jit(
             jax.vmap(lambda y: held_within(self._fine, limits.still, y, self._fine.bound, growth))
         )
-        self._excess = jax.jit(lambda y: problem.constrained(y, problem.seen))
 
     def begin(self, key: PRNGKeyArray) -> Searched:
         """Random motions that fill their limits."""
-        y, starts = random_starts(self._problem.limits, key, self._starts), self._starts
+        y = random_starts(self.problem.limits, key, self._starts)
         best = self._judged(y)
-        none = jnp.zeros((starts, self._problem.seen, self._problem.entries))
-        weight = jnp.asarray(FIRST_WEIGHT)
-        return Searched(self._solver.start(y), none, weight, 0, best.value, best)
+        state = self._solver.start(y, self.problem.conditions)
+        return Searched(state, 0, best.value, best)
 
     def advance(self, searched: Searched) -> Searched:
         """The next leg."""
-        leg = LEGS[searched.leg]
-        context = Context(jnp.asarray(leg.sharpness), searched.multipliers, searched.weight)
+        leg = self._legs[searched.leg]
+        context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(searched.state.y))
         state = self._solver.run(searched.state, leg.stage, context)
-        multipliers, weight = searched.multipliers, searched.weight
-        if self._problem.constraints and leg.stage.bound <= 1.0:
-            excess = self._excess(state.y)
-            multipliers = jnp.maximum(0.0, multipliers + weight * excess)
-            weight = jnp.minimum(HEAVIER * weight, LAST_WEIGHT)
         best = searched.best
         if leg.judged:
             best = _better(best, self._judged(self._restore(state.y)))
-        return Searched(state, multipliers, weight, searched.leg + 1, searched.first, best)
+        return Searched(state, searched.leg + 1, searched.first, best)
 
     @property
     def legs(self) -> int:
         """Number of legs."""
-        return len(LEGS)
+        return len(self._legs)
 
     def _judged(self, y: Array) -> Best:
-        numbers = [np.asarray(self._problem.limits.numbers(np.asarray(one))) for one in y]
-        values = np.array([self._problem.value(x) for x in numbers])
-        excess = np.array([self._problem.excess(x) for x in numbers])
+        numbers = [np.asarray(self.problem.limits.numbers(np.asarray(one))) for one in y]
+        values = np.array([self.problem.value(x) for x in numbers])
+        excess = np.array([self.problem.excess(x) for x in numbers])
         return Best(np.asarray(y), np.where(np.isfinite(values), values, np.inf), excess)
 
 

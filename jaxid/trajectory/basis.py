@@ -72,8 +72,20 @@ class AbstractBasis(eqx.Module):
         return self.rows(np.zeros(1)).shape[2]
 
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
-        """Equidistant times over the duration, without its end [s]."""
+        """Equidistant times at which a run is measured, without their end [s].
+
+        Args:
+            samples: How many.
+        """
         return np.arange(samples) * (self.duration / samples)
+
+    def instants(self, points: int) -> Float[np.ndarray, " points"]:
+        """Equidistant times over everything that is moved, for what must hold all along [s].
+
+        Args:
+            points: How many.
+        """
+        return self.times(points)
 
 
 class FourierBasis(AbstractBasis):

@@ -4,42 +4,120 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from jaxid.excitation.interior_point import InteriorPoint, Stage
+from jaxid.excitation.interior_point import Evaluation, InteriorPoint, Stage
 from jaxid.excitation.limits import JointLimits
 from jaxid.trajectory.basis import FourierBasis
 
+RANDOM = np.random.default_rng(0)
 
-def test_reaches_the_constrained_minimum_from_every_start(arm):
+
+def problem(arm):
+    """Limits, a wish outside of them, and how dear it is to be away from it."""
     limits = JointLimits.of(arm, FourierBasis(3, 1.1))
-    grid = limits.grid(64)
     size = limits.scale.size
-    random = np.random.default_rng(0)
-    A, wish = random.standard_normal((size, size)), 1.5 * random.standard_normal(size)
-    H = 0.1 * A @ A.T + np.eye(size)
+    A, wish = RANDOM.standard_normal((size, size)), 1.5 * RANDOM.standard_normal(size)
+    return limits, wish, 0.1 * A @ A.T + np.eye(size)
 
-    def objective(y, context):
-        away = y - wish[None]
-        return 0.5 * jnp.einsum("bi,ij,bj->b", away, H, away), away @ H
 
+def solved(limits, objective, constraints=0, stages=()):
+    grid, size = limits.grid(64), limits.scale.size
     solver = InteriorPoint(objective, grid, limits.still)
-    state = solver.start(jnp.asarray(0.1 * random.standard_normal((3, size))))
-    for stage in (Stage(2.0, 1.0, 1e-3, 40), Stage(1.0, 1.0, 1e-8, 200)):
+    start = jnp.asarray(0.1 * RANDOM.standard_normal((3, size)))
+    state = solver.start(start, constraints)
+    for stage in stages or (Stage(2.0, 1.0, 1e-3, 40), Stage(1.0, 1.0, 1e-8, 200)):
         state = solver.run(state, stage, None)
     rows = np.zeros((*grid.c.shape, 2, limits.shape[1]))
     for j in range(2):
         rows[j, :, j] = grid.R[j]
-    G, c = rows.reshape(-1, size), grid.c.reshape(-1)
-    best = scipy.optimize.minimize(
+    return state, rows.reshape(-1, size), grid.c.reshape(-1), grid.bound
+
+
+def by_scipy(wish, H, G, c, bound, *more):
+    return scipy.optimize.minimize(
         lambda y: (0.5 * (y - wish) @ H @ (y - wish), H @ (y - wish)),
-        np.zeros(size),
+        np.zeros(len(wish)),
         jac=True,
         method="SLSQP",
         constraints=[
-            {"type": "ineq", "fun": lambda y: grid.bound - G @ y + c, "jac": lambda y: -G},
-            {"type": "ineq", "fun": lambda y: grid.bound + G @ y - c, "jac": lambda y: G},
+            {"type": "ineq", "fun": lambda y: bound - G @ y + c, "jac": lambda y: -G},
+            {"type": "ineq", "fun": lambda y: bound + G @ y - c, "jac": lambda y: G},
+            *more,
         ],
         options={"maxiter": 300, "ftol": 1e-12},
     )
+
+
+def test_reaches_the_constrained_minimum_from_every_start(arm):
+    limits, wish, H = problem(arm)
+
+    def objective(y, context):
+        away = y - wish[None]
+        return Evaluation.free(0.5 * jnp.einsum("bi,ij,bj->b", away, H, away), away @ H)
+
+    state, G, c, bound = solved(limits, objective)
+    best = by_scipy(wish, H, G, c, bound)
     assert best.success
-    np.testing.assert_allclose(state.value, best.fun, rtol=1e-4)
-    assert (np.abs(np.asarray(state.y) @ G.T - c) <= grid.bound).all()
+    np.testing.assert_allclose(state.seen.value, best.fun, rtol=1e-4)
+    assert (np.abs(np.asarray(state.y) @ G.T - c) <= bound).all()
+
+
+def curved(wish, H, radii):
+    """The same within ellipsoids about places that are not inside of them all."""
+    size = len(wish)
+    places = 0.3 * RANDOM.standard_normal((len(radii), size))
+
+    def objective(y, context):
+        away, from_places = y - wish[None], y[:, None] - places[None]
+        return Evaluation(
+            0.5 * jnp.einsum("bi,ij,bj->b", away, H, away),
+            away @ H,
+            jnp.sum(from_places**2, axis=2) / radii[None] ** 2 - 1.0,
+            2 * from_places / radii[None, :, None] ** 2,
+        )
+
+    return objective, places
+
+
+def test_keeps_constraints_that_are_not_linear(arm):
+    limits, wish, H = problem(arm)
+    radii = np.array([1.4, 1.6, 1.8])
+    objective, places = curved(wish, H, radii)
+    stages = (Stage(1.0, 1e-1, 1e-3, 80, 100.0), Stage(1.0, 1e-3, 1e-8, 300, 100.0))
+    state, G, c, bound = solved(limits, objective, 3, stages)
+    ball = {
+        "type": "ineq",
+        "fun": lambda y: 1 - ((y - places) ** 2).sum(1) / radii**2,
+        "jac": lambda y: -2 * (y - places) / radii[:, None] ** 2,
+    }
+    best = by_scipy(wish, H, G, c, bound, ball)
+    assert best.success
+    assert best.fun > 1.02 * by_scipy(wish, H, G, c, bound).fun, "the ellipsoids bind"
+    np.testing.assert_allclose(state.seen.value, best.fun, rtol=1e-4)
+    assert np.max(state.seen.excess) <= 1e-6
+    assert (np.abs(np.asarray(state.y) @ G.T - c) <= bound).all()
+
+
+def test_what_cannot_be_kept_is_exceeded_as_little_as_can_be(arm):
+    limits, wish, H = problem(arm)
+    radii = np.array([0.5, 0.6])
+    objective, places = curved(wish, H, radii)
+    stages = (Stage(1.0, 1.0, 1e-2, 100, 100.0), Stage(1.0, 1e-2, 1e-6, 400, 100.0))
+    state, G, c, bound = solved(limits, objective, 2, stages)
+
+    def excess(y):
+        return ((y - places) ** 2).sum(1) / radii**2 - 1
+
+    least = scipy.optimize.minimize(
+        lambda z: z[-1],
+        np.append(np.zeros(len(wish)), 100.0),
+        method="SLSQP",
+        constraints=[
+            {"type": "ineq", "fun": lambda z: bound - np.abs(G @ z[:-1] - c)},
+            {"type": "ineq", "fun": lambda z: z[-1] - excess(z[:-1])},
+        ],
+        options={"maxiter": 300},
+    )
+    assert least.success
+    assert least.fun > 0.5
+    found = np.max(state.seen.excess, axis=1)
+    np.testing.assert_allclose(found, least.fun, rtol=1e-2)

@@ -10,6 +10,7 @@ from jaxid.robot.limits import Limits
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.fourier import FourierSeries, random_fourier_series
 from jaxid.trajectory.leads import WithLeads, with_leads
+from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRest, RestToRestBasis, rest_basis
 from jaxid.trajectory.segments import Segments
 from jaxid.trajectory.spline import RestToRestSplineBasis, Spline
@@ -45,7 +46,12 @@ FAMILY = {
     "segments": chain(),
 }
 AT_REST = ("rest to rest", "with leads", "spline at rest", "spline through points", "segments")
-BASES = (FourierBasis(5, 0.8), RestToRestBasis(5, 0.8), RestToRestSplineBasis(9, 6.0))
+BASES = (
+    FourierBasis(5, 0.8),
+    RestToRestBasis(5, 0.8),
+    RestToRestSplineBasis(9, 6.0),
+    LeadsBasis(5, 0.8, lead=0.4, periods=2),
+)
 
 
 @pytest.mark.parametrize("name", FAMILY)
@@ -114,7 +120,7 @@ def test_a_basis_gives_the_motion_of_its_trajectory(basis):
     x = np.random.default_rng(1).standard_normal((3, basis.variables))
     trajectory = basis.trajectory(x)
     assert float(trajectory.duration) == pytest.approx(basis.duration)
-    t = basis.times(50)[1:]
+    t = basis.instants(50)[1:-1]
     motion = trajectory.motion(t)
     expected = (motion.q, motion.qd, motion.qdd, trajectory.jerk(t))
     for rows, values in zip(basis.rows(t), expected, strict=True):
@@ -125,7 +131,7 @@ def test_a_basis_gives_the_motion_of_its_trajectory(basis):
 @pytest.mark.parametrize("points", [16, 64, 512])
 def test_the_envelope_bounds_a_finer_grid_and_grows_tight(basis, points):
     rows, factor = basis.envelope(points)
-    t = basis.times(20_000)
+    t = basis.instants(20_000)
     fine = basis.rows(t)
     for seed in range(5):
         x = np.random.default_rng(seed).standard_normal(basis.variables)

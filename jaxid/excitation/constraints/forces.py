@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.machine import on_samples
+from jaxid.dynamics.model import Coordinates
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
 from jaxid.robot.robot import Robot
@@ -80,16 +82,20 @@ class NominalForces(eqx.Module):
             to_motors: From forces to what is limited.
             scale: The limits, by which small numbers are judged.
         """
-        forces = self.base.inverse_dynamics(self.parameters, motion)
-        if self.base.model.robot.tool is not None:
-            forces = forces + self.base.model.tool_forces(motion)
-        size = jnp.abs(forces @ to_motors)
+        size = jnp.abs(on_samples(self, self.forces, motion.q, motion.qd, motion.qdd) @ to_motors)
         if self.covariance is None:
             return size
         rows = jnp.einsum("...jb,jm->...mb", self.base.regressor(motion), to_motors)
         variance = jnp.einsum("...mb,bc,...mc->...m", rows, self.covariance, rows)
         smooth = jnp.broadcast_to((SMALL * scale) ** 2, variance.shape)
         return size + self.deviations * jnp.sqrt(jnp.maximum(variance, 0.0) + smooth)
+
+    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Float[Array, " joints"]:
+        """The expected forces of one sample."""
+        forces = self.base.forces(jnp.asarray(self.parameters), q, qd, qdd)
+        if self.base.model.robot.tool is not None:
+            forces = forces + self.base.model.known_forces(q, qd, qdd)
+        return jnp.asarray(forces)
 
 
 class JointForces(AbstractConstraint):

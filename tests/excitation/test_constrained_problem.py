@@ -1,0 +1,111 @@
+"""Constraints as a search sees them: by a motion's numbers, at its peaks; designs with leads and rest."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxid.excitation.constraints.clearance import Clearance
+from jaxid.excitation.constraints.forces import JointForces, NominalForces
+from jaxid.excitation.constraints.tip import TipSpeed
+from jaxid.excitation.criteria import DOptimal
+from jaxid.excitation.design import design_excitation
+from jaxid.excitation.limits import JointLimits
+from jaxid.excitation.problem import CHECKED, MARGIN, PEAKS, WATCHED, Context, Problem
+from jaxid.excitation.search import random_starts
+from jaxid.robot.capsules import Capsule, HalfSpace
+from jaxid.robot.collision import CollisionModel
+from jaxid.trajectory.leads_basis import LeadsBasis
+from jaxid.trajectory.rest import RestToRestBasis
+
+BASES = {
+    "rest": RestToRestBasis(3, 1.1),
+    "leads": LeadsBasis(3, 1.1, lead=0.4),
+}
+
+
+@pytest.fixture(scope="module")
+def shapes(pendulum):
+    return CollisionModel.of(
+        pendulum.model.robot,
+        (Capsule.of("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),),
+        (HalfSpace.of("wall", normal=(1.0, 0.0, 0.0), height=-0.3),),
+        (("hand", "wall"),),
+    )
+
+
+@pytest.fixture(scope="module")
+def constraints(pendulum, shapes):
+    nominal = NominalForces.of(pendulum, np.linspace(0.5, 0.2, pendulum.size))
+    return JointForces(nominal, margin=0.2), TipSpeed(1.2), Clearance(shapes, distance=0.02)
+
+
+@pytest.fixture(scope="module")
+def problem(pendulum, constraints):
+    limits = JointLimits.of(pendulum.model.robot, BASES["leads"])
+    return Problem(
+        pendulum,
+        limits,
+        DOptimal(),
+        constraints,
+        weights=np.ones(1),
+        prior=np.zeros((pendulum.size, pendulum.size)),
+        sizes=np.ones(pendulum.size),
+        measured=100,
+    )
+
+
+def test_derivatives_by_numbers_are_central_differences(problem):
+    y = np.asarray(random_starts(problem.limits, jax.random.key(2), 1))
+    context = Context(None, problem.peaks(y))
+    evaluate = jax.jit(problem.evaluation())
+    slopes = np.asarray(evaluate(y, context).slopes)[0]
+    assert slopes.shape == (problem.conditions, y.shape[1])
+    assert problem.conditions == (WATCHED + PEAKS) * 3
+    h, quotients = 1e-5, np.zeros_like(slopes)
+    for k in range(y.shape[1]):
+        e = np.zeros_like(y)
+        e[0, k] = h
+        near, far = (
+            [np.asarray(evaluate(y + s * m * e, context).excess)[0] for s in (1, -1)]
+            for m in (1, 2)
+        )
+        quotients[:, k] = (8 * (near[0] - near[1]) - (far[0] - far[1])) / (12 * h)
+    # A force that passes through zero within the difference has no derivative there.
+    wrong = np.linalg.norm(slopes - quotients, axis=1) > 1e-6 * np.linalg.norm(slopes, axis=1)
+    assert wrong.sum() <= 2
+    assert np.linalg.norm(slopes) > 1.0
+
+
+def test_the_highest_peaks_are_watched(problem):
+    y = np.asarray(random_starts(problem.limits, jax.random.key(4), 2))
+    watched = np.asarray(problem.peaks(y))
+    for one, instants in zip(y, watched, strict=True):
+        values = problem.checked(one)
+        assert values.shape == (CHECKED, 3)
+        np.testing.assert_array_equal(values[instants].max(axis=0), values.max(axis=0))
+    seen = np.asarray(problem.evaluation()(y, Context(None, watched)).excess) - MARGIN
+    highest = [problem.checked(one).max() for one in y]
+    np.testing.assert_allclose(seen.max(axis=1), highest, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_designs_that_stand_at_their_ends_keep_all_constraints(name, pendulum, constraints, shapes):
+    robot = pendulum.model.robot
+    plan = design_excitation(
+        pendulum, basis=BASES[name], constraints=constraints, starts=3, polish=0, samples=100
+    )
+    assert plan.feasible
+    t = np.linspace(0.0, float(plan.trajectory.duration), 8000)
+    motion = plan.trajectory.motion(t)
+    assert max(float(np.max(c(robot, motion))) for c in constraints) <= 0.0
+    assert float(np.min(shapes.clearance(robot, motion.q))) >= 0.02
+    lim = robot.limits
+    assert np.all(np.asarray(motion.q) <= lim.position_max)
+    assert np.all(np.asarray(motion.q) >= lim.position_min)
+    assert np.all(np.abs(motion.qd) <= lim.velocity)
+    assert np.all(np.abs(motion.qdd) <= lim.acceleration)
+    values = [f.value for f in plan.findings]
+    assert max(values) > -0.05, "something binds"
+    ends = plan.trajectory.motion(np.array([0.0, float(plan.trajectory.duration)]))
+    np.testing.assert_allclose(ends.qd, 0.0, atol=1e-12)
+    np.testing.assert_allclose(ends.qdd, 0.0, atol=1e-12)
