@@ -1,4 +1,4 @@
-"""Constraints as a search sees them: by a motion's numbers, at its peaks; designs with leads and rest."""
+"""Constraints as a search sees them: by a motion's numbers, at its peaks; with leads and rest."""
 
 import jax
 import numpy as np
@@ -83,7 +83,8 @@ def test_the_highest_peaks_are_watched(problem):
         values = problem.checked(one)
         assert values.shape == (CHECKED, 3)
         np.testing.assert_array_equal(values[instants].max(axis=0), values.max(axis=0))
-    seen = np.asarray(problem.evaluation()(y, Context(None, watched)).excess) - MARGIN
+    evaluate = jax.jit(problem.evaluation())
+    seen = np.asarray(evaluate(y, Context(None, watched)).excess) - MARGIN
     highest = [problem.checked(one).max() for one in y]
     np.testing.assert_allclose(seen.max(axis=1), highest, atol=1e-9)
 
