@@ -126,7 +126,15 @@ class ExcitationPlan(eqx.Module):
     @property
     def gains(self) -> Float[np.ndarray, " base"]:
         """How many times smaller each standard deviation is than that of a random motion."""
-        return deviations(self.reference.weighted) / self.standard_deviations
+        with np.errstate(invalid="ignore"):
+            return deviations(self.reference.weighted) / self.standard_deviations
+
+    @property
+    def mean_gain(self) -> float:
+        """Their geometric mean over the parameters that both motions determine; NaN if none."""
+        gains = self.gains
+        known = gains[np.isfinite(gains) & (gains > 0)]
+        return float(np.exp(np.mean(np.log(known)))) if known.size else np.nan
 
     @property
     def use(self) -> Float[np.ndarray, "4 joints"]:

@@ -45,10 +45,8 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
         if k < len(cells):
             cells[k].stylize("bold")
         table.add_row(str(k + 1), Text(row.name), significant(row.before), *cells)
-    means = (np.exp(np.mean(np.log(plan.gains))) for plan in plans)
-    table.add_row(
-        "", Text("deviations, times smaller than random"), "1", *(f"{m:.2f}" for m in means)
-    )
+    means = (significant(plan.mean_gain) for plan in plans)
+    table.add_row("", Text("deviations, times smaller than random"), "1", *means)
     return table
 
 
