@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxid.arrays import Hashable, as_array
 from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
-from jaxid.dynamics.machine import on_samples
+from jaxid.dynamics.machine import columns_of, on_samples
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.observation import observation_matrix
@@ -92,6 +92,7 @@ class BaseParameters(Hashable):
         """Values of the letters in the expressions: lengths [m], and `g` [m/s²]."""
         return dict(self.closed_forms.lengths)
 
+    @columns_of(lambda base: (base.model, base.model.columns, base.indices))
     def columns(self, q, qd, qdd) -> Float[AnyArray, "joints base"]:
         """The base regressor of one sample, as it is defined (Eq. 23)."""
         return self.model.columns(q, qd, qdd)[:, np.array(self.indices)]

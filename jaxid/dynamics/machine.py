@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import as_array, content, is_traced
-from jaxid.program import Program, evaluate, evaluate_packed, lower, trace
+from jaxid.program import Program, chosen, evaluate, evaluate_packed, lower, trace
 from jaxid.types import AnyArray, Array, Numbers
 
 FEW = 4096
@@ -83,12 +83,37 @@ def machines(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) 
         if key in _machines:
             _machines.move_to_end(key)
             return _machines[key]
-    made = Machines(trace(definition, *shapes))
+    made = Machines(_translated(owner, definition, shapes))
     with _lock:
         _machines[key] = made
         while len(_machines) > _KEPT:
             _machines.popitem(last=False)
     return made
+
+
+def columns_of(source: Callable[[Any], tuple[eqx.Module, Callable, tuple[int, ...]]]) -> Callable:
+    """Marks a definition that is some columns of another: its program follows from the other's.
+
+    Args:
+        source: From a model to the other one, its definition, and the columns.
+    """
+
+    def mark(definition: Callable) -> Callable:
+        definition.__dict__["columns_of"] = source
+        return definition
+
+    return mark
+
+
+def _translated(owner: eqx.Module, definition: Callable, shapes: tuple) -> Program:
+    source = getattr(getattr(definition, "__func__", None), "columns_of", None)
+    if source is None:
+        return trace(definition, *shapes)
+    other, whole, columns = source(owner)
+    program = program_of(other, whole, *shapes)
+    (shape,) = program.output_shapes
+    entries = np.arange(math.prod(shape)).reshape(shape)
+    return chosen(program, entries[:, np.array(columns, int)])
 
 
 def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:

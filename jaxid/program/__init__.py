@@ -16,6 +16,7 @@ from jaxid.program.fence import NoFence as NoFence
 from jaxid.program.fence import default_fence as default_fence
 from jaxid.program.program import OperationCounts as OperationCounts
 from jaxid.program.program import Program as Program
+from jaxid.program.program import chosen as chosen
 from jaxid.program.sincos import library_sine_cosine as library_sine_cosine
 from jaxid.program.sincos import sine_cosine as sine_cosine
 from jaxid.program.trace import FREE as FREE

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxid.program.operation import COMPARISONS, FUNCTIONS, LOGIC, Operation
 from jaxid.program.rewrite import live, rewrite
-from jaxid.program.scalar import Operand, Scalar
+from jaxid.program.scalar import Graph, Operand, Scalar
 
 Reference = int | float
 """An operand or a result: the position of a node (int) or a constant (float)."""
@@ -168,3 +168,24 @@ def assemble(
         for s in scalars
     )
     return Program(input_shapes, nodes, tuple(map(reference, outputs)), output_shapes, structure)
+
+
+def chosen(program: Program, entries: np.ndarray) -> Program:
+    """The program of some of a program's results: what they do not need is left out.
+
+    Args:
+        program: Of which some results are wanted.
+        entries: Their positions in the packed result, in the shape of the new result.
+    """
+    graph = Graph()
+    scalars: list[Scalar] = []
+
+    def operand(x: Reference) -> Operand:
+        return scalars[x] if isinstance(x, int) else x
+
+    for node in program.nodes:
+        is_input = node.operation is Operation.INPUT
+        operands = node.operands if is_input else tuple(map(operand, node.operands))
+        scalars.append(graph.node(node.operation, *operands))
+    outputs = [operand(program.outputs[k]) for k in entries.ravel()]
+    return assemble(program.input_shapes, outputs, (entries.shape,), jax.tree.structure(0))
