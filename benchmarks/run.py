@@ -32,6 +32,8 @@ BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 HEAD = ("row", "what", "asked", "measured", "holds", "recipe")
 LONGER = 3.0
 """How many times longer than expected a script may take."""
+NO_GPU = "G"
+"""Number of the row that says so."""
 BUSY = 0.5
 """Load of each core above which times say more about the load."""
 
@@ -238,6 +240,9 @@ def main():
         print(f"   {script.name}: {seconds:.0f} s; {whole:.1f} min in all\n", flush=True)
         if found is None:
             failed.append(script.name)
+            continue
+        if [row["number"] for row in found.get("rows", [])] == [NO_GPU]:
+            # Figures of a machine that has one stay.
             continue
         lost += [Row(**r) for r in found.get("rows", []) if r["holds"] is False]
         if not options.quick:

@@ -291,8 +291,8 @@ def table(samples, joints, compiling, devices, away):
         Row(
             "9d",
             "`identify` by devices, per sample",
-            "Panda with friction, every sample a row, a core for each device as far as there are "
-            f"cores; estimates of all are {away:.0e} apart (columns of length one)",
+            f"Panda with friction, {LOG} samples, each a row, a core for each device as far as "
+            f"there are cores; estimates of all are {away:.0e} apart (columns of length one)",
             "the same to 1e-12",
             line(devices),
             away <= 1e-12,
