@@ -33,12 +33,14 @@ from jaxid.dynamics.compiled import acting_columns, regressor_rows
 from jaxid.excitation.information import information
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import CRITERIA, deviations
-from jaxid.excitation.problem import Context, Problem
+from jaxid.excitation.problem import CHECKED, Context, Problem
 from jaxid.excitation.search import LEGS, Search, random_starts
 from jaxid.excitation.spectral import log_condition, log_largest_inverse
 from jaxid.trajectory.basis import FourierBasis
 
 RANDOM = range(15)
+H = 1e-4
+"""Step of difference quotients, in scaled numbers."""
 
 
 def base_of(principal_axes):
@@ -209,7 +211,7 @@ def gradients():
             def value(z, problem=problem, criterion=criterion, sharpness=sharpness):
                 return of_logs(criterion, logs_of(problem, criterion, z, 64), sharpness)
 
-            error = np.linalg.norm(differences(value, y[0], 1e-4) - g) / np.linalg.norm(g)
+            error = np.linalg.norm(differences(value, y[0], H) - g) / np.linalg.norm(g)
             worst = max(worst, error)
             print(f"{criterion.name}, sharpness {sharpness}: {error:.1e}", flush=True)
     print(f"worst: {worst:.1e}")
@@ -227,9 +229,9 @@ def constraint_gradients():
     ):
         problem = problem_of(base, jid.DOptimal(), (constraint,))
         y = np.asarray(random_starts(problem.limits, jax.random.key(1), 1))[0]
-        values = jax.jit(lambda z, p=problem: p.constrained(z[None], 7)[0].ravel())
-        exact = np.asarray(jax.jit(jax.jacrev(values))(y))
-        found = differences(lambda z, f=values: np.asarray(f(z)), y, 1e-4)
+        evaluate, instants = jax.jit(problem.constrained), np.arange(0, CHECKED, CHECKED // 7)
+        exact = np.asarray(evaluate(y, instants)[1]).reshape(-1, len(y))
+        found = differences(lambda z, f=evaluate, t=instants: np.asarray(f(z, t)[0]).ravel(), y, H)
         sizes = np.linalg.norm(exact, axis=1)
         # What a motion does not change has no gradient to compare with.
         errors = np.linalg.norm(found - exact, axis=1) / np.maximum(sizes, 1e-6 * sizes.max())

@@ -51,7 +51,7 @@ class Rivals:
         within = partial(held_within, fine, limits.still, bound=fine.bound)
         self.restore = jax.jit(jax.vmap(lambda y: within(y)))
         self.starts = np.asarray(random_starts(limits, jax.random.key(SEED), starts))
-        none = Context(None, np.zeros((1, 1, 0)), 1.0)
+        none = Context(None, np.zeros((1, 0), int))
         coarse, exact = self.problem.objective(64), self.problem.objective(800)
         self.repaired = jax.jit(lambda y: coarse(jax.vmap(within)(y), none)[0])
         self.value = jax.jit(lambda y: exact(y[None], none)[0][0])

@@ -117,11 +117,11 @@ class ExcitationPlan(eqx.Module):
 
     @property
     def relative_deviations(self) -> Float[np.ndarray, " base"] | None:
-        """Standard deviations over the nominal parameters, if those are known; NaN where not."""
+        """Standard deviations over the nominal parameters; NaN where those are unknown or zero."""
         if self.nominal is None:
             return None
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return self.standard_deviations / np.abs(np.asarray(self.nominal))
+        size = np.abs(np.asarray(self.nominal))
+        return self.standard_deviations / np.where(size > 0, size, np.nan)
 
     @property
     def gains(self) -> Float[np.ndarray, " base"]:
