@@ -111,9 +111,9 @@ class _Machine(NamedTuple):
 def solve_at_once(program: ConeProgram) -> Optimum:
     """Solves one program in NumPy: some tens of milliseconds, and nothing to compile."""
     with np.errstate(all="ignore"):
-        state = _first(_NUMPY, program)
+        state, gram = _first(_NUMPY, program), program.A.T @ program.A
         while not state.finished:
-            state = _next(_NUMPY, program, state)
+            state = _next(_NUMPY, program, gram, state)
         return _optimum(program, state)
 
 
@@ -122,9 +122,10 @@ def solve_compiled(program: ConeProgram) -> Optimum:
     """Solves one program; works under `jit` and `vmap`."""
     require_float64("the search for physically consistent parameters")
     program = jax.tree.map(jnp.asarray, program)
+    gram = program.A.T @ program.A
     state = jax.lax.while_loop(
         lambda x: ~x.finished,
-        lambda x: _next(_JAX, program, x),
+        lambda x: _next(_JAX, program, gram, x),
         _first(_JAX, program),
     )
     return _optimum(program, state)
@@ -196,10 +197,10 @@ def _gap(xp: ModuleType, p: ConeProgram, S: Values, Z: Values) -> Values:
     return xp.sum(xp.where(pulled, bodies, own)) + xp.sum(more)
 
 
-def _next(machine: _Machine, p: ConeProgram, state: _State) -> _State:
+def _next(machine: _Machine, p: ConeProgram, gram: Values, state: _State) -> _State:
     """One iteration, and whether it was the last."""
     xp = machine.xp
-    point, length = _moved(machine, p, state.point)
+    point, length = _moved(machine, p, gram, state.point)
     better = point.error < state.best.error
     best = _Point(*(xp.where(better, a, b) for a, b in zip(point, state.best, strict=True)))
     stalled = xp.where(better, 0, state.stalled + 1)
@@ -214,12 +215,12 @@ def _next(machine: _Machine, p: ConeProgram, state: _State) -> _State:
     return _State(point, best, iterations, stalled, finished)
 
 
-def _moved(machine: _Machine, p: ConeProgram, x: _Point) -> tuple[_Point, Values]:
+def _moved(machine: _Machine, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Point, Values]:
     """Predictor, corrector, and the step between them and the boundary."""
     xp = machine.xp
     inverse = blocks.inverse(xp, x.S)
     ratio = x.z / x.s
-    solve = _directions(machine, p, _hessian(xp, p, inverse, x.Z, ratio))
+    solve = _directions(machine, p, gram + _barriers(xp, p, inverse, x.Z, ratio))
     target = _targets(xp, p)
 
     def direction(rZ: Values, rz: Values, toward: Values) -> tuple[Values, ...]:
@@ -263,8 +264,8 @@ def _length(xp: ModuleType, x: _Point, dS: Values, ds: Values, dZ: Values, dz: V
     return xp.where(xp.any(good), steps[xp.argmax(good)], 0.0)
 
 
-def _hessian(xp: ModuleType, p: ConeProgram, inverse: Values, Z: Values, ratio: Values) -> Values:
-    """The matrix of Newton's equations: information of the data, and barriers of the bounds."""
+def _barriers(xp: ModuleType, p: ConeProgram, inverse: Values, Z: Values, ratio: Values) -> Values:
+    """What the bounds add to the matrix of Newton's equations, beside the data's information."""
     K, w, n = p.bodies, p.width, p.drives
     flat = BASIS[:w].reshape(w, 16)
     own = flat[None] @ _sandwich(xp, inverse[:K], Z[:K]) @ flat.T[None]
@@ -275,7 +276,7 @@ def _hessian(xp: ModuleType, p: ConeProgram, inverse: Values, Z: Values, ratio: 
     bodies = xp.reshape(own[:, :, None, :] * diagonal, (K * w, K * w))
     drives = xp.diag(ratio[count : count + n] + ratio[count + n :])
     corner = xp.zeros((K * w, n))
-    H = p.A.T @ p.A + xp.concatenate(
+    H = xp.concatenate(
         [
             xp.concatenate([bodies, corner], axis=1),
             xp.concatenate([corner.T, drives], axis=1),
@@ -286,7 +287,7 @@ def _hessian(xp: ModuleType, p: ConeProgram, inverse: Values, Z: Values, ratio: 
         more = flat @ _sandwich(xp, inverse[K:], Z[K:]) @ xp.swapaxes(flat, -1, -2)
         ones = indicators(p.members, H.shape[0])
         H = H + xp.einsum("kia,kij,kjb->ab", ones, blocks.symmetric(xp, more), ones)
-    return H + TINY * xp.diag(xp.diag(H))
+    return H
 
 
 def _sandwich(xp: ModuleType, inverse: Values, Z: Values) -> Values:
@@ -297,10 +298,10 @@ def _sandwich(xp: ModuleType, inverse: Values, Z: Values) -> Values:
 
 def _directions(machine: _Machine, p: ConeProgram, H: Values) -> Callable[[Values], Values]:
     """Solves Newton's equations, along what may change."""
-    solve = machine.factor(H)
+    xp = machine.xp
+    solve = machine.factor(H + TINY * xp.diag(xp.diag(H)))
     if not p.equal.shape[0]:
         return solve
-    xp = machine.xp
     bent = xp.stack([solve(row) for row in p.equal], axis=1)
     square = p.equal @ bent
 
