@@ -34,6 +34,8 @@ from jaxid.types import AnyArray, Array, Bool, Float, Int, require_float64
 STEPS = np.array([1.0, *1.0 - np.geomspace(0.01, 0.64, 13), 0.28, 0.2, 0.13, 0.08, 0.04, 0.01])
 TOLERANCE = 2.5e-7
 """Error bound at which an optimum counts as found, as a share of objective and scale together."""
+NEAR = 1e-3
+"""Error bound, likewise, from which rounding matters."""
 MOST = 50
 PATIENCE = 4
 """Iterations without a better bound after which the search ends."""
@@ -102,10 +104,12 @@ class _Machine(NamedTuple):
     Attributes:
         xp: NumPy, or what JAX has in its place.
         factor: Solver of a positive definite system.
+        choose: One of two functions without arguments, and what it returns.
     """
 
     xp: ModuleType
     factor: Callable[[Values], Callable[[Values], Values]]
+    choose: Callable[[Values, Callable[[], tuple], Callable[[], tuple]], tuple]
 
 
 def solve_at_once(program: ConeProgram) -> Optimum:
@@ -228,9 +232,12 @@ def _moved(machine: _Machine, p: ConeProgram, gram: Values, x: _Point) -> tuple[
         dS, ds = p.matrices(xp, dy), p.slacks(xp, dy)
         return dy, dS, ds, rZ - blocks.symmetric(xp, inverse @ dS @ x.Z), rz - ratio * ds
 
+    def plain(rZ: Values, rz: Values) -> tuple[Values, ...]:
+        return direction(rZ, rz, p.adjoint(xp, rZ, rz) - x.residual)
+
     def refined(rZ: Values, rz: Values) -> tuple[Values, ...]:
         # Near the boundary rounding leaves a residual that the error bound would count.
-        found = direction(rZ, rz, p.adjoint(xp, rZ, rz) - x.residual)
+        found = plain(rZ, rz)
         dy, _, _, dZ, dz = found
         left = p.adjoint(xp, dZ, dz) - x.residual - (p.A @ dy) @ p.A
         more = direction(xp.zeros_like(rZ), xp.zeros_like(rz), left)
@@ -241,15 +248,16 @@ def _moved(machine: _Machine, p: ConeProgram, gram: Values, x: _Point) -> tuple[
         return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
 
     mu = complementarity(x.S, x.Z, x.s, x.z) + 1e-300
-    rZ, rz = target * inverse - x.Z, -x.z
-    _, dS, ds, dZ, dz = direction(rZ, rz, p.adjoint(xp, rZ, rz) - x.residual)
+    _, dS, ds, dZ, dz = plain(target * inverse - x.Z, -x.z)
     a = _length(xp, x, dS, ds, dZ, dz)
     ahead = complementarity(x.S + a * dS, x.Z + a * dZ, x.s + a * ds, x.z + a * dz)
     centre = xp.clip((ahead / mu) ** 3, 1e-6, 1.0)
     centre = xp.where(a < 0.1, xp.maximum(centre, 0.5), centre)
     second = blocks.symmetric(xp, inverse @ dS @ dZ)
     rZ = (target + centre * mu) * inverse - x.Z - second
-    dy, dS, ds, dZ, dz = refined(rZ, centre * mu / x.s - x.z - ds * dz / x.s)
+    rz = centre * mu / x.s - x.z - ds * dz / x.s
+    near = x.error <= NEAR * (p.scale + x.value)
+    dy, dS, ds, dZ, dz = machine.choose(near, lambda: refined(rZ, rz), lambda: plain(rZ, rz))
     a = 0.99 * _length(xp, x, dS, ds, dZ, dz)
     return _point(xp, p, x.y + a * dy, x.Z + a * dZ, x.z + a * dz), a
 
@@ -325,5 +333,5 @@ def _factor_compiled(H: Array) -> Callable[[Array], Array]:
     return lambda r: jax.scipy.linalg.cho_solve((L, True), r)
 
 
-_NUMPY = _Machine(np, _factor_at_once)
-_JAX = _Machine(jnp, _factor_compiled)
+_NUMPY = _Machine(np, _factor_at_once, lambda first, a, b: a() if first else b())
+_JAX = _Machine(jnp, _factor_compiled, jax.lax.cond)
