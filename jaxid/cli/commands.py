@@ -16,7 +16,11 @@ from jaxid.experiment import terminal
 from jaxid.experiment.excite import design, side_by_side, write
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
-from jaxid.experiment.folder import output_folder, refuse_foreign_folder
+from jaxid.experiment.folder import (
+    output_folder,
+    refuse_foreign_folder,
+    refuse_foreign_table,
+)
 from jaxid.experiment.lateness import delay_doubts
 from jaxid.experiment.loading import Loaded, choose, load_log, observe_all
 from jaxid.experiment.mistakes import likely_mistake
@@ -100,7 +104,9 @@ def init(
 @app.command()
 def example(
     folder: Annotated[Path, typer.Argument(help="Where the files shall lie.", metavar="DIR")],
-    seed: Annotated[int, typer.Option(metavar="N", help="Of parameters, motion and noise.")] = 0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Of parameters, motion and noise.")
+    ] = 0,
 ) -> None:
     """Write an experiment to try things on.
 
@@ -187,6 +193,7 @@ def excite(
     the best motion so far.
     """
     console = open_console()
+    refuse_foreign_table(output)
     loaded = load_experiment(experiment)
     state = output.with_suffix(".state.npz")
     with designing(console) as tell:
@@ -240,7 +247,11 @@ def identify(
     console = open_console()
     if split is not None and not 0 < split < 1:
         raise ValueError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
-    twice = {p.resolve() for p in logs} & {p.resolve() for p in verify or []}
+    places = [p.resolve() for p in logs]
+    repeated = next((p for k, p in enumerate(logs) if places[k] in places[:k]), None)
+    if repeated is not None:
+        raise ValueError(f"`{repeated}` is given twice: what it tells would count double.")
+    twice = set(places) & {p.resolve() for p in verify or []}
     if twice:
         raise ValueError(
             f"`{sorted(twice)[0].name}` is given both to identify and to verify with: a model that "

@@ -50,6 +50,8 @@ from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot, Tool
 from jaxid.types import Float
 
+SHORTEST = 1e-6
+"""Time between two samples that no robot's log goes below [s]."""
 LONG = 500_000
 """Samples from which a log is read part by part."""
 
@@ -165,6 +167,11 @@ class Experiment:
                 "name one column for each joint, or choose another robot (`robot.tip`)."
             )
         with within(self.path.name, "recording"):
+            if recording.sample_time < SHORTEST:
+                raise ValueError(
+                    f"`{log.name}` has {1 / recording.sample_time:.3g} samples in a second: check "
+                    "`time_unit` or `sample_time`."
+                )
             if table.start is not None or table.stop is not None:
                 recording = recording.crop(
                     -np.inf if table.start is None else table.start,

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from jaxid.report import compared_files, content, found
+from jaxid.trajectory.files import load_trajectory
 
 WRITTEN = (
     ("result.json", content.SCHEMA),
@@ -35,6 +36,33 @@ def refuse_foreign_folder(target: Path, force: bool) -> None:
         f"`{target}` holds files but no report: choose another folder with -o, or add --force to "
         "put the report beside them."
     )
+
+
+def refuse_foreign_table(target: Path) -> None:
+    """Refuses to write a motion over other files; an earlier motion may go.
+
+    Args:
+        target: The table, beside which the trajectory lies with the suffix `.json`.
+
+    Raises:
+        ValueError: If the name is not that of a table, or something else is in its place.
+    """
+    if target.suffix.lower() != ".csv":
+        raise ValueError(f"`{target}` must end in .csv: choose another -o.")
+    beside = target.with_suffix(".json")
+    if (target.exists() or beside.exists()) and not _is_trajectory(beside):
+        taken = target if target.exists() else beside
+        raise ValueError(
+            f"`{taken}` is there already, and no motion of `jaxid excite`: choose another -o."
+        )
+
+
+def _is_trajectory(path: Path) -> bool:
+    try:
+        load_trajectory(path)
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _is_report(folder: Path) -> bool:

@@ -10,6 +10,8 @@ from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.observations import Observations
 
+EXPLAINED = 0.3
+"""Share of the forces that the model must not leave unexplained, of 1: else it sees no delay."""
 LEAST = 0.1
 """Delay that is worth a word, in sample times."""
 ALIKE = 0.001
@@ -26,7 +28,7 @@ def delay_doubts(
         observations: Of one log; a long one is not looked at.
         fit: Of this log.
     """
-    if isinstance(observations, LongLog):
+    if isinstance(observations, LongLog) or not fit.residual < EXPLAINED:
         return ()
     try:
         found = estimate_delay(base, observations, GivenWeights(np.asarray(fit.weights)))
@@ -40,7 +42,8 @@ def delay_doubts(
         f"{'later' if found.seconds > 0 else 'earlier'} in the log than the angles: "
     )
     if found.alike > ALIKE:
-        return (f"{said}`force_delay = {found.seconds:.3g}` in `[recording]` removes that.",)
+        cure = f"`force_delay = {found.seconds:.3g}` in `[recording]` removes that"
+        return (f"{said}{cure}, unless the model lacks an effect instead.",)
     low, high = (1e3 * float(x) for x in (np.min(found.of_joints), np.max(found.of_joints)))
     return (
         f"{said}from {low:.3g} to {high:.3g} ms joint by joint, so that some effect which the "

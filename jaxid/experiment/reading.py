@@ -109,6 +109,8 @@ def _came(what: str, value: Any) -> str:
         return f"holds {len(value)}"
     if isinstance(value, dict):
         return "is a table"
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return "is a list of tables (`[[…]]`)"
     if isinstance(value, bool):
         return f"is {str(value).lower()}"
     if isinstance(value, str):

@@ -34,6 +34,8 @@ BUILTIN = {
     "kr300": library.kr300,
     "planar_arm": library.planar_arm,
 }
+SMALLEST, LARGEST = 1e-9, 1e9
+"""Forces that no joint of a robot is below or above [N m or N]: weights stay numbers."""
 LIMIT_FIELDS = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
 
 
@@ -103,6 +105,9 @@ def _source(table: RobotTable, path: Path) -> Robot:
                 f"{path.name}: `robot.{key}` belongs to `{owner}` and means nothing for "
                 f"`{given[0]}`: leave it out."
             )
+    for key in ("gravity", "base_rotation", "base_position"):
+        if getattr(table, key) is not None and not np.isfinite(getattr(table, key)).all():
+            raise ValueError(f"{path.name}: `robot.{key}` must hold three finite numbers.")
     gravity = GRAVITY if table.gravity is None else table.gravity
     R = None if table.base_rotation is None else rpy_rotation(np.deg2rad(table.base_rotation))
     position = (0.0, 0.0, 0.0) if table.base_position is None else table.base_position
@@ -181,6 +186,10 @@ def _limits(robot: Robot, table: LimitsTable) -> Limits:
         values = each(robot, name, getattr(table, name))
         if values is not None:
             given = np.array(values) * (1.0 if name == "force" else degrees)
+            if name == "force" and (np.isfinite(given) & ~(np.abs(given) < LARGEST)).any():
+                raise ValueError(f"`force` must be below {LARGEST:g} N m or N, but is {values}.")
+            if name == "force" and ((given > 0) & (given < SMALLEST)).any():
+                raise ValueError(f"`force` must be above {SMALLEST:g} N m or N, but is {values}.")
             # In the file, nan stands for a number that the robot's source knows better.
             said += [
                 f"{name} of {j}" for j, x in zip(robot.joint_names, given, strict=True) if x == x
@@ -200,6 +209,8 @@ def _drives(robot: Robot, table: DrivesTable) -> Drives:
     reduction = drives.reduction
     if table.gear_ratios is not None:
         reduction = each(robot, "gear_ratios", table.gear_ratios)
+        if not np.isfinite(np.array(table.gear_ratios)).all():
+            raise ValueError(f"`gear_ratios` must be finite numbers, but are {table.gear_ratios}.")
     if table.matrix is not None:
         widths = {len(row) for row in table.matrix}
         if len(table.matrix) != n or widths != {n}:
@@ -208,6 +219,8 @@ def _drives(robot: Robot, table: DrivesTable) -> Drives:
     zero = drives.zero
     if each(robot, "zero", table.zero) is not None:
         turns = np.array(robot.revolute) & (table.angle_unit == "deg")
+        if not np.isfinite(np.array(table.zero)).all():
+            raise ValueError(f"`zero` must hold finite numbers, but is {table.zero}.")
         zero = np.array(table.zero) * np.where(turns, np.pi / 180, 1.0)
     torques = each(robot, "max_torques", table.max_torques)
     inertia = each(robot, "rotor_inertia", table.rotor_inertia)

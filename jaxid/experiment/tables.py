@@ -88,8 +88,8 @@ class DrivesTable(_Table, frozen=True):
     matrix: list[PerJoint] | None = None
     angle_unit: AngleUnit = "rad"
     zero: PerJoint | None = None
-    max_torques: PerJoint | None = None
-    rotor_inertia: PerJoint | None = None
+    max_torques: list[Positive] | None = None
+    rotor_inertia: list[Magnitude] | None = None
 
 
 class CapsuleTable(_Table, frozen=True):
@@ -167,7 +167,7 @@ class RecordingTable(_Table, frozen=True):
     forces_side: Side | None = None
     forces_file: str | None = None
     velocities_file: str | None = None
-    largest_gap: Positive = 1.75
+    largest_gap: Annotated[float, Meta(gt=1)] = 1.75
     start: float | None = None
     stop: float | None = None
 
@@ -229,8 +229,8 @@ class ExcitationTable(_Table, frozen=True):
         "weighted_condition_number",
         "scaled_condition_number",
     ] = "d_optimal"
-    harmonics: Count = 5
-    omega: Positive = 0.8
+    harmonics: Annotated[int, Meta(ge=1, le=50)] = 5
+    omega: Annotated[float, Meta(gt=0, le=1000)] = 0.8
     rest: bool = False
     samples: Annotated[int, Meta(ge=2)] = 800
     noise: PerJoint | None = None

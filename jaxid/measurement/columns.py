@@ -121,6 +121,12 @@ class Columns(eqx.Module):
             signs = getattr(self, name)
             if signs is not None and any(abs(s) != 1 for s in signs):
                 raise ValueError(f"`{name}` must be +1 or -1 for each joint, but is {signs}.")
+        constants = self.torque_constants
+        if constants is not None and not all(c != 0 and np.isfinite(c) for c in constants):
+            raise ValueError(
+                "`torque_constants` must be numbers other than zero [N m/A], but are "
+                f"{', '.join(f'{c:g}' for c in constants)}."
+            )
         if self.force_gains is not None and not all(0 < g < np.inf for g in self.force_gains):
             raise ValueError(
                 f"`force_gains` must be positive for each joint, but is {self.force_gains}."

@@ -72,8 +72,8 @@ class Subsample(AbstractDecimation):
             raise ValueError(
                 f"`Subsample({self.every})` leaves {rate:.6g} Hz, but the filter lets forces and "
                 f"columns pass up to {cutoff:.6g} Hz, which must be below half of that: take "
-                f"at most every {max(1, math.floor(0.5 / (cutoff * sample_time)))}th sample, "
-                "a lower cut-off, or `Decimation`."
+                f"one of {max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, a "
+                "lower cut-off, or `Decimation`."
             )
 
 

@@ -27,6 +27,7 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
     Raises:
         ValueError: If the delay is longer than a segment allows.
     """
+    _refuse_endless(seconds)
     lost = math.ceil(abs(seconds) / recording.sample_time - 1e-9)
     early, late = (lost, 0) if seconds > 0 else (0, lost)
     kept, segments = [], []
@@ -37,7 +38,7 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
             segments.append((start, start + len(kept[-1])))
     if not kept:
         raise ValueError(
-            f"`seconds` is {seconds:g} s, but the longest segment of `{recording.name}` lasts "
+            f"the delay is {seconds:g} s, but the longest segment of `{recording.name}` lasts "
             f"{max(b - a for a, b in recording.segments) * recording.sample_time:g} s."
         )
     chosen = np.concatenate(kept)
@@ -73,6 +74,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
     Raises:
         ValueError: If no rows are left.
     """
+    _refuse_endless(seconds)
     time, dt = np.asarray(observations.time), observations.sample_time
     lost = math.ceil(abs(seconds) / dt - 1e-9)
     edge = observations.filter.edge(dt)
@@ -88,11 +90,16 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
         mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
     if not mask.any(axis=0).all():
         raise ValueError(
-            f"`seconds` is {seconds:g} s, but `{observations.name}` lasts "
+            f"the delay is {seconds:g} s, but `{observations.name}` lasts "
             f"{time[-1] - time[0]:g} s: no rows of some joint are left."
         )
     motion = Motion(*(np.concatenate(values) for values in parts))
     return eqx.tree_at(lambda o: (o.motion, o.mask), observations, (motion, mask))
+
+
+def _refuse_endless(seconds: float) -> None:
+    if not math.isfinite(seconds):
+        raise ValueError(f"the delay must be a finite time [s], but is {seconds:g}.")
 
 
 def _arrays(motion: Motion) -> list[np.ndarray]:

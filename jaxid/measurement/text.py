@@ -1,5 +1,6 @@
 """Text files of numbers: how one is written, and its rows as columns."""
 
+import codecs
 import dataclasses
 import io
 import re
@@ -39,6 +40,8 @@ class Dialect:
         Raises:
             ValueError: If it is empty, or names a column twice.
         """
+        if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise ValueError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
         first, _, _ = head.partition(b"\n")
         line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
         if not line.strip():
@@ -77,10 +80,13 @@ class Dialect:
                 **self._options(),
             )
         except pl.exceptions.PolarsError as error:
-            reason = str(error).strip().splitlines()[0] if str(error).strip() else "no reason given"
+            if isinstance(error, pl.exceptions.NoDataError):
+                raise ValueError(
+                    f"`{self.source}` has a header, but no rows: is the log cut?"
+                ) from error
             raise ValueError(
-                f"`{self.source}` is no table with {len(self.names)} columns in every line "
-                f"({reason}): repair or remove the lines that differ."
+                f"`{self.source}` is no table with {len(self.names)} columns in every line: repair "
+                "or remove the lines that differ."
             ) from error
         if frame.width != len(self.names):
             raise ValueError(

@@ -52,7 +52,9 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
         key: [_entry(row, key, path, k) for k, row in enumerate(rows)]
         for key in ("name", "expression", "unit", "estimate")
     }
-    covariance = np.array(_list(content.get("fit", {}), "covariance", path), np.float64)
+    fit = content.get("fit")
+    found = _list(fit if isinstance(fit, dict) else {}, "covariance", path)
+    covariance = _numbers(found, "fit.covariance", path)
     size = len(rows)
     if covariance.shape != (size, size):
         raise ValueError(
@@ -65,10 +67,10 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
         expressions=tuple(columns["expression"]),
         units=tuple(columns["unit"]),
         groups=tuple(str(row.get("group", UNGROUPED)) for row in rows),
-        parameters=np.array(columns["estimate"], np.float64),
+        parameters=_numbers(columns["estimate"], "estimate", path),
         # What is not finite is null in JSON, and nothing is known of it.
         covariance=np.where(np.isnan(covariance), np.inf, covariance),
-        freedom=np.array([_freedom(row) for row in rows]),
+        freedom=_numbers([_freedom(row) for row in rows], "degrees_of_freedom", path),
     )
 
 
@@ -85,9 +87,16 @@ def _entry(row: Any, key: str, path: Path, number: int) -> Any:
     return row[key]
 
 
-def _freedom(row: Mapping[str, Any]) -> float:
+def _numbers(values: list[Any], key: str, path: Path) -> np.ndarray:
+    try:
+        return np.array(values, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"`{path}`: `{key}` must hold numbers: identify again.") from None
+
+
+def _freedom(row: Mapping[str, Any]) -> Any:
     found = row.get("degrees_of_freedom")
-    return np.inf if found is None else float(found)
+    return np.inf if found is None else found
 
 
 def write_comparison(
