@@ -52,8 +52,8 @@ LEGS = (
 )
 """Relaxed limits, then the limits; once more a little relaxed; sharper in the end."""
 
-SETTLING = (Leg(Stage(TIGHT, 1e-4, 1e-6, 50), 20.0, True),) * 3
-"""What follows where there are constraints, whose peaks move between instants."""
+SETTLING = (Leg(Stage(TIGHT, 1e-4, 1e-6, 50, 100.0), 20.0, True),) * 3
+"""What follows where there are constraints: their peaks move, and what cannot be kept is dear."""
 
 
 class Best(NamedTuple):
