@@ -145,12 +145,13 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written
         _, q, _, qdd = table(written / folder / "motion.csv").T
         return np.abs((0.11 + 2 * 0.4**2) * qdd - 2 * 0.4 * 9.81 * np.cos(q)).max()
 
-    keys = ("force_margin = 0.5", 'earlier = ["plan/motion.json"]', "leads = false")
+    keys = ("force_margin = 0.5", 'earlier = ["plan/motion.json"]')
     path = with_keys(written, "weak.toml", *keys)
     code, out, err = run("excite", path, "-o", "weak/motion.csv")
     assert code == 0, err
     assert largest_force("weak") <= 6.0 < 7.5 < largest_force("plan")
     assert "the force of joint `hinge` keeps its limit" in out
+    assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
 
 
 def test_an_impossible_motion_is_diagnosed(written, run):

@@ -178,6 +178,8 @@ class InteriorPoint:
                 barrier=barrier,
                 step=jnp.zeros_like(one.step),
                 dual_step=jax.tree.map(jnp.zeros_like, one.dual_step),
+                length=jnp.zeros_like(one.length),
+                dual_length=jnp.zeros_like(one.dual_length),
                 fresh=jnp.ones((), bool),
             )
 
@@ -270,6 +272,8 @@ class InteriorPoint:
         spare = one * (jnp.sum(central.constraints) - price) + central.allowance
         downhill = jnp.concatenate([downhill, spare])
         step = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(H), True), downhill)
+        # Where rounding makes the matrix indefinite, its diagonal alone decides.
+        step = jnp.where(jnp.all(jnp.isfinite(step)), step, downhill / jnp.diagonal(H))
         more = step[size:]
         change = Bounds(self._along(step[:size]), seen.slopes @ step[:size] - jnp.sum(more), -more)
         dual_step = jax.tree.map(

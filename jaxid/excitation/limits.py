@@ -185,6 +185,7 @@ def random_motion(
     draws: Float[Array, " scaled"],
     places: Float[Array, " joints"],
     reach: float = 0.95,
+    size: float = 1.0,
 ) -> Float[Array, " scaled"]:
     """A motion from random numbers that fills its limits, anywhere in its ranges.
 
@@ -194,13 +195,14 @@ def random_motion(
         draws: Its shape.
         places: Where in the range that is left each joint moves, from 0 to 1.
         reach: Share of the limits to use.
+        size: Share of that, of the motion; its place is anywhere in what is left.
     """
     motion = draws.reshape(np.shape(still))
     rows = jnp.einsum("jrk,jk->jr", grid.R, motion)
     q, rest = rows[:, : grid.positions], rows[:, grid.positions :]
     peak = jnp.maximum(jnp.abs(rest).max(axis=1), 0.5 * (q.max(axis=1) - q.min(axis=1)))
     bound = reach * grid.bound
-    s = bound / peak
+    s = size * bound / peak
     low = grid.c[:, 0] - bound - s * q.min(axis=1)
     high = grid.c[:, 0] + bound - s * q.max(axis=1)
     shift = low + (high - low) * places

@@ -199,6 +199,17 @@ class Problem:
         """All constraints of one motion at all checked instants."""
         return np.asarray(self._check(self.limits.numbers(np.asarray(y))))
 
+    def worst(self, y: Float[Array, "starts scaled"]) -> Float[Array, " starts"]:
+        """The worst excess of some motions at the instants that are always watched."""
+        steady = np.arange(0, CHECKED, CHECKED // WATCHED)
+        rows = np.asarray(self._all_rows)[:, steady]
+
+        def one(y: Array) -> Array:
+            x = self.limits.numbers(y)
+            return jnp.max(self._values(Motion(*(part @ x.T for part in rows))))
+
+        return jax.lax.map(one, y)
+
     def _highest(self, y: Float[Array, " scaled"]) -> Int[Array, " instants"]:
         """Equidistant instants, and the highest peaks of each value."""
         values = self._constrained(self.limits.numbers(y)).T

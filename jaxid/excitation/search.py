@@ -12,12 +12,14 @@ import numpy as np
 from jaxid.excitation.interior_point import InteriorPoint, Stage, State
 from jaxid.excitation.limits import CERTIFIED, JointLimits, held_within, random_motion
 from jaxid.excitation.problem import Context, Problem
-from jaxid.types import AnyArray, Array, Float, PRNGKeyArray
+from jaxid.types import AnyArray, Array, Bool, Float, PRNGKeyArray
 
 GRID = 64
 """Rows of each order by which limits are kept during the search."""
 GROWTH = 1.05
 """Most by which a motion is enlarged to meet its limits in the end."""
+CALM = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
+"""Sizes of further random motions, for starts that find no way to keep the constraints."""
 TIGHT = 0.998
 """Share of the limits within which legs end: what is left is for rounding."""
 
@@ -52,7 +54,7 @@ LEGS = (
 )
 """Relaxed limits, then the limits; once more a little relaxed; sharper in the end."""
 
-SETTLING = (Leg(Stage(TIGHT, 1e-4, 1e-6, 50, 100.0), 20.0, True),) * 3
+SETTLING = tuple(Leg(Stage(TIGHT, 1e-4, 1e-6, n, 100.0), 20.0, True) for n in (100, 50, 50))
 """What follows where there are constraints: their peaks move, and what cannot be kept is dear."""
 
 
@@ -101,6 +103,7 @@ class Search:
         limits = problem.limits
         self._solver = InteriorPoint(problem.evaluation(), limits.grid(GRID), limits.still)
         self._fine = limits.grid(CERTIFIED)
+        self._worst = jax.jit(problem.worst)
         growth = 1.0 if problem.constraints else GROWTH
         self._restore = jax.jit(
             jax.vmap(lambda y: held_within(self._fine, limits.still, y, self._fine.bound, growth))
@@ -116,12 +119,30 @@ class Search:
     def advance(self, searched: Searched) -> Searched:
         """The next leg."""
         leg = self._legs[searched.leg]
-        context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(searched.state.y))
-        state = self._solver.run(searched.state, leg.stage, context)
+        state = searched.state
+        if searched.leg == len(LEGS) and (searched.best.excess > 0).any():
+            state = self._calmed(state, searched.best.excess > 0)
+        context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(state.y))
+        state = self._solver.run(state, leg.stage, context)
         best = searched.best
         if leg.judged:
             best = _better(best, self._judged(self._restore(state.y)))
         return Searched(state, searched.leg + 1, searched.first, best)
+
+    def _calmed(self, state: State, broken: Bool[np.ndarray, " starts"]) -> State:
+        """Starts anew where constraints are broken, from small motions that keep them best."""
+        many = jnp.concatenate(
+            [
+                random_starts(self.problem.limits, jax.random.key(k), 16, s)
+                for k, s in enumerate(CALM)
+            ]
+        )
+        best = jnp.argsort(jnp.maximum(self._worst(many), 0.0))
+        chosen = many[best[np.arange(self._starts) % len(many)]]
+        anew = self._solver.start(chosen, self.problem.conditions)
+        return jax.tree.map(
+            lambda a, b: jnp.where(broken.reshape(-1, *(1,) * (a.ndim - 1)), a, b), anew, state
+        )
 
     @property
     def legs(self) -> int:
@@ -132,19 +153,29 @@ class Search:
         numbers = [np.asarray(self.problem.limits.numbers(np.asarray(one))) for one in y]
         values = np.array([self.problem.value(x) for x in numbers])
         excess = np.array([self.problem.excess(x) for x in numbers])
-        return Best(np.asarray(y), np.where(np.isfinite(values), values, np.inf), excess)
+        finite = np.isfinite(values) & ~np.isnan(excess)
+        return Best(
+            np.asarray(y), np.where(finite, values, np.inf), np.where(finite, excess, np.inf)
+        )
 
 
 def random_starts(
-    limits: JointLimits, key: PRNGKeyArray, starts: int
+    limits: JointLimits, key: PRNGKeyArray, starts: int, size: float = 1.0
 ) -> Float[Array, "starts scaled"]:
-    """Motions with random shapes and places that fill their limits, in scaled numbers."""
+    """Motions with random shapes and places that fill their limits, in scaled numbers.
+
+    Args:
+        limits: Of the joints.
+        key: Of the random numbers.
+        starts: How many.
+        size: Of the motions, relative to those that fill the limits.
+    """
     joints, variables = limits.shape
     fine = limits.grid(CERTIFIED)
     shape, place = jax.random.split(key)
     draws = jax.random.normal(shape, (starts, joints * variables), float)
     places = jax.random.uniform(place, (starts, joints), float)
-    return jax.vmap(lambda a, b: random_motion(fine, limits.still, a, b))(draws, places)
+    return jax.vmap(lambda a, b: random_motion(fine, limits.still, a, b, size=size))(draws, places)
 
 
 def _better(old: Best, new: Best) -> Best:

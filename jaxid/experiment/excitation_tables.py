@@ -28,6 +28,7 @@ from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import urdf_parameters
 from jaxid.trajectory.basis import AbstractBasis, FourierBasis
 from jaxid.trajectory.files import load_trajectory
+from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRestBasis
 from jaxid.types import Float
 
@@ -54,9 +55,17 @@ class Nominal(NamedTuple):
     covariance: Float[np.ndarray, "base base"] | None
 
 
-def build_basis(table: ExcitationTable) -> AbstractBasis:
-    """The trajectories to choose from."""
-    kind = RestToRestBasis if table.rest else FourierBasis
+def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
+    """The trajectories to choose from.
+
+    Args:
+        table: Of the experiment file.
+        constrained: Whether there is more to keep than limits of joints: then leads are designed
+            together with the motion, so that they keep it too.
+    """
+    if table.rest:
+        return RestToRestBasis(table.harmonics, table.omega)
+    kind = LeadsBasis if constrained and table.leads else FourierBasis
     return kind(table.harmonics, table.omega)
 
 

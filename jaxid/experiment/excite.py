@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxid.excitation.constraints.constraint import Finding
 from jaxid.excitation.design import DesignProgress, assumed_noise, design_excitation
 from jaxid.excitation.plan import CRITERIA as ALL
 from jaxid.excitation.plan import ExcitationPlan
@@ -27,12 +26,10 @@ from jaxid.trajectory.files import save_trajectory, write_csv
 from jaxid.trajectory.leads import with_leads
 from jaxid.trajectory.ros import write_ros_yaml
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import double_precision
+from jaxid.types import Float, double_precision
 
 FEW = 8
 """Starts of the designs that only show what a criterion buys."""
-STEP = 0.01
-"""Time between the samples at which leads are checked [s]."""
 
 
 class Excited(NamedTuple):
@@ -42,14 +39,12 @@ class Excited(NamedTuple):
         plan: The design.
         played: The motion from standstill to standstill where that could be had.
         window: Times of it between which lies the designed motion [s].
-        broken: Constraints that do not hold on the way into the motion or out of it.
         refused: Why there is no way into the motion, or an empty text.
     """
 
     plan: ExcitationPlan
     played: AbstractTrajectory
     window: tuple[float, float]
-    broken: tuple[Finding, ...]
     refused: str
 
 
@@ -125,7 +120,8 @@ def write(excited: Excited, output: Path) -> list[Path]:
         output: Of the table; the others lie beside it.
     """
     plan, played = excited.plan, excited.played
-    robot, step = plan.base.model.robot, float(plan.limits.basis.duration) / plan.samples
+    robot, times = plan.base.model.robot, _measured(plan)
+    step = float(times[1] - times[0])
     names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.yaml"]
     with double_precision(), written_whole(output.parent) as folder:
         write_csv(played, robot, folder / names[0], sample_time=step)
@@ -139,9 +135,10 @@ def _settings(experiment: Experiment, weighted: bool = True) -> dict:
     table, robot = experiment.excitation, experiment.robot
     noise = assumed_noise(robot) if table.noise is None else np.array(table.noise)
     nominal = build_nominal(experiment)
+    constraints = build_constraints(experiment, nominal)
     return {
-        "basis": build_basis(table),
-        "constraints": build_constraints(experiment, nominal),
+        "basis": build_basis(table, bool(constraints)),
+        "constraints": constraints,
         "key": jax.random.key(table.seed),
         "noise": noise,
         "nominal": None if nominal is None else nominal.parameters,
@@ -151,9 +148,10 @@ def _settings(experiment: Experiment, weighted: bool = True) -> dict:
 
 
 def _played(experiment: Experiment, plan: ExcitationPlan) -> Excited:
-    motion, table, refused = plan.trajectory, experiment.excitation, ""
-    window, broken = (0.0, float(plan.limits.basis.duration)), ()
-    if table.leads and not table.rest:
+    motion, table, times = plan.trajectory, experiment.excitation, _measured(plan)
+    window, refused = (float(times[0]), float(times[-1])), ""
+    # Where constraints were found, leads were designed together with the motion.
+    if table.leads and not table.rest and not plan.findings:
         robot = experiment.robot.replace(limits=plan.limits.limits)
         series = FourierBasis(table.harmonics, table.omega).trajectory(plan.numbers)
         try:
@@ -162,17 +160,11 @@ def _played(experiment: Experiment, plan: ExcitationPlan) -> Excited:
             refused = str(error)
         else:
             begin, end = (float(t) for t in motion.window)
-            window, broken = (begin, end), _broken(experiment, motion)
-    return Excited(plan, motion, window, broken, refused)
+            window = (begin, end)
+    return Excited(plan, motion, window, refused)
 
 
-def _broken(experiment: Experiment, motion: AbstractTrajectory) -> tuple[Finding, ...]:
-    """Constraints that a motion with its leads does not keep."""
-    robot, found = experiment.robot, []
-    constraints = build_constraints(experiment, build_nominal(experiment))
-    if constraints:
-        with double_precision():
-            samples = motion.sample(STEP)[1]
-            for constraint in constraints:
-                found += constraint.describe(robot, np.asarray(constraint(robot, samples)))
-    return tuple(f for f in found if f.value > 0)
+def _measured(plan: ExcitationPlan) -> Float[np.ndarray, " times"]:
+    """Times of the samples of one run, and its end [s]."""
+    times = plan.limits.basis.times(plan.samples)
+    return np.append(times, times[-1] + times[1] - times[0])

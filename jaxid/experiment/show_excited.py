@@ -72,7 +72,6 @@ def _warned(excited: Excited) -> list[str]:
         )
     if excited.refused:
         warned.append(f"the motion starts at full speed, for {excited.refused}")
-    warned += [f"on the way into the motion or out of it {f}" for f in excited.broken]
     if plan.interrupted:
         warned.append("the design was stopped: `--resume` goes on where it was")
     return warned
