@@ -120,8 +120,9 @@ class Search:
         """The next leg."""
         leg = self._legs[searched.leg]
         state = searched.state
-        if searched.leg == len(LEGS) and (searched.best.excess > 0).any():
-            state = self._calmed(state, searched.best.excess > 0)
+        broken = np.asarray(searched.best.excess) > 0
+        if searched.leg == len(LEGS) and broken.any():
+            state = self._calmed(state, broken)
         context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(state.y))
         state = self._solver.run(state, leg.stage, context)
         best = searched.best
