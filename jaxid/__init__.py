@@ -85,6 +85,7 @@ from jaxid.identification.nonlinear.temperature import temperature_law as temper
 from jaxid.identification.nonlinear.verdict import NonlinearFit as NonlinearFit
 from jaxid.identification.nonlinear.verdict import identify_nonlinear as identify_nonlinear
 from jaxid.identification.opening import open_log as open_log
+from jaxid.identification.prior import RelativeTo as RelativeTo
 from jaxid.identification.robust import AbstractLoss as AbstractLoss
 from jaxid.identification.robust import Huber as Huber
 from jaxid.identification.robust import IterativelyReweighted as IterativelyReweighted

@@ -1,7 +1,6 @@
 """Instrumental variables: columns of a motion without noise keep a noisy encoder from biasing."""
 
-from collections.abc import Sequence
-
+import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
@@ -54,12 +53,14 @@ class InstrumentalVariables(AbstractEstimator):
 
     Attributes:
         references: The commanded trajectory of each recording; one for all if there is one only.
-            Its time is that of the recording's stamps.
+        starts: Stamps of the recordings at which the trajectories began [s]; one for all if there
+            is one only.
         weights: Of the joints; by default the reciprocals of the largest forces (Eq. 30).
     """
 
     references: tuple[AbstractTrajectory, ...]
     weights: AbstractWeights = MaximumForces()
+    starts: tuple[float, ...] = eqx.field(static=True, default=(0.0,))
 
     def __call__(self, rows):
         """Solves with the references' columns.
@@ -69,10 +70,14 @@ class InstrumentalVariables(AbstractEstimator):
         """
         rows.require_seen("an estimate with instrumental variables")
         weights = self.weights(rows.robot, rows.factors)
-        references = self._for(len(rows.recordings))
-        pairs = zip(rows.recordings, references, strict=True)
+        count = len(rows.recordings)
+        references, starts = (
+            _for(count, "references", self.references),
+            _for(count, "starts", self.starts),
+        )
         instruments = tuple(
-            _columns(rows.base, source(recording)[0], reference) for recording, reference in pairs
+            _columns(rows.base, source(recording)[0], reference, start)
+            for recording, reference, start in zip(rows.recordings, references, starts, strict=True)
         )
         influence = InstrumentRows(weights, instruments)
         size = rows.base.size
@@ -92,17 +97,19 @@ class InstrumentalVariables(AbstractEstimator):
             solution=Complete(),
         )
 
-    def _for(self, recordings: int) -> Sequence[AbstractTrajectory]:
-        if len(self.references) not in (1, recordings):
-            raise ValueError(
-                f"`references` must hold one trajectory, or one for each of {recordings} "
-                f"recordings, but holds {len(self.references)}."
-            )
-        return self.references * recordings if len(self.references) == 1 else self.references
+
+def _for(recordings: int, name: str, given: tuple) -> tuple:
+    """One for each recording."""
+    if len(given) not in (1, recordings):
+        raise ValueError(
+            f"`{name}` must hold one entry, or one for each of {recordings} recordings, but holds "
+            f"{len(given)}."
+        )
+    return given * recordings if len(given) == 1 else given
 
 
 def _columns(
-    base: BaseParameters, observations: Observations, reference: AbstractTrajectory
+    base: BaseParameters, observations: Observations, reference: AbstractTrajectory, start: float
 ) -> tuple[np.ndarray, ...]:
     """The columns of a reference, reduced like those of the recording."""
     held = np.asarray(observations.time)
@@ -112,7 +119,7 @@ def _columns(
     n = observations.joints
 
     def read(samples: slice) -> tuple[Motion, np.ndarray]:
-        t = time[samples]
+        t = time[samples] - start
         m = reference.motion(t)
         motion = Motion(*(np.asarray(x, np.float64) for x in (m.q, m.qd, m.qdd)))
         return motion, np.zeros((len(t), n))
