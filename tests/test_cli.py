@@ -609,4 +609,4 @@ def test_axis_by_axis_stands_beside_at_once(folder, run):
     (folder / "experiment.toml").write_text(EXPERIMENT + extra + "single_axes = ['a.csv']\n")
     refused(run("identify", "experiment.toml", "b.csv"), "`single_axes` must hold motions of one")
     (folder / "experiment.toml").write_text(EXPERIMENT + extra + "ridge = 0.1\n")
-    refused(run("identify", "experiment.toml", "b.csv"), "`ridge` does not go with")
+    refused(run("identify", "experiment.toml", "b.csv"), "`ridge` belongs to")

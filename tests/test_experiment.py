@@ -291,6 +291,72 @@ def test_estimators(load, text, estimator, solution):
         assert experiment.estimator.solution.share == 0.02
 
 
+@pytest.mark.parametrize(
+    ("text", "estimator"),
+    [
+        ('kind = "huber"', jid.IterativelyReweighted(jid.Huber(), jid.ResidualVariances())),
+        (
+            'kind = "tukey"\nlimit = 4\nridge = 0.1',
+            jid.IterativelyReweighted(jid.Tukey(4.0), jid.ResidualVariances(), jid.Ridge(0.1)),
+        ),
+        ('kind = "correlated"', jid.GeneralisedLeastSquares()),
+        (
+            'kind = "consistent"\npull = 2\nmargin = 0.01',
+            jid.PhysicallyConsistent(
+                jid.ResidualVariances(), margin=0.01, pull=jid.EntropicPull(strength=2.0)
+            ),
+        ),
+    ],
+)
+def test_estimators_of_other_kinds(load, text, estimator):
+    experiment = load(f"{ARM}[estimator]\n{text}\n")
+    assert experiment.estimator == estimator
+    assert experiment.plain == jid.WeightedLeastSquares(
+        jid.ResidualVariances(), jid.Ridge(0.1) if "ridge" in text else jid.Complete()
+    )
+
+
+def test_estimators_of_files(load, tmp_path):
+    motion = jid.random_fourier_series(jid.robots.planar_arm(2), omega=1.0, seed=3)
+    jid.save_trajectory(motion, tmp_path / "motion.json")
+    text = '[estimator]\nkind = "instrumental"\nreference = ["motion.json"]\nreference_start = 2\n'
+    estimator = load(ARM + text).estimator
+    assert isinstance(estimator, jid.InstrumentalVariables)
+    assert (len(estimator.references), estimator.starts) == (1, (2.0,))
+    inertia = (
+        "<inertial><mass value='{}'/><inertia ixx='{}' ixy='0' ixz='0' iyy='3' iyz='0' izz='4'/>"
+    )
+    heavy = URDF
+    for link, mass in (("cart", 5), ("arm", 7)):
+        own = f"<link name='{link}'>{inertia.format(mass, mass)}</inertial></link>"
+        heavy = heavy.replace(f'<link name="{link}"/>', own)
+    (tmp_path / "arm.urdf").write_text(heavy)
+    robot = (
+        '[robot]\nurdf = "arm.urdf"\n[model]\nprincipal_axes = true\n[estimator]\nprior = "urdf"\n'
+    )
+    experiment = load(robot + "ridge = 0.1\n")
+    assert isinstance(experiment.estimator, jid.RelativeTo)
+    named = dict(
+        zip(experiment.model.parameter_names, experiment.estimator.parameters, strict=True)
+    )
+    assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [5.0, 7.0, 7.0, 4.0, 0.0]
+    consistent = load(robot + 'kind = "consistent"\nmass_max = [20, 30]\ntotal_mass = 12').estimator
+    assert consistent.pull.bodies[1, 0] == 7.0
+    assert consistent.bounds.total_mass == 12.0
+    np.testing.assert_array_equal(consistent.bounds.mass_max, [20.0, 30.0])
+
+
+@pytest.mark.parametrize("name", ["spectral", "jackknife", "independent"])
+def test_uncertainties(load, name):
+    found = load(f'{ARM}[estimator]\nuncertainty = "{name}"\n').uncertainty
+    kinds = {
+        "spectral": jid.SpectralSandwich,
+        "jackknife": jid.BlockJackknife,
+        "independent": jid.IndependentRows,
+    }
+    assert found == kinds[name]()
+
+
 def test_logs_are_read_cropped_and_filtered(load, tmp_path):
     t = 0.01 * np.arange(400)
     q = np.stack([np.sin(t), np.cos(2 * t)], 1)
@@ -439,7 +505,7 @@ REFUSALS = [
     (ARM + "[rows]\nslow = -1", "`rows.slow` must be at least 0, but is -1."),
     (
         ARM + "[estimator]\nkind = 'wls'",
-        '`estimator.kind` must be "weighted", "least_squares" or',
+        '`estimator.kind` must be "weighted", "least_squares", "huber", "tukey", "correlated"',
     ),
     (
         ARM + "[estimator]\nweights = 'maximum_forces'",
@@ -447,7 +513,19 @@ REFUSALS = [
     ),
     (
         ARM + "[estimator]\nkind = 'least_squares'\nweights = 'residual_variances'",
-        '`estimator`: `weights` belong to `kind = "weighted"`',
+        '`estimator`: `weights` belongs to `kind = "weighted" or "huber" or "tukey"',
+    ),
+    (
+        ARM + "[estimator]\nlimit = 2.0",
+        '`estimator`: `limit` belongs to `kind = "huber" or "tukey"`',
+    ),
+    (
+        ARM + "[estimator]\nkind = 'instrumental'",
+        '`estimator`: `kind = "instrumental"` needs `refe',
+    ),
+    (
+        ARM + "[estimator]\nridge = 0.1\nprior = 'urdf'",
+        "takes the inertias of the robot's URDF file",
     ),
     (ARM + "[estimator]\ntruncate = 1", "`estimator.truncate` must be below 1, but is 1."),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge` must be a number or"),

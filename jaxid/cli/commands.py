@@ -167,7 +167,7 @@ def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fi
     stage(f"factorising {path.name}")
     progress = stage.through(log.recording.samples)
     base, observations = experiment.base, log.observations
-    fit = estimate(base, observations, experiment.estimator, progress)
+    fit = estimate(base, observations, experiment.plain, progress)
     stage(f"looking for slips in {path.name}")
     slips = likely_mistake(base, observations)
     return log, fit, slips or delay_doubts(base, observations, fit)
@@ -325,6 +325,7 @@ def identify(
     console.print()
     terminal.show_rows(console, fitted, fit)
     terminal.show_undetermined(console, fit, loaded.regularised)
+    terminal.show_residuals(console, loaded.robot, fit)
     slips = [f"{o.name}: {said}" for o in fitted for said in likely_mistake(base, o)]
     terminal.sentences(console, (*negative_friction(fit), *slips), terminal.DOUBTFUL, "!")
     terminal.show_consistency(console, loaded.robot, fit)

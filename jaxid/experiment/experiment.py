@@ -10,21 +10,24 @@ from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.experiment.collision_tables import build_collision
+from jaxid.experiment.estimator_tables import build_estimator, build_single_axes
 from jaxid.experiment.method_tables import (
     build_candidates,
     build_columns,
     build_decimation,
-    build_estimator,
     build_filter,
     build_linear_terms,
-    build_single_axes,
     build_slow,
     build_terms,
 )
 from jaxid.experiment.reading import read_tables
 from jaxid.experiment.robot_tables import build_load, build_robot, within
 from jaxid.experiment.tables import ExcitationTable, RecordingTable, RobotTable
-from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
+from jaxid.identification.estimators import (
+    AbstractEstimator,
+    LeastSquares,
+    WeightedLeastSquares,
+)
 from jaxid.identification.filter_choice import FilterCandidate
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
@@ -36,6 +39,7 @@ from jaxid.identification.solutions import Complete, CrossValidated
 from jaxid.identification.stepwise import Stepwise
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
+from jaxid.identification.uncertainty.methods import AbstractUncertainty
 from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
@@ -75,6 +79,8 @@ class Experiment:
         decimation: For forces and columns.
         slow: Speeds below which rows do not count [rad/s or m/s]; None if all count.
         estimator: How rows become parameters.
+        plain: Least squares with the same weights and solution: to look at logs, one by one.
+        uncertainty: How standard deviations are found.
         regularised: Whether the estimator keeps small what the logs do not decide.
         single_axes: Logs of single axes if axes are identified one by one; None if at once.
         linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
@@ -96,7 +102,9 @@ class Experiment:
     filter: AbstractFilter
     decimation: AbstractDecimation
     slow: Float[np.ndarray, " joints"] | None
-    estimator: LeastSquares | WeightedLeastSquares
+    estimator: AbstractEstimator
+    plain: LeastSquares | WeightedLeastSquares
+    uncertainty: AbstractUncertainty
     regularised: bool
     single_axes: tuple[Path, ...] | None
     linear: tuple[AbstractTerm, ...] | None
@@ -117,12 +125,12 @@ class Experiment:
         other way round; identification at once beside axis by axis.
         """
         if self.single_axes is not None:
-            return self.estimator
+            return self.plain
         other = Complete() if self.regularised else CrossValidated()
-        return dataclasses.replace(self.estimator, solution=other)
+        return dataclasses.replace(self.plain, solution=other)
 
     def fit(self, rows: Rows, progress: Progress | None = None) -> Fit:
-        """Estimates: axis by axis, or with nonlinear friction, where the file asks for it.
+        """Estimates as the table `[estimator]` says.
 
         Args:
             rows: To identify with.
@@ -130,12 +138,13 @@ class Experiment:
         """
         if self.single_axes is not None:
             alone = tuple(self.observe(self.read(log)) for log in self.single_axes)
-            weights = np.asarray(self.estimator(rows).weights)
-            return fit_rows(rows, Stepwise(alone, GivenWeights(weights)))
+            weights = np.asarray(self.plain(rows).weights)
+            stepwise = Stepwise(alone, GivenWeights(weights))
+            return fit_rows(rows, stepwise, uncertainty=self.uncertainty)
         if self.linear is None:
-            return fit_rows(rows, self.estimator)
+            return fit_rows(rows, self.estimator, uncertainty=self.uncertainty)
         linear = base_parameters(Model(self.robot, self.linear))
-        estimator = NonlinearFriction(self.estimator)
+        estimator = NonlinearFriction(self.plain)
         found = identify_nonlinear(
             self.base, rows.recordings, estimator, linear=linear, progress=progress
         )
@@ -287,8 +296,8 @@ def load_experiment(path: str | Path) -> Experiment:
         decimation = build_decimation(tables.rows)
         slow = build_slow(tables.rows, robot)
     with within(path.name, "estimator"):
-        estimator, said = build_estimator(tables.estimator, robot)
-        notes += said
+        chosen = build_estimator(tables.estimator, robot, model, tables.robot, path)
+        notes += chosen.notes
         single_axes = build_single_axes(tables.estimator, path)
     return Experiment(
         path=path,
@@ -304,7 +313,9 @@ def load_experiment(path: str | Path) -> Experiment:
         filter=filtering,
         decimation=decimation,
         slow=slow,
-        estimator=estimator,
+        estimator=chosen.estimator,
+        plain=chosen.plain,
+        uncertainty=chosen.uncertainty,
         regularised=tables.estimator.ridge is not None or tables.estimator.truncate is not None,
         single_axes=single_axes,
         linear=linear,

@@ -1,6 +1,4 @@
-"""The tables `[model]`, `[recording]`, `[filter]`, `[rows]` and `[estimator]` become objects."""
-
-from pathlib import Path
+"""The tables `[model]`, `[recording]`, `[filter]` and `[rows]` become objects."""
 
 import msgspec
 import numpy as np
@@ -22,23 +20,13 @@ from jaxid.experiment.robot_tables import each
 from jaxid.experiment.tables import (
     ButterworthTable,
     CoulombTable,
-    EstimatorTable,
     ModelTable,
     PaperTable,
     PeriodicTable,
     RecordingTable,
     RowsTable,
 )
-from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.filter_choice import FilterCandidate
-from jaxid.identification.solutions import (
-    AbstractSolution,
-    Complete,
-    CrossValidated,
-    Ridge,
-    Truncated,
-)
-from jaxid.identification.weights import MaximumForces, ResidualVariances
 from jaxid.measurement.columns import Columns, Selection
 from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
 from jaxid.measurement.filters import (
@@ -274,63 +262,3 @@ def build_slow(table: RowsTable, robot: Robot) -> Float[np.ndarray, " joints"] |
     if table.slow is None:
         return None
     return np.broadcast_to(_number_or_each(robot, "slow", table.slow), (robot.joints,)) + 0.0
-
-
-def build_estimator(
-    table: EstimatorTable, robot: Robot
-) -> tuple[LeastSquares | WeightedLeastSquares, list[str]]:
-    """The estimator, and what is assumed.
-
-    Raises:
-        ValueError: If weights make no sense, or need forces that are not known.
-    """
-    solution = _solution(table)
-    if table.kind == "least_squares":
-        if table.weights is not None:
-            raise ValueError(
-                '`weights` belong to `kind = "weighted"`: leave them out, or change `kind`.'
-            )
-        return LeastSquares(solution), []
-    if table.weights == "residual_variances":
-        return WeightedLeastSquares(ResidualVariances(), solution), []
-    try:
-        _ = robot.max_forces
-    except ValueError as error:
-        if table.weights == "maximum_forces":
-            raise ValueError(f'`weights = "maximum_forces"`: {error}') from error
-        said = (
-            "the largest forces of the joints are not known: joints are weighted by the residuals' "
-            "variances."
-        )
-        return WeightedLeastSquares(ResidualVariances(), solution), [said]
-    return WeightedLeastSquares(MaximumForces(), solution), []
-
-
-def build_single_axes(table: EstimatorTable, path: Path) -> tuple[Path, ...] | None:
-    """Logs of single axes, for identification axis by axis; None where it is at once.
-
-    Raises:
-        ValueError: If keys do not go together.
-    """
-    if table.kind != "stepwise":
-        if table.single_axes is not None:
-            raise ValueError(
-                '`single_axes` belongs to `kind = "stepwise"`: leave it out, or change `kind`.'
-            )
-        return None
-    for key in ("ridge", "truncate"):
-        if getattr(table, key) is not None:
-            raise ValueError(f'`{key}` does not go with `kind = "stepwise"`: leave it out.')
-    if table.nonlinear_friction:
-        raise ValueError('`nonlinear_friction` does not go with `kind = "stepwise"`: choose one.')
-    return tuple(path.parent / log for log in table.single_axes or ())
-
-
-def _solution(table: EstimatorTable) -> AbstractSolution:
-    if table.truncate is not None and table.ridge is not None:
-        raise ValueError("give `truncate` or `ridge`, but not both.")
-    if table.truncate is not None:
-        return Truncated(table.truncate)
-    if table.ridge is None:
-        return Complete()
-    return CrossValidated() if isinstance(table.ridge, str) else Ridge(table.ridge)

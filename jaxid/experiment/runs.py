@@ -61,5 +61,5 @@ def read_run(
         stage(f"factorising the rows, {name}")
         through = stage.through(sum(len(source(o)[0].time) for o in observed))
         rows = Rows.of(experiment.base, observed, through)
-        earlier.append(Run.of_rows(rows, fit_rows(rows, experiment.estimator)))
+        earlier.append(Run.of_rows(rows, fit_rows(rows, experiment.plain)))
     return functools.reduce(update, earlier), doubts

@@ -210,12 +210,30 @@ class RowsTable(_Table, frozen=True):
 class EstimatorTable(_Table, frozen=True):
     """How the rows become parameters."""
 
-    kind: Literal["weighted", "least_squares", "stepwise"] = "weighted"
+    kind: Literal[
+        "weighted",
+        "least_squares",
+        "huber",
+        "tukey",
+        "correlated",
+        "instrumental",
+        "consistent",
+        "stepwise",
+    ] = "weighted"
     weights: Literal["maximum_forces", "residual_variances"] | None = None
     truncate: Share | None = None
     ridge: Share | Literal["cross_validated"] | None = None
     nonlinear_friction: bool = False
     single_axes: list[str] | None = None
+    prior: Literal["urdf"] | None = None
+    limit: Positive | None = None
+    reference: str | list[str] | None = None
+    reference_start: float | list[float] | None = None
+    margin: Share | None = None
+    pull: Positive | None = None
+    mass_max: Positive | list[Positive] | None = None
+    total_mass: Positive | None = None
+    uncertainty: Literal["spectral", "jackknife", "independent"] = "spectral"
 
 
 class ExcitationTable(_Table, frozen=True):

@@ -138,6 +138,10 @@ every = 1                             # every n-th sample, of signals below half
 
 [estimator]
 kind = "weighted"                     # or "least_squares": every newton metre counts the same;
+#                                     # "huber" or "tukey": rows that the model cannot explain count
+#                                     # less; "correlated": with what joints' residuals have in
+#                                     # common; "instrumental": for noisy angles; "consistent":
+#                                     # complete bodies that could exist;
 #                                     # "stepwise": axis by axis from the wrist inward
 # weights = "maximum_forces"          # joints count by their largest forces (Eq. 30); or
 #                                     # "residual_variances": by what the model leaves unexplained
@@ -148,6 +152,17 @@ kind = "weighted"                     # or "least_squares": every newton metre c
 #                                     # alone: friction comes from them
 # nonlinear_friction = true           # finds `epsilon` and `stribeck` of each joint too, and keeps
 #                                     # them if they predict unseen parts of the logs better
+# prior = "urdf"                      # what is not decided stays as the URDF's inertias say, with
+#                                     # `ridge`, `truncate`, or of "consistent"
+# limit = 1.345                       # of "huber" or "tukey": residuals beyond count less [1]
+# reference = "trajectory.json"       # of "instrumental": the motion that was commanded; or a list
+# reference_start = 0.0               # with one for each log; the stamp at which it began [s]
+# margin = 0.01                       # of "consistent": share of a ball that each body contains
+# pull = 1.0                          # strength of a pull towards the prior, or towards balls
+# mass_max = 50.0                     # of the bodies [kg]; or a list
+# total_mass = 120.0                  # of all bodies together, if it is known [kg]
+# uncertainty = "spectral"            # or "jackknife": from blocks of time left out in turn;
+#                                     # "independent": as if rows were independent, far too small
 
 # The motion that `jaxid excite` designs, within the limits above.
 [excitation]

@@ -24,8 +24,15 @@ from jaxid.measurement.recording import Recording
 from jaxid.report.bodies import body_table, consistency_facts
 from jaxid.report.compared import comparison_table, group_table
 from jaxid.report.content import Beside
-from jaxid.report.numbers import MISSING, aligned, percent, significant
-from jaxid.report.tables import error_table, joint_table, parameter_table, plain_table
+from jaxid.report.numbers import MISSING, percent, significant
+from jaxid.report.tables import (
+    error_table,
+    joint_table,
+    motor_table,
+    parameter_table,
+    plain_table,
+    residual_table,
+)
 from jaxid.robot.robot import Robot
 from jaxid.validation.errors import TorqueErrors
 from jaxid.validation.validate import Validation
@@ -79,39 +86,13 @@ def show_robot(console: Console, experiment: Experiment) -> None:
     show_table(console, joint_table(robot))
     drives = robot.drives
     if not drives.is_direct:
-        show_table(console, _motor_table(robot))
+        show_table(console, motor_table(robot))
     said = [(*robot.notes,), (f"assumed: {', '.join(robot.limits.assumed)}",)]
     sentences(console, [*said[0], *(said[1] if robot.limits.assumed else ())])
     tool = robot.tool
     if tool is not None:
         where = robot.joint_names[tool.body]
         sentences(console, [f"a known load of {float(tool.mass):g} kg on the body of `{where}`."])
-
-
-def _motor_table(robot: Robot) -> Table:
-    drives, n = robot.drives, robot.joints
-    A = np.asarray(drives.reduction)
-    turns = [
-        " + ".join(f"{A[i, j]:.6g} {robot.joint_names[j]}" for j in np.flatnonzero(A[i]))
-        for i in range(n)
-    ]
-    columns = [
-        ("joint at motor zero [rad or m]", np.asarray(drives.zero)),
-        ("largest torque [N m]", np.asarray(drives.max_torques)),
-        ("rotor inertia [kg m²]", np.asarray(drives.rotor_inertia)),
-    ]
-    table = plain_table("motors")
-    table.add_column("motor")
-    table.add_column("turns", no_wrap=True)
-    cells = []
-    for title, values in columns:
-        known = np.isfinite(values)
-        if known.any() and values.any():
-            table.add_column(Text(title), justify="right")
-            cells.append(aligned([significant(x) for x in np.where(known, values, np.nan)]))
-    for i in range(n):
-        table.add_row(str(i + 1), Text(turns[i]), *(column[i] for column in cells))
-    return table
 
 
 def show_base(console: Console, base: BaseParameters) -> None:
@@ -294,6 +275,21 @@ def show_consistency(console: Console, robot: Robot, fit: Fit) -> None:
     show_table(console, body_table(fit.consistency, robot.joint_names))
     console.print()
     facts(console, consistency_facts(fit.consistency))
+
+
+def show_residuals(console: Console, robot: Robot, fit: Fit) -> None:
+    """Whether residuals are white, and how far that widens the standard deviations."""
+    spectra, ratios = fit.residual_spectra, fit.uncertainty.ratios
+    if spectra is not None:
+        show_table(console, residual_table(spectra, robot))
+    ratios = ratios[np.isfinite(ratios)]
+    if len(ratios) and np.any(np.abs(ratios - 1.0) > 1e-9):
+        console.print()
+        text = (
+            f"standard deviations are {significant(float(np.median(ratios)), 2)} times (median) "
+            "those of independent rows: errors of neighbouring rows are alike"
+        )
+        sentences(console, [text])
 
 
 def show_validation(console: Console, robot: Robot, found: Validation, identification: int) -> None:

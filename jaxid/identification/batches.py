@@ -6,6 +6,7 @@ the forces (Gram matrices), weighted, added, and solved with columns scaled to l
 that loses digits, a refinement with the residuals, or orthogonal factors, bring them back.
 """
 
+import itertools
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,8 @@ from jaxid.arrays import is_traced
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
-from jaxid.identification.estimators import WeightedLeastSquares
+from jaxid.identification.batch_estimators import estimate_each
+from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.factors import CHUNK, Blocks, Factors, JointFactor
 from jaxid.identification.geometries import geometries
 from jaxid.identification.identify import fit_blocks
@@ -29,6 +31,8 @@ from jaxid.types import AnyArray, Array, Bool, Float, require_float64
 
 IN_A_CALL = 16
 """Data sets of one call of the compiled computation."""
+BLOCKS = 10
+"""Blocks of time of a data set that is solved by orthogonal factors."""
 
 
 def identify_batch(
@@ -39,6 +43,8 @@ def identify_batch(
     *,
     mask: Bool[AnyArray, "sets rows joints"] | None = None,
     robots: Sequence[Robot] | None = None,
+    row_time: float | None = None,
+    estimator: AbstractEstimator | None = None,
 ) -> BatchFit:
     """Estimates the base parameters of many data sets in one call (Eqs. 28-33).
 
@@ -56,6 +62,10 @@ def identify_batch(
         mask: Which rows count: data sets of different length are filled up and masked.
         robots: The robot of each data set, of the topology of the base parameters' robot: the
             columns that lead its base parameters are kept.
+        row_time: Between two rows [s]. With it, standard deviations come from the spectral
+            sandwich; without it, rows are taken for independent.
+        estimator: Another than weighted least squares: it estimates one data set after the other,
+            on all cores. It has weights of its own; not with `robots`, and not while JAX traces.
 
     Returns:
         The estimates of all data sets.
@@ -67,6 +77,13 @@ def identify_batch(
     require_float64("a batch of identifications")
     robot = base.model.robot
     _check(base, motion, forces, mask, robots)
+    if estimator is not None:
+        if robots is not None or weights is not None:
+            raise ValueError(
+                "`estimator` goes with neither `robots` nor `weights`: the estimator has its own "
+                "weights, and solves for one robot."
+            )
+        return estimate_each(base, motion, forces, mask, estimator, row_time)
     if weights is None:
         weights = 1.0 / np.asarray(robot.max_forces)
     if robots is None:
@@ -83,16 +100,22 @@ def identify_batch(
         numbers,
     )
     if is_traced(batch):
-        fit = solve(rows, batch)
+        fit = solve(rows, batch, row_time)
     else:
-        fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch))
+        fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch, row_time), row_time)
     draws = forces.shape[1:-2]
+
+    def shaped(x: Array) -> Array:
+        return x.reshape(len(forces), *draws, x.shape[-1])
+
     return BatchFit(
-        fit.parameters.reshape(len(forces), *draws, base.size),
-        fit.standard_deviations.reshape(len(forces), *draws, base.size),
-        fit.residual_rms.reshape(len(forces), *draws, robot.joints),
+        shaped(fit.parameters),
+        shaped(fit.standard_deviations),
+        shaped(fit.residual_rms),
         fit.condition_numbers,
         fit.determined,
+        shaped(fit.naive_standard_deviations),
+        shaped(fit.freedom),
     )
 
 
@@ -131,7 +154,7 @@ def _without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Arr
     )
 
 
-def _solve_in_parts(rows: JointRows, batch: DataSets) -> BatchFit:
+def _solve_in_parts(rows: JointRows, batch: DataSets, row_time: float | None) -> BatchFit:
     """Calls the compiled computation for a few data sets at a time, on all cores.
 
     XLA leaves small operations to one core, so each core gets data sets of its own. Parts of equal
@@ -143,7 +166,9 @@ def _solve_in_parts(rows: JointRows, batch: DataSets) -> BatchFit:
 
     def part(start: int) -> BatchFit:
         chosen = np.arange(start, start + size) % datasets
-        return jax.block_until_ready(solve(rows, jax.tree.map(lambda x: x[chosen], batch)))
+        return jax.block_until_ready(
+            solve(rows, jax.tree.map(lambda x: x[chosen], batch), row_time)
+        )
 
     starts = range(0, datasets, size)
     if jax.default_backend() == "cpu" and len(starts) > 1:
@@ -156,41 +181,54 @@ def _solve_in_parts(rows: JointRows, batch: DataSets) -> BatchFit:
 
 
 def _solved_again(
-    base: BaseParameters, rows: JointRows, batch: DataSets, fit: BatchFit
+    base: BaseParameters, rows: JointRows, batch: DataSets, fit: BatchFit, row_time: float | None
 ) -> BatchFit:
-    """Solves the data sets that are not well conditioned by orthogonal factors, one by one."""
+    """Solves the data sets that are not well conditioned by orthogonal factors, one by one.
+
+    Where standard deviations are not naive, they come from blocks of time, left out in turn.
+    """
     weak = np.flatnonzero(~np.asarray(fit.determined))
     if not len(weak):
         return fit
-    p, deviations, rms, condition, determined = (np.array(x) for x in jax.tree.leaves(fit))
+    p, deviations, rms, condition, determined, naive, freedom = (
+        np.array(x) for x in jax.tree.leaves(fit)
+    )
     for k in weak:
         one = jax.tree.map(lambda x, k=k: np.asarray(x)[k], batch)
         for draw, forces in enumerate(one.forces):
-            factors = _factors(rows, one, forces)
-            if factors.rows.sum() <= rows.size:
-                p[k, draw], deviations[k, draw], condition[k] = 0.0, np.inf, np.inf
+            blocks = _blocks(rows, one, forces)
+            if blocks.total.rows.sum() <= rows.size:
+                p[k, draw], condition[k] = 0.0, np.inf
+                deviations[k, draw] = naive[k, draw] = np.inf
                 continue
             estimator = WeightedLeastSquares(GivenWeights(one.weights))
-            again = fit_blocks(base, Blocks((factors,)), estimator)
-            known = np.isfinite(again.naive_standard_deviations).all()
-            p[k, draw], deviations[k, draw] = again.parameters, again.naive_standard_deviations
+            again = fit_blocks(base, blocks, estimator)
+            found = again.naive_standard_deviations
+            known = np.isfinite(found).all()
+            p[k, draw], naive[k, draw] = again.parameters, found
+            deviations[k, draw] = found if row_time is None else again.standard_deviations
+            if row_time is not None:
+                freedom[k, draw] = again.uncertainty.freedom
             rms[k, draw] = again.residual_rms
             condition[k] = again.condition_numbers.scaled if known else np.inf
             determined[k] = known
-    return BatchFit(*(jnp.asarray(x) for x in (p, deviations, rms, condition, determined)))
+    return BatchFit(*map(jnp.asarray, (p, deviations, rms, condition, determined, naive, freedom)))
 
 
-def _factors(rows: JointRows, one: DataSets, forces: np.ndarray) -> Factors:
-    """The triangular factors of one data set and one draw of its forces."""
-    joints = [JointFactor(c, np.zeros((0, len(c) + 1)), 0) for c in rows.columns]
-    for start in range(0, len(forces), CHUNK):
-        part = slice(start, start + CHUNK)
-        arrays = [x[part].T for x in jax.tree.leaves(one.motion)]
-        if one.numbers is not None:
-            arrays.append(
-                np.broadcast_to(one.numbers[:, None], (len(one.numbers), len(arrays[0].T)))
-            )
-        for j, columns in enumerate(rows.in_numpy(*arrays)):
-            kept = slice(None) if one.mask is None else one.mask[part, j] > 0
-            joints[j] = joints[j].joined(np.column_stack([columns.T, forces[part, j]])[kept])
-    return Factors(tuple(joints), rows.size)
+def _blocks(rows: JointRows, one: DataSets, forces: np.ndarray) -> Blocks:
+    """The triangular factors of one data set and one draw of its forces, by blocks of time."""
+    edges = np.linspace(0, len(forces), BLOCKS + 1).astype(int)
+    parts = []
+    for begin, end in itertools.pairwise(edges):
+        joints = [JointFactor(c, np.zeros((0, len(c) + 1)), 0) for c in rows.columns]
+        for start in range(begin, end, CHUNK):
+            part = slice(start, min(start + CHUNK, end))
+            arrays = [x[part].T for x in jax.tree.leaves(one.motion)]
+            if one.numbers is not None:
+                shape = (len(one.numbers), arrays[0].shape[-1])
+                arrays.append(np.broadcast_to(one.numbers[:, None], shape))
+            for j, columns in enumerate(rows.in_numpy(*arrays)):
+                kept = slice(None) if one.mask is None else one.mask[part, j] > 0
+                joints[j] = joints[j].joined(np.column_stack([columns.T, forces[part, j]])[kept])
+        parts.append(Factors(tuple(joints), rows.size))
+    return Blocks(tuple(parts))

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
+from jaxid.identification.uncertainty.compiled import LineSums, line_sums, variances
 from jaxid.types import AnyArray, Array, Bool, Float
 
 AT_ONCE = 2048
@@ -33,13 +34,15 @@ class BatchFit(eqx.Module):
 
     Attributes:
         parameters: The estimates; zero along what a data set does not determine.
-        standard_deviations: Of the estimates, for independent rows and a variance of each joint's
-            own; infinite where nothing is known.
+        standard_deviations: Of the estimates, by the spectral sandwich if the time between rows was
+            given; otherwise naive. Infinite where nothing is known.
         residual_rms: Of each joint's rows [N m or N].
         condition_numbers: Of each weighted observation matrix with columns of length one; an upper
             bound, at most the number of parameters too large, where it is well conditioned.
         determined: Whether a data set determines all parameters. Where it is False while JAX
             traces, the estimates are not to be used.
+        naive_standard_deviations: For independent rows and a variance of each joint's own.
+        freedom: Degrees of freedom behind each standard deviation, for the t distribution.
     """
 
     parameters: Float[AnyArray, "*results base"]
@@ -47,6 +50,8 @@ class BatchFit(eqx.Module):
     residual_rms: Float[AnyArray, "*results joints"]
     condition_numbers: Float[AnyArray, "*datasets"]
     determined: Bool[AnyArray, "*datasets"]
+    naive_standard_deviations: Float[AnyArray, "*results base"]
+    freedom: Float[AnyArray, "*results base"]
 
 
 class DataSets(eqx.Module):
@@ -60,8 +65,14 @@ class DataSets(eqx.Module):
 
 
 @eqx.filter_jit
-def solve(rows: JointRows, batch: DataSets) -> BatchFit:
-    """Solves all data sets, a group at a time."""
+def solve(rows: JointRows, batch: DataSets, row_time: float | None = None) -> BatchFit:
+    """Solves all data sets, a group at a time.
+
+    Args:
+        rows: How columns are divided among joints.
+        batch: The data sets.
+        row_time: Between two rows [s], for the spectral sandwich; without it all is naive.
+    """
     batch = jax.tree.map(jnp.asarray, batch)
     datasets, samples, _ = batch.motion.q.shape
     calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
@@ -73,7 +84,7 @@ def solve(rows: JointRows, batch: DataSets) -> BatchFit:
     groups = jax.tree.map(
         lambda x, y: jnp.concatenate([x, y]).reshape((-1, group, *x.shape[1:])), batch, more
     )
-    fits = jax.lax.map(lambda one: _solve_group(rows, one, chunks), groups)
+    fits = jax.lax.map(lambda one: _solve_group(rows, one, chunks, row_time), groups)
     return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
 
 
@@ -91,13 +102,14 @@ def _filled(batch: DataSets, missing: int) -> DataSets:
     )
 
 
-def _solve_group(rows: JointRows, batch: DataSets, chunks: int) -> BatchFit:
+def _solve_group(rows: JointRows, batch: DataSets, chunks: int, row_time: float | None) -> BatchFit:
     """Solves a few data sets; those that fit evaluate their columns together, once."""
+    length = batch.forces.shape[-2] // chunks
     if chunks == 1:
         columns = _columns(rows, batch)
 
         def one(x):
-            return _solve_one(rows, x[0], lambda f: f(*x))
+            return _solve_one(rows, x[0], lambda f: f(*x), length, row_time)
 
         # A CPU multiplies the matrices of one data set faster than those of several together.
         together = jax.default_backend() != "cpu"
@@ -115,7 +127,9 @@ def _solve_group(rows: JointRows, batch: DataSets, chunks: int) -> BatchFit:
 
         return jax.lax.scan(add, part(0), np.arange(1, chunks))[0]
 
-    return jax.lax.map(lambda one: _solve_one(rows, one, lambda f: total(one, f)), batch)
+    return jax.lax.map(
+        lambda one: _solve_one(rows, one, lambda f: total(one, f), length, row_time), batch
+    )
 
 
 def _in_chunks(one: DataSets, chunks: int) -> DataSets:
@@ -146,13 +160,17 @@ def _columns(rows: JointRows, batch: DataSets) -> list[Array]:
     return rows(*arrays)
 
 
-def _solve_one(rows: JointRows, one: DataSets, total: Callable) -> BatchFit:
+def _solve_one(
+    rows: JointRows, one: DataSets, total: Callable, length: int, row_time: float | None
+) -> BatchFit:
     """Solves one data set by the products of its rows.
 
     Args:
         rows: How columns are divided among joints.
         one: The data set.
         total: Sums a function of data and columns over the data set's chunks.
+        length: Rows of a chunk.
+        row_time: Between two rows [s], or None.
     """
     weights = jnp.asarray(one.weights)
     grams, products, forces = total(lambda x, A: _products(*_counted(x, A)))
@@ -174,12 +192,24 @@ def _solve_one(rows: JointRows, one: DataSets, total: Callable) -> BatchFit:
         count = jnp.full(weights.shape, float(one.motion.q.shape[0]))
     else:
         count = one.mask.sum(axis=0)
+    naive = _deviations(rows, inverse, grams, weights, squares, count)
+    deviations, freedom = naive, jnp.broadcast_to(count.sum() - rows.size, naive.shape)
+    if row_time is not None:
+
+        def lines(x: DataSets, A: list[Array]) -> LineSums:
+            share = jnp.ones(weights.shape) if x.mask is None else x.mask.mean(axis=0)
+            return line_sums(rows.columns, weights, inverse, p, *_counted(x, A), share)
+
+        variance, freedom = variances(total(lines), length, row_time)
+        deviations = jnp.sqrt(jnp.maximum(variance, 0.0))
     return BatchFit(
         p,
-        _deviations(rows, inverse, grams, weights, squares, count),
+        deviations,
         jnp.sqrt(squares / jnp.maximum(count, 1.0)[None]),
         condition,
         (condition < WELL_CONDITIONED) & (count.sum() > rows.size),
+        naive,
+        freedom,
     )
 
 

@@ -23,6 +23,8 @@ from jaxid.validation.definiteness import Definiteness
 from jaxid.validation.errors import TorqueErrors, torque_errors
 
 SCHEMA = "jaxid-result/1"
+LEVEL = 0.95
+"""Share of cases in which the intervals `low_95` to `high_95` hold the truth, of 1."""
 DISTRIBUTION = "jaxid-robotics"
 
 
@@ -111,6 +113,7 @@ def result(
                 "residual": fit.residual,
                 "residual_rms": fit.residual_rms,
                 "covariance": fit.covariance,
+                "naive_covariance": fit.uncertainty.naive_covariance,
                 "jackknife_standard_deviations": fit.uncertainty.jackknife,
                 "residuals": _residuals(fit),
                 "undetermined": [_direction(fit, d) for d in fit.undetermined],
@@ -150,9 +153,17 @@ def parameters(fit: Fit) -> list[dict[str, Any]]:
         np.asarray(fit.parameters).tolist(),
         fit.standard_deviations.tolist(),
         fit.relative_standard_deviations.tolist(),
+        *fit.intervals(LEVEL).T.tolist(),
+        np.asarray(fit.uncertainty.freedom).tolist(),
+        fit.naive_standard_deviations.tolist(),
+        fit.uncertainty.ratios.tolist(),
         strict=True,
     )
-    keys = ("name", "expression", "unit", "group", "estimate", "standard_deviation", "relative")
+    keys = (
+        *("name", "expression", "unit", "group", "estimate", "standard_deviation", "relative"),
+        *("low_95", "high_95", "degrees_of_freedom"),
+        *("naive_standard_deviation", "ratio_to_naive"),
+    )
     return [dict(zip(keys, row, strict=True)) for row in columns]
 
 

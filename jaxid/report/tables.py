@@ -5,6 +5,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jaxid.identification.fit import Fit, Trust
+from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.report.numbers import aligned, percent, significant, with_deviation
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
@@ -16,7 +17,8 @@ STYLES = {Trust.GOOD: "green", Trust.DOUBTFUL: "yellow", Trust.NONE: "red"}
 def parameter_table(fit: Fit, expressions: bool = True) -> Table:
     """The base parameters with their estimates and standard deviations, in the paper's order.
 
-    Estimates stand with the digits that their standard deviations leave meaningful.
+    Estimates stand with the digits that their standard deviations leave meaningful. Beside them
+    stand the standard deviations that independent rows would have, and the ratio to these.
 
     Args:
         fit: The estimates.
@@ -38,6 +40,13 @@ def parameter_table(fit: Fit, expressions: bool = True) -> Table:
     table.add_column("±", justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     table.add_column("± [%]", justify="right", no_wrap=True)
+    ratios = fit.uncertainty.ratios
+    differ = bool(np.any(np.abs(ratios[np.isfinite(ratios)] - 1.0) > 1e-9))
+    naive = aligned([significant(float(s), 2) for s in fit.naive_standard_deviations])
+    ratio = aligned([significant(float(x), 2) for x in ratios])
+    if differ:
+        table.add_column("naive ±", justify="right", no_wrap=True, style="dim")
+        table.add_column("ratio", justify="right", no_wrap=True, style="dim")
     trust = fit.trust
     names = base.expressions if expressions else base.names
     for k, name in enumerate(names):
@@ -48,6 +57,31 @@ def parameter_table(fit: Fit, expressions: bool = True) -> Table:
             deviations[k],
             base.units[k],
             Text(shares[k], style=STYLES[trust[k]]),
+            *((naive[k], ratio[k]) if differ else ()),
+        )
+    return table
+
+
+def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
+    """Whether the residuals of each joint are white, and where their power lies.
+
+    Args:
+        spectra: Of a fit.
+        robot: Whose joints they are.
+    """
+    table = plain_table("residuals within the filters' band")
+    table.add_column("joint")
+    table.add_column("white")
+    table.add_column(Text("departure [%]\n(white: below)"), justify="right", no_wrap=True)
+    slow = Text(f"power below {0.1 * spectra.band:.2g} Hz\n[%] (white: 10)")
+    table.add_column(slow, justify="right", no_wrap=True)
+    limit = percent(spectra.limit, 2)
+    for j, white in enumerate(spectra.white):
+        table.add_row(
+            Text(robot.joint_names[j]),
+            Text("yes" if white else "no", style="green" if white else "yellow"),
+            f"{percent(float(spectra.departure[j]), 2)} ({limit})",
+            percent(float(spectra.slow[j]), 2),
         )
     return table
 
@@ -121,6 +155,37 @@ def joint_table(robot: Robot) -> Table:
             robot.joint_unit(j),
             robot.force_unit(j),
         )
+    return table
+
+
+def motor_table(robot: Robot) -> Table:
+    """The motors of a robot: which joints they turn, and what is known of them.
+
+    Args:
+        robot: The robot.
+    """
+    drives, n = robot.drives, robot.joints
+    A = np.asarray(drives.reduction)
+    turns = [
+        " + ".join(f"{A[i, j]:.6g} {robot.joint_names[j]}" for j in np.flatnonzero(A[i]))
+        for i in range(n)
+    ]
+    columns = [
+        ("joint at motor zero [rad or m]", np.asarray(drives.zero)),
+        ("largest torque [N m]", np.asarray(drives.max_torques)),
+        ("rotor inertia [kg m²]", np.asarray(drives.rotor_inertia)),
+    ]
+    table = plain_table("motors")
+    table.add_column("motor")
+    table.add_column("turns", no_wrap=True)
+    cells = []
+    for title, values in columns:
+        known = np.isfinite(values)
+        if known.any() and values.any():
+            table.add_column(Text(title), justify="right")
+            cells.append(aligned([significant(x) for x in np.where(known, values, np.nan)]))
+    for i in range(n):
+        table.add_row(str(i + 1), Text(turns[i]), *(column[i] for column in cells))
     return table
 
 

@@ -17,6 +17,7 @@ from jaxid.report.bars import error_figure
 from jaxid.report.content import Beside, parameters, result
 from jaxid.report.estimates import parameter_figure
 from jaxid.report.filters import filter_figure
+from jaxid.report.residuals import residual_figure
 from jaxid.report.style import save
 from jaxid.report.torques import torque_figure
 from jaxid.validation.definiteness import Definiteness
@@ -69,6 +70,7 @@ def write_report(
     content = result(fit, identification, verification, definiteness, settings, notes, beside)
     names = ["result.json", "parameters.csv", "errors.png", "parameters.png"]
     names += ["filter.png"] if choice is not None else []
+    names += ["residuals.png"] if fit.residual_spectra is not None else []
     names += [file for file, _, _ in named]
     names += [RUN] if run is not None else []
     content["files"] = names
@@ -81,6 +83,8 @@ def write_report(
             save(filter_figure(choice), staging / "filter.png")
         if run is not None:
             save_run(staging / RUN, run)
+        if fit.residual_spectra is not None:
+            save(residual_figure(fit.residual_spectra, robot), staging / "residuals.png")
         for file, role, errors in named:
             title = errors.name if errors.name == role else f"{errors.name} ({role})"
             save(torque_figure(errors, robot, title), staging / file)

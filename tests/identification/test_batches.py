@@ -72,6 +72,70 @@ def test_masked_rows_and_weights_of_each_data_set(base):
         assert_same(base, fit, k, jid.identify(base, masked, estimator))
 
 
+def test_honest_deviations_of_many_draws(base):
+    """The compiled sandwich is that of one identification after the other."""
+    mask = np.ones((2, SAMPLES, 2), bool)
+    mask[1, :40, 0] = mask[1, 100:, 1] = False
+    sets = some_sets(base, 2)
+    m, forces = stacked(sets)
+    slow = np.cumsum(np.random.default_rng(4).normal(size=(2, 3, SAMPLES, 2)), axis=2)
+    draws = forces[:, None] + 0.1 * slow
+    dt = sets[0].sample_time
+    fit = identify_batch(base, m, draws, WEIGHTS, mask=mask, row_time=dt)
+    naive = identify_batch(base, m, draws, WEIGHTS, mask=mask)
+    np.testing.assert_allclose(fit.naive_standard_deviations, naive.standard_deviations)
+    assert np.median(fit.standard_deviations / fit.naive_standard_deviations) > 1.5
+    estimator = jid.WeightedLeastSquares(jid.GivenWeights(WEIGHTS))
+    for k, draw in ((0, 0), (0, 2), (1, 1)):
+        fields = {"mask": mask[k], "forces": draws[k, draw]}
+        one = jid.identify(base, jid.Observations(**{**vars(sets[k]), **fields}), estimator)
+        np.testing.assert_allclose(
+            fit.standard_deviations[k, draw], one.standard_deviations, rtol=1e-8
+        )
+        np.testing.assert_allclose(fit.freedom[k, draw], one.uncertainty.freedom, rtol=1e-8)
+
+
+def test_honest_deviations_under_jit_and_by_chunks(base, monkeypatch):
+    sets = some_sets(base, 2)
+    m, forces = stacked(sets)
+    dt = sets[0].sample_time
+
+    @jax.jit
+    def deviations(forces):
+        return identify_batch(base, m, forces, WEIGHTS, row_time=dt).standard_deviations
+
+    whole = deviations(forces)
+    fit = identify_batch(base, m, forces, WEIGHTS, row_time=dt)
+    np.testing.assert_allclose(whole, fit.standard_deviations, rtol=1e-9)
+    monkeypatch.setattr(normal_equations, "AT_ONCE", 80)
+    jax.clear_caches()
+    parts = identify_batch(base, m, forces, WEIGHTS, row_time=dt)
+    # White noise: half the resolution of the spectrum changes little.
+    ratio = np.asarray(parts.standard_deviations / whole)
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.25
+
+
+@pytest.mark.parametrize("loss", [jid.Huber(), jid.Tukey()])
+def test_any_estimator_takes_batches(base, loss):
+    mask = np.random.default_rng(1).random((2, SAMPLES, 2)) < 0.8
+    sets = some_sets(base, 2)
+    m, forces = stacked(sets)
+    draws = np.stack([forces, 2.0 * forces], axis=1)
+    draws = np.where(mask[:, None], draws, np.nan)
+    estimator = jid.IterativelyReweighted(loss)
+    dt = sets[0].sample_time
+    fit = identify_batch(base, m, draws, mask=mask, estimator=estimator, row_time=dt)
+    assert fit.parameters.shape == (2, 2, base.size)
+    assert np.asarray(fit.determined).all()
+    one = jid.identify(base, jid.Observations(**{**vars(sets[1]), "mask": mask[1]}), estimator)
+    np.testing.assert_allclose(fit.parameters[1, 0], one.parameters, rtol=1e-8)
+    np.testing.assert_allclose(fit.standard_deviations[1, 0], one.standard_deviations, rtol=1e-8)
+    np.testing.assert_allclose(fit.parameters[1, 1], 2 * one.parameters, rtol=1e-2)
+    with pytest.raises(ValueError, match="neither `robots` nor `weights`"):
+        identify_batch(base, m, forces, WEIGHTS, estimator=estimator)
+
+
 def test_long_data_sets_go_by_chunks(base, monkeypatch):
     sets = some_sets(base, 3)
     whole = identify_batch(base, *stacked(sets), WEIGHTS)

@@ -41,7 +41,7 @@ def noisy(base):
     return observations(base.model, p, noise=np.array([0.5, 0.1]))
 
 
-def members(o):
+def members(o, size=1.0):
     return (
         jid.LeastSquares(),
         jid.WeightedLeastSquares(MEASURED),
@@ -50,8 +50,8 @@ def members(o):
         jid.IterativelyReweighted(jid.Tukey(), MEASURED),
         jid.GeneralisedLeastSquares(),
         jid.InstrumentalVariables((Known(o.motion, o.sample_time),), MEASURED),
-        jid.RelativeTo(rough(o.joints), jid.IterativelyReweighted(jid.Tukey(), MEASURED)),
-        jid.RelativeTo(rough(o.joints), jid.WeightedLeastSquares(MEASURED)),
+        jid.RelativeTo(size * rough(o.joints), jid.IterativelyReweighted(jid.Tukey(), MEASURED)),
+        jid.RelativeTo(size * rough(o.joints), jid.WeightedLeastSquares(MEASURED)),
     )
 
 
@@ -79,7 +79,7 @@ def test_every_estimator_follows_its_forces_and_judges_itself(base, noisy, k):
     """Twice the forces, twice the parameters and their deviations; rows held or not, the same."""
     fit = jid.identify(base, noisy, members(noisy)[k])
     double = with_forces(noisy, lambda f: np.multiply(f, 2.0, out=f))
-    other = jid.identify(base, double, members(noisy)[k])
+    other = jid.identify(base, double, members(noisy, 2.0)[k])
     np.testing.assert_allclose(other.parameters, 2 * np.asarray(fit.parameters), rtol=1e-4)
     np.testing.assert_allclose(other.standard_deviations, 2 * fit.standard_deviations, rtol=1e-3)
     truth = np.asarray(base.from_standard(standard_parameters(base.model)))

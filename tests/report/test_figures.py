@@ -9,9 +9,11 @@ import pytest
 from matplotlib.colors import to_hex
 from report_samples import arm_of, errors_of
 
+from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.report.bars import error_figure
 from jaxid.report.estimates import parameter_figure
-from jaxid.report.style import BLUE, ERROR, MEASURED, ORANGE, PREDICTED, save
+from jaxid.report.residuals import residual_figure
+from jaxid.report.style import BLUE, ERROR, GREY, MEASURED, ORANGE, PREDICTED, save
 from jaxid.report.torques import torque_figure
 
 
@@ -104,6 +106,39 @@ def test_any_number_of_joints_fits_on_the_page(joints):
     require_everything_inside(figure)
     bars = error_figure((errors,), (errors,), robot)
     require_everything_inside(bars)
+
+
+def test_residuals_stand_beside_white_ones(fit):
+    spectra, robot = fit.residual_spectra, fit.base.model.robot
+    figure = residual_figure(spectra, robot)
+    for j, axes in enumerate(figure.axes):
+        own = line(axes, BLUE)
+        shown = np.isin(np.asarray(spectra.frequency), own.get_xdata())
+        np.testing.assert_array_equal(own.get_ydata(), np.asarray(spectra.density)[j][shown])
+        white = line(axes, GREY).get_ydata()
+        np.testing.assert_allclose(white.sum(), own.get_ydata().sum())
+        assert axes.get_ylabel() == ("N²/Hz", "(N m)²/Hz")[j]
+        assert ("not white" in axes.get_title(loc="right")) != spectra.white[j]
+    require_everything_inside(figure)
+    with pytest.raises(ValueError, match="must be those of the 3 joints"):
+        residual_figure(spectra, arm_of(3))
+
+
+@pytest.mark.parametrize("joints", [1, 2, 7, 17])
+def test_residuals_of_any_number_of_joints_fit_on_the_page(joints):
+    frequency = np.linspace(0.0, 20.0, 50)
+    density = np.random.default_rng(0).exponential(size=(joints, 50))
+    spectra = ResidualSpectra(
+        frequency,
+        density,
+        1.0 / (1.0 + (frequency / 10.0) ** 4),
+        np.full(joints, 0.5),
+        0.1,
+        np.full(joints, 0.314),
+        9.5,
+    )
+    names = tuple(f"a_long_name_of_the_joint_number_{i}" for i in range(joints))
+    require_everything_inside(residual_figure(spectra, arm_of(joints).replace(joint_names=names)))
 
 
 def test_a_single_row_can_be_drawn():

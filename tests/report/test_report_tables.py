@@ -8,7 +8,7 @@ import pytest
 from report_samples import arm_of, errors_of
 from rich.console import Console
 
-from jaxid.report.tables import error_table, joint_table, parameter_table
+from jaxid.report.tables import error_table, joint_table, parameter_table, residual_table
 
 
 def lines(table, width=140) -> list[str]:
@@ -30,6 +30,27 @@ def test_parameters_have_estimate_deviation_and_unit(fit):
         assert any(abs(x - fit.parameters[k]) <= slack for x in numbers[1:])
     plain = "\n".join(lines(parameter_table(fit, expressions=False)))
     assert all(name in plain for name in fit.base.names)
+
+
+def test_deviations_stand_beside_the_naive_ones(fit):
+    def naive(k):
+        return float(f"{fit.naive_standard_deviations[k]:.1e}")
+
+    text = lines(parameter_table(fit))
+    assert text[1].split()[-3:] == ["naive", "±", "ratio"]
+    for k, ratio in enumerate(fit.uncertainty.ratios):
+        last = [float(x) for x in text[2 + k].split()[-2:]]
+        assert last == [pytest.approx(naive(k)), pytest.approx(ratio, rel=0.06)]
+    alone = dataclasses.replace(fit, uncertainty=type(fit.uncertainty).given(fit.covariance))
+    assert "naive" not in lines(parameter_table(alone))[1]
+
+
+def test_residuals_are_white_or_not(fit):
+    spectra = fit.residual_spectra
+    text = lines(residual_table(spectra, fit.base.model.robot))
+    for row, white, slow in zip(text[3:], spectra.white, spectra.slow, strict=True):
+        assert ("yes" if white else "no") in row.split()
+        assert float(row.split()[-1]) == pytest.approx(100 * slow, rel=0.06)
 
 
 def test_errors_have_joints_and_units(fit, validation):

@@ -49,6 +49,7 @@ def test_writes_all_files_with_their_parents(tmp_path, fit, validation):
         "errors.png",
         "parameters.csv",
         "parameters.png",
+        "residuals.png",
         "result.json",
         "torque_first-run.png",
         "torque_second.png",
@@ -66,6 +67,14 @@ def test_numbers_come_back_exactly(tmp_path, fit, validation, quick):
     rows = found["base_parameters"]
     assert [r["estimate"] for r in rows] == np.asarray(fit.parameters).tolist()
     assert [r["standard_deviation"] for r in rows] == fit.standard_deviations.tolist()
+    assert [r["naive_standard_deviation"] for r in rows] == fit.naive_standard_deviations.tolist()
+    assert [r["ratio_to_naive"] for r in rows] == fit.uncertainty.ratios.tolist()
+    intervals = [[r["low_95"], r["high_95"]] for r in rows]
+    assert intervals == fit.intervals(0.95).tolist()
+    assert [r["degrees_of_freedom"] for r in rows] == fit.uncertainty.freedom.tolist()
+    residuals = found["fit"]["residuals"]
+    assert residuals["white"] == list(fit.residual_spectra.white)
+    assert np.shape(residuals["density"]) == (2, len(residuals["frequency"]))
     assert [r["name"] for r in rows] == list(fit.base.names)
     assert [r["expression"] for r in rows] == list(fit.base.expressions)
     assert [r["unit"] for r in rows] == list(fit.base.units)

@@ -57,7 +57,7 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     longest = max(lines, key=lambda x: x.length * x.stretches)
     rows = longest.length * np.maximum(np.mean(longest.exposure), 1e-300)
     half = 0.5 * longest.multiplicity
-    windows = Windows([longest])
+    windows = Windows.of([longest])
     smooth = windows.sums(half * longest.residual) / windows.sums(half)
     # One-sided: the mirror image of a line counts with it.
     scale = 2.0 * longest.row_time * longest.length / rows

@@ -7,11 +7,13 @@ left of it, $1 - h_{jf}$ with the leverage $h$ of each line.
 """
 
 from collections.abc import Sequence
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxid.identification.uncertainty.spectra import Lines
+from jaxid.types import AnyArray, Float
 
 NARROWEST, RELATIVE = 0.25, 0.3
 """Half of a window's width: at least the first [Hz], and this share of its frequency."""
@@ -38,15 +40,17 @@ class Variances(NamedTuple):
 class Windows:
     """Sums over windows of lines, and their transposes, of several kinds of stretches together.
 
+    They take and give arrays of NumPy or of JAX.
+
     Args:
-        lines: Of every kind of stretch.
+        frequency: Of the lines, in any order [Hz].
+        longest: Duration of the longest stretch [s].
     """
 
-    def __init__(self, lines: Sequence[Lines]):
-        frequency = np.concatenate([x.frequency for x in lines])
+    def __init__(self, frequency: Float[np.ndarray, " lines"], longest: float):
         self._order = np.argsort(frequency, kind="stable")
+        self._place = np.argsort(self._order, kind="stable")
         f = frequency[self._order]
-        longest = max(x.length * x.row_time for x in lines)
         half = np.maximum(np.maximum(NARROWEST, FEWEST / longest), RELATIVE * f)
         self._low = np.searchsorted(f, f - half * (1 + 1e-9), side="left")
         self._high = np.searchsorted(f, f + half * (1 + 1e-9), side="right")
@@ -55,24 +59,55 @@ class Windows:
         self._first = np.searchsorted(self._high, places, side="right")
         self._last = np.searchsorted(self._low, places, side="right")
 
-    def sums(self, x: np.ndarray) -> np.ndarray:
+    @classmethod
+    def of(cls, lines: Sequence[Lines]) -> "Windows":
+        """For every kind of stretch."""
+        frequency = np.concatenate([x.frequency for x in lines])
+        return cls(frequency, max(x.length * x.row_time for x in lines))
+
+    def sums(self, x: AnyArray) -> AnyArray:
         """For each line the sum over its window, along the last axis."""
         return self._between(x, self._low, self._high)
 
-    def transposed(self, x: np.ndarray) -> np.ndarray:
+    def transposed(self, x: AnyArray) -> AnyArray:
         """For each line the sum over the windows that hold it, along the last axis."""
         return self._between(x, self._first, self._last)
 
-    def _between(self, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        sums = np.cumsum(x[..., self._order], axis=-1)
-        sums = np.concatenate([np.zeros((*x.shape[:-1], 1)), sums], axis=-1)
-        out = np.empty(x.shape)
-        out[..., self._order] = sums[..., high] - sums[..., low]
-        return out
+    def _between(self, x: AnyArray, low: np.ndarray, high: np.ndarray) -> AnyArray:
+        sums = x[..., self._order].cumsum(axis=-1)
+        before = sums[..., np.maximum(low - 1, 0)] * (low > 0)
+        return (sums[..., np.maximum(high - 1, 0)] * (high > 0) - before)[..., self._place]
+
+
+def variance_map(
+    xp: ModuleType,
+    windows: Windows,
+    half: Float[np.ndarray, " lines"],
+    exposure: Float[AnyArray, "channels lines"],
+    leverage: Float[AnyArray, "channels lines"],
+    energy: Float[AnyArray, "base channels lines"],
+) -> tuple[Float[AnyArray, "base channels lines"], Float[AnyArray, "channels lines"]]:
+    r"""The sandwich as a linear map of periodograms, $var_i = \sum_{jg} C_{ijg} I_{jg}$.
+
+    Args:
+        xp: NumPy, or JAX's.
+        windows: Over which spectra are smoothed.
+        half: Half of each line's multiplicity.
+        exposure: Number of stretches, as many as rows count.
+        leverage: What of each line the fit has taken.
+        energy: How each line moves each estimate.
+
+    Returns:
+        The map, and what the fit has left of each window.
+    """
+    left = windows.sums(half * (exposure - leverage))
+    least = LEAST_LEFT * windows.sums(half * exposure)
+    left = xp.maximum(left, xp.maximum(least, 1e-300))
+    return half * windows.transposed(energy / left), left
 
 
 class SpectralTable:
-    r"""The sandwich as one linear map, $var_i = \sum_{jg} C_{ijg} I_{jg}$, made once for a design.
+    r"""The sandwich as one linear map, made once for a design and used for many draws.
 
     Attributes:
         map: $C$ [base, channels x lines].
@@ -80,20 +115,16 @@ class SpectralTable:
 
     def __init__(self, lines: Sequence[Lines]):
         self._lines = lines
-        self._windows = Windows(lines)
+        self._windows = Windows.of(lines)
         half = np.concatenate([0.5 * x.multiplicity for x in lines])
-        left = np.concatenate([x.exposure[:, None] - x.leverage for x in lines], axis=1)
+        leverage = np.concatenate([x.leverage for x in lines], axis=1)
         there = np.concatenate(
             [np.broadcast_to(x.exposure[:, None], x.leverage.shape) for x in lines], axis=1
         )
-        least = LEAST_LEFT * self._windows.sums(half * there)
-        self._left = np.maximum(self._windows.sums(half * left), np.maximum(least, 1e-300))
         energy = np.concatenate([x.energy for x in lines], axis=2)
-        C = half * self._windows.transposed(energy / self._left)
+        C, self._left = variance_map(np, self._windows, half, there, leverage, energy)
         self.map = C.reshape(len(C), -1)
-        # A line's power is that of as many draws as there are stretches: its square overstates.
-        scatter = np.sqrt(2.0 / (half * (1.0 + np.maximum(there, 1.0))))
-        self._scatter = np.broadcast_to(scatter, C.shape[1:]).ravel()
+        self._scatter = np.broadcast_to(scatter(np, half, there), C.shape[1:]).ravel()
 
     def density(self, power: np.ndarray) -> np.ndarray:
         """The errors' spectrum at each line, from the residuals' periodogram."""
@@ -108,10 +139,24 @@ class SpectralTable:
         """
         flat = power.reshape(*power.shape[:-2], -1)
         variance = flat @ self.map.T
-        scatter = (flat * self._scatter) ** 2 @ (self.map**2).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            freedom = np.where(scatter > 0, 4.0 * variance**2 / scatter, np.inf)
-        return variance, freedom
+        squares = (flat * self._scatter) ** 2 @ (self.map**2).T
+        return variance, satterthwaite(np, variance, squares)
+
+
+def scatter(
+    xp: ModuleType, half: Float[np.ndarray, " lines"], exposure: Float[AnyArray, "channels lines"]
+) -> Float[AnyArray, "channels lines"]:
+    """By how much to multiply a line's power to get the scatter of its mean.
+
+    A line's power is that of as many draws as there are stretches: its square overstates.
+    """
+    return xp.sqrt(2.0 / (half * (1.0 + xp.maximum(exposure, 1.0))))
+
+
+def satterthwaite(xp: ModuleType, variance: AnyArray, squares: AnyArray) -> AnyArray:
+    """Degrees of freedom of variances that are sums of chi-squares, one for each line."""
+    there = squares > 0
+    return xp.where(there, 4.0 * variance**2 / xp.where(there, squares, 1.0), xp.inf)
 
 
 def sandwich(lines: Sequence[Lines]) -> Variances:
