@@ -324,7 +324,7 @@ def test_estimators_of_files(load, tmp_path):
     assert isinstance(estimator, jid.InstrumentalVariables)
     assert (len(estimator.references), estimator.starts) == (1, (2.0,))
     inertia = (
-        "<inertial><mass value='{}'/><inertia ixx='{}' ixy='0' ixz='0' iyy='3' iyz='0' izz='4'/>"
+        "<inertial><mass value='{}'/><inertia ixx='{}' ixy='0' ixz='0' iyy='6' iyz='0' izz='6'/>"
     )
     heavy = URDF
     for link, mass in (("cart", 5), ("arm", 7)):
@@ -339,7 +339,7 @@ def test_estimators_of_files(load, tmp_path):
     named = dict(
         zip(experiment.model.parameter_names, experiment.estimator.parameters, strict=True)
     )
-    assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [5.0, 7.0, 7.0, 4.0, 0.0]
+    assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [5.0, 7.0, 7.0, 6.0, 0.0]
     consistent = load(robot + 'kind = "consistent"\nmass_max = [20, 30]\ntotal_mass = 12').estimator
     assert consistent.pull.bodies[1, 0] == 7.0
     assert consistent.bounds.total_mass == 12.0
