@@ -32,8 +32,8 @@ from timing import Row, hand_over
 SHARE, EVERY_OUTLIER, EVERY_NOISY = 0.05, 5, 4
 SEED = 2026
 BURST = 10
-ENCODERS = ((1e-4, 60.0), (4e-4, 60.0))
-"""Standard deviation of the angles [rad], and cut-off of the filter [Hz]."""
+ENCODERS = ((1.4e-5, 60.0), (1e-4, 60.0))
+"""Standard deviation of the angles [rad] (the first: 17 bits), and cut-off of the filter [Hz]."""
 
 
 def arm(coulomb=True, epsilon=None):
@@ -207,7 +207,7 @@ def main():
     parser.add_argument("--json", help="where run.py reads the rows")
     options = parser.parse_args()
     timing.pin_to(1)
-    rows = outlier_rows(2 if options.quick else 20) + encoder_rows(3 if options.quick else 40)
+    rows = outlier_rows(2 if options.quick else 20) + encoder_rows(3 if options.quick else 24)
     hand_over(rows, options.json)
 
 
