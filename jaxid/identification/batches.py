@@ -105,7 +105,7 @@ def identify_batch(
         fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch, row_time), row_time)
     draws = forces.shape[1:-2]
 
-    def shaped(x: Array) -> Array:
+    def shaped(x: AnyArray) -> AnyArray:
         return x.reshape(len(forces), *draws, x.shape[-1])
 
     return BatchFit(

@@ -123,13 +123,13 @@ class SpectralTable:
         )
         energy = np.concatenate([x.energy for x in lines], axis=2)
         C, self._left = variance_map(np, self._windows, half, there, leverage, energy)
-        self.map = C.reshape(len(C), -1)
+        self.map = np.asarray(C).reshape(len(C), -1)
         self._scatter = np.broadcast_to(scatter(np, half, there), C.shape[1:]).ravel()
 
     def density(self, power: np.ndarray) -> np.ndarray:
         """The errors' spectrum at each line, from the residuals' periodogram."""
         half = np.concatenate([0.5 * x.multiplicity for x in self._lines])
-        return self._windows.sums(half * power) / self._left
+        return np.asarray(self._windows.sums(half * power) / self._left)
 
     def __call__(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Variances and their degrees of freedom.
@@ -140,7 +140,7 @@ class SpectralTable:
         flat = power.reshape(*power.shape[:-2], -1)
         variance = flat @ self.map.T
         squares = (flat * self._scatter) ** 2 @ (self.map**2).T
-        return variance, satterthwaite(np, variance, squares)
+        return variance, np.asarray(satterthwaite(np, variance, squares))
 
 
 def scatter(
