@@ -114,7 +114,7 @@ class Study:
         self.bias = np.asarray(self.estimate.parameters) - self.truth
         e = self.estimate
         self.w = np.asarray(e.weights)
-        (lines,), _ = lines_of(self.rows, e.influence, e.inverse, e.parameters)
+        (lines,) = lines_of(self.rows, e.influence, e.inverse, e.parameters).lines
         self.lines, self.table = lines, SpectralTable([lines])
         count, n = self.o.rows, base.model.robot.joints
         A = np.zeros((count, n, base.size))

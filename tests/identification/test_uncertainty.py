@@ -1,5 +1,8 @@
 """The spectral sandwich against its definition, and against the scatter of many draws."""
 
+import dataclasses
+import itertools
+
 import numpy as np
 import pytest
 from scipy import signal, special
@@ -26,10 +29,15 @@ def base():
     return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
 
 
-def found_lines(base, recordings):
+def seen(base, recordings):
     rows = jid.Rows.of(base, recordings)
     e = ESTIMATOR(rows)
-    return lines_of(rows, e.influence, e.inverse, e.parameters)[0], e
+    return lines_of(rows, e.influence, e.inverse, e.parameters), e
+
+
+def found_lines(base, recordings):
+    found, e = seen(base, recordings)
+    return found.lines, e
 
 
 def by_definition(base, o, weights):
@@ -63,9 +71,9 @@ def by_definition(base, o, weights):
 @pytest.mark.parametrize("samples", [400, 401])
 def test_the_sandwich_is_its_definition(base, samples):
     o = observations(base.model, standard_parameters(base.model), samples=samples, noise=0.4)
-    lines, e = found_lines(base, [o])
+    found, e = seen(base, [o])
     covariance, freedom = by_definition(base, o, np.asarray(e.weights))
-    got = sandwich(lines)
+    got = sandwich(found)
     np.testing.assert_allclose(np.diag(got.covariance), np.diag(covariance), rtol=1e-8)
     np.testing.assert_allclose(got.freedom, freedom, rtol=1e-8)
     size = np.sqrt(np.diag(covariance))
@@ -258,3 +266,22 @@ def test_residuals_are_told_white_or_not(base):
     # One-sided densities: their area is the variance.
     area = np.trapezoid(spectra.density, spectra.frequency, axis=1)
     np.testing.assert_allclose(area, [1.0, 0.8], rtol=0.1)
+
+
+def test_many_gaps_cost_no_memory_and_change_little(base, monkeypatch):
+    """Stretches of many lengths share their lines: filled up with rows that do not count."""
+    ends = np.cumsum([0, *range(110, 150, 5)])
+    segments = tuple((int(a), int(b)) for a, b in itertools.pairwise(ends))
+    o = long_one(base, segments=segments, samples=int(ends[-1]))
+    noise = coloured(np.random.default_rng(8), (1, o.rows, 2), 0.1, o.row_time)[0]
+    o = dataclasses.replace(o, forces=o.forces + noise)
+    shared, _ = seen(base, [o])
+    assert [x.stretches for x in shared.lines] == [8]
+    monkeypatch.setattr(stretches, "KINDS", 8)
+    apart, _ = seen(base, [o])
+    assert len(apart.lines) == 8
+    one, other = sandwich(shared), sandwich(apart)
+    ratio = np.sqrt(np.diag(one.covariance) / np.diag(other.covariance))
+    assert ratio.min() > 0.9
+    assert ratio.max() < 1.1
+    np.testing.assert_allclose(one.white, other.white, rtol=1e-9)

@@ -50,10 +50,10 @@ class SpectralSandwich(AbstractUncertainty):
                 "factors of the rows were at hand, and no spectrum of the residuals."
             )
             return dataclasses.replace(found, notes=found.notes or (said,)), None
-        lines, whole = lines_of(rows, estimate.influence, estimate.inverse, estimate.parameters)
-        variances = sandwich(lines)
+        seen = lines_of(rows, estimate.influence, estimate.inverse, estimate.parameters)
+        variances = sandwich(seen)
         covariance = variances.covariance
-        if not whole:
+        if not seen.whole:
             exact = np.diag(naive)
             there = (variances.white > 0) & np.isfinite(exact)
             share = np.where(there, exact, 1.0) / np.where(there, variances.white, 1.0)
@@ -65,7 +65,7 @@ class SpectralSandwich(AbstractUncertainty):
             naive,
             _left_out(estimate),
         )
-        return found, residual_spectra(lines)
+        return found, residual_spectra(seen.lines)
 
 
 class BlockJackknife(AbstractUncertainty):

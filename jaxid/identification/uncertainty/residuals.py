@@ -76,7 +76,7 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
         density=scale * smooth[:, shown],
         gain=longest.gain[shown],
         departure=np.abs(summed - line).max(axis=1),
-        limit=KOLMOGOROV / np.sqrt(count * longest.stretches),
+        limit=float(KOLMOGOROV / np.sqrt(count * np.mean(longest.exposure))),
         slow=summed[:, max(0, round(0.1 * count) - 1)],
         band=float(longest.frequency[passed][-1]),
     )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.identification.uncertainty.spectra import Lines
+from jaxid.identification.uncertainty.spectra import Lines, Seen
 from jaxid.types import AnyArray, Float
 
 NARROWEST, RELATIVE = 0.25, 0.3
@@ -159,18 +159,20 @@ def satterthwaite(xp: ModuleType, variance: AnyArray, squares: AnyArray) -> AnyA
     return xp.where(there, 4.0 * variance**2 / xp.where(there, squares, 1.0), xp.inf)
 
 
-def sandwich(lines: Sequence[Lines]) -> Variances:
-    """The covariance of an estimate from the lines of its stretches."""
+def sandwich(seen: Seen) -> Variances:
+    """The covariance of an estimate from what a pass over the rows has seen."""
+    lines = seen.lines
     table = SpectralTable(lines)
     power = np.concatenate([x.power for x in lines], axis=1)
     variance, freedom = table(power)
-    density = np.split(table.density(power), np.cumsum([len(x.frequency) for x in lines])[:-1], 1)
+    density = table.density(power)
+    bins = np.concatenate([x.bins for x in lines])
+    weights = np.concatenate([x.multiplicity for x in lines])
+    count = np.maximum(np.bincount(bins, weights, len(seen.correlated)), 1e-300)
     rough = np.zeros((len(variance), len(variance)))
-    for x, phi in zip(lines, density, strict=True):
-        count = np.bincount(x.bins)
-        for c, own in enumerate(phi):
-            mean = np.bincount(x.bins, own) / count
-            rough += np.einsum("k,kab->ab", mean, x.correlated[:, c])
+    for c, own in enumerate(density):
+        mean = np.bincount(bins, weights * own, len(seen.correlated)) / count
+        rough += np.einsum("k,kab->ab", mean, seen.correlated[:, c])
     size = np.sqrt(np.maximum(np.diag(rough), 1e-300))
     deviation = np.sqrt(np.maximum(variance, 0.0))
     covariance = rough / size / size[:, None] * deviation * deviation[:, None]

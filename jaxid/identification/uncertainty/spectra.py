@@ -6,15 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.identification.influence import AbstractInfluence, Channel
-from jaxid.identification.rows import RowChunk, Rows
+from jaxid.identification.rows import Rows
 from jaxid.identification.streaming_log import source
 from jaxid.identification.uncertainty.stretches import (
     FAINT,
-    Stretch,
+    filled,
     gathered,
     passes,
     stretches,
 )
+from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Float
 
 BINS = np.concatenate([np.arange(0.0, 1.0, 0.05), 1.15 ** np.arange(0, 80)])
@@ -25,15 +26,13 @@ class Lines(NamedTuple):
     r"""Spectra of all stretches of one length, added up.
 
     Attributes:
-        length: Rows of a stretch.
+        length: Rows of a stretch; what is shorter is filled up with rows that do not count.
         row_time: Between two rows [s].
         frequency: Of the lines [Hz].
         multiplicity: 2, or 1 for the lines without a mirror image.
         gain: Of the filters.
         energy: $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, channels, lines].
-        bins: Of each line, counted among those that hold one.
-        correlated: The same for pairs of parameters, summed over the lines of each bin
-            [bins, channels, base, base].
+        bins: Of each line.
         leverage: Part of a channel's line that the fit has taken [channels, lines].
         power: Periodogram of the disturbances [channels, lines].
         residual: Periodogram of the residuals [joints, lines], in [N² m²] or [N²].
@@ -48,7 +47,6 @@ class Lines(NamedTuple):
     gain: np.ndarray
     energy: np.ndarray
     bins: np.ndarray
-    correlated: np.ndarray
     leverage: np.ndarray
     power: np.ndarray
     residual: np.ndarray
@@ -57,13 +55,24 @@ class Lines(NamedTuple):
 
     def added(self, other: "Lines") -> "Lines":
         """Both together, of stretches with the same lines."""
-        sums = {
-            name: getattr(self, name) + getattr(other, name)
-            for name in (
-                "energy", "correlated", "leverage", "power", "residual", "exposure", "stretches",
-            )
-        }  # fmt: skip
+        names = ("energy", "leverage", "power", "residual", "exposure", "stretches")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
         return self._replace(**sums)
+
+
+class Seen(NamedTuple):
+    """What a pass over the rows has seen.
+
+    Attributes:
+        lines: Of every kind of stretch.
+        correlated: As `energy`, for pairs of parameters, summed over the lines of each bin
+            [bins, channels, base, base].
+        whole: Whether it has seen all rows.
+    """
+
+    lines: list[Lines]
+    correlated: np.ndarray
+    whole: bool
 
 
 def lines_of(
@@ -71,7 +80,7 @@ def lines_of(
     influence: AbstractInfluence,
     inverse: Float[AnyArray, "base base"],
     p: Float[AnyArray, " base"],
-) -> tuple[list[Lines], bool]:
+) -> Seen:
     """Goes through the rows once and transforms every stretch.
 
     Args:
@@ -79,29 +88,36 @@ def lines_of(
         influence: How they move it.
         inverse: What takes the place of the inverse of the information.
         p: The estimate.
-
-    Returns:
-        The lines of every kind of stretch, and whether they are of all rows.
     """
     wanted, whole = stretches(rows)
+    lengths = filled(wanted)
     found: dict[tuple, Lines] = {}
+    B = np.asarray(inverse)
+    correlated = np.zeros((0, 0, *B.shape))
     for stretch, parts in gathered(rows, wanted, np.asarray(p)):
         o, _ = source(rows.recordings[stretch.recording])
-        lines = _transformed(stretch, parts, influence, np.asarray(inverse), o)
-        key = (stretch.length, stretch.row_time, len(lines.frequency))
+        pieces = [influence.channels(chunk, residuals) for chunk, residuals in parts]
+        if not len(correlated):
+            correlated = np.zeros((len(BINS) + 1, len(pieces[0]), *B.shape))
+        r = np.concatenate([np.where(chunk.counted, r, 0.0) for chunk, r in parts])
+        n = lengths[stretch.length, stretch.row_time]
+        lines = _transformed(n, stretch.row_time, pieces, r, B, o, correlated)
+        key = (n, stretch.row_time, len(lines.frequency))
         found[key] = found[key].added(lines) if key in found else lines
-    return list(found.values()), whole
+    return Seen(list(found.values()), correlated, whole)
 
 
 def _transformed(
-    stretch: Stretch,
-    parts: list[tuple[RowChunk, np.ndarray]],
-    influence: AbstractInfluence,
+    n: int,
+    row_time: float,
+    pieces: list[list[Channel]],
+    residuals: np.ndarray,
     inverse: np.ndarray,
-    observations,
+    observations: Observations,
+    correlated: np.ndarray,
 ) -> Lines:
-    n = stretch.length
-    frequency = np.fft.rfftfreq(n, stretch.row_time)
+    """The lines of one stretch; adds to what is correlated."""
+    frequency = np.fft.rfftfreq(n, row_time)
     gain = passes(observations, frequency)
     last = int(np.flatnonzero(gain > FAINT)[-1]) + 1
     frequency, gain = frequency[:last], gain[:last]
@@ -109,38 +125,34 @@ def _transformed(
     multiplicity[0] = 1.0
     if n % 2 == 0 and last == n // 2 + 1:
         multiplicity[-1] = 1.0
-    places = np.searchsorted(BINS, frequency, side="right")
-    _, starts, bins = np.unique(places, return_index=True, return_inverse=True)
-    pieces = [influence.channels(chunk, residuals) for chunk, residuals in parts]
+    bins = np.searchsorted(BINS, frequency, side="right")
+    there, starts = np.unique(bins, return_index=True)
     size, channels = len(inverse), len(pieces[0])
     energy = np.empty((size, channels, last))
-    correlated = np.empty((len(starts), channels, size, size))
     leverage, power = np.empty((channels, last)), np.empty((channels, last))
     exposure = np.empty(channels)
     for c in range(channels):
         own, Z, theta, u, counted = _joined([piece[c] for piece in pieces])
-        Zf = np.fft.rfft(Z, axis=0)[:last]
+        Zf = np.fft.rfft(Z, n, axis=0)[:last]
         P = Zf @ inverse[:, own].T
         energy[:, c] = (np.abs(P) ** 2 * multiplicity[:, None]).T / n
         weighted = P * np.sqrt(multiplicity / n)[:, None]
-        for k, (a, b) in enumerate(itertools.pairwise([*starts, last])):
+        for k, (a, b) in zip(there, itertools.pairwise([*starts, last]), strict=True):
             both = np.concatenate([weighted[a:b].real, weighted[a:b].imag])
-            correlated[k, c] = both.T @ both
-        Tf = Zf if theta is Z else np.fft.rfft(theta, axis=0)[:last]
+            correlated[k, c] += both.T @ both
+        Tf = Zf if theta is Z else np.fft.rfft(theta, n, axis=0)[:last]
         leverage[c] = np.real(np.sum(P[:, own].conj() * Tf, axis=1)) / n
-        power[c] = np.abs(np.fft.rfft(u)[:last]) ** 2 / n
+        power[c] = np.abs(np.fft.rfft(u, n)[:last]) ** 2 / n
         exposure[c] = counted / n
-    residuals = np.concatenate([np.where(chunk.counted, r, 0.0) for chunk, r in parts])
-    residual = np.abs(np.fft.rfft(residuals, axis=0)[:last].T) ** 2 / n
+    residual = np.abs(np.fft.rfft(residuals, n, axis=0)[:last].T) ** 2 / n
     return Lines(
         n,
-        stretch.row_time,
+        row_time,
         frequency,
         multiplicity,
         gain,
         energy,
         bins,
-        correlated,
         leverage,
         power,
         residual,

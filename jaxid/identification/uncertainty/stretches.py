@@ -16,6 +16,9 @@ LONGEST_SAMPLES = 2**17
 """Rows and samples of a stretch: what is longer is divided."""
 SEEN = 2**20
 """Samples up to which every stretch is looked at; of longer logs some, evenly spread."""
+KINDS, RATIO = 4, 1.5
+"""Different lengths up to which each has lines of its own; of more, those within this ratio share
+them, so that memory does not grow with the number of gaps."""
 FAINT = 1e-3
 """Gain of the filters below which a line says nothing."""
 
@@ -62,6 +65,22 @@ def stretches(rows: Rows) -> tuple[list[Stretch], bool]:
         return found, True
     chosen = np.linspace(0, len(found) - 1, max(1, len(found) * SEEN // samples))
     return [found[k] for k in np.unique(chosen.round().astype(int))], False
+
+
+def filled(wanted: list[Stretch]) -> dict[tuple[int, float], int]:
+    """Lengths to which stretches are filled up, by length and time between rows."""
+    kinds = {(s.length, s.row_time) for s in wanted}
+    if len(kinds) <= KINDS:
+        return {kind: kind[0] for kind in kinds}
+    found = {}
+    for row_time in {t for _, t in kinds}:
+        lengths = sorted((n for n, t in kinds if t == row_time), reverse=True)
+        top = lengths[0]
+        for n in lengths:
+            if n * RATIO < top:
+                top = n
+            found[n, row_time] = top
+    return found
 
 
 def passes(observations: Observations, frequency: Float[np.ndarray, " lines"]) -> np.ndarray:
