@@ -10,8 +10,8 @@ at the joints. The pipeline: `jid.ZeroPhaseButterworth(15.0)` on angles, forces 
 20th row, weights by the largest forces. The statistic: of all base parameters the share whose 95 %
 interval holds the truth in 93 to 97 % of the draws; beside it the naive interval of the same rows.
 A draw of noise passes the same filter; the truth counts, so the filters' bias is part of every
-error. Times are of one core's own time for a fit with its intervals, once the table of the design is
-made.
+error. Times are of one core's own time for a fit with its intervals, once the table of the design
+is made.
 
 With 1000 draws a perfect method has 0.4 % of its parameters outside 93 to 97 %.
 """
