@@ -48,11 +48,10 @@ def line_sums(
     for k, A, Q, w in zip(own, columns, forces, weights, strict=True):
         mine = np.array(k, int)
         Z = jnp.fft.rfft(w * A)
-        P = inverse[:, mine] @ Z
+        real, imaginary = inverse[:, mine] @ Z.real, inverse[:, mine] @ Z.imag
         r = jnp.fft.rfft(w * (Q - p[:, mine] @ A))
-        energy.append(m / length * (P.real**2 + P.imag**2))
-        own_part = P[mine]
-        both = own_part.real * Z.real + own_part.imag * Z.imag
+        energy.append(m / length * (real**2 + imaginary**2))
+        both = real[mine] * Z.real + imaginary[mine] * Z.imag
         leverage.append(jnp.sum(both, axis=0) / length)
         power.append((r.real**2 + r.imag**2) / length)
     return LineSums(
