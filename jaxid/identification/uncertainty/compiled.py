@@ -43,7 +43,7 @@ def line_sums(
         exposure: Share of each joint's rows that count.
     """
     length = columns[0].shape[-1]
-    m = _multiplicity(length)
+    m = _multiplicity(length)[None]
     energy, leverage, power = [], [], []
     for k, A, Q, w in zip(own, columns, forces, weights, strict=True):
         mine = np.array(k, int)
@@ -75,7 +75,7 @@ def variances(
     there = jnp.broadcast_to(sums.exposure[:, None], sums.leverage.shape)
     C, _ = variance_map(jnp, windows, half, there, sums.leverage, sums.energy)
     variance = jnp.einsum("djf,ijf->di", sums.power, C)
-    squares = jnp.einsum("djf,ijf->di", (sums.power * scatter(jnp, half, there)) ** 2, C**2)
+    squares = jnp.einsum("djf,ijf->di", (sums.power * scatter(jnp, half, there)[None]) ** 2, C**2)
     return variance, jnp.maximum(satterthwaite(jnp, variance, squares), 1.0)
 
 

@@ -75,8 +75,10 @@ class Windows:
 
     def _between(self, x: AnyArray, low: np.ndarray, high: np.ndarray) -> AnyArray:
         sums = x[..., self._order].cumsum(axis=-1)
-        before = sums[..., np.maximum(low - 1, 0)] * (low > 0)
-        return (sums[..., np.maximum(high - 1, 0)] * (high > 0) - before)[..., self._place]
+        flat = (1,) * (x.ndim - 1)
+        before = sums[..., np.maximum(low - 1, 0)] * (low > 0).astype(float).reshape(*flat, -1)
+        after = sums[..., np.maximum(high - 1, 0)] * (high > 0).astype(float).reshape(*flat, -1)
+        return (after - before)[..., self._place]
 
 
 def variance_map(
@@ -100,10 +102,10 @@ def variance_map(
     Returns:
         The map, and what the fit has left of each window.
     """
-    left = windows.sums(half * (exposure - leverage))
-    least = LEAST_LEFT * windows.sums(half * exposure)
+    left = windows.sums(half[None] * (exposure - leverage))
+    least = LEAST_LEFT * windows.sums(half[None] * exposure)
     left = xp.maximum(left, xp.maximum(least, 1e-300))
-    return half * windows.transposed(energy / left), left
+    return half[None, None] * windows.transposed(energy / left[None]), left
 
 
 class SpectralTable:
@@ -150,7 +152,7 @@ def scatter(
 
     A line's power is that of as many draws as there are stretches: its square overstates.
     """
-    return xp.sqrt(2.0 / (half * (1.0 + xp.maximum(exposure, 1.0))))
+    return xp.sqrt(2.0 / (half[None] * (1.0 + xp.maximum(exposure, 1.0))))
 
 
 def satterthwaite(xp: ModuleType, variance: AnyArray, squares: AnyArray) -> AnyArray:
