@@ -76,7 +76,8 @@ def run(written, monkeypatch, capsys):
 
 def listing(folder):
     """All that a user sees: a kill may leave a hidden folder with what was being written."""
-    return sorted(p.name for p in folder.iterdir() if not p.name.startswith("."))
+    paths = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*"))
+    return [p for p in paths if not p.startswith(".jaxid-")]
 
 
 def table(path):
