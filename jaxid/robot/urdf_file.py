@@ -146,7 +146,7 @@ class UrdfTree:
 
 def _read_xml(path: Path) -> etree._Element:
     if not path.is_file():
-        raise FileNotFoundError(f"the URDF file `{path}` does not exist.")
+        raise FileNotFoundError(f"the URDF file `{path}` does not exist: check its path.")
     if path.stat().st_size > _LARGEST_FILE:
         raise ValueError(
             f"`{path}` is larger than {_LARGEST_FILE // 2**20} MiB: this is no URDF of a robot."

@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.files import written_whole
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierSeries
+from jaxid.trajectory.joint_path import JointPath
 from jaxid.trajectory.leads import WithLeads
 from jaxid.trajectory.rest import RestToRest
 from jaxid.trajectory.segments import Segments
@@ -18,7 +19,7 @@ from jaxid.trajectory.trajectory import AbstractTrajectory
 
 FORMAT = "jaxid trajectory"
 VERSION = 1
-MEMBERS = (FourierSeries, RestToRest, WithLeads, Spline, Segments)
+MEMBERS = (FourierSeries, RestToRest, WithLeads, Spline, Segments, JointPath)
 """What a file may hold, each by the name of its class."""
 
 

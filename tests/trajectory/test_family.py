@@ -9,6 +9,8 @@ from jaxid.robot import library
 from jaxid.robot.limits import Limits
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.fourier import FourierSeries, random_fourier_series
+from jaxid.trajectory.iso9283 import iso9283_path
+from jaxid.trajectory.joint_path import joint_path
 from jaxid.trajectory.leads import WithLeads, with_leads
 from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRest, RestToRestBasis, rest_basis
@@ -44,8 +46,21 @@ FAMILY = {
     "spline at rest": Spline.at_rest(POINTS, 2.5),
     "spline through points": Spline.through(POINTS, 4.0),
     "segments": chain(),
+    "path of the end-effector": joint_path(
+        library.tx90l_on_rail(),
+        iso9283_path([0.0, 0.65, 0.65], 0.5, np.diag([1.0, -1.0, -1.0]), acceleration=3.0),
+        posture=[0.0, 1.57, 0.3, 1.6, 0.0, 0.5, 0.0],
+        spacing=0.05,
+    ),
 }
-AT_REST = ("rest to rest", "with leads", "spline at rest", "spline through points", "segments")
+AT_REST = (
+    "rest to rest",
+    "with leads",
+    "spline at rest",
+    "spline through points",
+    "segments",
+    "path of the end-effector",
+)
 BASES = (
     FourierBasis(5, 0.8),
     RestToRestBasis(5, 0.8),

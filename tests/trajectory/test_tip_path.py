@@ -1,0 +1,99 @@
+"""The verification path and how joints follow it."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxid.excitation.constraints.tip import tip_motion
+from jaxid.robot import library
+from jaxid.robot.kinematics import tip_placement
+from jaxid.trajectory.files import load_trajectory, save_trajectory
+from jaxid.trajectory.iso9283 import iso9283_path
+from jaxid.trajectory.joint_path import joint_path
+from jaxid.trajectory.tip_path import Line, TipPath
+
+ROBOT = library.tx90l_on_rail()
+DOWN = np.diag([1.0, -1.0, -1.0])
+BENT = [0.0, 1.57, 0.3, 1.6, 0.0, 0.5, 0.0]
+PATH = iso9283_path([0.0, 0.65, 0.65], 0.5, DOWN, acceleration=3.0)
+
+
+@pytest.fixture(scope="module")
+def followed():
+    return joint_path(ROBOT, PATH, posture=BENT)
+
+
+def test_the_path_lies_on_one_inclined_plane_within_the_cube():
+    places = PATH.positions(np.linspace(0.0, PATH.duration, 2000))
+    away = places - [0.0, 0.65, 0.65]
+    assert np.abs(away).max() < 0.25
+    np.testing.assert_allclose(away[:, 0], away[:, 2], atol=1e-12)
+    # Corners a tenth of the diagonal inside; circles of 80 % of the edge and of a tenth of that.
+    np.testing.assert_allclose(np.abs(away).max(axis=0), 0.2, atol=1e-6)
+    radii = [piece.radius for piece in PATH.pieces if np.isfinite(piece.radius)]
+    assert radii == pytest.approx([0.2, 0.02])
+    np.testing.assert_allclose(places[0], places[-1], atol=1e-12)
+
+
+def test_rounds_are_run_without_a_stop():
+    twice = iso9283_path([0.0, 0.65, 0.65], 0.5, DOWN, acceleration=3.0, rounds=2)
+    assert twice.length == pytest.approx(PATH.length + 2 * np.pi * 0.22)
+    begin, end = np.cumsum([0.0, *twice.durations])[8:10]
+    t = np.linspace(begin, end, 400)
+    speed = np.linalg.norm(np.diff(twice.positions(t), axis=0), axis=1) / np.diff(t)
+    # A quintic from rest to rest over both rounds: a quarter through, 9/16 of its largest speed.
+    assert speed[100:300].min() == pytest.approx(9 / 16 * speed.max(), rel=0.01)
+
+
+def test_speed_and_acceleration_of_the_tip_stay_within_what_was_asked(followed):
+    times, motion = followed.sample(1e-3)
+    tip = tip_motion(ROBOT, motion)
+    np.testing.assert_allclose(tip.position, PATH.positions(times), atol=1e-9)
+    speed = np.linalg.norm(tip.velocity, axis=1)
+    assert 0.99 < speed.max() <= 1.0 + 1e-6
+    along = np.einsum("ki,ki->k", tip.velocity, tip.acceleration)[speed > 0.05]
+    along = np.abs(along) / speed[speed > 0.05]
+    assert 2.9 < along.max() <= 3.0 + 1e-6
+    ends = np.cumsum(PATH.durations)[:-1]
+    still = followed.motion(ends)
+    np.testing.assert_allclose(still.qd, 0.0, atol=1e-9)
+    np.testing.assert_allclose(still.qdd, 0.0, atol=1e-7)
+
+
+def test_the_attitude_is_held_and_the_joints_stay_within_their_limits(followed):
+    _, motion = followed.sample(0.02)
+    R, _ = jax.vmap(lambda q: tip_placement(ROBOT, q))(motion.q)
+    np.testing.assert_allclose(R, np.broadcast_to(DOWN, R.shape), atol=1e-9)
+    limits = ROBOT.limits
+    assert (motion.q >= limits.position_min).all()
+    assert (motion.q <= limits.position_max).all()
+    assert (np.abs(motion.qd) <= limits.velocity).all()
+    assert (np.abs(motion.qdd) <= limits.acceleration).all()
+    # Round the elbow's singular pose, which is the middle of the ranges, the same path is too fast.
+    with pytest.raises(ValueError, match=r"joint `\w+` would need .* times its largest"):
+        joint_path(ROBOT, PATH, spacing=0.05)
+
+
+def test_survives_a_file(followed, tmp_path):
+    save_trajectory(followed, tmp_path / "path.json")
+    again = load_trajectory(tmp_path / "path.json")
+    np.testing.assert_array_equal(again.motion(1.234).qdd, followed.motion(1.234).qdd)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: iso9283_path([0.0, 0.0, 0.0], 0.0, DOWN), "edge"),
+        (lambda: iso9283_path([0.0, 0.0], 1.0, DOWN), "centre"),
+        (lambda: iso9283_path([0.0, 0.0, 0.0], 1.0, DOWN, leans_along=2), "leans_along"),
+        (lambda: iso9283_path([0.0, 0.0, 0.0], 1.0, DOWN, speed=0.0), "speed"),
+        (lambda: iso9283_path([0.0, 0.0, 0.0], 1.0, DOWN, rounds=0), "rounds"),
+        (lambda: TipPath.of((), DOWN), "pieces"),
+        (lambda: TipPath.of((PATH.pieces[0], PATH.pieces[2]), DOWN), "piece 2 must start"),
+        (lambda: TipPath.of((Line(np.zeros(3), np.zeros(3)),), DOWN), "piece 1 must have a length"),
+        (lambda: joint_path(ROBOT, PATH, spacing=0.0), "spacing"),
+    ],
+)
+def test_refuses(make, named):
+    with pytest.raises(ValueError, match=named):
+        make()
