@@ -23,7 +23,7 @@ from jaxid.dynamics.rank import (
     SingularValues,
     regrouping,
 )
-from jaxid.types import AnyArray, Array, Float, Numbers
+from jaxid.types import AnyArray, Float, Numbers
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
@@ -136,8 +136,12 @@ class BaseParameters(Hashable):
         They are no physical masses and inertias, but give the same forces and mass matrix.
         """
         p = _one_each("base", p, self.size)
-        full = jnp.zeros((*p.shape[:-1], self.model.size), p.dtype)
-        return full.at[..., np.array(self.indices)].set(p)
+        shape, places = (*p.shape[:-1], self.model.size), np.array(self.indices)
+        if isinstance(p, np.ndarray):
+            full = np.zeros(shape)
+            full[..., places] = p
+            return full
+        return jnp.zeros(shape, p.dtype).at[..., places].set(p)
 
     def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""The generalized forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
@@ -162,8 +166,9 @@ class BaseParameters(Hashable):
         return tuple(verdict)
 
 
-def _one_each(kind: str, p: Numbers, size: int) -> Float[Array, "*batch parameters"]:
-    p = jnp.asarray(as_array("p", p))
+def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch parameters"]:
+    # What is no array of JAX stays in NumPy, and in float64 where JAX runs in float32.
+    p = as_array("p", p)
     if p.shape[-1:] != (size,):
         raise ValueError(
             f"`p` must hold one number for each {kind} parameter ({size}) along its last axis, but "

@@ -13,6 +13,7 @@ from jaxid.dynamics import projection
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed import PackedRegressor
+from jaxid.dynamics.solve import solve_symmetric
 from jaxid.dynamics.terms import (
     AbstractTerm,
     CoulombFriction,
@@ -109,6 +110,10 @@ class Model(Hashable):
         """The bias forces of one sample, as they are defined (Eq. 38)."""
         return self.forces(p, q, qd, jnp.zeros_like(q))
 
+    def acceleration(self, p, q, qd, forces) -> Float[AnyArray, " joints"]:
+        """The accelerations of one sample that forces cause (Eq. 38)."""
+        return solve_symmetric(self.inertia(p, q), forces - self.bias(p, q, qd))
+
     def potential(self, p, q) -> Float[AnyArray, ""]:
         """The potential energy of one sample, as it is defined."""
         parts = zip(self.terms, self.split(p), strict=True)
@@ -181,6 +186,20 @@ class Model(Hashable):
             qd: Joint velocities [rad/s or m/s].
         """
         return on_samples(self, self.bias, self.check(q), self.check(qd), shared=(p,))
+
+    def forward_dynamics(
+        self, p: Parameters, q: Coordinates, qd: Coordinates, forces: Coordinates
+    ) -> Float[AnyArray, "*batch joints"]:
+        r"""The accelerations $M^{-1} (Q_m - h)$ that forces cause, the other way round (Eq. 38).
+
+        Args:
+            p: Standard parameters, of bodies that could exist.
+            q: Joint coordinates [rad or m].
+            qd: Joint velocities [rad/s or m/s].
+            forces: Generalized forces of the drives [N m or N].
+        """
+        samples = (self.check(x) for x in (q, qd, forces))
+        return on_samples(self, self.acceleration, *samples, shared=(p,))
 
     def kinetic_energy(
         self,

@@ -148,6 +148,19 @@ def each_joint(robot: Robot, name: str, unit_r: str, unit_p: str) -> tuple[tuple
     return tuple((f"{name}{i + 1}", unit_r if r else unit_p) for i, r in enumerate(robot.revolute))
 
 
+def one_drive_each(robot: Robot, order: int) -> Float[np.ndarray, "2 joints joints joints"]:
+    """Drive matrices of a parameter that belongs to one joint.
+
+    Args:
+        robot: Whose joints they are.
+        order: 0 for inertias, 1 for viscous friction.
+    """
+    n = robot.joints
+    matrices = np.zeros((2, n, n, n))
+    matrices[order, range(n), range(n), range(n)] = 1.0
+    return matrices
+
+
 class ViscousFriction(AbstractTerm):
     r"""Friction that grows with speed, $\mathrm{diag}\{\dot q_i\}$ (Eq. 13)."""
 
@@ -165,10 +178,7 @@ class ViscousFriction(AbstractTerm):
 
     def drive_matrices(self, robot):
         """The diagonal of the viscous friction."""
-        n = robot.joints
-        matrices = np.zeros((2, n, n, n))
-        matrices[1, range(n), range(n), range(n)] = 1.0
-        return matrices
+        return one_drive_each(robot, order=1)
 
 
 class CoulombFriction(AbstractTerm):
@@ -260,10 +270,7 @@ class RotorInertia(AbstractTerm):
 
     def drive_matrices(self, robot):
         """The diagonal of the inertia."""
-        n = robot.joints
-        matrices = np.zeros((2, n, n, n))
-        matrices[0, range(n), range(n), range(n)] = 1.0
-        return matrices
+        return one_drive_each(robot, order=0)
 
 
 class LinearSpring(AbstractTerm):

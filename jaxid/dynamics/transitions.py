@@ -93,6 +93,31 @@ class HardSign(AbstractTransition):
         return _outside(self.dead_zone, qd, jnp.sign(qd))
 
 
+class Reversal(AbstractTransition):
+    """Another transition that near standstill holds to one direction, for bounds of forces.
+
+    Where a joint turns round, its dry friction jumps, at an instant that no grid of samples meets.
+    Between the two sides of this class lies every force on the way, and both change smoothly.
+
+    Attributes:
+        own: The transition elsewhere.
+        side: 1 or -1: the direction that holds near standstill.
+        width: Speeds up to which it holds; at twice these it has faded [rad/s or m/s].
+    """
+
+    own: AbstractTransition
+    side: float
+    width: Float[AnyArray, " joints"]
+
+    def __call__(self, qd):
+        """The other transition, drawn to the side."""
+        one = jnp.ones_like(qd)
+        near = jnp.minimum(one, jnp.maximum(0 * one, 2 * one - jnp.abs(qd) / self.width))
+        near = near**2 * (3 - 2 * near)
+        value = self.own(qd)
+        return value + near * (self.side - value)
+
+
 def _outside(dead_zone, qd, value):
     if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
         return value

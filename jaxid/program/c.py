@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from jaxid.program.c_library import KINDS, SINE_COSINE, Library
 from jaxid.program.operation import TRUTH_VALUED, Operation
 from jaxid.program.program import Program, Reference
 
@@ -29,6 +30,7 @@ _FORMAT: dict[Operation, Callable[..., str]] = {
     Operation.MAXIMUM: lambda x, y: f"(({x} > {y}) | ({x} != {x})) ? {x} : {y}",
     Operation.MINIMUM: lambda x, y: f"(({x} < {y}) | ({x} != {x})) ? {x} : {y}",
 }
+_OF_LIBRARY = frozenset(kind for kinds in KINDS.values() for kind in kinds)
 _NAMES = {Operation.ABSOLUTE: "fabs"}
 _KEYWORDS = re.compile(
     "alignas|alignof|and|asm|auto|bool|break|case|catch|char|class|const|constexpr|continue|default|"
@@ -103,20 +105,65 @@ def to_c(
     """
     inputs = _names(inputs, "input", len(program.input_shapes))
     outputs = _names(outputs, "output", len(program.output_shapes))
+    head = declaration(name, inputs, outputs, double=double)
+    return f"""#include <math.h>
+
+/* Generated code: do not edit.
+{_description(program, inputs, outputs)}
+   {program.counts}. */
+#ifdef __cplusplus
+extern "C"
+#endif
+{head};
+
+{definition(program, name, inputs, outputs, double=double)}"""
+
+
+def declaration(name: str, inputs: Sequence[str], outputs: Sequence[str], *, double: bool) -> str:
+    """The prototype of a program's function, without a semicolon.
+
+    Args:
+        name: Name of the C function.
+        inputs: Names of the inputs.
+        outputs: Names of the outputs.
+        double: Whether its numbers are of `double`; of `float` otherwise.
+
+    Raises:
+        ValueError: If a name is no identifier of C, or is used twice.
+    """
     _check_names([name, *inputs, *outputs])
+    kind = "double" if double else "float"
+    arguments = [f"const {kind} *{x}" for x in inputs] + [f"{kind} *{x}" for x in outputs]
+    return f"void {name}({', '.join(arguments) or 'void'})"
+
+
+def definition(
+    program: Program,
+    name: str,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    double: bool,
+    library: Library | None = None,
+) -> str:
+    """A program as the definition of a C function, as `to_c` describes it.
+
+    Args:
+        program: Made by `trace`.
+        name: Name of the C function.
+        inputs: Names of the inputs.
+        outputs: Names of the outputs.
+        double: Whether the C code computes in `double`; in `float` otherwise.
+        library: Functions for many sines, cosines and tanh at once that stand before it in the
+            file, made for this program and others; the compiler's own functions if None.
+
+    Raises:
+        ValueError: If a name is no identifier of C, or is used twice.
+    """
+    head = declaration(name, inputs, outputs, double=double)
     writer = _Writer(double)
-    arguments = [f"const {writer.type} *{x}" for x in inputs]
-    arguments += [f"{writer.type} *{x}" for x in outputs]
-    lines, read = [], set()
-    for k, (operation, operands) in enumerate(program.nodes):
-        if operation is Operation.INPUT:
-            number, entry = operands
-            read.add(number)
-            expression = f"{inputs[int(number)]}[{entry}]"
-        else:
-            expression = writer.expression(operation, operands)
-        kind = "int" if operation in TRUTH_VALUED else writer.type
-        lines.append(f"const {kind} t{k} = {expression};")
+    lines = _statements(program, writer, inputs, library)
+    read = {int(node.operands[0]) for node in program.nodes if node.operation is Operation.INPUT}
     lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in read]
     start = 0
     for output, shape in zip(outputs, program.output_shapes, strict=True):
@@ -127,21 +174,63 @@ def to_c(
         lines += [f"{output}[{k}] = {writer.operand(x)};" for k, x in enumerate(entries)]
         start += size
     body = "\n".join(f"    {line}" for line in lines)
-    return f"""#include <math.h>
+    return f"{head}\n{{\n{body}\n}}\n"
 
-/* Generated code: do not edit.
-{_description(program, inputs, outputs)}
-   {program.counts}. */
-#ifdef __cplusplus
-extern "C"
-#endif
-void {name}({", ".join(arguments) or "void"});
 
-void {name}({", ".join(arguments) or "void"})
-{{
-{body}
-}}
-"""
+def _statements(
+    program: Program, writer: _Writer, inputs: Sequence[str], library: Library | None
+) -> list[str]:
+    """One line for each node; functions of the library wait until there are many of them."""
+    lines: list[str] = []
+    stages = _stages(program) if library else [0] * len(program.nodes)
+    for stage in range(max(stages, default=0) + 1):
+        own = [k for k, s in enumerate(stages) if s == stage]
+        if stage and library:
+            for call, kinds in KINDS.items():
+                nodes = [k for k in own if program.nodes[k].operation in kinds]
+                lines += _called(program, writer, library, call, nodes, stage) if nodes else []
+            own = [k for k in own if program.nodes[k].operation not in _OF_LIBRARY]
+        for k in own:
+            operation, operands = program.nodes[k]
+            if operation is Operation.INPUT:
+                number, entry = operands
+                expression = f"{inputs[int(number)]}[{entry}]"
+            else:
+                expression = writer.expression(operation, operands)
+            kind = "int" if operation in TRUTH_VALUED else writer.type
+            lines.append(f"const {kind} t{k} = {expression};")
+    return lines
+
+
+def _stages(program: Program) -> list[int]:
+    """For each node how many functions of the library stand before it, one after the other."""
+    stages: list[int] = []
+    for node in program.nodes:
+        before = max((stages[k] for k in node.uses), default=0)
+        stages.append(before + (node.operation in _OF_LIBRARY))
+    return stages
+
+
+def _called(
+    program: Program, writer: _Writer, library: Library, call: str, nodes: Sequence[int], stage: int
+) -> list[str]:
+    """Some functions of the library at once, and their results as nodes."""
+    width = library.width(call)
+    arguments = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
+    filled = [writer.operand(x) for x in arguments]
+    filled += [writer.number(0.0)] * (width - len(arguments))
+    label = f"t{call[0]}{stage}"
+    results = [f"{label}a"] + ([f"{label}b"] if call == SINE_COSINE else [])
+    lines = [
+        f"const {writer.type} {label}[{width}] = {{{', '.join(filled)}}};",
+        f"{writer.type} {', '.join(f'{x}[{width}]' for x in results)};",
+        f"{library.prefix}_{call}({label}, {', '.join(results)});",
+    ]
+    for k in nodes:
+        operation, (x,) = program.nodes[k]
+        result = results[operation is Operation.COSINE]
+        lines.append(f"const {writer.type} t{k} = {result}[{arguments.index(x)}];")
+    return lines
 
 
 def _description(program: Program, inputs: Sequence[str], outputs: Sequence[str]) -> str:
@@ -161,7 +250,7 @@ def _check_names(names: list[str]) -> None:
     for name in names:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _KEYWORDS.fullmatch(name):
             raise ValueError(f"A name in C code must be an identifier of C, but got {name!r}.")
-        if re.fullmatch(r"t[0-9]+", name):
+        if re.fullmatch(r"t[a-z]?[0-9]+[ab]?", name):
             raise ValueError(f"The name {name!r} is taken by the generated code: choose another.")
     if len(set(names)) < len(names):
         raise ValueError(f"Names in C code must differ from each other, but are {names}.")

@@ -31,7 +31,7 @@ def _pieces(bits: int, count: int) -> tuple[float, ...]:
     return (*pieces, float(rest))
 
 
-class _Precision:
+class Precision:
     """What differs between float64 and float32."""
 
     def __init__(self, bits, pieces, whole_bits, sine, cosine):
@@ -44,7 +44,7 @@ class _Precision:
 # Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded), lowest power
 # of z = r^2 first: sin r = r + r z P(z) with relative error 4e-18, and
 # cos r = 1 - z/2 + z^2 Q(z) with relative error 6e-20; in float32 4e-9 and 1e-10.
-_DOUBLE = _Precision(
+DOUBLE = Precision(
     22,
     3,
     31,
@@ -65,7 +65,7 @@ _DOUBLE = _Precision(
         -1.1358513953776357e-11,
     ),
 )
-_SINGLE = _Precision(
+SINGLE = Precision(
     8,
     3,
     16,
@@ -88,7 +88,7 @@ def sine_cosine(x: Array) -> tuple[Array, Array]:
     Args:
         x: Angles [rad]; |x| up to 3e9 in float64, up to 1e5 in float32, NaN beyond.
     """
-    precision = _DOUBLE if x.dtype == np.float64 else _SINGLE
+    precision = DOUBLE if x.dtype == np.float64 else SINGLE
     turns = jnp.round(x * float(1 / _HALF_PI))
     *leading, middle, last = precision.pieces
     r = x

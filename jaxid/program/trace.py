@@ -274,11 +274,46 @@ def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
     """
     graph = Graph()
     arguments = [_argument(graph, k, given) for k, given in enumerate(inputs)]
-    shapes = tuple(x.shape for x in arguments)
-    with double_precision():
-        avals = [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes]
-        jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)
-        arrays = _run(jaxpr.jaxpr, jaxpr.consts, arguments)
+    result = applied(function, *arguments)
     leaves, structure = jax.tree.flatten(result)
-    outputs: list[Operand] = [scalar.as_number(e) for x in arrays for e in _entries(x).ravel()]
+    outputs: list[Operand] = [e for x in leaves for e in x.ravel()]
+    shapes = tuple(x.shape for x in arguments)
     return assemble(shapes, outputs, tuple(x.shape for x in leaves), structure)
+
+
+def applied(function: Callable, *arrays: np.ndarray) -> Any:
+    """Runs a function, as `trace` takes it, on arrays of scalars of one graph.
+
+    Args:
+        function: Takes these arrays and returns any PyTree of arrays.
+        arrays: Of scalars and numbers.
+
+    Returns:
+        What the function returns, with arrays of scalars and numbers in it.
+
+    Raises:
+        ValueError: Like `trace`.
+    """
+    with double_precision():
+        avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arrays]
+        jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)
+        found = _run(jaxpr.jaxpr, jaxpr.consts, list(arrays))
+    leaves = [np.array([scalar.as_number(e) for e in _entries(x).ravel()], object) for x in found]
+    shaped = [x.reshape(np.shape(y)) for x, y in zip(leaves, found, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(result), shaped)
+
+
+def program_of_scalars(
+    function: Callable[..., np.ndarray], *inputs: tuple[int, ...] | np.ndarray
+) -> Program:
+    """A program from a function of arrays of scalars, which computes with them itself.
+
+    Args:
+        function: Takes one array of scalars per input and returns one.
+        inputs: As for `trace`.
+    """
+    graph = Graph()
+    arguments = [_argument(graph, k, given) for k, given in enumerate(inputs)]
+    result = function(*arguments)
+    shapes = tuple(x.shape for x in arguments)
+    return assemble(shapes, list(result.ravel()), (result.shape,), jax.tree.structure(0))
