@@ -191,6 +191,7 @@ class PaperFilter(AbstractFilter):
         return _margin(self.margin, sample_time, own, self.low_pass(sample_time))
 
     def _refuse_slow_logs(self, sample_time: float) -> None:
+        refuse_above_nyquist("velocity", 0.0, sample_time)
         for name, omega in (("velocity", self.velocity), ("acceleration", self.acceleration)):
             if omega * sample_time >= math.pi:
                 raise ValueError(

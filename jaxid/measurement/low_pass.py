@@ -11,6 +11,8 @@ from jaxid.types import AnyArray, Float
 BLOCK = 2**22
 """Numbers that are filtered at once: what scipy copies stays small."""
 
+SLOWEST, FASTEST = 10.0, 1e6
+"""Samples in a second outside of which the unit of the time is wrong or doubtful [Hz]."""
 Sections = tuple[tuple[float, ...], ...]
 
 
@@ -113,8 +115,16 @@ def as_sections(sos: np.ndarray) -> Sections:
 
 def refuse_above_nyquist(name: str, cutoff: float, sample_time: float) -> None:
     """Raises ValueError unless `cutoff` [Hz] can be told apart at this sampling rate."""
-    if cutoff >= 0.5 / sample_time:
+    rate = 1 / sample_time
+    if rate > FASTEST:
+        raise ValueError(
+            f"the log has {rate:.3g} samples in a second, as no robot's has: check the unit of its "
+            "time, or `sample_time`."
+        )
+    if cutoff >= 0.5 * rate:
+        slow = " Few robots log so slowly: check `time_unit`, or `sample_time`."
         raise ValueError(
             f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of "
-            f"{1 / sample_time:.6g} Hz: take a lower one, or log faster than {2 * cutoff:.6g} Hz."
+            f"{rate:.6g} Hz: take a lower one, or log faster than {2 * cutoff:.6g} Hz."
+            f"{slow if rate <= SLOWEST else ''}"
         )

@@ -4,12 +4,13 @@ import os
 import zipfile
 from abc import abstractmethod
 from pathlib import Path
+from typing import BinaryIO
 
 import equinox as eqx
 import numpy as np
 import polars as pl
 
-from jaxid.measurement.tables import Table
+from jaxid.measurement.tables import Table, whole_parquet
 from jaxid.measurement.text import HEAD, SUFFIXES, Dialect
 from jaxid.types import Int
 
@@ -52,13 +53,15 @@ class ParquetParts(AbstractParts):
 
     @property
     def rows(self) -> int:  # noqa: D102
-        return int(pl.scan_parquet(self.path).select(pl.len()).collect().item())
+        with whole_parquet(self.path):
+            return int(pl.scan_parquet(self.path).select(pl.len()).collect().item())
 
     def part(self, start, stop):  # noqa: D102
-        frame = pl.scan_parquet(self.path)
-        if self.names is not None:
-            frame = frame.select(self.names)
-        frame = frame.slice(start, stop - start).collect()
+        with whole_parquet(self.path):
+            frame = pl.scan_parquet(self.path)
+            if self.names is not None:
+                frame = frame.select(self.names)
+            frame = frame.slice(start, stop - start).collect()
         return Table(self.path.name, frame.to_dict(as_series=True), before=start)
 
     def only(self, names):  # noqa: D102
@@ -91,21 +94,14 @@ class ArrayParts(AbstractParts):
                         f"`{entry.filename}` in `{path.name}` is compressed, so it cannot be "
                         "mapped: write it with `np.savez`, or as Parquet."
                     )
-                file.seek(entry.header_offset + 26)
-                lengths = np.frombuffer(file.read(4), "<u2")
-                file.seek(entry.header_offset + 30 + int(lengths.sum()))
-                version = np.lib.format.read_magic(file)
-                first = version == (1, 0)
-                read = (
-                    np.lib.format.read_array_header_1_0
-                    if first
-                    else np.lib.format.read_array_header_2_0
-                )
-                shape, fortran, dtype = read(file)
-                order = "F" if fortran else "C"
-                arrays[entry.filename.removesuffix(".npy")] = np.memmap(
-                    path, dtype, "r", file.tell(), shape, order
-                )
+                try:
+                    mapped = _mapped(file, path, entry.header_offset)
+                except Exception as error:  # it depends on which bytes are damaged
+                    raise ValueError(
+                        f"`{entry.filename}` in `{path.name}` is no array of numbers, or is "
+                        f"damaged ({' '.join(str(error).split())}): write it again."
+                    ) from error
+                arrays[entry.filename.removesuffix(".npy")] = mapped
         return cls(path, arrays)
 
     @property
@@ -118,6 +114,17 @@ class ArrayParts(AbstractParts):
 
     def only(self, names):  # noqa: D102
         return ArrayParts(self.path, {name: self.arrays[name] for name in names})
+
+
+def _mapped(file: BinaryIO, path: Path, header: int) -> np.ndarray:
+    """An array of an archive, from where its local header begins."""
+    file.seek(header + 26)
+    lengths = np.frombuffer(file.read(4), "<u2")
+    file.seek(header + 30 + int(lengths.sum()))
+    first = np.lib.format.read_magic(file) == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(file)
+    return np.memmap(path, dtype, "r", file.tell(), shape, "F" if fortran else "C")
 
 
 class TextParts(AbstractParts):
@@ -183,7 +190,10 @@ class TextParts(AbstractParts):
 
 
 def _is_large(column: pl.Series) -> bool:
-    return column.dtype.is_integer() and int(np.abs(column.fill_null(0).to_numpy()).max()) > EXACT
+    if not column.dtype.is_integer():
+        return False
+    # As floating numbers: NumPy has no type for the whole numbers beyond 64 bits.
+    return float(column.fill_null(0).cast(pl.Float64).abs().to_numpy().max(initial=0.0)) > EXACT
 
 
 def _end(file) -> int:
@@ -222,13 +232,8 @@ def open_parts(path: Path) -> AbstractParts:
     if suffix in SUFFIXES:
         return TextParts.of(path)
     if suffix == ".parquet":
-        try:
-            found = ParquetParts(path)
-            found.part(0, 1)
-        except (pl.exceptions.PolarsError, OSError) as error:
-            raise ValueError(
-                f"`{path.name}` is no Parquet file, or is damaged: {error}."
-            ) from error
+        found = ParquetParts(path)
+        found.part(0, 1)
         return found
     if suffix == ".npz":
         try:

@@ -37,6 +37,10 @@ def read_recording(
     forces_table = table if forces_path is None else read_table(forces_path)
     velocities_table = table if velocities_path is None else read_table(velocities_path)
 
+    own = {"angles": columns.angles, "time": columns.time}
+    other = {"forces": columns.forces, "velocities": columns.velocities}
+    homes = {"forces": forces_path, "velocities": velocities_path}
+    table.refuse_shared(own | {what: s for what, s in other.items() if homes[what] is None})
     angles = table.array("angles", columns.angles)
     joints = angles.shape[1]
     forces = _like(angles, table, forces_table, "forces", columns.forces)

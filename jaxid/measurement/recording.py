@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.measurement.clock import clock, uniform
+from jaxid.measurement.tables import LARGEST
 from jaxid.types import AnyArray, Float
 
 FEWEST = 10
@@ -93,6 +94,11 @@ class Recording(eqx.Module):
                 raise ValueError(
                     f"`{key}` of `{name}` must be finite, but are {array[row, joint]} for joint "
                     f"{joint + 1} at row {row + first_row}: repair or remove the row."
+                )
+            if np.abs(array).max(initial=0.0) > LARGEST:
+                raise ValueError(
+                    f"`{key}` of `{name}` must be numbers that can be measured, but go up to "
+                    f"{np.abs(array).max():.3g}: check their units, or remove the rows."
                 )
         samples = shape[0]
         if samples < FEWEST:

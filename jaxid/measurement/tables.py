@@ -1,18 +1,24 @@
 """Files of numbers: CSV, Parquet, NPZ and MAT, seen alike as named columns."""
 
+import contextlib
 import dataclasses
 import difflib
 import re
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 
+from jaxid.files import read_arrays
 from jaxid.measurement.columns import Selection
 from jaxid.measurement.text import SUFFIXES, Dialect
+
+LARGEST = 1e30
+"""Numbers that no robot's log goes beyond, in any unit: their squares still are numbers."""
+LONGEST = 200
+"""Letters of a library's words about a damaged file that are passed on."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,16 +54,16 @@ class Table:
             return tuple(self._name(what, one) for one in selection)
         if isinstance(selection, int) or "{}" not in selection:
             return (self._name(what, selection),)
-        pattern = re.escape(selection).replace(re.escape("{}"), r"(\d+)")
+        pattern = re.escape(selection).replace(re.escape("{}"), r"(\d{1,18})")
         found = {int(m[1]): c for c in self.columns if (m := re.fullmatch(pattern, c))}
         if not found:
             return (self._name(what, selection.replace("{}", "1")),)
         first = min(found)
         numbers = range(min(first, 1), max(found) + 1)
-        missing = [number for number in numbers if number not in found]
-        if missing:
+        missing = next((number for number in numbers if number not in found), None)
+        if missing is not None:
             raise ValueError(
-                f"`{self.source}` has no column `{selection.replace('{}', str(missing[0]))}` for "
+                f"`{self.source}` has no column `{selection.replace('{}', str(missing))}` for "
                 f"`{what}`, though it has `{found[max(found)]}`: name the columns one by one."
             )
         return tuple(found[number] for number in numbers)
@@ -85,6 +91,26 @@ class Table:
         raise ValueError(
             f"`{self.source}` has no column `{column}` for `{what}`{hint}: it has {shown}{more}."
         )
+
+    def refuse_shared(self, channels: dict[str, Selection | None]) -> None:
+        """Refuses one column that is meant to be two things.
+
+        Args:
+            channels: Selections by what they are for; those of None are left out.
+
+        Raises:
+            ValueError: If a column comes twice.
+        """
+        used: dict[str, str] = {}
+        for what, selection in channels.items():
+            for name in () if selection is None else self.expand(what, selection):
+                if name in used:
+                    both = "twice" if used[name] == what else f"for `{used[name]}` and `{what}`"
+                    raise ValueError(
+                        f"the column `{name}` of `{self.source}` is used {both}: one column holds "
+                        "one channel; name the right one."
+                    )
+                used[name] = what
 
     def array(self, what: str, selection: Selection) -> np.ndarray:
         """The numbers of some columns (samples x columns).
@@ -154,6 +180,8 @@ class Table:
         array = np.array(array.reshape(len(array), -1), np.float64)
         bad = np.asarray(np.logical_not(np.isfinite(array)).any(axis=1))
         self._refuse_first(name, bad, array.min(axis=1) + array.max(axis=1), "is not finite ({})")
+        size = np.abs(array).max(axis=1)
+        self._refuse_first(name, size > LARGEST, size, "is {} in size, which nothing measures")
         return array
 
     def _nested(self, name: str, column: pl.Series) -> np.ndarray:
@@ -208,19 +236,33 @@ def _read_text(path: Path) -> Table:
     return Table(path.name, columns, dialect.first_line, dialect.named)
 
 
-def _read_parquet(path: Path) -> Table:
+@contextlib.contextmanager
+def whole_parquet(path: Path) -> Iterator[None]:
+    """Says of a Parquet file that cannot be read that it is damaged.
+
+    Args:
+        path: Of the file.
+
+    Raises:
+        ValueError: If reading fails, also where Polars itself takes damage for a bug of its own.
+    """
     try:
+        yield
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+        said = " ".join(str(error).split())[:LONGEST]
+        raise ValueError(f"`{path.name}` is no Parquet file, or is damaged: {said}.") from error
+
+
+def _read_parquet(path: Path) -> Table:
+    with whole_parquet(path):
         frame = pl.read_parquet(path)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        raise ValueError(f"`{path.name}` is no Parquet file, or is damaged: {error}.") from error
     return Table(path.name, frame.to_dict(as_series=True))
 
 
 def _read_npz(path: Path) -> Table:
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(path)
+    except ValueError as error:
         raise ValueError(
             f"`{path.name}` is no NPZ file of plain arrays ({error}): save the log with "
             "`numpy.savez` and without objects."
@@ -230,7 +272,6 @@ def _read_npz(path: Path) -> Table:
 
 def _read_mat(path: Path) -> Table:
     from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
 
     try:
         content = loadmat(path, simplify_cells=True)
@@ -239,8 +280,9 @@ def _read_mat(path: Path) -> Table:
             f"`{path.name}` is a MAT file of version 7.3, which cannot be read: save it with "
             "`save(name, ..., '-v7')`, or as CSV."
         ) from error
-    except (MatReadError, ValueError, OSError, TypeError) as error:
-        raise ValueError(f"`{path.name}` is no MAT file, or is damaged: {error}.") from error
+    except Exception as error:  # of many kinds: it depends on which bytes are damaged
+        said = " ".join(str(error).split())[:LONGEST]
+        raise ValueError(f"`{path.name}` is no MAT file, or is damaged: {said}.") from error
     return Table(path.name, _arrays({k: v for k, v in content.items() if not k.startswith("__")}))
 
 

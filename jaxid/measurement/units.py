@@ -81,7 +81,10 @@ def unit(symbol: str) -> Unit:
     found = [known for known in ALL if known.symbol == symbol]
     if not found:
         symbols = [known.symbol for known in ALL]
-        near = difflib.get_close_matches(symbol, symbols, n=1)
+        spelt = [known for known in symbols if len(known) > 1 and symbol.startswith(known)]
+        begun = sorted(spelt, key=len)
+        near = difflib.get_close_matches(symbol, symbols, n=1, cutoff=0.9) or begun[-1:]
+        near = near or difflib.get_close_matches(symbol, symbols, n=1)
         hint = f" (did you mean `{near[0]}`?)" if near else ""
         raise ValueError(f"`{symbol}` is no known unit{hint}: write one of {', '.join(symbols)}.")
     return found[0]

@@ -12,6 +12,7 @@ from scipy.io import savemat
 
 from jaxid.measurement import units
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.parts import open_parts
 from jaxid.measurement.read import read_recording
 from jaxid.measurement.units import Quantity, Unit
 
@@ -208,7 +209,7 @@ def test_bad_cells_are_named_with_file_column_and_line(tmp_path, cell, complaint
     (tmp_path / "log.csv").write_text("\n".join(rows))
     columns = Columns(angles="q1", forces="tau1", time="t")
     refused(tmp_path / "log.csv", columns, "`log.csv`", "`q1`", "line 9", complaint)
-    ignored = Columns(angles="tau1", forces="tau1", time="t")
+    ignored = Columns(angles="t", forces="tau1", sample_time=0.01)
     assert read_recording(tmp_path / "log.csv", ignored).samples == 20
 
 
@@ -274,6 +275,41 @@ def test_damaged_files(tmp_path):
     refused(tmp_path / "new.mat", columns, "7.3", "-v7")
 
 
+def test_damage_that_polars_takes_for_a_bug_of_its_own(tmp_path, monkeypatch):
+    """Its panics are no `Exception`, and depend on which bytes are damaged."""
+    path = tmp_path / "log.parquet"
+    pl.DataFrame(a_log()).write_parquet(path)
+    whole = open_parts(path)
+
+    def panic(*_, **__):
+        raise pl.exceptions.PanicException("called `Result::unwrap()` on an `Err` value")
+
+    monkeypatch.setattr(pl, "read_parquet", panic)
+    refused(path, COLUMNS, "`log.parquet` is no Parquet file, or is damaged: called")
+    monkeypatch.setattr(pl, "scan_parquet", panic)
+    with pytest.raises(ValueError, match="or is damaged: called"):
+        whole.part(0, 3)
+
+
+@settings(max_examples=60)
+@given(places=st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(0, 255)), max_size=4))
+def test_mat_files_with_damaged_bytes(tmp_path_factory, places):
+    path = tmp_path_factory.mktemp("mat") / "log.mat"
+    t = 0.01 * np.arange(30)
+    q = np.sin(np.outer(t, [1.0, 2.0]))
+    savemat(path, {"t": t, "q": q, "tau": 3 * q})
+    data = bytearray(path.read_bytes())
+    for share, byte in places:
+        data[int(share * (len(data) - 1))] = byte
+    path.write_bytes(data)
+    try:
+        log = read_recording(path, Columns(angles="q", forces="tau", time="t"))
+    except ValueError:
+        return
+    assert np.isfinite(log.angles).all()
+    assert np.isfinite(log.forces).all()
+
+
 def test_lengths_and_shapes_must_agree(tmp_path):
     log = a_log()
     write_csv(tmp_path / "q.csv", log)
@@ -319,8 +355,11 @@ def test_columns_that_contradict_themselves(change, complaint):
 
 def test_units_by_symbol():
     assert all(units.unit(known.symbol) is known for known in units.ALL)
-    with pytest.raises(ValueError, match=r"`rads` is no known unit \(did you mean `rad/s`\?\)"):
-        units.unit("rads")
+    for wrong, near in (("degrees", "deg"), ("rads/s", "rad/s"), ("Nm", "N m")):
+        with pytest.raises(
+            ValueError, match=rf"`{wrong}` is no known unit \(did you mean `{near}`"
+        ):
+            units.unit(wrong)
     with pytest.raises(ValueError, match="`factor`"):
         Unit("nothing", 0.0, Quantity.FORCE)
 
@@ -347,3 +386,16 @@ def test_measured_robots(shared_data):
         assert kr300.angles.shape == (2501, 6)
         assert kr300.sample_time == 0.004
         assert kr300.notes == ()
+
+
+def test_whole_numbers_beyond_64_bits_are_read_part_by_part(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("q1,tau1\n" + "18446744073709551616,1\n" * 30)
+    found = open_parts(path).part(0, 30).array("angles", "q1")
+    np.testing.assert_array_equal(found, np.full((30, 1), 2.0**64))
+
+
+def test_a_column_with_a_huge_number_costs_no_memory(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,q1674407370955165,q2,tau1,tau2\n" + "0,1,2,3,4\n" * 30)
+    refused(path, Columns("q{}", "tau{}", time="t"), "has no column `q1`")
