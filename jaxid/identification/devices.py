@@ -175,7 +175,7 @@ def factorise_across_processes(
         progress: Is told now and then which share of long logs is done, of 1.
 
     Raises:
-        RuntimeError: If another process is lost during the exchange.
+        RuntimeError: If another process is lost, or JAX's 64-bit mode is off.
         TimeoutError: If another process does not arrive in time: it died, or reads for longer.
         ValueError: If the processes' base parameters differ.
     """
@@ -183,8 +183,8 @@ def factorise_across_processes(
     own = factorise(base, recordings, blocks, progress) if recordings else Blocks(())
     if jax.process_count() == 1:
         return own
-    _wait(patience)
     try:
+        _wait(patience)
         heads = multihost_utils.process_allgather(np.array([zlib.crc32(_content(base))]))
         if (heads != heads[0]).any():
             raise ValueError(
@@ -194,8 +194,8 @@ def factorise_across_processes(
         return Blocks(tuple(_tree(own.parts, base)))
     except jax.errors.JaxRuntimeError as error:
         raise RuntimeError(
-            f"process {jax.process_index()} lost another one while factors were exchanged: look "
-            f"for the first error in the others' logs. ({str(error).splitlines()[0]})"
+            f"process {jax.process_index()} lost another one: look for the first error in the "
+            f"others' logs, and start all again. ({str(error).splitlines()[0]})"
         ) from error
 
 
@@ -247,6 +247,8 @@ def _wait(patience: float) -> None:
     try:
         client.wait_at_barrier(f"jaxid_factors_{next(_calls)}", int(1000 * patience))
     except jax.errors.JaxRuntimeError as error:
+        if "DEADLINE_EXCEEDED" not in str(error):
+            raise
         raise TimeoutError(
             f"process {jax.process_index()} of {jax.process_count()} waited for the others' "
             f"factors, but not all came within {patience:g} s: look for the first error in the "

@@ -14,6 +14,7 @@ from jaxid.identification.identify import fit_rows
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import NUMERICAL
 from jaxid.identification.streaming_log import LongLog
+from jaxid.identification.uncertainty.methods import AbstractUncertainty
 from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Float
 
@@ -62,6 +63,13 @@ class EssentialParameters(eqx.Module):
         """Names of the parameters that are not essential, in the order in which they went."""
         return tuple(s.name for s in self.path[1:] if s.left >= self.fit.base.size)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know, in sentences."""
+        if not self.left_out:
+            return (str(self),)
+        return str(self), f"left out, and taken as zero: {', '.join(self.left_out)}."
+
     def __str__(self):
         first, last = self.path[0], self.chosen
         return (
@@ -76,6 +84,7 @@ def essential_parameters(
     observations: Observations | LongLog | Sequence[Observations | LongLog],
     *,
     cost: float = COST,
+    uncertainty: AbstractUncertainty | None = None,
 ) -> EssentialParameters:
     """Leaves out the parameter with the largest relative standard deviation, again and again.
 
@@ -87,6 +96,7 @@ def essential_parameters(
         fit: Of all base parameters.
         observations: Those of the fit.
         cost: Held-out error that this may cost, of the smallest on the way, of 1.
+        uncertainty: How standard deviations are found; the spectral sandwich if None.
 
     Raises:
         ValueError: If `cost` is negative, or the observations are not those of the fit.
@@ -104,7 +114,8 @@ def essential_parameters(
     smallest = min(step.held_out for step in path)
     within = [k for k, step in enumerate(path) if step.held_out <= (1 + cost) * smallest]
     base = restricted(fit.base, kept[within[-1]])
-    return EssentialParameters(fit_rows(Rows.of(base, recordings), fit.estimator), fit, tuple(path))
+    left = fit_rows(Rows.of(base, recordings), fit.estimator, uncertainty=uncertainty)
+    return EssentialParameters(left, fit, tuple(path))
 
 
 def restricted(base: BaseParameters, kept: Sequence[int]) -> BaseParameters:

@@ -137,3 +137,27 @@ class WeightedLeastSquares(AbstractEstimator):
         """Finds the weights, then the solution."""
         weights = self.weights(rows.robot, rows.factors)
         return Estimate.solved(rows, weights, self.solution.choose(rows.blocks, weights))
+
+
+class EstimatorInWords(AbstractEstimator):
+    """What is left in a file of an estimator that held recordings or functions.
+
+    Attributes:
+        words: What it was.
+    """
+
+    words: str = eqx.field(static=True)
+
+    def __call__(self, rows):
+        """Refuses: only the words are left.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError(
+            "the estimator of a model file that held recordings or functions is kept in words "
+            f"only: make it anew to estimate again. It was {self.words:.200}"
+        )
+
+    def __str__(self):
+        return self.words

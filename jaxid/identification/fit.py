@@ -1,19 +1,25 @@
 """What comes out of an identification."""
 
+import dataclasses
 import enum
+from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 
+from jaxid.documents import NotAValueError, encoded
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.consistency.consistency import Consistency
-from jaxid.identification.estimators import AbstractEstimator
+from jaxid.identification.estimators import AbstractEstimator, EstimatorInWords
 from jaxid.identification.excited import UndeterminedDirection
+from jaxid.identification.model_file import checksum_of, read_model, write_model
 from jaxid.identification.solutions import AbstractSpectralSolution
+from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.identification.uncertainty.uncertainty import Uncertainty
+from jaxid.measurement.observations import Observations
 from jaxid.types import AnyArray, Float
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
@@ -63,6 +69,7 @@ class Fit(eqx.Module):
         full_parameters: Standard parameters, of an estimator that finds a complete set of them.
         residual_spectra: Of each joint's residuals, and whether they are white; None where only
             factors of the rows were known.
+        date: Day on which the fit was made, like 2026-01-31; empty if it is not known.
     """
 
     base: BaseParameters
@@ -81,6 +88,7 @@ class Fit(eqx.Module):
     consistency: Consistency | None = None
     full_parameters: Float[AnyArray, " standard"] | None = None
     residual_spectra: ResidualSpectra | None = None
+    date: str = eqx.field(static=True, default="")
 
     @property
     def covariance(self) -> Float[AnyArray, "base base"]:
@@ -153,3 +161,57 @@ class Fit(eqx.Module):
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39)."""
         return compiled.forces(self.base, self.parameters, motion)
+
+    @property
+    def checksum(self) -> str:
+        """Of everything that a model file of this fit holds: tells models apart."""
+        return checksum_of(encoded(self._kept()))
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the fit to a model file (JSON) from which `load` makes the same fit again.
+
+        An estimator that holds recordings or functions is kept in words only.
+
+        Args:
+            path: Of the file; one that is there already is replaced.
+
+        Raises:
+            ValueError: If the model holds something that no file can hold, such as a term with
+                functions in it.
+        """
+        return write_model(path, self._kept())
+
+    def _kept(self) -> "Fit":
+        try:
+            encoded(self.estimator, refused=(Observations, LongLog))
+        except NotAValueError:
+            return dataclasses.replace(self, estimator=EstimatorInWords(str(self.estimator)))
+        return self
+
+
+def load(path: str | Path) -> Fit:
+    """Reads a fit from a model file, as `Fit.save` and `jaxid identify` write it.
+
+    Numbers are the same to the last bit, and everything works as it did after `identify`. Terms of
+    one's own are found if the module that defines them is imported; nothing in a file is run.
+
+    Args:
+        path: Of the file.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If it is no model file, of another version, or not as it was written.
+    """
+    return read_model(path, Fit, _check)
+
+
+def _check(fit: Fit) -> None:
+    """Refuses arrays of a file that do not belong to its robot."""
+    n, joints = fit.base.size, fit.base.model.robot.joints
+    for name, array, shape in (
+        ("parameters", fit.parameters, (n,)),
+        ("uncertainty.covariance", fit.uncertainty.covariance, (n, n)),
+        ("weights", fit.weights, (joints,)),
+    ):
+        if np.shape(array) != shape:
+            raise ValueError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")

@@ -1,5 +1,6 @@
 """Identification: from observations to parameters with their uncertainty (Eqs. 26-33)."""
 
+import datetime
 from collections.abc import Sequence
 
 import numpy as np
@@ -128,6 +129,7 @@ def fit_rows(
             *estimate.notes,
             *found.notes,
         ),
+        date=datetime.date.today().isoformat(),
     )
 
 

@@ -5,7 +5,9 @@ and with the forces (Gram matrices) and the solution follow for each, with one r
 residuals themselves where products alone would lose digits.
 """
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,6 +28,8 @@ ACCURATE = 1e3
 """Bound of the condition number up to which the products' solution needs no refinement."""
 SMALL = 1e-6
 """Share of the forces' squares below which the residuals' are summed themselves."""
+KEPT = 8
+"""Shapes of batches for which what was compiled is kept: memory does not grow with their number."""
 RIDGE = 64 * np.finfo(float).eps
 
 
@@ -64,15 +68,35 @@ class DataSets(eqx.Module):
     numbers: Float[AnyArray, "datasets numbers"] | None
 
 
-@eqx.filter_jit
 def solve(rows: JointRows, batch: DataSets, row_time: float | None = None) -> BatchFit:
-    """Solves all data sets, a group at a time.
+    """Solves all data sets, a group at a time; compiled once for each of the latest shapes.
 
     Args:
         rows: How columns are divided among joints.
         batch: The data sets.
         row_time: Between two rows [s], for the spectral sandwich; without it all is naive.
     """
+    leaves, tree = jax.tree.flatten((rows, batch, row_time))
+    known = tuple(not isinstance(x, jax.Array | np.ndarray) for x in leaves)
+    arrays = [x for x, is_number in zip(leaves, known, strict=True) if not is_number]
+    numbers = tuple(x for x, is_number in zip(leaves, known, strict=True) if is_number)
+    shapes = tuple((x.shape, str(x.dtype)) for x in arrays)
+    return _compiled(tree, known, numbers, shapes)(arrays)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _compiled(tree: Any, known: tuple[bool, ...], numbers: tuple, shapes: tuple) -> Callable:
+    """The computation for one set of shapes; what is forgotten here gives its memory back."""
+
+    def run(arrays: list[Array]) -> BatchFit:
+        held, given = iter(numbers), iter(arrays)
+        leaves = [next(held if is_number else given) for is_number in known]
+        return _solved(*jax.tree.unflatten(tree, leaves))
+
+    return jax.jit(run)
+
+
+def _solved(rows: JointRows, batch: DataSets, row_time: float | None) -> BatchFit:
     batch = jax.tree.map(jnp.asarray, batch)
     datasets, samples, _ = batch.motion.q.shape
     calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))

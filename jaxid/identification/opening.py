@@ -132,6 +132,7 @@ class _Files:
         self._path, self._joints = path, joints
         self._parts: dict[Path, AbstractParts] = {}
         self._wanted: dict[Path, list[str]] = {}
+        self._channels: dict[Path, dict[str, Selection | None]] = {}
 
     def want(self, what: str, selection: Selection, path: Path | None = None) -> tuple[str, ...]:
         """Names of the columns of a selection in one of the files."""
@@ -141,6 +142,8 @@ class _Files:
         parts = self._parts[path]
         first = parts.part(0, min(parts.rows, FIRST))
         names = first.expand(what, selection)
+        self._channels.setdefault(path, {})[what] = selection
+        first.refuse_shared(self._channels[path])
         if what != "time":
             found = first.array(what, selection).shape[1]
             if found != self._joints:

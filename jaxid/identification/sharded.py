@@ -9,10 +9,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxid.dynamics.base import BaseParameters
-from jaxid.identification.kernel import CHUNK, Grams, Kernel, _padded
-from jaxid.identification.streaming import Piece, Progress, Read, Stream
-from jaxid.measurement.observations import Observations
+from jaxid.identification.kernel import Grams, Kernel, _padded
+from jaxid.identification.streaming import Piece, Stream
 from jaxid.types import Array, double_precision
 
 _AXIS = "pieces"
@@ -28,27 +26,11 @@ class StreamOnDevices(Stream):
 
     Products are added up in the order of the pieces, so the number of devices changes no digit
     but those that a compiler may change.
-
-    Args:
-        base: The base parameters.
-        observations: A long log.
-        edges: Rows at which blocks of time begin, and the last one ends.
-        chunk: Samples of an iteration.
-        read: Gives motion and forces of some samples; those of the observations if None.
-        progress: Is told now and then which share of the log is done, of 1.
     """
 
-    def __init__(
-        self,
-        base: BaseParameters,
-        observations: Observations,
-        edges: Sequence[int],
-        chunk: int = CHUNK,
-        read: Read | None = None,
-        progress: Progress | None = None,
-    ):
-        super().__init__(base, observations, edges, chunk, read, progress)
-        self._mesh = Mesh(np.array(devices()), (_AXIS,))
+    @functools.cached_property
+    def _mesh(self) -> Mesh:
+        return Mesh(np.array(devices()), (_AXIS,))
 
     def _runs(
         self, pieces: Sequence[Piece], mixing: Grams, most: int | None = None

@@ -9,7 +9,9 @@ from jaxid.identification.factors import Blocks
 from jaxid.types import AnyArray, Float
 
 NUMERICAL = 1e-11
-"""Singular values, and columns, below this share of the largest are rounding."""
+"""Singular values below this share of the largest are rounding."""
+FELT = 1e-13
+"""Columns below this share of the longest are rounding: units may differ by less."""
 
 
 class Decomposition(eqx.Module):
@@ -43,7 +45,7 @@ class Decomposition(eqx.Module):
             R = np.vstack([R, np.zeros((size - len(R), size))])
             z = np.append(z, np.zeros(size - len(z)))
         norms = np.linalg.norm(R, axis=0)
-        felt = norms > NUMERICAL * norms.max(initial=0.0)
+        felt = norms > FELT * norms.max(initial=0.0)
         scale = np.where(felt, norms, 1.0)
         U, s, Vt = np.linalg.svd(np.where(felt, R / scale, 0.0), full_matrices=False)
         forces = U.T @ z

@@ -1,5 +1,7 @@
 """Batches give what one identification after the other gives."""
 
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -280,3 +282,22 @@ def test_bootstrap_refuses_what_it_cannot_answer(base):
     still = [observations(base.model, p, still=(1,), noise=1.0), observations(base.model, p)]
     with pytest.raises(ValueError, match="do not determine all parameters"):
         bootstrap(factorise(base, still, blocks=1), WEIGHTS, 50, jax.random.key(0))
+
+
+def test_what_was_compiled_for_shapes_that_are_forgotten_is_given_back(base):
+    p = standard_parameters(base.model)
+    client = jax.devices("cpu")[0].client
+
+    def identified(samples):
+        m = motion(base.model.robot.joints, samples, seed=1)
+        forces = np.asarray(base.model.inverse_dynamics(p, m))
+        stacked = jax.tree.map(lambda x: np.asarray(x)[None], m)
+        identify_batch(base, stacked, forces[None], np.ones(base.model.robot.joints))
+
+    normal_equations._compiled.cache_clear()
+    gc.collect()
+    identified(301)
+    held = len(client.live_executables())
+    normal_equations._compiled.cache_clear()
+    gc.collect()
+    assert len(client.live_executables()) < held

@@ -33,7 +33,9 @@ if len(sys.argv) > 3:
     number, processes = map(int, sys.argv[3].split("/"))
     jax.distributed.initialize(
         f"127.0.0.1:{sys.argv[2]}", num_processes=processes, process_id=number,
-        initialization_timeout=60, heartbeat_timeout_seconds=10,
+        initialization_timeout=60,
+        heartbeat_timeout_seconds=int(os.environ["HEARTBEAT"]),
+        coordinator_bind_address=f"127.0.0.1:{sys.argv[2]}",
     )
 terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
 base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
@@ -93,9 +95,20 @@ LEFT_ALONE = """
 if number == 1:
     os._exit(3)
 try:
-    factorise_across_processes(base, [recording(0)], patience=3.0)
-except TimeoutError as error:
-    print(error, flush=True)
+    factorise_across_processes(base, [recording(0)], patience=float(sys.argv[4]))
+except (RuntimeError, TimeoutError) as error:
+    print(type(error).__name__, error, flush=True)
+    os._exit(7)
+"""
+
+LEFT_BY_THE_FIRST = """
+import signal
+if number == 0:
+    os.kill(os.getpid(), signal.SIGKILL)
+try:
+    factorise_across_processes(base, [recording(1)], patience=40.0)
+except (RuntimeError, TimeoutError) as error:
+    print("ended:", type(error).__name__, error, flush=True)
     os._exit(7)
 """
 
@@ -111,13 +124,14 @@ def recording(base, seed, samples=1003):
     return observations(base.model, p, samples=samples, noise=0.3, seed=seed, noise_seed=seed)
 
 
-def start(script, *arguments, flags=""):
+def start(script, *arguments, flags="", heartbeat=10):
     paths = [str(HERE), str(HERE.parent.parent), os.environ.get("PYTHONPATH", "")]
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(p for p in paths if p),
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": flags,
+        "HEARTBEAT": str(heartbeat),
     }
     return subprocess.Popen(
         [sys.executable, "-c", COMMON + script, *map(str, arguments)],
@@ -245,14 +259,34 @@ def test_a_process_that_is_killed_in_the_exchange_ends_the_others(tmp_path):
     assert time.monotonic() - began < 90.0
 
 
-def test_a_process_that_dies_ends_the_others(tmp_path):
-    port = free_port()
-    processes = [start(LEFT_ALONE, tmp_path / "no.npz", port, f"{k}/2") for k in range(2)]
+@pytest.mark.parametrize(
+    ("heartbeat", "patience", "said"),
+    [
+        (100, 3, "TimeoutError process 0 of 2 waited for the others' factors, but not all came"),
+        (3, 100, "RuntimeError process 0 lost another one"),
+    ],
+)
+def test_a_process_that_dies_ends_the_others(tmp_path, heartbeat, patience, said):
+    """Whichever of the two notices first: this package's patience or JAX's own watch."""
+    arguments = tmp_path / "no.npz", free_port()
+    processes = [
+        start(LEFT_ALONE, *arguments, f"{k}/2", patience, heartbeat=heartbeat) for k in range(2)
+    ]
     outputs = finish(*processes)
     assert processes[1].returncode == 3
-    # Whichever of the two notices first: this package's patience or JAX's own watch.
-    assert processes[0].returncode != 0, outputs[0]
-    assert "not all came within 3 s" in outputs[0], outputs[0]
+    assert processes[0].returncode == 7, outputs[0]
+    assert said in outputs[0], outputs[0]
+
+
+def test_a_first_process_that_is_killed_ends_the_others(tmp_path):
+    """It watches over the others: where it is gone, JAX itself ends them at once."""
+    arguments = tmp_path / "no.npz", free_port()
+    processes = [start(LEFT_BY_THE_FIRST, *arguments, f"{k}/2") for k in range(2)]
+    outputs = finish(*processes)
+    assert processes[0].returncode == -signal.SIGKILL
+    assert processes[1].returncode not in (0, None), outputs[1]
+    assert "lost another one" in outputs[1] or "another task died" in outputs[1], outputs[1]
+    assert not (tmp_path / "no.npz").exists()
 
 
 def test_a_program_of_one_process_needs_no_coordinator(base):

@@ -27,12 +27,13 @@ def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
     return L
 
 
-def definite(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Bool[AnyArray, "*stack"]:
-    """Which matrices are positive definite."""
-    L = _cholesky(xp, P)
-    good = L[0][0] > 0
-    for j in range(1, P.shape[-1]):
-        good = good & (L[j][j] > 0)
+def definite(xp: ModuleType, P: Float[AnyArray, "stack n n many"]) -> Bool[AnyArray, "stack many"]:
+    """Which matrices are positive definite; many for each of a stack, side by side."""
+    good = P[:, 0, 0] > 0
+    for _ in range(P.shape[1] - 1):
+        column = P[:, 1:, 0]
+        P = P[:, 1:, 1:] - column[:, :, None] * (column / P[:, :1, 0])[:, None]
+        good = good & (P[:, 0, 0] > 0)
     return good
 
 

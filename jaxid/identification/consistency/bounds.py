@@ -181,10 +181,12 @@ class BodyBounds(eqx.Module):
         n = len(self.radius)
         for name in ("mass_max", "radius", "ellipsoid_axes"):
             values = np.asarray(getattr(self, name)).reshape(n, -1)
-            finite = name == "ellipsoid_axes" or np.isfinite(values).all()
-            if not finite or not (values > 0).all():
+            good = (values > 0) & ((name == "ellipsoid_axes") | np.isfinite(values))
+            if not good.all():
+                k, which = np.argwhere(~good)[0]
+                rule = "positive" if name == "ellipsoid_axes" else "positive and finite"
                 raise ValueError(
-                    f"`{name}` must be positive and finite, but is {values.squeeze()}."
+                    f"`{name}` must be {rule}, but body {k + 1} has {values[k, which]:g}."
                 )
         low, high = np.asarray(self.mass_min), np.asarray(self.mass_max)
         if not ((low >= 0) & (low < high)).all():

@@ -40,12 +40,9 @@ class Consistency(eqx.Module):
         return tuple(k for k in range(len(self.bodies)) if not self.decided[k * width])
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What a user should know, in sentences."""
-        said = [
-            f"physically consistent: {self.bounds.sentence}; the weighted residuals are "
-            f"{100 * self.price:.2g} % larger than without bounds."
-        ]
+    def tabulated(self) -> tuple[str, ...]:
+        """Price, and where bounds have decided, in sentences: the report's table says it too."""
+        said = [f"the weighted residuals are {100 * self.price:.2g} % larger than without bounds."]
         loose = self.masses_from_bounds
         if loose:
             names = ", ".join(f"m{k + 1}" for k in loose)
@@ -55,10 +52,17 @@ class Consistency(eqx.Module):
             )
         if self.active:
             said.append(f"bounds that decide: {'; '.join(self.active)}.")
-        said.append(
+        return tuple(said)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know, in sentences."""
+        said = [
+            f"physically consistent: {self.bounds.sentence}.",
+            *self.tabulated,
             "standard deviations are those of the estimate without bounds: where bounds decide, "
-            "estimates scatter less."
-        )
+            "estimates scatter less.",
+        ]
         if self.outcome is not Outcome.CERTIFIED:
             said.append(self.outcome.value)
         return tuple(said)

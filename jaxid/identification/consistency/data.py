@@ -7,8 +7,10 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.consistency.cone_program import Number, Values
-from jaxid.identification.consistency.possible import NOISE
 from jaxid.types import AnyArray, Float
+
+NOISE = 1e-3
+"""Smallest noise that is believed, as a share of the forces."""
 
 
 class Data(eqx.Module):

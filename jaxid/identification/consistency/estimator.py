@@ -14,6 +14,7 @@ from jaxid.identification.consistency.data import Data, whitened
 from jaxid.identification.consistency.interior_point import MOST, Optimum, Outcome, solve_at_once
 from jaxid.identification.consistency.possible import PossibleParameters, nominal_bodies
 from jaxid.identification.consistency.priors import EntropicPull, ParameterPrior
+from jaxid.identification.consistency.program import program_of
 from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
 from jaxid.identification.estimators import AbstractEstimator, Estimate
 from jaxid.identification.solutions import Complete
@@ -125,7 +126,7 @@ class PhysicallyConsistent(AbstractEstimator):
         if self.pull is not None:
             strength = self.pull.strength
             bodies = self.pull.pseudo_inertias(nominal_bodies(possible.bounds))
-        return possible.program(xp, data.A, data.b, data.scale, strength, bodies)
+        return program_of(xp, possible, data.A, data.b, data.scale, strength, bodies)
 
 
 def decided(base: BaseParameters) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.interior_point import Outcome, solve_at_once
 from jaxid.identification.consistency.possible import PossibleParameters
+from jaxid.identification.consistency.program import program_of
 from jaxid.types import AnyArray, Float
 
 
@@ -66,7 +67,7 @@ def consistent_body(
         couplings=(),
         size=10,
     )
-    program = possible.program(np, A, b, np.float64(len(b)))
+    program = program_of(np, possible, A, b, np.float64(len(b)))
     program.require_interior()
     optimum = solve_at_once(program)
     outcome = Outcome.CERTIFIED if bool(optimum.certified) else Outcome.STALLED

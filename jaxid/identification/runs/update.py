@@ -2,14 +2,14 @@
 
 import io
 import json
-import zipfile
+import operator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
-from jaxid.files import written_whole
+from jaxid.files import read_arrays, written_whole
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.tied import tied
@@ -17,6 +17,35 @@ from jaxid.identification.runs.tied import tied
 SCHEMA = "jaxid-run/1"
 ALIKE = 1e-6
 """Relative difference that two regroupings of one geometry may have."""
+
+
+class _Head(NamedTuple):
+    """What is no array in the file of a run."""
+
+    schema: str
+    name: str
+    recordings: tuple[str, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    robot: str
+    columns: list[tuple[int, ...]]
+    rows: list[list[int]]
+
+    @classmethod
+    def of(cls, text: str) -> "_Head":
+        raw = json.loads(text)
+        columns = [tuple(map(operator.index, own)) for own in raw["columns"]]
+        rows = [list(map(operator.index, own)) for own in raw["rows"]]
+        return cls(
+            schema=str(raw["schema"]),
+            name=str(raw["name"]),
+            recordings=tuple(map(str, raw["recordings"])),
+            names=tuple(map(str, raw["names"])),
+            units=tuple(map(str, raw["units"])),
+            robot=str(raw["robot"]),
+            columns=columns,
+            rows=rows,
+        )
 
 
 def update(earlier: Run, later: Run, name: str | None = None) -> Run:
@@ -97,43 +126,77 @@ def load_run(path: str | Path, base: BaseParameters) -> Run:
         ValueError: If the file holds no run, or one of other base parameters.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        head = json.loads(str(arrays["head"]))
-        known = head["schema"] == SCHEMA
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-        known, head, arrays = False, {}, {}
-    if not known:
-        raise ValueError(f"`{path}` must hold a run (`{SCHEMA}`), as `save_run` writes it.")
-    _require_same(path, head, arrays["kappa"], base)
-    columns = [tuple(own) for own in head["columns"]]
+        arrays = read_arrays(path)
+        head = _Head.of(str(arrays["head"]))
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise _no_run(path) from error
+    if head.schema != SCHEMA:
+        raise _no_run(path)
+    _require_same(path, head, arrays.get("kappa", np.zeros(0)), base)
+    found = {key: _sound(path, arrays, key, shape) for key, shape in _shapes(base).items()}
+    columns = head.columns
+    if len(columns) != base.model.robot.joints or not all(
+        0 <= k < base.size for own in columns for k in own
+    ):
+        raise ValueError(
+            f"`{path}` is damaged: `columns` are not those of its joints; identify again."
+        )
     parts = []
-    for b, rows in enumerate(head["rows"]):
+    for b, rows in enumerate(head.rows):
+        if len(rows) != len(columns) or min(rows, default=0) < 0:
+            raise ValueError(
+                f"`{path}` is damaged: `rows[{b}]` are not its joints'; identify again."
+            )
         joints = (
-            JointFactor(own, arrays[f"R_{b}_{j}"], count)
+            JointFactor(own, _sound(path, arrays, f"R_{b}_{j}", (None, len(own) + 1)), count)
             for j, (own, count) in enumerate(zip(columns, rows, strict=True))
         )
         parts.append(Factors(tuple(joints), base.size))
+    if not parts:
+        raise ValueError(f"`{path}` is damaged: it holds no rows; identify again.")
     return Run(
-        base=base,
-        blocks=Blocks(tuple(parts)),
-        name=head["name"],
-        recordings=tuple(head["recordings"]),
-        **{key: arrays[key] for key in ("weights", "parameters", "covariance", "freedom")},
+        base=base, blocks=Blocks(tuple(parts)), name=head.name, recordings=head.recordings, **found
     )
 
 
-def _require_same(path: str | Path, head: dict[str, Any], kappa: np.ndarray, base: BaseParameters):
-    for key, own in (("names", base.names), ("units", base.units)):
-        if tuple(head[key]) != own:
-            pairs = zip(head[key], own, strict=False)
-            there, here = next(((a, b) for a, b in pairs if a != b), ("more", "fewer"))
+def _no_run(path: str | Path) -> ValueError:
+    return ValueError(f"`{path}` must hold a run (`{SCHEMA}`), as `save_run` writes it.")
+
+
+def _shapes(base: BaseParameters) -> dict[str, tuple[int, ...]]:
+    n, size = base.model.robot.joints, base.size
+    return {"weights": (n,), "parameters": (size,), "covariance": (size, size), "freedom": (size,)}
+
+
+def _sound(
+    path: str | Path, arrays: dict[str, np.ndarray], key: str, shape: tuple[int | None, ...]
+) -> np.ndarray:
+    """An array of the file, of the right shape and without what is no number."""
+    array = arrays.get(key, np.zeros(0))
+    wrong = array.dtype != np.float64 or array.ndim != len(shape)
+    wrong = wrong or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
+    if wrong or np.isnan(array).any():
+        raise ValueError(
+            f"`{path}` is damaged: its array `{key}` is missing, or holds what is no number; "
+            "identify again."
+        )
+    return array
+
+
+def _require_same(path: str | Path, head: _Head, kappa: np.ndarray, base: BaseParameters):
+    for key, there, own in (
+        ("names", head.names, base.names),
+        ("units", head.units, base.units),
+    ):
+        if there != own:
+            pairs = zip(there, own, strict=False)
+            first, here = next(((a, b) for a, b in pairs if a != b), ("more", "fewer"))
             raise ValueError(
                 f"`{path}` holds a run of other base parameters than `base`: {key} differ, "
-                f"`{there}` there and `{here}` here; use the robot and the terms of the file."
+                f"`{first}` there and `{here}` here; use the robot and the terms of the file."
             )
     if kappa.shape != base.kappa.shape or not np.allclose(kappa, base.kappa, ALIKE, ALIKE):
         raise ValueError(
-            f"`{path}` holds a run of `{head['robot']}` with another geometry than that of `base`: "
+            f"`{path}` holds a run of `{head.robot}` with another geometry than that of `base`: "
             "lengths differ; use the robot of the file."
         )

@@ -1,6 +1,7 @@
 """The optimum against a conic solver, the certificate, and the two machines against each other."""
 
 import arms
+import conic
 import jax
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 import jaxid as jid
 from jaxid.identification.consistency import interior_point
 from jaxid.identification.consistency.possible import PossibleParameters, nominal_bodies
+from jaxid.identification.consistency.program import program_of
 
 TERMS = (
     jid.RigidBodies(),
@@ -34,7 +36,7 @@ def _case(name, terms=TERMS, margin=0.0, **bounds):
 
 
 def _program(possible, data):
-    return possible.program(np, data.A, data.b, data.scale)
+    return program_of(np, possible, data.A, data.b, data.scale)
 
 
 CASES = {
@@ -64,7 +66,7 @@ def test_the_optimum_is_a_conic_solvers(name):
     (base, possible), noise = CASES[name]
     data = arms.data(base, 3, noise)
     optimum = interior_point.solve_at_once(_program(possible, data))
-    value, p = arms.conic(possible, data)
+    value, p = conic.optimum(possible, data)
     assert optimum.certified
     assert optimum.iterations <= 30
     assert abs(optimum.value - value) <= 1e-6 * value
@@ -97,7 +99,7 @@ def test_the_bound_holds_with_a_pull(monkeypatch):
     (base, possible), _ = CASES["all bounds"]
     data = arms.data(base, 7, 0.3)
     prior = nominal_bodies(possible.bounds)
-    program = possible.program(np, data.A, data.b, data.scale, 3.0, prior)
+    program = program_of(np, possible, data.A, data.b, data.scale, 3.0, prior)
     optimum = interior_point.solve_at_once(program)
     assert optimum.certified
 

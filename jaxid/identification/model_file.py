@@ -1,0 +1,100 @@
+"""The model file: one JSON document that holds an identified model whole."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import equinox as eqx
+
+from jaxid.documents import decoded, encoded, text_of
+from jaxid.files import written_whole
+
+FORMAT = "jaxid model"
+VERSION = 1
+KEYS = ("format", "version", "checksum", "model")
+_Kind = TypeVar("_Kind", bound=eqx.Module)
+
+
+def write_model(path: str | Path, model: eqx.Module) -> Path:
+    """Writes a model file, whole or not at all.
+
+    Args:
+        path: Of the file.
+        model: An identified model.
+
+    Raises:
+        ValueError: If the model holds something that no file can hold.
+    """
+    path = Path(path)
+    content = encoded(model)
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "checksum": checksum_of(content),
+        "model": content,
+    }
+    with written_whole(path.parent) as staging:
+        (staging / path.name).write_text(text_of(document), encoding="utf-8")
+    return path
+
+
+def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], None]) -> _Kind:
+    """Reads a model file.
+
+    Args:
+        path: Of the file.
+        kind: What it must hold.
+        check: Raises a `ValueError` where parts of it do not belong together.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If it is no model file, of another version, or not as it was written.
+    """
+    try:
+        document = json.loads(
+            Path(path).read_text(encoding="utf-8"), object_pairs_hook=_without_repetition
+        )
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"`{path}` is no model file: it cannot be read as JSON.") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ValueError(
+            f'`{path}` is no model file (`"format": "{FORMAT}"`), as `save` writes it.'
+        )
+    if document.get("version") != VERSION:
+        raise ValueError(
+            f"`{path}` is a model file of version {document.get('version')!r:.20}, but this jaxid "
+            f"reads version {VERSION}: use the jaxid that wrote it, or identify again."
+        )
+    if set(document) != set(KEYS):
+        other = sorted(set(document) ^ set(KEYS))
+        raise ValueError(
+            f"`{path}` must have the keys {', '.join(KEYS)}, but differs by {', '.join(other)}."
+        )
+    content = document["model"]
+    if document["checksum"] != checksum_of(content):
+        raise ValueError(
+            f"`{path}` is damaged or was changed by hand: its checksum does not fit its content; "
+            "save the model again."
+        )
+    try:
+        model = decoded(content, kind)
+        check(model)
+    except (ValueError, TypeError) as error:
+        said = " ".join(str(error).split()).rstrip(".")
+        raise ValueError(f"`{path}` holds no model that can be used: {said}.") from error
+    return model
+
+
+def checksum_of(content: Any) -> str:
+    """SHA-256 of plain JSON values, whatever their layout in a file."""
+    plain = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return f"sha256:{hashlib.sha256(plain.encode()).hexdigest()}"
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        raise ValueError("a key comes twice")
+    return content

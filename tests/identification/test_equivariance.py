@@ -1,0 +1,153 @@
+"""What estimates do when their data are scaled, moved, reordered, divided or padded."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from virtual import dense, observations, standard_parameters
+
+import jaxid as jid
+from jaxid.identification.factors import Factors, factorise
+from jaxid.identification.solutions import Complete, Decomposition
+
+TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
+ROBOT = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits.of(2, force=[40.0, 5.0]))
+BASE = jid.base_parameters(jid.Model(ROBOT, TERMS))
+NOISE = np.array([0.5, 0.1])
+LINEAR = (
+    jid.LeastSquares(),
+    jid.WeightedLeastSquares(),
+    jid.LeastSquares(solution=jid.Truncated(1e-6)),
+    jid.WeightedLeastSquares(solution=jid.Ridge(0.1)),
+)
+"""Estimates that are linear in the forces."""
+FOLLOWING = (
+    *LINEAR,
+    jid.WeightedLeastSquares(jid.ResidualVariances()),
+    jid.IterativelyReweighted(loss=jid.Huber()),
+    jid.IterativelyReweighted(loss=jid.Tukey()),
+    jid.GeneralisedLeastSquares(),
+)
+"""Estimates that are in other units where the forces are."""
+few = settings(max_examples=4)
+seeds = st.integers(0, 1000)
+
+
+def name(estimator):
+    return type(estimator).__name__
+
+
+def observed(seed, samples=150, **options):
+    p = standard_parameters(BASE.model, seed)
+    return observations(
+        BASE.model, p, samples=samples, noise=NOISE, seed=seed % 7, noise_seed=seed, **options
+    )
+
+
+def with_forces(o, forces):
+    return dataclasses.replace(o, forces=forces)
+
+
+def close(found, expected, rtol=1e-9):
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol * size)
+
+
+@pytest.mark.parametrize("estimator", FOLLOWING, ids=name)
+@few
+@given(seed=seeds, power=st.integers(-30, 30))
+def test_forces_in_other_units_give_parameters_in_other_units(estimator, seed, power):
+    """Grams for kilograms, say; by powers of two nothing is rounded on the way in."""
+    o, c = observed(seed), 2.0**power
+    one, other = (jid.identify(BASE, x, estimator) for x in (o, with_forces(o, c * o.forces)))
+    close(other.parameters, c * one.parameters)
+    close(other.standard_deviations, c * one.standard_deviations, 1e-8)
+    assert other.undetermined == one.undetermined
+
+
+@pytest.mark.parametrize("estimator", LINEAR, ids=name)
+@few
+@given(first=seeds, second=seeds, c=st.floats(-3.0, 3.0))
+def test_forces_that_add_up_give_parameters_that_do(estimator, first, second, c):
+    a, b = observed(first), observed(second)
+    b = with_forces(a, np.asarray(b.forces))
+    both = with_forces(a, np.asarray(a.forces) + c * np.asarray(b.forces))
+    p, q, sum_ = (jid.identify(BASE, x, estimator).parameters for x in (a, b, both))
+    np.testing.assert_allclose(sum_, p + c * q, rtol=1e-8, atol=1e-8 * np.abs(p).max())
+
+
+@few
+@given(seed=seeds, weights=st.tuples(*[st.floats(1e-3, 1e3)] * 2), power=st.integers(-40, 40))
+def test_only_the_ratio_of_weights_counts(seed, weights, power):
+    o = observed(seed)
+    fits = [
+        jid.identify(BASE, o, jid.WeightedLeastSquares(jid.GivenWeights(c * np.array(weights))))
+        for c in (1.0, 2.0**power)
+    ]
+    close(fits[1].parameters, fits[0].parameters)
+    close(fits[1].standard_deviations, fits[0].standard_deviations)
+
+
+@few
+@given(seed=seeds, order=seeds)
+def test_the_order_of_rows_is_rounding(seed, order):
+    """Of the observation matrix, whose rows of one joint become one triangle."""
+    o = observed(seed)
+    chosen = np.random.default_rng(order).permutation(len(o.time))
+    motion = jid.Motion(*(np.asarray(x)[chosen] for x in (o.motion.q, o.motion.qd, o.motion.qdd)))
+    # Not filtered, so that rows are samples.
+    mixed = dataclasses.replace(o, motion=motion, forces=np.asarray(o.forces)[chosen])
+    a, b = (jid.identify(BASE, x, jid.WeightedLeastSquares()) for x in (o, mixed))
+    close(b.parameters, a.parameters, 1e-10)
+    assert b.rows == a.rows
+    close(b.residual_rms, a.residual_rms, 1e-10)
+    theta, forces, joint = dense(BASE, o)
+    w = 1.0 / np.array([40.0, 5.0])[joint]
+    expected = np.linalg.lstsq(w[:, None] * theta, w * forces, rcond=None)[0]
+    close(b.parameters, expected, 1e-10)
+
+
+@few
+@given(seed=seeds, added=st.integers(1, 50), blocks=st.integers(1, 10))
+def test_rows_of_zeros_and_the_number_of_blocks_change_nothing(seed, added, blocks):
+    o = observed(seed)
+    total = factorise(BASE, [o]).total
+    padded = [j.joined(np.zeros((added, len(j.columns) + 1))) for j in total.joints]
+    divided = factorise(BASE, [o], blocks=blocks).total
+    expected, *others = (
+        solved(factors) for factors in (total, Factors(tuple(padded), BASE.size), divided)
+    )
+    for found in others:
+        close(found, expected, 1e-11)
+
+
+def solved(factors):
+    decomposition = Decomposition.of(*factors.weighted(np.array([0.025, 0.2])))
+    return decomposition.solve(Complete().inverse(decomposition.values))
+
+
+@few
+@given(seed=seeds, share=st.floats(0.3, 0.7))
+def test_an_update_is_the_joint_fit(seed, share):
+    parts = observed(seed, samples=400).split(share)
+    runs = [jid.Run.of(BASE, part) for part in parts]
+    joint = jid.identify(BASE, parts, jid.WeightedLeastSquares())
+    close(jid.update(*runs).fit.parameters, joint.parameters)
+    close(jid.update(*runs[::-1]).fit.parameters, joint.parameters)
+    swapped = jid.identify(BASE, parts[::-1], jid.WeightedLeastSquares())
+    close(swapped.parameters, joint.parameters)
+    close(swapped.standard_deviations, joint.standard_deviations)
+
+
+@few
+@given(seed=seeds)
+def test_rows_that_do_not_count_may_hold_anything(seed):
+    rng = np.random.default_rng(seed)
+    mask = rng.uniform(size=(150, 2)) > 0.2
+    o = observed(seed, mask=mask)
+    spoilt = with_forces(o, np.where(mask, o.forces, 1e6 * rng.standard_normal((150, 2))))
+    a, b = (jid.identify(BASE, x, jid.WeightedLeastSquares()) for x in (o, spoilt))
+    close(b.parameters, a.parameters, 1e-12)
+    assert b.rows == a.rows == tuple(mask.sum(axis=0))

@@ -1,0 +1,212 @@
+"""A model file gives the same fit back, bit for bit; everything else is refused in a sentence."""
+
+import copy
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from virtual import motion, observations, standard_parameters
+
+import jaxid as jid
+from jaxid.documents import decoded, encoded
+from jaxid.identification.model_file import checksum_of
+
+
+@pytest.fixture(scope="module")
+def robot():
+    arm = jid.robots.planar_arm(2, 0.4)
+    return arm.replace(limits=jid.Limits.of(2, force=[40.0, 5.0])).with_tool(
+        mass=0.7, centre_of_mass=(0.0, 0.1, 0.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def fit(robot):
+    terms = (
+        jid.RigidBodies(),
+        jid.ViscousFriction(),
+        jid.StribeckFriction(speed=[0.1, 0.2], transition=jid.Tanh(1e-3)),
+        jid.TemperatureScaled(jid.ConstantOffset(), rate=0.02),
+    )
+    model = jid.Model(robot, terms)
+    p = standard_parameters(model)
+    log = observations(model, p, noise=np.array([0.5, 0.1]))
+    return jid.identify(jid.base_parameters(model), log)
+
+
+@pytest.fixture
+def path(fit, tmp_path):
+    return fit.save(tmp_path / "folder" / "arm.json")
+
+
+def same(a, b):
+    """The same structure, classes and static fields; numbers to the last bit, NaN and -0 too."""
+    assert type(a) is type(b)
+    if dataclasses.is_dataclass(a):
+        for field in dataclasses.fields(a):
+            same(getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            same(x, y)
+    elif isinstance(a, np.ndarray):
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    else:
+        assert a == b or (a != a and b != b)
+
+
+def plain(tree):
+    """JAX's arrays and NumPy's scalars as a file gives them back."""
+    return jax.tree.map(lambda x: float(x) if isinstance(x, np.floating) else np.asarray(x), tree)
+
+
+def test_everything_comes_back_bit_for_bit(fit, path):
+    loaded = jid.load(path)
+    same(plain(loaded), plain(fit))
+    assert loaded.checksum == fit.checksum
+    assert loaded.date == fit.date != ""
+    assert [p.name for p in path.parent.iterdir()] == ["arm.json"]
+
+
+def test_everything_works_as_after_identify(fit, path, robot):
+    loaded, other = jid.load(path), motion(2, 50, seed=3)
+    np.testing.assert_array_equal(loaded.predict(other), fit.predict(other))
+    np.testing.assert_array_equal(loaded.intervals(), fit.intervals())
+    np.testing.assert_array_equal(loaded.base.regressor(other), fit.base.regressor(other))
+    assert loaded.base.expressions == fit.base.expressions
+    assert loaded.trust == fit.trust
+    assert loaded.estimator == fit.estimator
+    log = observations(fit.base.model, standard_parameters(fit.base.model), seed=5)
+    np.testing.assert_array_equal(
+        jid.validate(loaded, log).errors[0].rms, jid.validate(fit, log).errors[0].rms
+    )
+    np.testing.assert_array_equal(jid.compare(loaded, fit).difference, 0.0)
+    again = jid.identify(loaded.base, log, loaded.estimator)
+    np.testing.assert_array_equal(again.parameters, jid.identify(fit.base, log).parameters)
+
+
+def test_a_consistent_fit_keeps_bodies_and_verdict(tmp_path):
+    arm = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits.of(2, force=[40.0, 5.0]))
+    model = jid.Model(arm)
+    log = observations(model, standard_parameters(model), noise=0.1)
+    estimator = jid.PhysicallyConsistent(throw=False)
+    fit = jid.identify(jid.base_parameters(model), log, estimator)
+    loaded = jid.load(fit.save(tmp_path / "arm.json"))
+    same(plain(loaded), plain(fit))
+    assert loaded.consistency.outcome is fit.consistency.outcome
+
+
+@pytest.mark.parametrize("name", ["tx90l_on_rail", "tx40", "panda", "kr300"])
+def test_robots_come_back(name):
+    robot = getattr(jid.robots, name)()
+    through = json.loads(json.dumps(encoded(robot), allow_nan=False))
+    same(plain(decoded(through, jid.Robot)), plain(robot))
+
+
+@pytest.mark.parametrize("number", [0.1, -0.0, 5e-324, 1.7976931348623157e308, np.inf, np.nan])
+def test_every_number_survives(number):
+    array = np.array([[number, 1.0]])
+    values = json.loads(json.dumps(encoded(array), allow_nan=False))
+    assert decoded(values, np.ndarray).tobytes() == array.tobytes()
+    again = decoded(json.loads(json.dumps(encoded(float(number)))), float)
+    assert np.array(again).tobytes() == np.array(number).tobytes()
+
+
+class CubicFriction(jid.AbstractTerm):
+    power: float = 3.0
+
+    def parameters(self, robot):
+        return tuple((f"fq{i + 1}", "N m s³") for i in range(robot.joints))
+
+    def columns(self, robot, q, qd, qdd):
+        return jnp.diag(qd**3)
+
+
+def test_a_term_of_ones_own_is_found_where_it_is_known():
+    values = encoded(CubicFriction(2.0))
+    assert decoded(values, jid.AbstractTerm) == CubicFriction(2.0)
+    with pytest.raises(ValueError, match=r"`Cubic` , which|is a `Cubic`, which is not known"):
+        decoded({**values, "kind": "Cubic"}, jid.AbstractTerm)
+
+
+def test_a_class_outside_of_the_family_is_not_looked_up():
+    with pytest.raises(ValueError, match="not known"):
+        decoded({"kind": "WeightedLeastSquares"}, jid.AbstractTerm)
+
+
+def test_an_estimator_with_recordings_is_kept_in_words(fit, tmp_path):
+    log = observations(fit.base.model, standard_parameters(fit.base.model))
+    fit = dataclasses.replace(fit, estimator=jid.Stepwise((log,)))
+    loaded = jid.load(fit.save(tmp_path / "arm.json"))
+    assert str(loaded.estimator) == str(fit.estimator)
+    assert loaded.checksum == fit.checksum
+    with pytest.raises(ValueError, match="in words"):
+        jid.identify(loaded.base, log, loaded.estimator)
+
+
+def changed(path, change, sealed=True):
+    document = json.loads(path.read_text("utf-8"))
+    change(document)
+    if sealed and "model" in document:
+        document["checksum"] = checksum_of(document["model"])
+    path.write_text(json.dumps(document), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("change", "sealed", "message"),
+    [
+        (lambda d: d.update(version=2), True, "version 2, but this jaxid reads version 1"),
+        (lambda d: d.update(format="arm"), True, "is no model file"),
+        (lambda d: d.update(more=1), True, "must have the keys .* differs by more"),
+        (lambda d: d.pop("model"), True, "differs by model"),
+        (lambda d: d["model"]["parameters"]["float64"].append(1.0), False, "changed by hand"),
+        (lambda d: d["model"]["parameters"]["float64"].append(1.0), True, "shape"),
+        (lambda d: d["model"].update(extra=1), True, "unknown key `extra`"),
+        (lambda d: d["model"].pop("base"), True, "lacks `base`"),
+        (lambda d: d["model"].update(kind="BaseParameters"), True, "not known"),
+        (lambda d: d["model"].update(weights=None), True, "`weights` holds None"),
+        (lambda d: d["model"].update(weights={"float64": ["one", 1.0]}), True, "'one'"),
+        (lambda d: d["model"].update(weights={"float64": [1, 1.0]}), True, "holds 1 in an array"),
+        (lambda d: d["model"].update(weights={"float64": [[1.0], []]}), True, "weights"),
+        (lambda d: d["model"].update(weights={"object": []}), True, "has the keys object"),
+        (lambda d: d["model"].update(notes="a"), True, "`notes` holds"),
+        (lambda d: d["model"].update(rows=[1.5, 2]), True, r"`rows\[0\]` holds 1.5"),
+        (lambda d: d["model"]["base"]["model"].update(terms=[]), True, "at least one term"),
+        (
+            lambda d: d["model"]["base"]["model"]["robot"].update(parent=[3, 0]),
+            True,
+            "`parent` must name",
+        ),
+    ],
+)
+def test_what_is_no_model_is_refused_in_one_sentence(path, change, sealed, message):
+    changed(path, change, sealed)
+    with pytest.raises(ValueError, match=message) as error:
+        jid.load(path)
+    text = str(error.value)
+    assert str(path) in text
+    assert "\n" not in text
+    assert text.endswith((".", "again."))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", "null", "[" * 100_000, '{"a": 1, "a": 2}', "\0"])
+def test_what_is_no_document_is_refused(tmp_path, text):
+    path = tmp_path / "arm.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match="is no model file"):
+        jid.load(path)
+
+
+def test_a_file_that_is_not_there_is_the_systems_error(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        jid.load(tmp_path / "arm.json")
+
+
+def test_the_file_is_the_same_for_the_same_fit(fit, path):
+    before = path.read_bytes()
+    copy.deepcopy(fit).save(path)
+    assert path.read_bytes() == before
+    assert max(map(len, before.splitlines())) > 100  # arrays stand on lines of their own
