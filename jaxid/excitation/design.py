@@ -10,11 +10,12 @@ import numpy as np
 from jaxid.dynamics.base import BaseParameters
 from jaxid.excitation.constraints.constraint import AbstractConstraint
 from jaxid.excitation.criteria import AbstractCriterion, DOptimal
+from jaxid.excitation.judge import Best
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.polish import Polish
 from jaxid.excitation.problem import Problem
-from jaxid.excitation.search import Best, Search, Searched, random_starts
+from jaxid.excitation.search import Search, Searched, kicked, random_starts
 from jaxid.excitation.state import fingerprint, load_state, save_state
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
@@ -45,7 +46,7 @@ class DesignProgress(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Everything that a design has done so far."""
+    """Everything that a design has done so far; kicks count as polished."""
 
     searched: Searched
     order: np.ndarray
@@ -64,6 +65,7 @@ def design_excitation(
     constraints: tuple[AbstractConstraint, ...] = (),
     starts: int = 32,
     polish: int = 4,
+    kicks: int = 8,
     key: PRNGKeyArray | None = None,
     noise: Float[AnyArray, " joints"] | None = None,
     prior: Float[AnyArray, "base base"] | None = None,
@@ -92,6 +94,7 @@ def design_excitation(
         constraints: What must be kept beside the joints' limits.
         starts: Random motions to start from.
         polish: How many of the best are polished; 0 for the path that is JAX alone.
+        kicks: How often the best motion after that is disturbed and polished again.
         key: Of the random motions; `jax.random.key(0)` if None.
         noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
             if None. The weights of the criterion are its inverse, like the estimator's.
@@ -114,7 +117,7 @@ def design_excitation(
     criterion = DOptimal() if criterion is None else criterion
     basis = FourierBasis(harmonics, omega) if basis is None else basis
     key = jax.random.key(0) if key is None else key
-    _check(base, criterion, starts, polish, samples, prior)
+    _check(base, criterion, starts, polish, kicks, samples, prior)
     robot = base.model.robot
     noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
     if noise.shape != (robot.joints,) or not (noise > 0).all():
@@ -133,8 +136,9 @@ def design_excitation(
         measured=samples,
     )
     problem.sizes = _sizes(problem)
-    design = _Design(problem, starts, polish, progress, None if state is None else Path(state))
-    found, interrupted = design.run(key, resume)
+    path = None if state is None else Path(state)
+    design = _Design(problem, starts, polish, kicks, key, progress, path)
+    found, interrupted = design.run(resume)
     plan = _plan(problem, found, key, starts, noise, nominal, interrupted)
     if throw and not plan.feasible:
         raise ValueError("no motion was found that keeps all limits: " + "; ".join(plan.diagnosis))
@@ -150,10 +154,11 @@ def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
     return NOISE * np.asarray(robot.max_forces)
 
 
-def _check(base, criterion, starts, polish, samples, prior) -> None:
+def _check(base, criterion, starts, polish, kicks, samples, prior) -> None:
     for name, value, least in (
         ("starts", starts, 1),
         ("polish", polish, 0),
+        ("kicks", kicks, 0),
         ("samples", samples, 2),
     ):
         if value < least:
@@ -185,9 +190,10 @@ def _tools(problem: Problem, starts: int, digest: str) -> tuple[Search, Polish]:
 class _Design:
     """The steps of a design, one after the other."""
 
-    def __init__(self, problem, starts, polish, progress, path):
-        self._progress, self._path = progress, path
+    def __init__(self, problem, starts, polish, kicks, key, progress, path):
+        self._progress, self._path, self._key = progress, path, key
         self._polished, self._starts = min(polish, starts), starts
+        self._kicks = kicks if polish else 0
         p = problem
         self._digest = fingerprint(
             (p.base, p.limits, p.criterion, p.constraints, p.weights, p.prior),
@@ -197,15 +203,17 @@ class _Design:
         self._search, self._polish = _tools(problem, starts, self._digest)
         self._problem = self._search.problem
 
-    def run(self, key: PRNGKeyArray, resume: bool) -> tuple[_State, bool]:
+    def run(self, resume: bool) -> tuple[_State, bool]:
         """All steps; the last state, and whether Ctrl-C has ended them."""
-        digest = fingerprint(self._digest, self._polished, jax.random.key_data(key))
-        searched = self._search.begin(key)
-        state = _State(searched, searched.best.order(), 0, searched.best)
+        digest = fingerprint(
+            self._digest, (self._polished, self._kicks), jax.random.key_data(self._key)
+        )
+        searched = self._search.begin(self._key)
+        state = _State(searched, searched.best.promising(), 0, searched.best)
         if resume and self._path is not None and self._path.is_file():
             state = load_state(self._path, digest, state)
             state = jax.tree.map(np.asarray, state)
-        total = self._search.legs + 4 * self._polished
+        total = self._search.legs + 4 * (self._polished + self._kicks)
         try:
             self._tell(state, total)
             while (step := self._next(state)) is not None:
@@ -214,26 +222,33 @@ class _Design:
                     save_state(self._path, digest, state)
                 self._tell(state, total)
         except KeyboardInterrupt:
-            return state, True
-        return state, False
+            return self._kept(state), True
+        return self._kept(state), False
+
+    def _kept(self, state: _State) -> _State:
+        """With smaller motions where no other keeps all constraints."""
+        if (np.asarray(state.best.excess) <= 0.0).any():
+            return state
+        best = state.best
+        for place, y in enumerate(np.asarray(best.y)):
+            best = best.improved_at(place, self._search.judge.shrunk(y))
+        return state._replace(best=best)
 
     def _next(self, state: _State) -> _State | None:
         if int(state.searched.leg) < self._search.legs:
             searched = self._search.advance(state.searched)
-            return _State(searched, searched.best.order(), 0, searched.best)
-        if int(state.polished) >= self._polished:
+            return _State(searched, searched.best.promising(), 0, searched.best)
+        done = int(state.polished)
+        if done >= self._polished + self._kicks:
             return None
-        start = int(state.order[int(state.polished)])
-        y = self._polish(state.searched.best.y[start])
-        x = np.asarray(self._problem.limits.numbers(y))
-        value, excess = self._problem.value(x), self._problem.excess(x)
-        old = state.best
-        worse = max(float(old.excess[start]), 0.0), float(old.value[start])
-        if np.isfinite(value) and (max(excess, 0.0), value) < worse:
-            best = Best(*(np.array(part) for part in old))
-            best.y[start], best.value[start], best.excess[start] = y, value, excess
-            old = best
-        return state._replace(polished=int(state.polished) + 1, best=old)
+        if done < self._polished:
+            place = int(state.order[done])
+            start = np.asarray(state.searched.best.y[place])
+        else:
+            place = int(state.best.order()[0])
+            start = kicked(self._problem.limits, state.best.y[place], self._key, done)
+        best = state.best.improved_at(place, self._polish(start))
+        return state._replace(polished=done + 1, best=best)
 
     def _tell(self, state: _State, total: int) -> None:
         if self._progress is None:

@@ -179,6 +179,25 @@ def held_within(
     return (s[:, None] * motion + shift[:, None] * np.asarray(still)).reshape(y.shape)
 
 
+def calmed(
+    grid: Grid,
+    still: Float[AnyArray, "joints variables"],
+    y: Float[Array, " scaled"],
+    share: Float[Array, ""] | float,
+) -> Float[Array, " scaled"]:
+    """The same motion made smaller, each joint's about its mean position.
+
+    Args:
+        grid: Rows of the limits.
+        still: Scaled numbers of half of each joint's range.
+        y: Scaled numbers of one trajectory.
+        share: Of its size that is left.
+    """
+    motion = y.reshape(np.shape(still))
+    mean = jnp.einsum("jrk,jk->jr", grid.R[:, : grid.positions], motion).mean(axis=1)
+    return (share * motion + (1.0 - share) * mean[:, None] * np.asarray(still)).reshape(y.shape)
+
+
 def random_motion(
     grid: Grid,
     still: Float[AnyArray, "joints variables"],

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 import scipy.optimize
 
-from jaxid.excitation.limits import CERTIFIED, Grid, held_within
+from jaxid.excitation.judge import Best, Judge
+from jaxid.excitation.limits import CERTIFIED, Grid
 from jaxid.excitation.problem import CHECKED, MARGIN, Context, Problem
 from jaxid.types import AnyArray, Float
 
@@ -24,13 +25,17 @@ NEW = 0.97
 """Share of a limit from which a later peak is added."""
 CLOSED = 1.003
 """Peaks up to which the exchange has nothing left to add."""
-STEADY = 32
-"""Instants at which all constraints always belong to the problem."""
+STEADY = 48
+"""Instants at which constraints belong to the problem if they are not far from binding there."""
+FAR = 0.6
+"""Relative distance from which they are."""
 WITHIN = 0.3
 """Relative distance from which a constraint's peak is given to the solver."""
 BATCH = 64
 """Instants whose constraints are differentiated in one call."""
-ROUNDS = ((8.0, 60, 5), (None, 60, 4))
+GAINED = 1e-4
+"""Improvement below which a motion within its limits is left as it is."""
+ROUNDS = ((8.0, 60, 5), (None, 60, 8))
 """Sharpness, iterations of a run, and most runs."""
 
 
@@ -48,19 +53,17 @@ class Polish:
         objective, none = problem.objective(SEEN), np.zeros((1, 0), int)
         self._smooth = jax.jit(lambda y, p: objective(y[None], Context(p, none)))
         self._exact = jax.jit(lambda y: objective(y[None], Context(None, none)))
-        self._restore = jax.jit(
-            lambda y: held_within(self._fine, limits.still, y, self._fine.bound)
-        )
+        self._judge = Judge(problem)
         self._local = jax.jit(problem.constrained)
 
-    def __call__(self, start: Float[AnyArray, " scaled"]) -> Float[np.ndarray, " scaled"]:
-        """A better motion, or the same."""
+    def __call__(self, start: Float[AnyArray, " scaled"]) -> Best:
+        """A better motion than any before it, or the same; within all limits."""
         limits = _Exchange(self._fine)
         constraints = _Instants(self) if self._problem.constraints else None
         y: np.ndarray = np.array(start, np.float64)
+        best = self._judge.within(y[None])
         rounds = ROUNDS if self._problem.criterion.extreme else ROUNDS[1:]
         for sharpness, iterations, runs in rounds:
-            before = np.inf
             limits.add(y, NEAR)
             for _ in range(runs):
                 if constraints is not None:
@@ -69,14 +72,13 @@ class Polish:
                 if not np.isfinite(result.x).all():
                     break
                 y = result.x
-                peak = limits.add(y, NEW)
-                done = result.nit <= 3 or before - result.fun < 1e-3
-                if constraints is not None:
-                    done = done and constraints.worst(y) <= 0.0
-                if peak < CLOSED and done:
+                peak, before = limits.add(y, NEW), best
+                best = best.improved(self._judge.within(y[None]))
+                gained = float(before.value[0] - best.value[0])
+                kept = constraints is None or constraints.worst(y) <= 0.0
+                if peak < CLOSED and kept and (result.nit <= 3 or gained < GAINED):
                     break
-                before = result.fun
-        return np.asarray(self._restore(y))
+        return best
 
     def _minimised(
         self,
@@ -149,11 +151,8 @@ class _Instants:
 
     def __init__(self, polish: Polish):
         self._polish = polish
-        self._chosen = {
-            (instant, value)
-            for instant in range(0, CHECKED, CHECKED // STEADY)
-            for value in range(polish._problem.entries)
-        }
+        self._peaks: set[tuple[int, int]] = set()
+        self._chosen: set[tuple[int, int]] = set()
         self._last: tuple[bytes, np.ndarray, np.ndarray] | None = None
 
     def __len__(self) -> int:
@@ -164,11 +163,14 @@ class _Instants:
         return float(np.max(self._polish._problem.checked(y)))
 
     def add(self, y: np.ndarray) -> None:
-        """Adds the peaks of a motion."""
+        """Adds the peaks of a motion, and what else it may soon meet in place of what was that."""
         values = np.asarray(self._polish._problem.checked(y))
         peaks = (values >= np.roll(values, 1, 0)) & (values >= np.roll(values, -1, 0))
         found = np.argwhere(peaks & (values > -WITHIN))
-        self._chosen |= {(int(t), int(v)) for t, v in found}
+        self._peaks |= {(int(t), int(v)) for t, v in found}
+        step = CHECKED // STEADY
+        near = np.argwhere(values[::step] > -FAR)
+        self._chosen = self._peaks | {(step * int(t), int(v)) for t, v in near}
         self._last = None
 
     def slack(self, y: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ CHECKED = 8160
 """Samples on which constraints are checked."""
 WATCHED = 48
 """Samples at which constraints are always watched during the search."""
-PEAKS = 4
+PEAKS = 10
 """Further instants for each value of the constraints: its highest peaks between those samples."""
 MARGIN = 1e-3
 """Relative distance that is kept from constraints, for what happens between instants."""
@@ -89,16 +89,16 @@ class Problem:
 
     def excess(self, x: Float[AnyArray, "joints variables"]) -> float:
         """By how much the worst constraint is not kept, relative; minus infinity without any."""
-        return float(np.max(self._check(x))) if self.constraints else -np.inf
+        return float(self._tops(x).max()) if self.constraints else -np.inf
 
     def findings(self, x: Float[AnyArray, "joints variables"]) -> list[Finding]:
         """The constraints in words."""
         if not self.constraints:
             return []
-        values, start, found = np.asarray(self._check(x)), 0, []
+        values, start, found = self._tops(x), 0, []
         for constraint in self.constraints:
             width = len(constraint.entries(self.robot))
-            found += constraint.describe(self.robot, values[:, start : start + width])
+            found += constraint.describe(self.robot, values[start : start + width])
             start += width
         return found
 
@@ -182,15 +182,13 @@ class Problem:
         x = self.limits.numbers(y)
         q, qd, qdd = (part @ x.T for part in rows)
 
-        def one(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
-            value = self._values(Motion(q, qd, qdd))
-            return value, value
-
-        jacobian = jax.jacrev(one, argnums=(0, 1, 2), has_aux=True)
-        by_motion, values = jax.vmap(jacobian)(q, qd, qdd)
+        # Samples do not see each other: one pull gives a value's derivatives at all of them.
+        values, pull = jax.vjp(lambda *motion: self._values(Motion(*motion)), q, qd, qdd)
+        each = jnp.eye(values.shape[1])[:, None, :]
+        by_motion = jax.vmap(lambda one: pull(jnp.broadcast_to(one, values.shape)))(each)
         scale = np.asarray(self.limits.scale)
         slopes = sum(
-            jnp.einsum("tvj,tk,jk->tvjk", J, part, scale)
+            jnp.einsum("vtj,tk,jk->tvjk", J, part, scale)
             for J, part in zip(by_motion, rows, strict=True)
         )
         return values, jnp.reshape(slopes, (*values.shape, y.shape[-1]))
@@ -209,6 +207,18 @@ class Problem:
             return jnp.max(self._values(Motion(*(part @ x.T for part in rows))))
 
         return jax.lax.map(one, y)
+
+    def _tops(self, x: Float[AnyArray, "joints variables"]) -> Float[np.ndarray, " values"]:
+        """The highest of each value, between the checked instants as well.
+
+        There it is that of the parabola through a peak and its two neighbours.
+        """
+        values = np.asarray(self._check(x))
+        before, peak, after = values[:-2], values[1:-1], values[2:]
+        bend = 2 * peak - before - after
+        top = (peak >= before) & (peak >= after) & (bend > 0)
+        rise = np.where(top, (after - before) ** 2 / (8 * np.where(top, bend, 1.0)), 0.0)
+        return np.maximum((peak + rise).max(axis=0), values[[0, -1]].max(axis=0))
 
     def _highest(self, y: Float[Array, " scaled"]) -> Int[Array, " instants"]:
         """Equidistant instants, and the highest peaks of each value."""

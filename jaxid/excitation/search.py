@@ -9,17 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.excitation.interior_point import InteriorPoint, Stage, State
-from jaxid.excitation.limits import CERTIFIED, JointLimits, held_within, random_motion
+from jaxid.excitation.interior_point import COOLING, InteriorPoint, Stage, State
+from jaxid.excitation.judge import Best, Judge
+from jaxid.excitation.limits import CERTIFIED, JointLimits, random_motion
 from jaxid.excitation.problem import Context, Problem
 from jaxid.types import AnyArray, Array, Bool, Float, PRNGKeyArray
 
 GRID = 64
 """Rows of each order by which limits are kept during the search."""
-GROWTH = 1.05
-"""Most by which a motion is enlarged to meet its limits in the end."""
 CALM = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
 """Sizes of further random motions, for starts that find no way to keep the constraints."""
+KICK = 0.15
+"""Size of a disturbance of all joints, by the mean size of a motion's numbers."""
+STRETCH = 25
+"""Iterations after which the peaks of constraints are looked for anew."""
 TIGHT = 0.998
 """Share of the limits within which legs end: what is left is for rounding."""
 
@@ -58,25 +61,6 @@ SETTLING = tuple(Leg(Stage(TIGHT, 1e-4, 1e-6, n, 100.0), 20.0, True) for n in (1
 """What follows where there are constraints: their peaks move, and what cannot be kept is dear."""
 
 
-class Best(NamedTuple):
-    """The best motion of each start so far, certified to keep the joints' limits.
-
-    Attributes:
-        y: Scaled numbers.
-        value: The criterion's logarithm, exact.
-        excess: Relative excess of the worst constraint; not positive where all are kept.
-    """
-
-    y: Float[AnyArray, "starts scaled"]
-    value: Float[AnyArray, " starts"]
-    excess: Float[AnyArray, " starts"]
-
-    def order(self) -> np.ndarray:
-        """Starts from the best to the worst; what keeps its constraints comes first."""
-        broken = np.maximum(np.asarray(self.excess), 0.0)
-        return np.lexsort((np.asarray(self.value), broken))
-
-
 class Searched(NamedTuple):
     """What a search knows between two legs."""
 
@@ -95,6 +79,7 @@ class Search:
 
     Attributes:
         problem: The same.
+        judge: Of its motions.
     """
 
     def __init__(self, problem: Problem, starts: int):
@@ -102,17 +87,13 @@ class Search:
         self._legs = LEGS + SETTLING if problem.constraints else LEGS
         limits = problem.limits
         self._solver = InteriorPoint(problem.evaluation(), limits.grid(GRID), limits.still)
-        self._fine = limits.grid(CERTIFIED)
+        self.judge = Judge(problem)
         self._worst = jax.jit(problem.worst)
-        growth = 1.0 if problem.constraints else GROWTH
-        self._restore = jax.jit(
-            jax.vmap(lambda y: held_within(self._fine, limits.still, y, self._fine.bound, growth))
-        )
 
     def begin(self, key: PRNGKeyArray) -> Searched:
         """Random motions that fill their limits."""
         y = random_starts(self.problem.limits, key, self._starts)
-        best = self._judged(y)
+        best = self.judge(y)
         state = self._solver.start(y, self.problem.conditions)
         return Searched(state, 0, best.value, best)
 
@@ -123,12 +104,26 @@ class Search:
         broken = np.asarray(searched.best.excess) > 0
         if searched.leg == len(LEGS) and broken.any():
             state = self._calmed(state, broken)
-        context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(state.y))
-        state = self._solver.run(state, leg.stage, context)
+        for stage in self._stretches(leg.stage):
+            context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(state.y))
+            state = self._solver.run(state, stage, context)
         best = searched.best
         if leg.judged:
-            best = _better(best, self._judged(self._restore(state.y)))
+            best = best.improved(self.judge.within(state.y))
         return Searched(state, searched.leg + 1, searched.first, best)
+
+    def _stretches(self, stage: Stage) -> list[Stage]:
+        """A stage in parts, between which the instants of constraints follow their peaks."""
+        if not self.problem.constraints:
+            return [stage]
+        parts = range(-(-stage.iterations // STRETCH))
+        return [
+            stage._replace(
+                iterations=min(STRETCH, stage.iterations - k * STRETCH),
+                barrier=max(stage.least, stage.barrier * COOLING ** (k * STRETCH)),
+            )
+            for k in parts
+        ]
 
     def _calmed(self, state: State, broken: Bool[np.ndarray, " starts"]) -> State:
         """Starts anew where constraints are broken, from small motions that keep them best."""
@@ -150,15 +145,6 @@ class Search:
         """Number of legs."""
         return len(self._legs)
 
-    def _judged(self, y: Array) -> Best:
-        numbers = [np.asarray(self.problem.limits.numbers(np.asarray(one))) for one in y]
-        values = np.array([self.problem.value(x) for x in numbers])
-        excess = np.array([self.problem.excess(x) for x in numbers])
-        finite = np.isfinite(values) & ~np.isnan(excess)
-        return Best(
-            np.asarray(y), np.where(finite, values, np.inf), np.where(finite, excess, np.inf)
-        )
-
 
 def random_starts(
     limits: JointLimits, key: PRNGKeyArray, starts: int, size: float = 1.0
@@ -179,12 +165,25 @@ def random_starts(
     return jax.vmap(lambda a, b: random_motion(fine, limits.still, a, b, size=size))(draws, places)
 
 
-def _better(old: Best, new: Best) -> Best:
-    """Start by start the better of two."""
-    a, b = np.maximum(old.excess, 0.0), np.maximum(new.excess, 0.0)
-    improved = (b < a) | ((b == a) & (new.value < old.value))
-    return Best(
-        np.where(improved[:, None], new.y, old.y),
-        np.where(improved, new.value, old.value),
-        np.where(improved, new.excess, old.excess),
-    )
+def kicked(
+    limits: JointLimits, y: Float[AnyArray, " scaled"], key: PRNGKeyArray, number: int
+) -> Float[np.ndarray, " scaled"]:
+    """A motion near a good one, from which another optimum may be found.
+
+    By turns all joints are disturbed a little, and one joint much.
+
+    Args:
+        limits: Of the joints.
+        y: The good motion.
+        key: Of the design.
+        number: Of the disturbance.
+    """
+    of_shape, of_joint = jax.random.split(jax.random.fold_in(key, number))
+    motion = np.reshape(np.array(y), limits.shape)
+    noise = np.asarray(jax.random.normal(of_shape, limits.shape, float))
+    if number % 2:
+        joint = int(jax.random.randint(of_joint, (), 0, limits.shape[0]))
+        motion[joint] += np.abs(motion[joint]).mean() * noise[joint]
+    else:
+        motion += KICK * np.abs(motion).mean() * noise
+    return motion.ravel()

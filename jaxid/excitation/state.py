@@ -2,14 +2,13 @@
 
 import hashlib
 import io
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxid.files import written_whole
+from jaxid.files import read_arrays, written_whole
 
 
 def fingerprint(*parts: Any) -> str:
@@ -51,9 +50,9 @@ def load_state(path: Path, digest: str, like: Any) -> Any:
         ValueError: If the file is no state, or belongs to another problem.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
-            arrays = [content[f"arr_{k}"] for k in range(len(content.files))]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        content = read_arrays(path)
+        arrays = [content[f"arr_{k}"] for k in range(len(content))]
+    except (ValueError, KeyError) as error:
         raise ValueError(f"`{path}` is no saved state of a design: remove it.") from error
     structure = jax.tree.structure(like)
     if str(arrays[0]) != digest or len(arrays) - 1 != structure.num_leaves:

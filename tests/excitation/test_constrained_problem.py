@@ -1,6 +1,7 @@
 """Constraints as a search sees them: by a motion's numbers, at its peaks; and with leads."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,7 +10,8 @@ from jaxid.excitation.constraints.forces import JointForces, NominalForces
 from jaxid.excitation.constraints.tip import TipSpeed
 from jaxid.excitation.criteria import DOptimal
 from jaxid.excitation.design import design_excitation
-from jaxid.excitation.limits import JointLimits
+from jaxid.excitation.judge import PRICE, Best, Judge
+from jaxid.excitation.limits import CERTIFIED, JointLimits, calmed
 from jaxid.excitation.problem import CHECKED, MARGIN, PEAKS, WATCHED, Context, Problem
 from jaxid.excitation.search import random_starts
 from jaxid.robot.capsules import Capsule, HalfSpace
@@ -83,6 +85,41 @@ def test_the_highest_peaks_are_watched(problem):
     seen = np.asarray(evaluate(y, Context(None, watched)).excess) - MARGIN
     highest = [problem.checked(one).max() for one in y]
     np.testing.assert_allclose(seen.max(axis=1), highest, atol=1e-9)
+
+
+def test_peaks_between_the_checked_instants_count(problem):
+    y = np.asarray(random_starts(problem.limits, jax.random.key(5), 1))[0]
+    x = np.asarray(problem.limits.numbers(y))
+    duration = problem.basis.duration
+    motion = problem.basis.trajectory(x).motion(np.linspace(0.0, duration, 20 * CHECKED))
+    finer = np.concatenate(
+        [np.asarray(c(problem.robot, motion)).max(axis=0) for c in problem.constraints]
+    )
+    found = np.array([f.value for f in problem.findings(x)])
+    checked = problem.checked(y).max(axis=0)
+    assert (found >= checked).all()
+    np.testing.assert_allclose(found, finer, atol=2e-7)
+    assert problem.excess(x) == found.max()
+
+
+def test_a_motion_is_made_as_small_as_its_constraints_need(problem):
+    judge = Judge(problem)
+    y = np.asarray(random_starts(problem.limits, jax.random.key(6), 1))
+    assert judge(y).excess[0] > 0.02
+    small = judge.shrunk(y[0])
+    assert small.excess[0] <= 0.0
+    size = np.ptp(problem.limits.numbers(small.y[0]) @ BASIS.rows(BASIS.instants(50))[0].T)
+    whole = np.ptp(problem.limits.numbers(y[0]) @ BASIS.rows(BASIS.instants(50))[0].T)
+    fine = problem.limits.grid(CERTIFIED)
+    larger = calmed(fine, problem.limits.still, jnp.asarray(y[0]), float(1.01 * size / whole))
+    assert judge(np.asarray(larger)[None]).excess[0] > 0.0
+
+
+def test_a_small_excess_does_not_outweigh_a_better_value():
+    best = Best(np.zeros((3, 1)), np.array([-1.0, -1.5, -1.6]), np.array([-0.1, 0.01, 1.0]))
+    assert list(best.order()) == [0, 1, 2]
+    assert list(best.promising()) == [1, 0, 2]
+    assert 0.01 * PRICE < 0.5
 
 
 def test_a_design_with_leads_keeps_all_constraints_in_them_too(pendulum, constraints, shapes):

@@ -8,7 +8,8 @@ import pytest
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.terms import RigidBodies
+from jaxid.dynamics.terms import CoulombFriction, RigidBodies
+from jaxid.dynamics.transitions import HardSign
 from jaxid.excitation.constraints.clearance import SIZE, Clearance
 from jaxid.excitation.constraints.forces import JointForces, MotorTorques, NominalForces
 from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace, tip_motion
@@ -134,6 +135,36 @@ def test_the_margin_covers_what_is_uncertain():
     bound = (np.asarray(FAMILY["forces"](ROBOT, MOTION[:5])) + 1) * [0.9 * 60.0, 0.9 * 9.0]
     # Two deviations, and more where the other side is as far: 97.7 % or more, but not all.
     assert 0.965 < (np.abs(forces) <= bound).mean() < 0.9999
+
+
+def test_a_joint_that_turns_round_may_need_friction_to_either_side():
+    terms = (RigidBodies(), CoulombFriction(HardSign()))
+    base = base_parameters(Model(ROBOT, terms))
+    p = np.random.default_rng(3).standard_normal(base.size)
+    p[[k for k, name in enumerate(base.names) if name.startswith("fc")]] = [5.0, 3.0, 1.0]
+    constraint = JointForces(NominalForces.of(base, p), margin=0.0)
+    limits = np.array([60.0, 9.0])
+
+    def needed(motion):
+        forces = base.inverse_dynamics(p, motion) + base.model.tool_forces(motion)
+        return np.abs(np.asarray(forces))[:, [0, 2]] / limits - 1
+
+    coarse = Motion(*(np.asarray(x) for x in (MOTION.q, MOTION.qd, MOTION.qdd)))
+    values = np.asarray(constraint(ROBOT, coarse))
+    assert (values >= needed(coarse) - 1e-12).all()
+    width = 0.02 * np.asarray(ROBOT.limits.velocity)
+    for side in (-1.0, 1.0):
+        turning = Motion(coarse.q, side * 0.2 * width + 0 * coarse.qd, coarse.qdd)
+        other = Motion(coarse.q, -side * 0.2 * width + 0 * coarse.qd, coarse.qdd)
+        assert (np.asarray(constraint(ROBOT, turning)) >= needed(other) - 1e-3).all()
+    fast = (np.abs(coarse.qd) > 2 * width).all(axis=1)
+    assert fast.sum() > 10
+    np.testing.assert_allclose(values[fast], needed(coarse)[fast], atol=1e-12)
+    # No jump is left for which a solver would have to know the instant.
+    speeds = np.linspace(-0.2, 0.2, 2001)[:, None] * np.ones(3)
+    still = Motion(0 * speeds + 0.3, speeds, 0 * speeds)
+    assert np.abs(np.diff(np.asarray(constraint(ROBOT, still)), axis=0)).max() < 3e-3
+    assert np.abs(np.diff(needed(still), axis=0)).max() > 0.1
 
 
 def test_coupled_motors_share_joints():

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.excitation.limits import JointLimits, held_within, random_motion
+from jaxid.excitation.limits import JointLimits, calmed, held_within, random_motion
+from jaxid.excitation.search import random_starts
 from jaxid.robot.limits import Limits
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.rest import RestToRestBasis
@@ -56,6 +57,22 @@ def test_what_is_within_is_not_touched(limits):
     middle = held_within(fine, limits.still, y, fine.bound)
     again = held_within(fine, limits.still, middle, fine.bound)
     np.testing.assert_allclose(again, middle, atol=1e-12)
+
+
+def test_a_calmer_motion_is_smaller_about_the_same_place(limits):
+    fine = limits.grid(512)
+    y = random_starts(limits, jax.random.key(1), 1)[0]
+    half = calmed(fine, limits.still, y, 0.5)
+    assert peaks(limits, limits.numbers(half)) <= 0.0
+    rows = limits.basis.rows(np.linspace(0.0, limits.basis.duration, 100))
+    (q, qd), (q_half, qd_half) = (
+        [part @ np.asarray(limits.numbers(z)).T for part in rows[:2]] for z in (y, half)
+    )
+    np.testing.assert_allclose(qd_half, 0.5 * qd, atol=1e-12)
+    place = 2 * q_half - q
+    np.testing.assert_allclose(place, np.broadcast_to(place[0], place.shape), atol=1e-12)
+    assert (np.min(q, axis=0) < place[0]).all()
+    assert (place[0] < np.max(q, axis=0)).all()
 
 
 def test_scaled_numbers_go_there_and_back(limits, random):

@@ -1,23 +1,34 @@
 """Limits of joint forces and motor torques, by nominal parameters and what is uncertain of them."""
 
+from abc import abstractmethod
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import on_samples
-from jaxid.dynamics.model import Coordinates
+from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.transitions import AbstractTransition, Reversal
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
 from jaxid.robot.robot import Robot
+from jaxid.trajectory.fourier import assumed_bounds
 from jaxid.types import AnyArray, Array, Float, Numbers
 
+REVERSING = 0.02
+"""Share of a joint's largest speed below which its dry friction may have either direction."""
 SMALL = 1e-12
 """Part of a limit below which a standard deviation is rounded, so that it is smooth at zero."""
 
 
 class NominalForces(eqx.Module):
     """The forces that a motion is expected to need, and how uncertain they are.
+
+    Near standstill dry friction counts in the direction that is worse: a joint that turns round
+    passes through both, between any two samples.
 
     Attributes:
         base: The base parameters' model.
@@ -82,7 +93,8 @@ class NominalForces(eqx.Module):
             to_motors: From forces to what is limited.
             scale: The limits, by which small numbers are judged.
         """
-        size = jnp.abs(on_samples(self, self.forces, motion.q, motion.qd, motion.qdd) @ to_motors)
+        forces = on_samples(self, self.forces, motion.q, motion.qd, motion.qdd)
+        size = jnp.max(jnp.abs(forces @ to_motors), axis=-2)
         if self.covariance is None:
             return size
         rows = jnp.einsum("...jb,jm->...mb", self.base.regressor(motion), to_motors)
@@ -90,15 +102,76 @@ class NominalForces(eqx.Module):
         smooth = jnp.broadcast_to((SMALL * scale) ** 2, variance.shape)
         return size + self.deviations * jnp.sqrt(jnp.maximum(variance, 0.0) + smooth)
 
-    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Float[Array, " joints"]:
-        """The expected forces of one sample."""
-        forces = self.base.forces(jnp.asarray(self.parameters), q, qd, qdd)
-        if self.base.model.robot.tool is not None:
-            forces = forces + self.base.model.known_forces(q, qd, qdd)
-        return jnp.asarray(forces)
+    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Float[Array, "3 joints"]:
+        """The expected forces of one sample: as they are, and with dry friction to either side."""
+        model = self.base.model
+        p = self.base.to_standard(jnp.asarray(self.parameters))
+        width = REVERSING * np.asarray(assumed_bounds(model.robot)[2])
+        found = jnp.stack(
+            [
+                jnp.asarray(m.forces(p, q, qd, qdd))
+                for m in (model, _reversing(model, 1.0, width), _reversing(model, -1.0, width))
+            ]
+        )
+        return found if model.robot.tool is None else found + model.known_forces(q, qd, qdd)[None]
 
 
-class JointForces(AbstractConstraint):
+def _reversing(model: Model, side: float, width: Float[np.ndarray, " joints"]) -> Model:
+    """The model whose dry friction near standstill holds to one side."""
+
+    def is_transition(part: Any) -> bool:
+        return isinstance(part, AbstractTransition)
+
+    terms = jax.tree.map(
+        lambda part: Reversal(part, side, width) if is_transition(part) else part,
+        model.terms,
+        is_leaf=is_transition,
+    )
+    return eqx.tree_at(lambda m: m.terms, model, terms)
+
+
+class AbstractForceLimits(AbstractConstraint):
+    """Keeps forces, or what motors make of them, below limits.
+
+    Attributes:
+        nominal: Nominal parameters and their uncertainty.
+        margin: Share of the limits that stays unused.
+    """
+
+    nominal: NominalForces
+    margin: float = 0.1
+
+    @abstractmethod
+    def limits(self, robot: Robot) -> Float[np.ndarray, " joints"]:
+        """What must not be exceeded, without the margin [N m or N]; infinite where open."""
+
+    @abstractmethod
+    def to_limited(self, robot: Robot) -> Float[np.ndarray, "joints joints"]:
+        """From forces of the joints to what is limited."""
+
+    @abstractmethod
+    def named(self, robot: Robot, number: int) -> tuple[str, str]:
+        """What is limited, in words, and its unit."""
+
+    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
+        """Relative excess where there is a limit."""
+        limits = (1 - self.margin) * self.limits(robot)
+        forces = self.nominal(motion, self.to_limited(robot), limits)
+        limited = np.flatnonzero(np.isfinite(limits))
+        size = jnp.broadcast_to(limits[limited], (*forces.shape[:-1], len(limited)))
+        return forces[..., limited] / size - 1.0
+
+    def entries(self, robot: Robot) -> tuple[Entry, ...]:
+        """What has a limit."""
+        found = []
+        for number, limit in enumerate((1 - self.margin) * self.limits(robot)):
+            if np.isfinite(limit):
+                name, unit = self.named(robot, number)
+                found.append(Entry(name, float(limit), unit))
+        return tuple(found)
+
+
+class JointForces(AbstractForceLimits):
     r"""Keeps the joints' forces below the robot's limits, with room for what is uncertain of them.
 
     $$|Q_i| + k\,\sigma_i \le (1 - m)\,Q_{i,max}$$
@@ -111,25 +184,20 @@ class JointForces(AbstractConstraint):
         margin: Share of the limits that stays unused.
     """
 
-    nominal: NominalForces
-    margin: float = 0.1
+    def limits(self, robot: Robot) -> Float[np.ndarray, " joints"]:
+        """The robot's largest forces."""
+        return np.asarray(robot.limits.force)
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
-        """Relative excess of each limited joint."""
-        limits = (1 - self.margin) * np.asarray(robot.limits.force)
-        return _excess(self.nominal(motion, np.eye(robot.joints), limits), limits)
+    def to_limited(self, robot: Robot) -> Float[np.ndarray, "joints joints"]:
+        """The forces themselves."""
+        return np.eye(robot.joints)
 
-    def entries(self, robot: Robot) -> tuple[Entry, ...]:
-        """The joints with a limit."""
-        limits = (1 - self.margin) * np.asarray(robot.limits.force)
-        return tuple(
-            Entry(f"the force of joint `{name}`", float(limit), robot.force_unit(j))
-            for j, (name, limit) in enumerate(zip(robot.joint_names, limits, strict=True))
-            if np.isfinite(limit)
-        )
+    def named(self, robot: Robot, number: int) -> tuple[str, str]:
+        """The joint."""
+        return f"the force of joint `{robot.joint_names[number]}`", robot.force_unit(number)
 
 
-class MotorTorques(AbstractConstraint):
+class MotorTorques(AbstractForceLimits):
     """Keeps the motors' torques below those of the robot's drives, on the motors' side.
 
     Like `JointForces`, for robots whose drives are known: where a motor turns several joints, its
@@ -140,27 +208,14 @@ class MotorTorques(AbstractConstraint):
         margin: Share of the limits that stays unused.
     """
 
-    nominal: NominalForces
-    margin: float = 0.1
+    def limits(self, robot: Robot) -> Float[np.ndarray, " joints"]:
+        """The drives' largest torques."""
+        return np.asarray(robot.drives.max_torques)
 
-    def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
-        """Relative excess of each limited motor."""
-        limits = (1 - self.margin) * np.asarray(robot.drives.max_torques)
-        to_motors = np.linalg.inv(np.asarray(robot.drives.reduction))
-        return _excess(self.nominal(motion, to_motors, limits), limits)
+    def to_limited(self, robot: Robot) -> Float[np.ndarray, "joints joints"]:
+        """From the joints to the motors."""
+        return np.linalg.inv(np.asarray(robot.drives.reduction))
 
-    def entries(self, robot: Robot) -> tuple[Entry, ...]:
-        """The motors with a limit."""
-        limits = (1 - self.margin) * np.asarray(robot.drives.max_torques)
-        return tuple(
-            Entry(f"the torque of motor {j + 1}", float(limit), "N m")
-            for j, limit in enumerate(limits)
-            if np.isfinite(limit)
-        )
-
-
-def _excess(forces: Array, limits: np.ndarray) -> Array:
-    """Relative excess where there is a limit."""
-    limited = np.flatnonzero(np.isfinite(limits))
-    size = jnp.broadcast_to(limits[limited], (*forces.shape[:-1], len(limited)))
-    return forces[..., limited] / size - 1.0
+    def named(self, robot: Robot, number: int) -> tuple[str, str]:
+        """The motor."""
+        return f"the torque of motor {number + 1}", "N m"
