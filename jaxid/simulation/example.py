@@ -7,17 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.dynamics.base import base_parameters
-from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import (
-    ConstantOffset,
-    CoulombFriction,
-    RigidBodies,
-    RotorInertia,
-    ViscousFriction,
-)
+from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
 from jaxid.files import written_whole
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
+from jaxid.simulation.gear_friction import SmoothFriction
+from jaxid.simulation.sensors import Sensors
 from jaxid.simulation.virtual import VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 
@@ -28,6 +23,8 @@ MASSES = (3.4, 2.2, 2.6, 2.4, 1.6, 1.3, 0.6)
 """About what the bodies weigh [kg]."""
 ROTORS = (0.6, 0.6, 0.45, 0.45, 0.2, 0.2, 0.15)
 """About what the motors add to the joints' inertia [kg m²]."""
+STRIBECK, STRIBECK_SPEED = 0.005, 0.05
+"""Friction near standstill that no model has, of the largest torques, and its speed [rad/s]."""
 FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")
 
 _EXPERIMENT = """\
@@ -88,29 +85,24 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
         return values * random.uniform(0.8, 1.2, n)
 
     bodies = random_bodies(robot, about(np.array(MASSES)), random)
-    parameters = [
-        bodies.ravel(),
-        about(0.02 * largest),
-        about(0.03 * largest),
-        about(np.array(ROTORS)),
-        0.01 * largest * random.uniform(-1.0, 1.0, n),
-    ]
-    terms = (
-        RigidBodies(),
-        ViscousFriction(),
-        CoulombFriction(),
-        RotorInertia(),
-        ConstantOffset(),
+    friction = SmoothFriction(
+        viscous=about(0.02 * largest),
+        coulomb=about(0.03 * largest),
+        stribeck=STRIBECK * largest,
+        stribeck_speed=STRIBECK_SPEED,
     )
+    rotors, offsets = about(np.array(ROTORS)), 0.01 * largest * random.uniform(-1.0, 1.0, n)
     return VirtualRobot(
-        model=Model(robot, terms),
-        parameters=np.concatenate(parameters),
-        stribeck=0.005 * largest,
-        stribeck_speed=0.05,
-        encoder_step=2 * math.pi / 2**19,
-        white_noise=0.009 * largest,
-        coloured_noise=0.004 * largest,
-        memory=0.02,
+        robot=robot,
+        terms=(RigidBodies(), RotorInertia(), ConstantOffset()),
+        values=np.concatenate([bodies.ravel(), rotors, offsets]),
+        friction=friction,
+        sensors=Sensors(
+            encoder_step=2 * math.pi / 2**19,
+            white_noise=0.009 * largest,
+            coloured_noise=0.004 * largest,
+            memory=0.02,
+        ),
     )
 
 
@@ -198,11 +190,11 @@ def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
         "base_parameters": [dict(zip(keys, row, strict=True)) for row in regrouped],
         "standard_parameters": [dict(zip(keys, row, strict=True)) for row in standard],
         "beyond_the_model": {
-            "stribeck_friction": np.asarray(robot.stribeck).tolist(),
-            "stribeck_speed": robot.stribeck_speed,
-            "encoder_step": robot.encoder_step,
-            "white_noise": np.asarray(robot.white_noise).tolist(),
-            "coloured_noise": np.asarray(robot.coloured_noise).tolist(),
-            "noise_memory": robot.memory,
+            "stribeck_friction": (STRIBECK * np.asarray(model.robot.max_forces)).tolist(),
+            "stribeck_speed": STRIBECK_SPEED,
+            "encoder_step": robot.sensors.encoder_step,
+            "white_noise": np.asarray(robot.sensors.white_noise).tolist(),
+            "coloured_noise": np.asarray(robot.sensors.coloured_noise).tolist(),
+            "noise_memory": robot.sensors.memory,
         },
     }

@@ -1,21 +1,31 @@
 """A virtual robot: bodies that could exist, friction beyond the model, sensors with noise."""
 
-import equinox as eqx
+import dataclasses
+from typing import Any
+
 import numpy as np
-from scipy import signal
 
 from jaxid.dynamics.machine import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.terms import AbstractTerm
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
+from jaxid.simulation.disturbances import AbstractDisturbance
+from jaxid.simulation.experiment import AbstractExperiment
+from jaxid.simulation.gear_friction import AbstractGearFriction, SmoothFriction
+from jaxid.simulation.gears import AbstractGear, RigidGear
+from jaxid.simulation.lubricant import Lubricant
+from jaxid.simulation.mechanics import DriveTrain, SimulatedPlant
+from jaxid.simulation.sensors import Sensors
+from jaxid.simulation.servo import Servo
 from jaxid.trajectory.trajectory import AbstractTrajectory
 from jaxid.types import AnyArray, Float, require_float64
 
 GRAINS = 12
 """Point masses of a random body: enough to fill all directions."""
-PIECE = 4000
-"""Samples that are evaluated at once: so few need no compiling."""
+SPEEDS = 2000
+"""Of a motion, over which the power of friction is averaged."""
 
 
 def random_bodies(
@@ -48,44 +58,164 @@ def random_bodies(
     return bodies
 
 
-class VirtualRobot(eqx.Module):
+class VirtualRobot(AbstractExperiment):
     """A robot whose parameters are known, with what no measurement is free of.
 
+    It can follow a motion without error (`measure`), which is fast, or by its servo (`track`),
+    where gears, stiction and disturbances act as they do in a machine.
+
     Attributes:
-        model: Its equations of motion.
-        parameters: Its standard parameters.
-        stribeck: Friction near standstill that the model lacks [N m or N].
-        stribeck_speed: Speed at which it has faded to a third [rad/s or m/s].
-        encoder_step: Resolution of the angles [rad or m].
-        white_noise: Standard deviation of the forces' noise without memory [N m or N].
-        coloured_noise: Standard deviation of the forces' noise with memory [N m or N].
-        memory: Time constant of the coloured noise [s].
+        robot: What is known of it.
+        terms: Its equations of motion without friction.
+        values: Parameters of these terms.
+        friction: Of the gears, at the lubricant's reference temperature.
+        sensors: What the log will say.
+        gear: Between motors and joints.
+        disturbances: What else pushes.
+        lubricant: How friction depends on temperature; it does not if None.
+        temperature: Of the gears [°C].
     """
 
-    model: Model
-    parameters: Float[AnyArray, " standard"]
-    stribeck: Float[AnyArray, " joints"]
-    stribeck_speed: float
-    encoder_step: float
-    white_noise: Float[AnyArray, " joints"]
-    coloured_noise: Float[AnyArray, " joints"]
-    memory: float
+    robot: Robot
+    terms: tuple[AbstractTerm, ...]
+    values: Float[AnyArray, " parameters"]
+    friction: AbstractGearFriction
+    sensors: Sensors
+    gear: AbstractGear = RigidGear()
+    disturbances: tuple[AbstractDisturbance, ...] = ()
+    lubricant: Lubricant | None = None
+    temperature: Float[AnyArray, " joints"] | None = None
+
+    def __check_init__(self):
+        size, n = self.bodies.size, self.robot.joints
+        if self.values.shape != (size,):
+            raise ValueError(
+                f"`values` must hold one number for each parameter of `terms` ({size}), but has "
+                f"shape {self.values.shape}."
+            )
+        if (self.lubricant is None) != (self.temperature is None):
+            raise ValueError(
+                "`lubricant` and `temperature` belong together: give both, or neither."
+            )
+        if self.temperature is not None and self.temperature.shape != (n,):
+            raise ValueError(
+                f"`temperature` must be one for each gear ({n}), but has shape "
+                f"{self.temperature.shape}."
+            )
+
+    @property
+    def bodies(self) -> Model:
+        """The equations of motion without friction."""
+        return Model(self.robot, self.terms)
+
+    @property
+    def present_friction(self) -> AbstractGearFriction:
+        """Friction of the gears at their temperature."""
+        if self.lubricant is None or self.temperature is None:
+            return self.friction
+        return self.friction.scaled(*self.lubricant.factors(self.temperature))
+
+    @property
+    def model(self) -> Model:
+        """The model to identify: friction's columns stand behind those of the first term."""
+        return Model(self.robot, (self.terms[0], *self.friction.terms, *self.terms[1:]))
+
+    @property
+    def parameters(self) -> Float[np.ndarray, " standard"]:
+        """The truth: standard parameters of `model` at the present temperature."""
+        first, *others = (np.asarray(x) for x in self.bodies.split(self.values))
+        return np.concatenate([first, self.present_friction.parameters, *others])
+
+    def replace(self, **fields: Any) -> "VirtualRobot":
+        """A copy with some fields replaced: another gear, further disturbances, other sensors."""
+        return dataclasses.replace(self, **fields)
+
+    def undisturbed(self) -> "VirtualRobot":
+        """The same robot as its model has it: smooth friction, rigid gears, nothing else.
+
+        Sensors keep their noise.
+        """
+        plain = SmoothFriction(self.friction.viscous, self.friction.coulomb)
+        return self.replace(friction=plain, gear=RigidGear(), disturbances=())
+
+    def at(self, temperature: Float[AnyArray, " joints"] | float) -> "VirtualRobot":
+        """The same robot with gears of another temperature.
+
+        Args:
+            temperature: Of all gears, or of each [°C].
+
+        Raises:
+            ValueError: If the robot has no lubricant.
+        """
+        self._require_lubricant()
+        return self.replace(temperature=np.full(self.robot.joints, temperature, np.float64))
+
+    def _require_lubricant(self) -> Lubricant:
+        if self.lubricant is None:
+            raise ValueError(
+                "friction of this robot does not depend on temperature: give it a `lubricant` and "
+                "a `temperature`."
+            )
+        return self.lubricant
+
+    def warming(
+        self, trajectory: AbstractTrajectory, *, duration: float, interval: float = 30.0
+    ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times joints"]]:
+        """Temperatures while a motion is repeated: friction heats the gears (Sec. 6).
+
+        Args:
+            trajectory: The motion.
+            duration: How long it is repeated [s].
+            interval: Time between two temperatures; friction is constant in between [s].
+
+        Returns:
+            Times [s] and temperatures [°C], from now on.
+
+        Raises:
+            ValueError: If the robot has no lubricant, or a time is not positive.
+            RuntimeError: If JAX runs in single precision.
+        """
+        require_float64("warming a virtual robot")
+        lubricant = self._require_lubricant()
+        if not (duration > 0 and interval > 0):
+            raise ValueError(
+                f"`duration` and `interval` must be positive [s], but are {duration:g} and "
+                f"{interval:g}."
+            )
+        _, motion = trajectory.sample(float(trajectory.duration) / SPEEDS)
+        steps = max(1, round(duration / interval))
+        n = self.robot.joints
+        parts = (self.friction.scaled(*x) for x in np.eye(2)[:, :, None] * np.ones(n))
+        powers = [np.mean(in_numpy(x, x.steady, motion.qd) * motion.qd, axis=0) for x in parts]
+        temperatures = [np.asarray(self.temperature)]
+        for _ in range(steps):
+            viscous, dry = lubricant.factors(temperatures[-1])
+            power = viscous * powers[0] + dry * powers[1]
+            temperatures.append(lubricant.warmer(temperatures[-1], power, duration / steps))
+        return np.linspace(0.0, duration, steps + 1), np.array(temperatures)
+
+    def warmed(self, trajectory: AbstractTrajectory, *, duration: float) -> "VirtualRobot":
+        """The same robot after a motion has been repeated for some time.
+
+        Args:
+            trajectory: The motion.
+            duration: How long it is repeated [s]; the paper's robot is warm after 1800 s.
+
+        Raises:
+            ValueError: If the robot has no lubricant, or the time is not positive.
+            RuntimeError: If JAX runs in single precision.
+        """
+        _, temperatures = self.warming(trajectory, duration=duration)
+        return self.replace(temperature=temperatures[-1])
 
     def forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
-        """The forces that a motion truly needs [N m or N]."""
-        qd = np.asarray(motion.qd)
-        fading = np.exp(-((qd / self.stribeck_speed) ** 2)) * np.tanh(
-            4.0 * qd / self.stribeck_speed
-        )
-        modelled = in_numpy(
-            self.model,
-            self.model.forces,
-            motion.q,
-            motion.qd,
-            motion.qdd,
-            shared=(self.parameters,),
-        )
-        return modelled + fading * np.asarray(self.stribeck)
+        """The forces that the drives need for a motion; gears count as rigid [N m or N]."""
+        arrays = [np.asarray(x, np.float64) for x in (motion.q, motion.qd, motion.qdd)]
+        forces = in_numpy(self.bodies, self.bodies.forces, *arrays, shared=(self.values,))
+        if self.robot.tool is not None:
+            forces = forces + in_numpy(self.bodies, self.bodies.known_forces, *arrays)
+        drives = self.drives(1.0)
+        return forces + in_numpy(drives, drives.resistance, *arrays[:2])
 
     def measure(
         self,
@@ -109,20 +239,46 @@ class VirtualRobot(eqx.Module):
             RuntimeError: If JAX runs in single precision.
         """
         require_float64("a virtual measurement")
-        random = np.random.default_rng(seed)
         motion = trajectory.motion(sample_time * np.arange(round(duration / sample_time)))
         forces = self.forces(motion)
-        white, drive = random.standard_normal((2, *forces.shape))
-        kept = np.exp(-sample_time / self.memory)
-        warm = random.standard_normal((1, forces.shape[1]))
-        coloured, _ = signal.lfilter(
-            [np.sqrt(1.0 - kept**2)], [1.0, -kept], drive, axis=0, zi=kept * warm
+        return self.sensors.record(
+            self.robot, motion.q, forces, sample_time=sample_time, seed=seed, name=name
         )
-        return Recording.of(
-            self.encoder_step * np.round(np.asarray(motion.q) / self.encoder_step),
-            forces
-            + white * np.asarray(self.white_noise)
-            + coloured * np.asarray(self.coloured_noise),
-            sample_time=sample_time,
-            name=name,
-        )
+
+    def servo(self, frequency: float = 8.0, damping: float = 1.0) -> Servo:
+        """A servo whose gains suit the robot's inertia.
+
+        Args:
+            frequency: Of a joint's answer to a disturbance [Hz].
+            damping: Of that answer.
+        """
+        return Servo.tuned(self.bodies, self.values, frequency=frequency, damping=damping)
+
+    def drives(self, step: float) -> DriveTrain:
+        """Motors, gears and friction as they are now.
+
+        Args:
+            step: Of time in which they move [s].
+        """
+        parts = zip(self.terms, self.bodies.split(self.values), strict=True)
+        inertia = sum(t.drive_matrices(self.robot)[0] @ np.asarray(x) for t, x in parts)
+        friction, rotors = self.present_friction, np.diagonal(inertia)
+        return DriveTrain(self.robot, rotors, friction, self.gear, self.disturbances, step)
+
+    def plant(self, step: float) -> SimulatedPlant:
+        """The robot as a machine that moves when its drives push.
+
+        Args:
+            step: Of time [s].
+
+        Raises:
+            ValueError: If an elastic gear has a motor without inertia.
+        """
+        drives = self.drives(step)
+        elastic = np.asarray(self.gear.twist(np.ones(self.robot.joints))) != 0.0
+        if (elastic & ~(np.asarray(drives.rotors) > 0)).any():
+            raise ValueError(
+                "an elastic gear needs a motor with inertia: give `terms` a `RotorInertia` with "
+                "positive `values`."
+            )
+        return SimulatedPlant(self.bodies, np.asarray(self.values, np.float64), drives)

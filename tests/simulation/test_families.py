@@ -1,0 +1,96 @@
+"""What every friction, gear and disturbance must hold to, whoever wrote it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxid.robot import library
+from jaxid.simulation.disturbances import CableForce, TorqueRipple
+from jaxid.simulation.gear_friction import LuGreFriction, SmoothFriction
+from jaxid.simulation.gears import BacklashGear, Balance, FlexibleGear, RigidGear, Shafts
+
+VISCOUS, COULOMB = np.array([3.0, 0.2, 1.0]), np.array([5.0, 0.4, 2.0])
+FRICTIONS = [
+    SmoothFriction(VISCOUS, COULOMB),
+    SmoothFriction(VISCOUS, COULOMB, stribeck=0.3 * COULOMB),
+    LuGreFriction(VISCOUS, COULOMB, 1.2 * COULOMB),
+]
+STIFF, DAMPING = np.array([500.0, 40.0, 200.0]), np.array([0.5, 0.04, 0.2])
+GEARS = [
+    RigidGear(),
+    FlexibleGear(STIFF, DAMPING),
+    BacklashGear(STIFF, DAMPING, np.array([0.01, 0.02, 0.0])),
+]
+STEP = 1e-3
+FAST = np.array([0.3, -0.8, 1.5])
+
+
+@pytest.mark.parametrize("friction", FRICTIONS)
+def test_a_step_at_a_speed_that_lasts_has_the_steady_friction(friction):
+    z = friction.settled(FAST)
+    law = friction.over_step(FAST, FAST, z, STEP)
+    np.testing.assert_allclose(law.force + law.slope * FAST, friction.steady(FAST), rtol=1e-12)
+    np.testing.assert_allclose(law.deflection + law.rate * FAST, z, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("friction", FRICTIONS)
+def test_friction_brakes_alike_in_both_directions(friction):
+    steady = np.asarray(friction.steady(FAST))
+    assert (steady * FAST > 0).all()
+    np.testing.assert_allclose(friction.steady(-FAST), -steady)
+    still = friction.over_step(0.0 * FAST, 0.0 * FAST, friction.settled(0.0 * FAST), STEP)
+    np.testing.assert_array_equal(still.force, 0.0)
+    assert (np.asarray(still.slope) > 0).all()
+
+
+@pytest.mark.parametrize("friction", FRICTIONS)
+def test_temperature_scales_viscous_and_dry_friction_apart(friction):
+    ones = np.ones(3)
+    viscous, dry = friction.scaled(ones, 0.0 * ones), friction.scaled(0.0 * ones, ones)
+    np.testing.assert_allclose(viscous.steady(FAST), VISCOUS * FAST, rtol=1e-12)
+    whole = friction.scaled(0.5 * ones, 2.0 * ones).steady(FAST)
+    parts = 0.5 * viscous.steady(FAST) + 2.0 * dry.steady(FAST)
+    np.testing.assert_allclose(whole, parts, rtol=1e-12)
+    np.testing.assert_allclose(friction.scaled(ones, 2.0 * ones).parameters[3:], 2.0 * COULOMB)
+
+
+@pytest.mark.parametrize("gear", GEARS, ids=lambda g: type(g).__name__)
+@pytest.mark.parametrize("twist", [0.0, 0.03, -0.03])
+def test_what_the_motor_loses_the_joint_gets(gear, twist):
+    random = np.random.default_rng(0)
+    motors = Balance(random.uniform(50.0, 200.0, 3), random.normal(size=3))
+    shafts = Shafts(np.full(3, twist), 0.1 * random.normal(size=3))
+    felt = gear.transmit(shafts, motors, STEP)
+    assert (np.asarray(felt.slope) >= 0).all()
+    assert (np.asarray(felt.share) >= 0).all()
+    assert (np.asarray(felt.share) <= 1).all()
+    for qd in random.normal(size=(3, 3)):
+        w, torque = felt.speed + felt.share * qd, felt.force - felt.slope * qd
+        np.testing.assert_allclose(motors.inertia * w, motors.drive - torque, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("gear", GEARS, ids=lambda g: type(g).__name__)
+def test_a_gear_that_is_wound_up_holds_its_load(gear):
+    load = np.array([2.0, -0.3, 1.0])
+    held = Balance(np.full(3, 1e12), np.zeros(3))
+    if gear.twist(load).any():
+        felt = gear.transmit(Shafts(gear.twist(load), jnp.zeros(3)), held, STEP)
+        np.testing.assert_allclose(felt.force, load, rtol=1e-6)
+
+
+def test_ripple_goes_round_with_the_motor():
+    robot = library.tx40()
+    ripple = TorqueRipple(np.full(6, 0.5), np.full(6, 4.0), np.zeros(6))
+    q = np.random.default_rng(0).normal(size=6)
+    turn = robot.drives.joint_velocities(np.full(6, 2 * np.pi))
+    forces = np.asarray(ripple.forces(robot, q, 0.0 * q))
+    np.testing.assert_allclose(ripple.forces(robot, q + turn, 0.0 * q), forces, atol=1e-9)
+    assert np.abs(forces).max() <= 0.5
+
+
+def test_cables_pull_back_and_rub():
+    robot = library.tx40()
+    cable = CableForce(np.full(6, 2.0), np.full(6, 0.1), np.full(6, 0.3))
+    q = np.full(6, 0.6)
+    np.testing.assert_allclose(cable.forces(robot, q, np.ones(6)), -1.0 - 0.3, rtol=1e-12)
+    np.testing.assert_allclose(cable.forces(robot, q, -np.ones(6)), -1.0 + 0.3, rtol=1e-12)

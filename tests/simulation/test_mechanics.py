@@ -1,0 +1,207 @@
+"""Forward dynamics: the other way round of inverse dynamics, and a step that keeps the energy."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, eigh
+
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.terms import RigidBodies, RotorInertia
+from jaxid.robot import library
+from jaxid.robot.robot import Robot
+from jaxid.simulation.disturbances import CableForce
+from jaxid.simulation.gear_friction import LuGreFriction, SmoothFriction
+from jaxid.simulation.gears import BacklashGear, FlexibleGear, RigidGear
+from jaxid.simulation.mechanics import DriveTrain, SimulatedPlant
+from jaxid.simulation.virtual import random_bodies
+
+ZERO = np.zeros(2)
+FREE = SmoothFriction(ZERO, ZERO)
+
+
+def cart():
+    """A rail and a pendulum, hanging at q = 0."""
+    return Robot.of(
+        "cart",
+        revolute=(False, True),
+        axis=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)],
+        rotation=np.tile(np.eye(3), (2, 1, 1)),
+        offset=np.zeros((2, 3)),
+    )
+
+
+MODEL = Model(cart(), (RigidBodies(), RotorInertia()))
+BODIES = np.array(
+    [
+        [8.0, 0, 0, 0, 1, 1, 1, 0, 0, 0],
+        [2.0, 0, 0, -0.8, 0.4, 0.4, 0.1, 0, 0, 0],
+    ]
+)
+PARAMETERS = np.concatenate([BODIES.ravel(), [1.5, 0.05]])
+
+
+def plant(friction=FREE, gear=None, disturbances=(), step=1e-3):
+    gear = RigidGear() if gear is None else gear
+    drives = DriveTrain(MODEL.robot, PARAMETERS[-2:], friction, gear, disturbances, step)
+    return SimulatedPlant(MODEL, PARAMETERS, drives)
+
+
+def moved(machine, u, steps, ramp=1):
+    """Positions, velocities and accelerations after each step; the force may come slowly."""
+    rows = []
+    for k in range(steps):
+        machine.step([min((k + 1) / ramp, 1.0) * x for x in u])
+        rows.append(machine.read()[1])
+    return np.array(rows).reshape(steps, 3, 2).transpose(1, 0, 2)
+
+
+@pytest.mark.parametrize("robot", [library.tx90l_on_rail(), library.ur10()], ids=lambda r: r.name)
+def test_forward_dynamics_is_the_inverse_of_inverse_dynamics(robot):
+    model, n, random = Model(robot), robot.joints, np.random.default_rng(0)
+    bodies = random_bodies(robot, np.linspace(20.0, 2.0, n), random)
+    p = np.concatenate([bodies.ravel(), random.uniform(0.1, 1.0, 3 * n)])
+    q, qd, qdd = random.normal(size=(3, 20, n))
+    forces = model.inverse_dynamics(p, Motion(q, qd, qdd))
+    np.testing.assert_allclose(model.forward_dynamics(p, q, qd, forces), qdd, rtol=1e-9, atol=1e-9)
+
+
+def test_forward_dynamics_is_compiled_and_differentiated_like_all_else():
+    import jax
+
+    q, qd, u = np.random.default_rng(1).normal(size=(3, 2))
+    jacobian = jax.jacfwd(lambda x: MODEL.forward_dynamics(PARAMETERS, q, qd, x))(u)
+    inverse = np.linalg.inv(MODEL.mass_matrix(PARAMETERS, q))
+    np.testing.assert_allclose(jacobian, inverse, rtol=1e-12)
+
+
+@pytest.mark.parametrize("gear", [RigidGear(), FlexibleGear(np.array([4e4, 400.0]), ZERO)])
+def test_energy_is_kept_without_friction(gear):
+    machine = plant(gear=gear)
+    start = np.array([0.2, 2.0])
+    machine.start(start, ZERO, np.asarray(MODEL.forward_dynamics(PARAMETERS, start, ZERO, ZERO)))
+    q, qd, _ = moved(machine, ZERO, 4000)
+    energy = MODEL.kinetic_energy(PARAMETERS, q, qd) + MODEL.potential_energy(PARAMETERS, q)
+    swing = np.ptp(np.asarray(MODEL.potential_energy(PARAMETERS, q)))
+    elastic = 0.0 if isinstance(gear, RigidGear) else 0.02
+    assert np.abs(energy - energy[0]).max() < (2e-4 + elastic) * swing
+    if not elastic:
+        # The end-state of 4 s, by a Runge-Kutta method of high order.
+        from scipy.integrate import solve_ivp
+
+        def rate(_, x):
+            return np.concatenate([x[2:], MODEL.forward_dynamics(PARAMETERS, x[:2], x[2:], ZERO)])
+
+        exact = solve_ivp(rate, (0, 1.0), [*start, 0, 0], method="DOP853", rtol=1e-10).y[:2, -1]
+        np.testing.assert_allclose(q[999], exact, atol=2e-5)
+
+
+def test_friction_brakes_as_much_as_the_law_says():
+    friction = SmoothFriction(np.array([30.0, 0.0]), np.array([20.0, 0.0]))
+    machine = plant(friction)
+    q, qd = np.array([0.0, 0.0]), np.array([1.0, 0.0])
+    machine.start(q, qd, ZERO)
+    # At a steady speed the drive gives what friction takes, and the pendulum hangs.
+    _, qd, qdd = moved(machine, [50.0, 0.0], 500)
+    np.testing.assert_allclose(qd[:, 0], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(qdd, 0.0, atol=1e-8)
+
+
+LUGRE = LuGreFriction(
+    viscous=np.array([10.0, 0.1]),
+    coulomb=np.array([30.0, 3.0]),
+    breakaway=np.array([36.0, 3.6]),
+)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_stiction_holds_below_the_breakaway_force_and_lets_go_above(sign):
+    machine = plant(LUGRE)
+    machine.start(ZERO, ZERO, ZERO)
+    # The pendulum hangs; the rail is pushed with 95 % of what it withstands.
+    # It comes slowly, for a sudden force bends the bristles twice as far.
+    q, _, _ = moved(machine, [sign * 0.95 * 36.0, 0.0], 6000, ramp=2000)
+    assert np.ptp(q[5000:, 0]) < 2e-6
+    assert 0.9 * 5e-4 < sign * q[-1, 0] < 4 * 5e-4
+    machine.start(ZERO, ZERO, ZERO)
+    q, qd, _ = moved(machine, [sign * 1.05 * 36.0, 0.0], 3000, ramp=1000)
+    assert sign * q[-1, 0] > 0.1
+    # And without a push it comes to rest and stays there.
+    q, qd, _ = moved(machine, ZERO, 8000)
+    assert np.abs(qd[-1, 0]) < 1e-6
+
+
+def test_a_pendulum_stays_where_stiction_holds_it():
+    machine = plant(LUGRE)
+    held = np.array([0.0, np.arcsin(0.4 * 3.6 / (0.8 * 9.81))])
+    machine.start(held, ZERO, ZERO)
+    q, qd, _ = moved(machine, ZERO, 4000)
+    np.testing.assert_allclose(q[-1], held, atol=1e-3)
+    assert np.abs(qd[-1]).max() < 1e-6
+
+
+def test_lugre_at_speed_is_stribecks_curve():
+    for speed in (0.02, 0.05, 0.5):
+        machine, qd = plant(LUGRE), np.array([speed, 0.0])
+        machine.start(ZERO, qd, ZERO)
+        steady = np.asarray(LUGRE.steady(qd))
+        level = 30.0 + 6.0 * np.exp(-((speed / 0.05) ** 2)) + 10.0 * speed
+        assert steady[0] == pytest.approx(level * 1.0, rel=0.04)
+        _, speeds, _ = moved(machine, [level, 0.0], 50)
+        np.testing.assert_allclose(speeds[:, 0], speed, rtol=2e-3)
+
+
+def test_steps_that_are_halved_agree():
+    ends = []
+    for step in (1e-3, 2.5e-4):
+        machine = plant(
+            LUGRE, FlexibleGear(np.array([4e4, 400.0]), np.array([20.0, 0.2])), step=step
+        )
+        machine.start(ZERO, ZERO, ZERO)
+        steps = round(0.25 / step)
+        for k in range(4):
+            q, _, _ = moved(machine, [60.0 * (-1) ** k, 6.0], steps)
+        ends.append(q[-1])
+    np.testing.assert_allclose(*ends, atol=2e-3 * np.abs(ends[0]).max())
+
+
+def test_an_elastic_gear_swings_as_its_eigenvalues_say():
+    stiffness, rotors = np.array([2000.0, 50.0]), PARAMETERS[-2:]
+    machine = plant(gear=FlexibleGear(stiffness, ZERO))
+    # Small motions about the hanging pendulum: joints, then motors.
+    M = block_diag(
+        np.asarray(MODEL.mass_matrix(PARAMETERS, ZERO)) - np.diag(rotors), np.diag(rotors)
+    )
+    spring = np.diag(stiffness)
+    K = np.block([[spring, -spring], [-spring, spring]])
+    K[1, 1] += 0.8 * 9.81
+    squares, modes = eigh(K, M)
+    w, shape = np.sqrt(squares[-2]), 1e-3 * modes[:, -2]
+    # Bent before the start: only the joints are moved, and the gears by their forces.
+    machine.start(shape[:2], ZERO, -squares[-2] * shape[:2])
+    times = 1e-3 * np.arange(1, 501)
+    q, _, _ = moved(machine, ZERO, 500)
+    np.testing.assert_allclose(q, np.cos(w * times)[:, None] * shape[:2], atol=2e-5)
+
+
+def test_backlash_lets_the_joint_rattle_within_the_play():
+    play = np.array([0.01, 0.02])
+    gear = BacklashGear(np.array([1e6, 4e3]), np.array([50.0, 1.0]), play)
+    machine = plant(LUGRE, gear)
+    machine.start(ZERO, ZERO, ZERO)
+    twists = []
+    for k in range(2000):
+        machine.step([45.0 * np.sin(0.02 * k), 4.5 * np.sin(0.015 * k)])
+        twists.append(np.array(machine.read()[0]) - machine.read()[1][:2])
+    twists = np.array(twists)
+    assert (np.abs(twists).max(axis=0) < play).all()
+    assert (np.abs(twists).max(axis=0) > 0.5 * play).all()
+    # There are times without contact, and both flanks are reached.
+    assert (np.ptp(twists, axis=0) > 0.95 * play).all()
+
+
+def test_cables_pull_to_their_rest():
+    cable = CableForce(np.array([40.0, 0.0]), np.array([0.3, 0.0]), ZERO)
+    machine = plant(SmoothFriction(np.array([80.0, 1.0]), ZERO), disturbances=(cable,))
+    machine.start(ZERO, ZERO, ZERO)
+    q, _, _ = moved(machine, ZERO, 20000)
+    np.testing.assert_allclose(q[-1], [0.3, 0.0], atol=1e-3)

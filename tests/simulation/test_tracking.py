@@ -1,0 +1,146 @@
+"""A servo on a virtual robot: it follows, better with a better model; sensors say what they can."""
+
+import numpy as np
+import pytest
+
+from jaxid.dynamics.model import Model
+from jaxid.robot.drives import Drives
+from jaxid.robot.limits import Limits
+from jaxid.simulation.sensors import Sensors
+from jaxid.simulation.servo import Servo
+from jaxid.simulation.tx90l import cad_tx90l_on_rail, virtual_tx90l_on_rail
+from jaxid.trajectory.fourier import random_fourier_series
+
+DURATION = 1.5
+
+
+@pytest.fixture(scope="module")
+def virtual():
+    return virtual_tx90l_on_rail()
+
+
+@pytest.fixture(scope="module")
+def motion(virtual):
+    return random_fourier_series(virtual.robot, omega=0.8, reach=0.7, seed=1)
+
+
+def feeding(virtual, parameters):
+    return lambda motion: virtual.model.inverse_dynamics(parameters, motion)
+
+
+@pytest.fixture(scope="module")
+def run(virtual, motion):
+    return virtual.track(
+        motion, feed_forward=feeding(virtual, virtual.parameters), duration=DURATION, seed=1
+    )
+
+
+def rms(x):
+    return np.sqrt(np.mean(np.square(x), axis=0))
+
+
+def test_a_better_model_tracks_better(virtual, motion, run):
+    alone = virtual.track(motion, duration=DURATION, seed=1)
+    cad = virtual.track(
+        motion, feed_forward=feeding(virtual, cad_tx90l_on_rail()), duration=DURATION, seed=1
+    )
+    errors = [np.mean(rms(r.tracking_error)[:6]) for r in (alone, cad, run)]
+    assert errors[0] > errors[1] > 3 * errors[2]
+    assert not run.saturated.any()
+
+
+def test_without_disturbances_the_true_model_leaves_no_error(motion):
+    ideal = virtual_tx90l_on_rail(disturbed=False)
+    fine = ideal.replace(sensors=Sensors(1e-9, *np.zeros((2, 7))))
+    errors = []
+    for tick in (1e-3, 5e-4):
+        servo = Servo.tuned(ideal.bodies, ideal.values, sample_time=tick)
+        run = fine.track(
+            motion,
+            servo=servo,
+            feed_forward=feeding(ideal, ideal.parameters),
+            duration=0.5,
+            seed=1,
+        )
+        errors.append(np.abs(run.tracking_error).max())
+    # What is left is that torques are held between ticks: it falls with them.
+    assert errors[1] < 0.7 * errors[0] < 1e-3
+
+
+def test_true_forces_belong_to_the_true_motion(motion):
+    ideal = virtual_tx90l_on_rail(disturbed=False)
+    run = ideal.track(
+        motion, feed_forward=feeding(ideal, ideal.parameters), duration=DURATION, seed=1
+    )
+    wanted = ideal.model.inverse_dynamics(ideal.parameters, run.actual)
+    error = rms(run.forces - np.asarray(wanted)) / np.asarray(ideal.robot.max_forces)
+    assert error.max() < 2e-3
+
+
+def test_the_log_is_on_the_motors_side_in_steps_of_the_encoders(virtual, run):
+    log = run.recording
+    assert log.angles_on_motor_side
+    assert log.forces_on_motor_side
+    step = 2 * np.pi / 2**17
+    lines = np.asarray(log.angles) / step
+    np.testing.assert_allclose(lines, np.round(lines), atol=1e-6)
+    drives = virtual.robot.drives
+    np.testing.assert_allclose(
+        drives.joint_angles(log.angles), run.actual.q, atol=step / drives.reduction[6, 6]
+    )
+    noise = (np.asarray(drives.joint_forces(log.forces)) - run.forces) / virtual.robot.max_forces
+    np.testing.assert_allclose(rms(noise), 0.01, rtol=0.1)
+
+
+def test_seeds_decide_and_a_log_can_be_slower(virtual, motion, run):
+    again = virtual.track(
+        motion,
+        feed_forward=feeding(virtual, virtual.parameters),
+        duration=DURATION,
+        sample_time=0.004,
+        seed=1,
+    )
+    np.testing.assert_array_equal(again.actual.q, run.actual.q[::4])
+    assert again.recording.sample_time == pytest.approx(0.004)
+    other = virtual.sensors.record(
+        virtual.robot, run.actual.q, run.forces, sample_time=1e-3, seed=2, name="other"
+    )
+    assert np.abs(other.forces - run.recording.forces).max() > 0
+
+
+def test_drives_do_not_give_more_than_they_can(virtual, motion):
+    weak = Limits.of(7, force=0.1 * np.asarray(virtual.robot.max_forces))
+    robot = virtual.replace(robot=virtual.robot.replace(limits=weak))
+    run = robot.track(motion, servo=virtual.servo(), duration=0.3, seed=1)
+    assert run.saturated.max() > 0.2
+    assert (np.abs(run.forces) <= weak.force + 1e-9).all()
+
+
+def test_what_does_not_fit_is_refused(virtual, motion):
+    with pytest.raises(ValueError, match="`sample_time` must be a multiple of the servo's"):
+        virtual.track(motion, sample_time=0.0015, seed=0)
+    with pytest.raises(ValueError, match="`duration` must be at least one tick"):
+        virtual.track(motion, duration=0.0, seed=0)
+    with pytest.raises(ValueError, match="`feed_forward` must give one finite force"):
+        virtual.track(motion, feed_forward=lambda m: m.q[:, :3], duration=0.1, seed=0)
+    strong = virtual.robot.replace(limits=Limits.of(7), drives=Drives.of(7))
+    free = virtual.replace(robot=strong)
+    stiff = Servo(1e9 * np.ones(7), 1e9 * np.ones(7))
+    with pytest.raises(ValueError, match="ran away after"):
+        free.track(motion, servo=stiff, duration=1.0, seed=0)
+    with pytest.raises(ValueError, match="`frequency` and `damping` must be positive"):
+        virtual.servo(frequency=0.0)
+    with pytest.raises(ValueError, match="belong together"):
+        virtual.replace(temperature=None)
+    with pytest.raises(ValueError, match="`values` must hold one number for each parameter"):
+        virtual.replace(values=np.ones(3))
+    cold = virtual.replace(lubricant=None, temperature=None)
+    with pytest.raises(ValueError, match="does not depend on temperature"):
+        cold.at(30.0)
+
+
+def test_the_model_to_identify_has_frictions_columns_behind_the_bodies(virtual):
+    names = virtual.model.parameter_names
+    assert names[49:63] == (*(f"fv{i}" for i in range(1, 8)), *(f"fc{i}" for i in range(1, 8)))
+    assert isinstance(virtual.bodies, Model)
+    assert virtual.parameters.shape == (70,)

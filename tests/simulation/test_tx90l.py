@@ -1,0 +1,72 @@
+"""The paper's robot: its published numbers come out, its bodies could exist."""
+
+import numpy as np
+import pytest
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.simulation.tx90l import cad_tx90l_on_rail, virtual_tx90l_on_rail
+from jaxid.trajectory.fourier import random_fourier_series
+
+COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}
+WARM = {1: 273.62, 2: 1.65, 27: 90.19, 28: 25.65, 34: 233.00, 35: 15.07}
+
+
+@pytest.fixture(scope="module")
+def base():
+    return base_parameters(virtual_tx90l_on_rail().model)
+
+
+@pytest.mark.parametrize(("warm", "published"), [(False, COLD), (True, WARM)])
+@pytest.mark.parametrize("disturbed", [True, False])
+def test_published_base_parameters_come_out(base, warm, published, disturbed):
+    assert base.size == 44
+    virtual = virtual_tx90l_on_rail(warm=warm, disturbed=disturbed)
+    truth = np.asarray(base.from_standard(virtual.parameters))
+    for number, value in published.items():
+        assert truth[number - 1] == pytest.approx(value, abs=5e-9)
+
+
+def test_temperature_leads_from_cold_to_warm_friction(base):
+    cold, warm = (virtual_tx90l_on_rail(warm=w) for w in (False, True))
+    heated = np.asarray(base.from_standard(cold.at(45.0).parameters))
+    np.testing.assert_allclose(heated[26:40], base.from_standard(warm.parameters)[26:40], rtol=1e-9)
+    between = np.asarray(base.from_standard(cold.at(30.0).parameters))
+    assert WARM[27] < between[26] < COLD[27]
+    np.testing.assert_allclose(between[:26], base.from_standard(cold.parameters)[:26], rtol=1e-12)
+
+
+def test_half_an_hour_of_motion_warms_it_up(base):
+    cold = virtual_tx90l_on_rail()
+    motion = random_fourier_series(cold.robot, omega=0.8, reach=0.95, seed=2)
+    times, temperatures = cold.warming(motion, duration=1800.0)
+    assert (np.diff(temperatures, axis=0) > 0).all()
+    assert times[-1] == 1800.0
+    assert 40.0 < np.median(temperatures[-1]) < 50.0
+    warmed = base.from_standard(cold.warmed(motion, duration=1800.0).parameters)
+    assert warmed[26] == pytest.approx(WARM[27], rel=0.15)
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_bodies_could_exist(warm):
+    for m, mx, my, mz, a, b, c in virtual_tx90l_on_rail(warm=warm).values[:49].reshape(7, 7):
+        first, second = np.array([mx, my, mz]), 0.5 * np.diag([b + c - a, a + c - b, a + b - c])
+        pseudo = np.block([[second, first[:, None]], [first[None], np.array([[m]])]])
+        assert np.linalg.eigvalsh(pseudo)[0] > 1e-7
+
+
+def test_cad_is_off_by_some_ten_percent_and_knows_no_friction():
+    virtual = virtual_tx90l_on_rail()
+    truth, cad = virtual.parameters, cad_tx90l_on_rail()
+    assert cad.shape == truth.shape
+    inertial = np.r_[np.arange(49), np.arange(63, 70)]
+    inertial = inertial[truth[inertial] != 0.0]
+    errors = np.abs(cad[inertial] / truth[inertial] - 1.0)
+    assert errors.min() + 1e-12 >= 0.1
+    assert errors.max() < 0.2
+    assert not cad[49:63].any()
+
+
+def test_motors_are_the_papers():
+    drives = virtual_tx90l_on_rail().robot.drives
+    assert drives.max_torques[0] == pytest.approx(69.0)
+    assert drives.max_torques[6] == pytest.approx(2.2)
