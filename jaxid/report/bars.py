@@ -7,13 +7,24 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.report.numbers import percent, shortened
-from jaxid.report.style import BLUE, INK, ORANGE, WIDTH, heading, house_style, new_figure
+from jaxid.report.style import (
+    BLUE,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    WIDTH,
+    heading,
+    house_style,
+    new_figure,
+)
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
 from jaxid.validation.errors import TorqueErrors
 
 BAR = 0.36
+COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
 NUMBERED = 10
 """Most joints whose bars bear numbers."""
 
@@ -55,32 +66,53 @@ def error_figure(
     Raises:
         ValueError: If there is no recording at all, or the numbers of joints differ.
     """
-    everything = (*identification, *verification)
-    if not everything:
+    if not (*identification, *verification):
         raise ValueError("`identification` or `verification` must hold errors, but both are empty.")
+    groups = (("identification", identification), ("verification", verification))
+    return bar_figure(groups, robot)
+
+
+def bar_figure(groups: Sequence[tuple[str, Sequence[TorqueErrors]]], robot: Robot) -> Figure:
+    """Draws mean absolute errors as bars and RMS errors as marks, for several groups (Eq. 37).
+
+    In percent of the largest forces; of the RMS of the measured forces if a largest one is not
+    known. Recordings of one group count as one.
+
+    Args:
+        groups: Names, and errors on some recordings, like those of one estimator; groups without
+            recordings are left out.
+        robot: Whose joints they are.
+
+    Raises:
+        ValueError: If there is no recording at all, there are too many groups, or the numbers of
+            joints differ.
+    """
+    filled = [(name, recordings) for name, recordings in groups if recordings]
+    if not 0 < len(filled) <= len(COLOURS):
+        raise ValueError(
+            f"`groups` must hold 1 to {len(COLOURS)} groups with errors, but holds {len(filled)}."
+        )
+    everything = [errors for _, recordings in filled for errors in recordings]
     for errors in everything:
         require_joints(errors, robot)
     largest = np.asarray(everything[0].max_forces)
     known = bool(np.isfinite(largest).all())
     n = robot.joints
-    groups = [
+    pooled_groups = [
         (label, colour, _Pooled.of(recordings))
-        for label, colour, recordings in (
-            ("identification", BLUE, identification),
-            ("verification", ORANGE, verification),
-        )
-        if recordings
+        for colour, (label, recordings) in zip(COLOURS, filled, strict=False)
     ]
+    bar = min(BAR, 2 * BAR / len(filled))
     with house_style():
         figure = new_figure(max(7.6, min(2.0 + 1.1 * n, 1.4 * WIDTH)), 4.4)
         axes = figure.add_subplot()
-        for k, (label, colour, pooled) in enumerate(groups):
-            place = np.arange(n) + (k - 0.5 * (len(groups) - 1)) * (BAR + 0.02)
+        for k, (label, colour, pooled) in enumerate(pooled_groups):
+            place = np.arange(n) + (k - 0.5 * (len(filled) - 1)) * (bar + 0.02)
             scale = 100.0 / (largest if known else np.maximum(pooled.force_rms, 1e-300))
             mean, rms = pooled.mean * scale, pooled.rms * scale
             average = percent(float(np.mean(mean)) / 100.0)
             axes.bar(
-                place, mean, BAR, color=colour, label=f"{label}, mean |e|: {average} % on average"
+                place, mean, bar, color=colour, label=f"{label}, mean |e|: {average} % on average"
             )
             axes.plot(
                 place,
@@ -91,9 +123,9 @@ def error_figure(
                 markerfacecolor="white",
                 markeredgecolor=INK,
                 markeredgewidth=0.9,
-                label="RMS" if k == len(groups) - 1 else "_",
+                label="RMS" if k == len(filled) - 1 else "_",
             )
-            if n <= NUMBERED:
+            if n * len(filled) <= 2 * NUMBERED:
                 for x, value in zip(place, mean, strict=True):
                     axes.annotate(
                         percent(value / 100.0),

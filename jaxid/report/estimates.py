@@ -49,6 +49,7 @@ def parameter_figure(fit: Fit) -> Figure:
         grid = figure.add_gridspec(1, columns, wspace=0.06)
         for c in range(columns):
             axes = figure.add_subplot(grid[c])
+            axes.set_gid(f"column-{c}")
             _column(axes, fit, relative, order[c * rows : (c + 1) * rows], rows, low)
         heading(figure, _summary(fit, relative))
         figure.legend(

@@ -1,22 +1,13 @@
-"""What a design has found: tables for the terminal, and files."""
+"""What a design has found: tables for the terminal."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
-import numpy as np
 from rich.table import Table
 from rich.text import Text
 
 from jaxid.excitation.plan import VAGUE, ExcitationPlan
-from jaxid.files import written_whole
-from jaxid.report.motion_figures import joint_figure, tip_figure
 from jaxid.report.numbers import aligned, percent, significant
-from jaxid.report.style import save
 from jaxid.report.tables import plain_table
-from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import double_precision
-
-JOINTS, TIP = "joints.png", "end_effector.png"
 
 
 def criteria_table(plan: ExcitationPlan) -> Table:
@@ -84,27 +75,3 @@ def use_table(plan: ExcitationPlan) -> Table:
     for j, name in enumerate(plan.base.model.robot.joint_names):
         table.add_row(Text(name), *(f"{100 * use[k, j]:.1f}" for k in shown))
     return table
-
-
-def write_pictures(
-    folder: Path, plan: ExcitationPlan, played: AbstractTrajectory | None = None
-) -> list[Path]:
-    """Draws the joints and the end-effector (Figs. 3, 4); the files appear together.
-
-    Args:
-        folder: Where they shall lie.
-        plan: With the motion.
-        played: The motion with its leads, to be drawn in its place.
-    """
-    robot, shown = plan.base.model.robot, plan.trajectory if played is None else played
-    with double_precision():
-        time = np.linspace(0.0, float(shown.duration), 801)
-        motion = shown.motion(time)
-    figures = {
-        JOINTS: joint_figure(robot, plan.limits.limits, time, motion),
-        TIP: tip_figure(robot, time, motion),
-    }
-    with written_whole(folder) as staging:
-        for name, figure in figures.items():
-            save(figure, staging / name)
-    return [folder / name for name in figures]

@@ -4,7 +4,17 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.identification.filter_choice import FilterChoice
-from jaxid.report.style import BLUE, GREY, ORANGE, PALE, WIDTH, heading, house_style, new_figure
+from jaxid.report.style import (
+    BLUE,
+    GREY,
+    ORANGE,
+    PALE,
+    WIDTH,
+    heading,
+    house_style,
+    new_figure,
+    plain_powers,
+)
 
 
 def filter_figure(choice: FilterChoice) -> Figure:
@@ -29,8 +39,10 @@ def filter_figure(choice: FilterChoice) -> Figure:
         for axes in (left, right):
             axes.axvline(best, color=ORANGE, linewidth=1.0)
             axes.set_xscale("log")
+            plain_powers(axes.xaxis)
             axes.set_xlabel("cut-off of forces and columns [Hz]")
         left.set_yscale("log")
+        plain_powers(left.yaxis)
         left.set_ylabel("error on unseen parts [% of the forces]")
         left.set_title(f"chosen: {best:.3g} Hz", loc="left", fontweight="bold")
         right.plot(

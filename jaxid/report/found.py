@@ -1,4 +1,4 @@
-"""Estimates with their intervals, for the terminal and in files: payloads and drive gains."""
+"""Estimates with their intervals, for the terminal and in files: payloads, gains, states."""
 
 import datetime
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from jaxid.report.numbers import aligned, with_deviation
 from jaxid.report.tables import plain_table
 from jaxid.report.write import write_csv, write_json
 
-PAYLOAD, GAINS = "jaxid-payload/1", "jaxid-gains/1"
+PAYLOAD, GAINS, STATES = "jaxid-payload/1", "jaxid-gains/1", "jaxid-states/1"
 """Schemas of the files."""
 
 

@@ -1,8 +1,9 @@
-"""Figures of a motion: its joints against their limits, and its end-effector (Figs. 3, 4)."""
+"""Figures of a motion: its joints against their limits, and its end-effector (Figs. 4, 5)."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints.tip import tip_motion
@@ -10,6 +11,8 @@ from jaxid.report.style import (
     BLUE,
     GREY,
     HEADING,
+    MEASURED,
+    PREDICTED,
     VERMILION,
     WIDTH,
     caption,
@@ -28,7 +31,7 @@ ROW = 1.25
 def joint_figure(
     robot: Robot, limits: Limits, time: Float[AnyArray, " samples"], motion: Motion
 ) -> Figure:
-    """Position, velocity and acceleration of every joint between their limits (Fig. 3).
+    """Position, velocity and acceleration of every joint between their limits (Fig. 4).
 
     Args:
         robot: Whose joints they are.
@@ -58,7 +61,7 @@ def joint_figure(
 
 
 def tip_figure(robot: Robot, time: Float[AnyArray, " samples"], motion: Motion) -> Figure:
-    """Position, speed and acceleration of the end-effector (Fig. 4).
+    """Position, speed and acceleration of the end-effector (Sec. 4).
 
     Args:
         robot: Whose end-effector moves.
@@ -83,6 +86,50 @@ def tip_figure(robot: Robot, time: Float[AnyArray, " samples"], motion: Motion) 
             axes.plot(time, values, color=BLUE, linewidth=1.0)
             caption(axes, name, f"up to {values.max():.3g} {unit}")
         _time_axis(panels[-1:], time)
+    return figure
+
+
+def filtered_figure(
+    robot: Robot,
+    time: Float[AnyArray, " samples"],
+    desired: Motion,
+    filtered: Motion,
+    joint: int,
+) -> Figure:
+    """Velocity and acceleration of a joint: as desired, and out of a filter (Fig. 5).
+
+    Args:
+        robot: Whose joint it is.
+        time: Of the samples [s].
+        desired: At the samples.
+        filtered: At the samples, from measured positions.
+        joint: Its index; 0 is the first.
+
+    Raises:
+        ValueError: If there is no such joint.
+    """
+    if not 0 <= joint < robot.joints:
+        raise ValueError(f"`joint` must lie between 0 and {robot.joints - 1}, but is {joint}.")
+    unit = robot.joint_unit(joint)
+    with house_style():
+        figure = new_figure(WIDTH, 2 * 1.9 + HEADING + 0.3)
+        heading(figure, f"{robot.name}: {robot.joint_names[joint]}, desired and filtered")
+        panels = figure.subplots(2, 1, sharex=True)
+        for axes, name, rate, wanted, found in (
+            (panels[0], "velocity", "/s", desired.qd, filtered.qd),
+            (panels[1], "acceleration", "/s²", desired.qdd, filtered.qdd),
+        ):
+            pair = [np.asarray(x)[:, joint] for x in (wanted, found)]
+            axes.plot(time, pair[0], color=MEASURED, linewidth=2.4)
+            axes.plot(time, pair[1], color=PREDICTED, linewidth=1.0)
+            apart = float(np.sqrt(np.mean((pair[1] - pair[0]) ** 2)))
+            caption(axes, f"{name} [{unit}{rate}]", f"RMS difference {apart:.3g} {unit}{rate}")
+        _time_axis(panels[-1:], time)
+        handles = [
+            Line2D([], [], color=MEASURED, lw=2.4, label="desired"),
+            Line2D([], [], color=PREDICTED, lw=1.2, label="filtered"),
+        ]
+        figure.legend(handles=handles, loc="outside lower left", ncols=2)
     return figure
 
 

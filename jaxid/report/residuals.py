@@ -9,7 +9,16 @@ from matplotlib.lines import Line2D
 
 from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.report.numbers import percent, shortened
-from jaxid.report.style import BLUE, GREY, WIDTH, caption, heading, house_style, new_figure
+from jaxid.report.style import (
+    BLUE,
+    GREY,
+    WIDTH,
+    caption,
+    heading,
+    house_style,
+    new_figure,
+    plain_powers,
+)
 from jaxid.robot.robot import Robot
 
 COLUMNS = 2
@@ -45,6 +54,8 @@ def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
         panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
         for j, axes in enumerate(panels.flat):
             if j < n:
+                axes.set_gid(f"joint-{j}")
+                axes.tick_params(labelbottom=True)
                 _panel(axes, spectra, j, robot)
             else:
                 axes.set_axis_off()
@@ -80,8 +91,10 @@ def _panel(axes: Axes, spectra: ResidualSpectra, j: int, robot: Robot) -> None:
     axes.plot(frequency[shown], density[shown], color=BLUE, lw=1.2)
     axes.plot(frequency[shown], level * gain[shown], color=GREY, lw=1.0, ls="--")
     axes.set_xscale("log")
+    plain_powers(axes.xaxis)
     if np.any(density[shown] > 0):
         axes.set_yscale("log")
+        plain_powers(axes.yaxis)
     unit = "(N m)²/Hz" if robot.force_unit(j) == "N m" else "N²/Hz"
     axes.set_ylabel(unit)
     verdict = "white" if spectra.white[j] else "not white"

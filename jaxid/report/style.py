@@ -1,17 +1,24 @@
 """How figures look: one palette, one size of type, thin lines; nothing global is changed."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import matplotlib.style
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.layout_engine import ConstrainedLayoutEngine, PlaceHolderLayoutEngine
+from matplotlib.ticker import FuncFormatter
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 BLUE, ORANGE, VERMILION = "#0072B2", "#E69F00", "#D55E00"
+GREEN, PURPLE = "#009E73", "#CC79A7"
 INK, GREY, PALE = "#22262b", "#5f6b78", "#d5dae0"
 MEASURED, PREDICTED, ERROR = "#9aa6b2", VERMILION, BLUE
 
@@ -22,6 +29,8 @@ HEADING = 0.36
 """Height that a figure keeps for its title [inch]."""
 WIDE = 15.0
 """Width of a figure of many panels [inch]."""
+TITLE = "heading"
+"""Name by which the title of a figure is known."""
 
 _SETTINGS = {
     "figure.facecolor": "white",
@@ -56,12 +65,23 @@ _SETTINGS = {
     "lines.solid_joinstyle": "round",
     "agg.path.chunksize": 20000,
 }
+NARROW = 30.0
+"""Ends of a logarithmic scale up to which labels stand between powers of ten too, as a ratio."""
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+LETTERS_AS_SHAPES = {"pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "jaxid"}
+"""Settings of files that look alike everywhere."""
+LETTERS_AS_TEXT = {"svg.fonttype": "none", "svg.hashsalt": "jaxid"}
+"""Settings of drawings in a page, in the page's letters."""
 
 
 @contextlib.contextmanager
-def house_style() -> Iterator[None]:
-    """The settings of matplotlib within a block; what the user has set is back afterwards."""
-    with matplotlib.style.context(["default", _SETTINGS]):
+def house_style(files: Mapping[str, Any] = MappingProxyType({})) -> Iterator[None]:
+    """The settings of matplotlib within a block; what the user has set is back afterwards.
+
+    Args:
+        files: Settings of what is written, besides.
+    """
+    with matplotlib.style.context(["default", {**_SETTINGS, **files}]):
         yield
 
 
@@ -83,13 +103,73 @@ def new_figure(width: float, height: float, gap: float = 0.06) -> Figure:
 def heading(figure: Figure, text: str) -> None:
     """The title of a figure, at its left."""
     x, y = 0.11 / figure.get_figwidth(), 1.0 - 0.1 / figure.get_figheight()
-    figure.text(x, y, text, va="top", fontsize=12, fontweight="bold").set_in_layout(False)
+    title = figure.text(x, y, text, va="top", fontsize=12, fontweight="bold", gid=TITLE)
+    title.set_in_layout(False)
+
+
+def heading_of(figure: Figure) -> str:
+    """The title of a figure; empty if it has none."""
+    return next((text.get_text() for text in figure.texts if text.get_gid() == TITLE), "")
+
+
+def plain_powers(axis: Axis) -> None:
+    """Labels of a logarithmic scale in plain letters: those of matplotlib are formulas."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: plain_number(value)))
+
+    def between(value: float, _: int | None) -> str:
+        low, high = sorted(axis.get_view_interval())
+        first = f"{value:e}"[0]
+        return plain_number(value) if first in "25" and high < NARROW * low else ""
+
+    axis.set_minor_formatter(FuncFormatter(between))
+
+
+def plain_number(value: float) -> str:
+    """A number as a label: decimals where they are few, else a power of ten."""
+    if 1e-3 < value < 1e5 or value <= 0:
+        return f"{value:g}"
+    mantissa, exponent = f"{value:.0e}".split("e")
+    power = "10" + str(int(exponent)).translate(RAISED)
+    return power if mantissa == "1" else f"{mantissa}·{power}"
+
+
+def settle(figure: Figure) -> None:
+    """Finds the layout of a figure, which takes longer than to draw it, once and for all."""
+    engine = figure.get_layout_engine()
+    if engine is not None and not isinstance(engine, PlaceHolderLayoutEngine):
+        with house_style():
+            engine.execute(figure)
+        figure.set_layout_engine("none")
+
+
+@contextlib.contextmanager
+def as_it_was(figure: Figure) -> Iterator[None]:
+    """Keeps canvas and resolution of a figure through a block that changes them."""
+    canvas, dpi = figure.canvas, figure.dpi
+    try:
+        yield
+    finally:
+        figure.set_canvas(canvas)
+        figure.set_dpi(dpi)
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes a figure as PNG, without time or version in it."""
-    with house_style():
-        figure.savefig(path, dpi=DPI, format="png", metadata={"Software": None})
+    """Writes a figure as PNG, PDF or SVG, without time or version in it.
+
+    Args:
+        figure: The figure.
+        path: Of the file; its suffix says which.
+    """
+    settle(figure)
+    with house_style(LETTERS_AS_SHAPES), as_it_was(figure):
+        # `savefig` would draw everything twice.
+        if path.suffix == ".pdf":
+            FigureCanvasPdf(figure).print_pdf(path, metadata={"CreationDate": None})
+        elif path.suffix == ".svg":
+            FigureCanvasSVG(figure).print_svg(path, metadata={"Date": None})
+        else:
+            figure.set_dpi(DPI)
+            FigureCanvasAgg(figure).print_png(path, metadata={"Software": None})
 
 
 def caption(axes: Axes, left: str, right: str = "") -> None:

@@ -8,15 +8,19 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxid.documents import text_of
 from jaxid.files import written_whole
 from jaxid.identification.filter_choice import FilterChoice
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.update import save_run
+from jaxid.report.autocorrelation import autocorrelation_figure
 from jaxid.report.bars import error_figure
 from jaxid.report.content import Beside, parameters, result
 from jaxid.report.estimates import parameter_figure
 from jaxid.report.filters import filter_figure
+from jaxid.report.identified import PAGE, identification_page
+from jaxid.report.page import write_page
 from jaxid.report.residuals import residual_figure
 from jaxid.report.style import save
 from jaxid.report.torques import torque_figure
@@ -24,9 +28,11 @@ from jaxid.validation.definiteness import Definiteness
 from jaxid.validation.errors import TorqueErrors
 
 LONGEST_NAME = 80
+MODEL = "model.json"
+"""File of a report that holds the fit, for `load` and `jaxid export`."""
 RUN = "run.npz"
 """File of a report that keeps what its logs have told, to add, compare and combine later."""
-OWN = r"torque_[A-Za-z0-9._-]+\.png|run\.npz|filter\.png"
+OWN = r"[A-Za-z0-9._-]+\.(png|pdf)|run\.npz"
 """Files that not every report has; those of an earlier one go."""
 
 
@@ -41,8 +47,10 @@ def write_report(
     beside: Beside | None = None,
     choice: FilterChoice | None = None,
     run: Run | None = None,
+    doubts: tuple[str, ...] = (),
+    pdf: bool = False,
 ) -> list[Path]:
-    """Writes `result.json`, `parameters.csv`, `run.npz` and the figures, all of them or nothing.
+    """Writes `report.html`, `result.json`, `parameters.csv`, `model.json`, `run.npz` and figures.
 
     A folder that is there already keeps its other files; figures of recordings that an earlier
     report left in it go.
@@ -58,6 +66,8 @@ def write_report(
         beside: Another way to solve the same equations.
         choice: Of the filter, where it was left to the logs.
         run: What the recordings have told, for later runs; no `run.npz` if None.
+        doubts: About the logs, in sentences.
+        pdf: Whether figures are written as PDF too.
 
     Returns:
         The files.
@@ -68,38 +78,41 @@ def write_report(
     robot = fit.base.model.robot
     named = _file_names(identification, verification)
     content = result(fit, identification, verification, definiteness, settings, notes, beside)
-    names = ["result.json", "parameters.csv", "errors.png", "parameters.png"]
-    names += ["filter.png"] if choice is not None else []
-    names += ["residuals.png"] if fit.residual_spectra is not None else []
-    names += [file for file, _, _ in named]
+    figures = {"errors": error_figure(identification, verification, robot)}
+    figures["parameters"] = parameter_figure(fit)
+    if choice is not None:
+        figures["filter"] = filter_figure(choice)
+    if fit.residual_spectra is not None:
+        figures["residuals"] = residual_figure(fit.residual_spectra, robot)
+        longest = max(identification, key=lambda errors: len(errors.time))
+        figures["autocorrelation"] = autocorrelation_figure(longest, robot, fit.residual_spectra)
+    for stem, role, errors in named:
+        title = errors.name if errors.name == role else f"{errors.name} ({role})"
+        figures[stem] = torque_figure(errors, robot, title)
+    suffixes = (".png", ".pdf") if pdf else (".png",)
+    drawn = [f"{stem}{suffix}" for stem in figures for suffix in suffixes]
+    names = [PAGE, "result.json", "parameters.csv", MODEL, *drawn]
     names += [RUN] if run is not None else []
     content["files"] = names
-    with written_whole(folder) as staging:
+    with written_whole(folder, _earlier) as staging:
         write_json(staging / "result.json", content)
         write_csv(staging / "parameters.csv", parameters(fit))
-        save(error_figure(identification, verification, robot), staging / "errors.png")
-        save(parameter_figure(fit), staging / "parameters.png")
-        if choice is not None:
-            save(filter_figure(choice), staging / "filter.png")
+        fit.save(staging / MODEL)
+        page = identification_page(
+            *(fit, identification, verification, definiteness, settings, figures, notes, doubts)
+        )
+        write_page(staging / PAGE, page)
         if run is not None:
             save_run(staging / RUN, run)
-        if fit.residual_spectra is not None:
-            save(residual_figure(fit.residual_spectra, robot), staging / "residuals.png")
-        for file, role, errors in named:
-            title = errors.name if errors.name == role else f"{errors.name} ({role})"
-            save(torque_figure(errors, robot, title), staging / file)
-        stale = _earlier(folder) - set(names)
-    for name in stale:
-        (folder / name).unlink(missing_ok=True)
+        for stem, figure in figures.items():
+            for suffix in suffixes:
+                save(figure, staging / f"{stem}{suffix}")
     return [folder / name for name in names]
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a file that programs read exactly and people can read."""
-    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
-    # A list of numbers or texts stands on one line. Texts hold no line breaks, so none is touched.
-    text = re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text)
-    path.write_text(f"{text}\n", encoding="utf-8")
+    path.write_text(text_of(content), encoding="utf-8")
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -113,7 +126,7 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 def _file_names(
     identification: Iterable[TorqueErrors], verification: Iterable[TorqueErrors]
 ) -> list[tuple[str, str, TorqueErrors]]:
-    """A file name of its own for every recording, also where file names ignore case."""
+    """A file name without suffix for every recording, its own also where case is ignored."""
     used: set[str] = set()
     named = []
     for role, recordings in (("identification", identification), ("verification", verification)):
@@ -122,7 +135,7 @@ def _file_names(
             choices = (stem, f"{stem}_{role}", *(f"{stem}_{role}_{k}" for k in range(2, 10_000)))
             name = next(c for c in choices if c.lower() not in used)
             used.add(name.lower())
-            named.append((f"torque_{name}.png", role, errors))
+            named.append((f"torque_{name}", role, errors))
     return named
 
 

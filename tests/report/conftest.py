@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from jaxid.dynamics.base import base_parameters
-from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction
+from jaxid.dynamics.terms import RigidBodies
 from jaxid.identification.estimators import LeastSquares
 from jaxid.identification.identify import identify
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
+from jaxid.simulation.gear_friction import SmoothFriction
+from jaxid.simulation.sensors import Sensors
 from jaxid.simulation.virtual import VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 from jaxid.validation.validate import Validation, validate
@@ -34,18 +35,19 @@ def cart() -> Robot:
 def validated():
     """A fit of the cart with its validation on two recordings."""
     robot = cart()
-    model = Model(robot, (RigidBodies(), ViscousFriction(), CoulombFriction()))
     random = np.random.default_rng(0)
     bodies = random_bodies(robot, np.array([8.0, 2.0]), random)
     virtual = VirtualRobot(
-        model=model,
-        parameters=np.concatenate([bodies.ravel(), [3.0, 0.2, 5.0, 0.4]]),
-        stribeck=np.zeros(2),
-        stribeck_speed=0.1,
-        encoder_step=1e-6,
-        white_noise=np.array([0.5, 0.05]),
-        coloured_noise=np.zeros(2),
-        memory=0.1,
+        robot=robot,
+        terms=(RigidBodies(),),
+        values=bodies.ravel(),
+        friction=SmoothFriction(np.array([3.0, 0.2]), np.array([5.0, 0.4])),
+        sensors=Sensors(
+            encoder_step=1e-6,
+            white_noise=np.array([0.5, 0.05]),
+            coloured_noise=np.zeros(2),
+            memory=0.1,
+        ),
     )
     observations = [
         observe(
@@ -61,7 +63,7 @@ def validated():
         )
         for s, name in ((1, "first/run"), (2, "second"))
     ]
-    fit = identify(base_parameters(model), observations[0], LeastSquares())
+    fit = identify(base_parameters(virtual.model), observations[0], LeastSquares())
     return fit, validate(fit, observations)
 
 

@@ -10,6 +10,7 @@ from report_samples import errors_of
 
 from jaxid.report import write
 from jaxid.report.content import plain
+from jaxid.report.page import Page
 from jaxid.report.write import safe_name, write_report
 
 
@@ -17,6 +18,7 @@ from jaxid.report.write import safe_name, write_report
 def quick(monkeypatch):
     """Figures are tested elsewhere."""
     monkeypatch.setattr(write, "save", lambda figure, path: path.write_bytes(b"figure"))
+    monkeypatch.setattr(write, "identification_page", lambda *_: Page("page", ()))
 
 
 def report(folder, fit, validation, **changes):
@@ -46,9 +48,12 @@ def test_writes_all_files_with_their_parents(tmp_path, fit, validation):
     files = report(folder, fit, validation)
     assert sorted(p.name for p in files) == names(folder)
     assert names(folder) == [
+        "autocorrelation.png",
         "errors.png",
+        "model.json",
         "parameters.csv",
         "parameters.png",
+        "report.html",
         "residuals.png",
         "result.json",
         "torque_first-run.png",
@@ -150,6 +155,17 @@ def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, 
     assert "torque_first-run.png" in names(tmp_path)
     assert (tmp_path / "log.csv").read_text() == "mine"
     assert (tmp_path / "torque_mine.png").read_text() == "mine"
+
+
+def test_figures_come_as_pdf_too_if_asked(tmp_path, fit, validation):
+    report(tmp_path, fit, validation, pdf=True)
+    pictures = {n for n in names(tmp_path) if n.endswith(".png")}
+    assert {n.removesuffix(".pdf") for n in names(tmp_path) if n.endswith(".pdf")} == {
+        n.removesuffix(".png") for n in pictures
+    }
+    assert (tmp_path / "errors.pdf").read_bytes().startswith(b"%PDF")
+    report(tmp_path, fit, validation)
+    assert not [n for n in names(tmp_path) if n.endswith(".pdf")]
 
 
 def test_recordings_of_one_name_keep_their_figures_apart(tmp_path, fit, validation, quick):
