@@ -1,0 +1,201 @@
+"""The C code against NumPy on the same model, against itself, and against its own promises."""
+
+import re
+import shutil
+import subprocess
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from export_samples import fit_of, motion, possible
+
+import jaxid as jid
+from jaxid.dynamics.machine import in_numpy
+from jaxid.export.compiled_model import CompiledModel
+from jaxid.export.feed_forward import forms
+
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
+STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror", "-O1"]
+
+
+def railed():
+    terms = (
+        jid.RigidBodies(principal_axes=True),
+        jid.AsymmetricCoulombFriction(),
+        jid.ConstantOffset(),
+    )
+    return jid.Model(jid.robots.tx90l_on_rail(), terms[:2])
+
+
+def coupled():
+    terms = (*jid.Model(jid.robots.planar_arm(1, 1.0)).terms, jid.CoupledDrives())
+    return jid.Model(jid.robots.tx40(), terms)
+
+
+MODELS = {"panda": lambda: jid.Model(jid.robots.panda()), "rail": railed, "coupled": coupled}
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def fit(request):
+    model = MODELS[request.param]()
+    return fit_of(model, possible(model))
+
+
+@pytest.fixture(scope="module")
+def source(fit, tmp_path_factory):
+    return jid.export_c(fit, tmp_path_factory.mktemp("exported"))
+
+
+@pytest.fixture(scope="module")
+def compiled(fit, source):
+    return CompiledModel(source, fit.base.model.robot.joints, fit.base.size, flags=["-O0"])
+
+
+def close(got, wanted, tolerance=1e-12):
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
+
+
+def test_all_forms_agree_with_numpy(fit, compiled):
+    base, model = fit.base, fit.base.model
+    m = motion(model.robot.joints, 300)
+    wanted, p = fit.predict(m), fit.standard_parameters
+    close(compiled.torque(m), wanted)
+    close(compiled.torque_of_parameters(m, fit.parameters), wanted)
+    close(compiled.torque_of_masses(m), wanted)
+    close(compiled.regressor(m), in_numpy(base, base.columns, m.q, m.qd, m.qdd))
+    M = in_numpy(model, model.inertia, m.q, shared=(p,))
+    close(compiled.mass_matrix(m.q), M)
+    h = in_numpy(model, model.bias, m.q, m.qd, shared=(p,))
+    close(compiled.bias(m.q, m.qd), h)
+    still = np.zeros_like(m.q)
+    g = in_numpy(model, model.bias, m.q, still, shared=(p,))
+    close(compiled.gravity(m.q), g)
+    rigid = p.copy()
+    rigid[len(rigid) * 0 + model.robot.joints * model.terms[0].body_parameters :] = 0.0
+    moving = h - in_numpy(model, model.bias, m.q, m.qd, shared=(rigid,))
+    standing = g - in_numpy(model, model.bias, m.q, still, shared=(rigid,))
+    np.testing.assert_allclose(
+        compiled.friction(m.q, m.qd), moving - standing, rtol=0, atol=1e-11 * np.abs(h).max()
+    )
+    assert compiled.messages == ""
+
+
+def test_the_recursion_has_few_operations(source):
+    header = source.with_suffix(".h").read_text("ascii")
+    counts = re.findall(r"(\d+) operations:[^;]*?void arm_(\w+)\(", header)
+    found = {name: int(count) for count, name in counts}
+    assert len(found) == 8
+    assert found["torque"] < 0.59 * found["torque_of_masses"]
+    assert found["torque"] < 0.53 * found["torque_of_parameters"]
+
+
+def test_counts_of_the_recursion_are_pinned():
+    model = jid.Model(jid.robots.panda(), (jid.RigidBodies(),))
+    p = np.random.default_rng(0).uniform(0.1, 1.0, model.size)
+    counts = forms(fit_of(model, p))[0].program.counts
+    assert (counts.multiplications, counts.additions) == (281, 271)
+    assert counts.functions == 12
+
+
+def test_bodies_with_no_symmetry_in_a_tree_with_skew_axes():
+    rng = np.random.default_rng(5)
+    turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(5)]
+    robot = jid.Robot.of(
+        "tree",
+        parent=(-1, 0, 1, 1, 3),
+        revolute=(True, False, True, True, False),
+        axis=rng.normal(size=(5, 3)),
+        rotation=[t * np.sign(np.linalg.det(t)) for t in turns],
+        offset=rng.normal(size=(5, 3)),
+        gravity=(1.0, 2.0, -9.0),
+    )
+    model = jid.Model(robot, (jid.RigidBodies(), jid.LinearSpring(0.3)))
+    fit = fit_of(model, rng.normal(size=model.size))
+    m = motion(5, 50)
+    from jaxid.export.feed_forward import torque_program
+    from jaxid.program import evaluate
+
+    close(evaluate(torque_program(fit), m.q.T, m.qd.T, m.qdd.T).T, fit.predict(m))
+
+
+class CubicFriction(jid.AbstractTerm):
+    def parameters(self, robot):
+        return tuple((f"fq{i + 1}", "N m s³") for i in range(robot.joints))
+
+    def columns(self, robot, q, qd, qdd):
+        return jnp.diag(qd**3)
+
+
+@pytest.fixture(scope="module")
+def small():
+    terms = (jid.RigidBodies(), jid.StribeckFriction(), jid.CoulombFriction(), CubicFriction())
+    model = jid.Model(jid.robots.planar_arm(2, 0.4), (terms[0], terms[1], terms[3]))
+    return fit_of(model, possible(model))
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize("language", ["c", "c++"])
+def test_the_file_compiles_without_warnings_and_checks_itself(small, tmp_path, double, language):
+    source = jid.export_c(small, tmp_path, name="my_arm", double=double)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["my_arm.c", "my_arm.h"]
+    standard = {"c": "-std=c99", "c++": "-std=c++11"}[language]
+    command = ["gcc", "-x", language, standard, *STRICT, "-DMY_ARM_SELF_TEST", str(source)]
+    subprocess.run([*command, "-o", str(tmp_path / "check"), "-lm"], check=True)
+    done = subprocess.run([str(tmp_path / "check")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "this build is right" in done.stdout
+    text = re.sub(r"(_torque_expected.*\n    \{)", r"\g<1>9", source.read_text("ascii"), count=1)
+    source.write_text(text, "ascii")
+    subprocess.run([*command, "-o", str(tmp_path / "check"), "-lm"], check=True)
+    done = subprocess.run([str(tmp_path / "check")], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "WRONG" in done.stdout
+
+
+def test_single_precision(small):
+    compiled, m = CompiledModel.of(small, double=False, flags=["-O1"]), motion(2, 50)
+    close(compiled.torque(m), small.predict(m), 1e-5)
+
+
+def test_the_header_says_what_it_is(small, tmp_path):
+    header = jid.export_c(small, tmp_path).with_suffix(".h").read_text("ascii")
+    for text in (
+        small.checksum,
+        "Model of 2026-01-31",
+        "first, second",
+        'robot "planar arm, 2 joints"',
+        "0  joint1: turns, q in rad, tau in N m",
+        "void arm_torque(const double *q, const double *qd, const double *qdd, double *tau);",
+        "#define ARM_JOINTS 2",
+    ):
+        assert text in header
+    source = (tmp_path / "arm.c").read_text("ascii")
+    assert "fc1 [N m]" in source
+    assert "malloc" not in source
+    functions = source[source.index("void arm_torque") : source.index("#ifdef ARM_SELF_TEST")]
+    assert not re.search(r"\b(if|while|goto|switch)\b", functions)
+
+
+def test_numbers_that_are_not_finite_give_nan(compiled, fit):
+    n = fit.base.model.robot.joints
+    for bad in (np.nan, np.inf, 1e30):
+        q = np.zeros((1, n))
+        q[0, 2] = bad
+        found = compiled.torque(jid.Motion(q, np.zeros((1, n)), np.zeros((1, n))))
+        assert np.isnan(found).any()
+
+
+def test_refusals(small, tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="must be an identifier"):
+        jid.export_c(small, tmp_path, name="7 axes")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.raises(RuntimeError, match="no C compiler `no-such-compiler`"):
+        CompiledModel.of(small)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_does_not_compile_is_one_sentence(tmp_path):
+    (tmp_path / "arm.c").write_text("int f(void) { return x; }\n", "ascii")
+    with pytest.raises(RuntimeError, match=r"refuses `arm\.c`: .*error") as error:
+        CompiledModel(tmp_path / "arm.c", 2, 3)
+    assert "\n" not in str(error.value)

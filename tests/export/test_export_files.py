@@ -1,0 +1,227 @@
+"""Files for simulators give the same torques there, as far as they can hold the model."""
+
+import importlib.util
+
+import jax
+import numpy as np
+import pytest
+from export_samples import changed, fit_of, motion, possible
+from lxml import etree
+
+import jaxid as jid
+from jaxid.export.mjcf import mjcf_text
+from jaxid.export.physical import Joints
+
+URDF = """<?xml version="1.0"?>
+<!-- kept -->
+<robot name="small" xmlns:xacro="http://example.org">
+  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+  <link name="world"/>
+  <link name="cart">
+    <visual><geometry><mesh filename="package://a/cart.dae"/></geometry></visual>
+    <inertial><origin xyz="1 2 3" rpy="0.1 0.2 0.3"/><mass value="3"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+  </link>
+  <link name="plate"><inertial><mass value="9"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <link name="upper"/>
+  <link name="lower"><inertial><mass value="2"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <joint name="rail" type="prismatic"><parent link="world"/><child link="cart"/>
+    <origin xyz="0 0 0.5" rpy="0.3 0.2 0.1"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" effort="100" velocity="2"/></joint>
+  <joint name="mount" type="fixed"><parent link="cart"/><child link="plate"/>
+    <origin xyz="0 0.1 0"/></joint>
+  <joint name="shoulder" type="continuous"><parent link="plate"/><child link="upper"/>
+    <origin xyz="0.1 0 0.2" rpy="0.4 0 0"/><axis xyz="0 1 0"/>
+    <dynamics damping="7" friction="8"/></joint>
+  <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0 0.3 0" rpy="0 0.7 0.2"/><axis xyz="0.6 0 0.8"/>
+    <safety_controller k_velocity="3"/>
+    <limit lower="-2" upper="2" effort="30" velocity="2"/></joint>
+  <transmission name="t"><type>simple</type></transmission>
+</robot>
+"""
+
+
+@pytest.fixture
+def source(tmp_path):
+    path = tmp_path / "small.urdf"
+    path.write_text(URDF, "utf-8")
+    return path
+
+
+@pytest.fixture
+def fit(source):
+    robot = jid.load_urdf(source)
+    limits = jid.Limits.of(3, force=[120.0, np.inf, 25.0])
+    terms = (*jid.Model(robot).terms, jid.ConstantOffset())
+    model = jid.Model(robot.replace(limits=limits), terms)
+    return fit_of(model, possible(model), full=True)
+
+
+def held(fit, m, *, drives):
+    """Torques of the parts that a simulator holds."""
+    model, p = fit.base.model, fit.standard_parameters.copy()
+    p[10 * model.robot.joints :] = 0.0
+    forces = np.asarray(model.inverse_dynamics(p, m))
+    if drives:
+        joints = Joints.of(fit)
+        forces = forces + joints.armature * m.qdd + joints.damping * m.qd
+    return forces
+
+
+def pinocchio_torques(pin, model, m):
+    data, order = model.createData(), []
+    for v in zip(m.q, m.qd, m.qdd, strict=True):
+        q = pin.neutral(model)
+        for j, joint in enumerate(model.joints):
+            if joint.nq == 2:
+                q[joint.idx_q : joint.idx_q + 2] = np.cos(v[0][j - 1]), np.sin(v[0][j - 1])
+            elif joint.nq == 1:
+                q[joint.idx_q] = v[0][j - 1]
+        order.append(pin.rnea(model, data, q, v[1], v[2]).copy())
+    return np.array(order)
+
+
+def test_the_urdf_gives_the_same_torques_in_pinocchio(fit, source, tmp_path):
+    pin = pytest.importorskip("pinocchio")
+    path = jid.export_urdf(fit, source, tmp_path / "new" / "arm.urdf")
+    model = pin.buildModelFromUrdf(str(path))
+    assert list(model.names)[1:] == ["rail", "shoulder", "elbow"]
+    m, joints = motion(3, 40), Joints.of(fit)
+    wanted = held(fit, m, drives=False)
+    np.testing.assert_allclose(
+        pinocchio_torques(pin, model, m), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max()
+    )
+    np.testing.assert_array_equal(model.damping, joints.damping)
+    np.testing.assert_array_equal(model.friction, joints.friction)
+    np.testing.assert_array_equal(model.effortLimit[[0, 2]], [120.0, 25.0])
+    claimed = jid.urdf_parameters(path)
+    np.testing.assert_allclose(claimed, fit.standard_parameters[:30], rtol=1e-12, atol=1e-12)
+
+
+def test_everything_else_in_the_urdf_is_untouched(fit, source, tmp_path):
+    path = jid.export_urdf(fit, source, tmp_path / "arm.urdf")
+
+    def rest(file):
+        root = etree.parse(str(file), etree.XMLParser(remove_blank_text=True)).getroot()
+        for tag in ("inertial", "dynamics"):
+            for element in list(root.iter(tag)):
+                element.getparent().remove(element)
+        for limit in root.iter("limit"):
+            limit.attrib.pop("effort")
+        for comment in root.xpath("//comment()"):
+            if "Inertias and friction" in comment.text:
+                root.remove(comment)
+        return etree.tostring(root, method="c14n")
+
+    assert rest(path) == rest(source)
+    text = path.read_text("utf-8")
+    assert "<!-- kept -->" in text
+    assert f"{fit.checksum}. Not in this file: Ia1, Ia2, Ia3, fo1, fo2, fo3." in text
+    assert path.read_bytes() == jid.export_urdf(fit, path, tmp_path / "b.urdf").read_bytes()
+
+
+def test_a_urdf_of_another_robot_is_refused(fit, source, tmp_path):
+    source.write_text(URDF.replace('"elbow"', '"knee"'), "utf-8")
+    with pytest.raises(ValueError, match="has the joints rail, shoulder, knee"):
+        jid.export_urdf(fit, source, tmp_path / "arm.urdf")
+    source.write_text(URDF.replace("0 0.3 0", "0 0.4 0"), "utf-8")
+    with pytest.raises(ValueError, match=r"another geometry .* \(offset differs\)"):
+        jid.export_urdf(fit, source, tmp_path / "arm.urdf")
+    assert not (tmp_path / "arm.urdf").exists()
+
+
+def mujoco_torques(mujoco, model, m):
+    flags = mujoco.mjtDisableBit
+    model.opt.disableflags |= flags.mjDSBL_FRICTIONLOSS | flags.mjDSBL_LIMIT
+    data, found = mujoco.MjData(model), []
+    for q, qd, qdd in zip(m.q, m.qd, m.qdd, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
+        mujoco.mj_inverse(model, data)
+        found.append(data.qfrc_inverse.copy())
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", ["small", "panda", "tx90l_on_rail"])
+def test_the_mjcf_gives_the_same_torques_in_mujoco(fit, tmp_path, name):
+    mujoco = pytest.importorskip("mujoco")
+    if name != "small":
+        model = jid.Model(getattr(jid.robots, name)())
+        fit = fit_of(model, possible(model), full=True)
+    path = jid.export_mjcf(fit, tmp_path / "arm.xml")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    n, joints = fit.base.model.robot.joints, Joints.of(fit)
+    m = motion(n, 40)
+    wanted = held(fit, m, drives=True)
+    np.testing.assert_allclose(
+        mujoco_torques(mujoco, model, m), wanted, rtol=0, atol=1e-11 * np.abs(wanted).max()
+    )
+    np.testing.assert_array_equal(model.dof_armature, joints.armature)
+    np.testing.assert_array_equal(model.dof_damping, joints.damping)
+    np.testing.assert_array_equal(model.dof_frictionloss, joints.friction)
+    assert model.nu == n
+    assert fit.checksum in path.read_text("utf-8")
+
+
+def test_mjcf_of_any_robot_and_bodies(fit):
+    mujoco = pytest.importorskip("mujoco")
+    robot, bodies = fit.base.model.robot, fit.standard_parameters[:30].reshape(3, 10)
+    model = mujoco.MjModel.from_xml_string(mjcf_text(robot, bodies, damping=0.5, timestep=0.002))
+    assert model.opt.timestep == 0.002
+    np.testing.assert_array_equal(model.dof_damping, 0.5)
+
+
+def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, source):
+    pin = pytest.importorskip("pinocchio")
+    rows, m = jid.pinocchio_parameters(fit), motion(3, 20)
+    model = pin.buildModelFromUrdf(str(source))
+    for i, row in enumerate(rows):
+        model.inertias[i + 1] = pin.Inertia.FromDynamicParameters(row)
+        np.testing.assert_allclose(model.inertias[i + 1].toDynamicParameters(), row, atol=1e-12)
+    wanted = held(fit, m, drives=False)
+    np.testing.assert_allclose(
+        pinocchio_torques(pin, model, m), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max()
+    )
+
+
+def test_the_exported_function_takes_any_number_of_samples(fit):
+    exported = jid.exported_function(fit)
+    for samples in (1, 30):
+        m = motion(3, samples)
+        wanted = fit.predict(m)
+        np.testing.assert_allclose(exported.call(m.q, m.qd, m.qdd), wanted, rtol=1e-11, atol=1e-11)
+
+
+def test_a_file_of_the_exported_function_runs_without_jaxid(fit, tmp_path):
+    if importlib.util.find_spec("flatbuffers") is None:
+        with pytest.raises(RuntimeError, match="pip install flatbuffers"):
+            jid.export_jax(fit, tmp_path / "arm.bin")
+        return
+    path = jid.export_jax(fit, tmp_path / "arm.bin")
+    read, m = jax.export.deserialize(bytearray(path.read_bytes())), motion(3, 7)
+    found = read.call(m.q, m.qd, m.qdd)
+    np.testing.assert_allclose(found, fit.predict(m), rtol=1e-11, atol=1e-11)
+
+
+def as_urdf(fit, path):
+    jid.export_urdf(fit, path.parent / "small.urdf", path)
+
+
+@pytest.mark.parametrize("write", [jid.export_mjcf, as_urdf])
+@pytest.mark.parametrize("case", ["base", "body", "friction"])
+@pytest.mark.usefixtures("source")
+def test_what_could_not_exist_is_refused_with_the_way_out(fit, tmp_path, write, case):
+    p = fit.standard_parameters.copy()
+    if case == "body":
+        p[14] = -1.0
+    if case == "friction":
+        p[30] = -0.1
+    fit = changed(fit, full_parameters=None if case == "base" else p)
+    said = {"base": "only base parameters", "body": "body 2 could not", "friction": "fv1 is neg"}
+    with pytest.raises(ValueError, match=said[case]) as error:
+        write(fit, tmp_path / "out")
+    assert "`jid.PhysicallyConsistent()`" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
