@@ -15,10 +15,13 @@ from jaxtyping import install_import_hook
 
 install_import_hook("jaxid", "beartype.beartype")
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 # The same examples in every run, and no clock: a busy machine is no bug.
 settings.register_profile("jaxid", deadline=None, derandomize=True)
@@ -34,3 +37,15 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("measured data (../shared/data beside the project) are not here")
     return folder
+
+
+@pytest.fixture(scope="module")
+def blank_figures() -> Iterator[None]:
+    """Figures without layout or ink, for tests of what commands say and which files they write.
+
+    Figures take most of a report's time; `tests/report` looks at them.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
+        patch.setattr(FigureCanvasAgg, "draw", lambda canvas: canvas.get_renderer())
+        yield

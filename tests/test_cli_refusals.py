@@ -5,6 +5,8 @@ import json
 import pytest
 from test_cli import EXPERIMENT, folder, refused, run  # noqa: F401
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 KEYS = [
     ("[limits]\nforce = [80, 20]", "[limits]\nforce = [1e-300, 20]", "`force` must be above"),
     ("[limits]\nforce = [80, 20]", "[limits]\nforce = [80, 1e300]", "`force` must be below"),
@@ -84,3 +86,75 @@ def test_damaged_results(folder, run):  # noqa: F811
     first = whole["base_parameters"][0]
     assert first["name"]
     assert damaged(lambda c: c["base_parameters"][0].update(estimate="x"), "must hold numbers")
+
+
+def test_one_column_is_one_channel(folder, run):  # noqa: F811
+    swapped = 'angles = ["q1", "q2"]\nforces = ["tau1", "q2"]'
+    text = EXPERIMENT.replace('angles = "q{}"\nforces = "tau{}"', swapped)
+    (folder / "e.toml").write_text(text)
+    said = "the column `q2` of `a.csv` is used for `angles` and `forces`"
+    assert refused(run("inspect", "e.toml", "a.csv"), said)
+    (folder / "e.toml").write_text(text.replace('["tau1", "q2"]', '["tau1", "tau1"]'))
+    assert refused(run("inspect", "e.toml", "a.csv"), "the column `tau1` of `a.csv` is used twice")
+
+
+def test_numbers_that_nothing_measures(folder, run):  # noqa: F811
+    lines = (folder / "a.csv").read_text().splitlines()
+    lines[7] = "0.03,1e31,0,0,0"
+    (folder / "x.csv").write_text("\n".join(lines))
+    said = "column `q1` of `x.csv`, line 8, is 1e+31 in size, which nothing measures"
+    assert refused(run("inspect", "experiment.toml", "x.csv"), said)
+
+
+def test_an_option_that_needs_a_log(folder, run):  # noqa: F811
+    for end in ((), ("-o", "report")):
+        result = run("identify", "experiment.toml", "a.csv", "--verify", *end)
+        assert refused(result, "`--verify` needs at least one log behind it, but has none")
+    assert not (folder / "report").exists()
+
+
+def test_rates_that_cannot_be(folder, run):  # noqa: F811
+    (folder / "e.toml").write_text(EXPERIMENT.replace('"t"', '"t"\ntime_unit = "s"'))
+    lines = (folder / "a.csv").read_text().splitlines()
+    rows = [line.split(",", 1) for line in lines[1:]]
+    slow = [lines[0], *(f"{1e3 * float(t):g},{rest}" for t, rest in rows)]
+    (folder / "x.csv").write_text("\n".join(slow))
+    said = "sampling rate of 0.2 Hz: take a lower one, or log faster than 20 Hz. Few robots log so"
+    assert refused(run("inspect", "e.toml", "x.csv"), said, "check `time_unit`")
+
+
+def test_a_urdf_that_is_not_there(folder, run):  # noqa: F811
+    text = EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "lost.urdf"')
+    (folder / "e.toml").write_text(text)
+    said = "`lost.urdf` is no file: paths in an experiment file are relative to its folder; mend"
+    assert refused(run("inspect", "e.toml"), "`robot.urdf`", said)
+
+
+def test_results_that_cannot_run_code(folder, run):  # noqa: F811
+    import numpy as np
+
+    assert run("identify", "experiment.toml", "a.csv", "-o", "r")[0] == 0
+    path = folder / "r" / "run.npz"
+    for content in (b"", b"PK", path.read_bytes()[:900]):
+        path.write_bytes(content)
+        result = run("identify", "experiment.toml", "r", "b.csv", "-o", "s")
+        assert refused(result, "must hold a run (`jaxid-run/1`)")
+    np.savez(path, head=np.array([{"a": 1}], dtype=object))
+    result = run("identify", "experiment.toml", "r", "b.csv", "-o", "s")
+    assert refused(result, "must hold a run (`jaxid-run/1`)")
+    assert not (folder / "s").exists()
+
+
+def test_a_disk_without_room(folder, run, monkeypatch):  # noqa: F811
+    import errno
+    import os
+
+    from jaxid.report import write
+
+    def full(path, content):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(write, "write_json", full)
+    result = run("identify", "experiment.toml", "a.csv")
+    assert refused(result, "No space left on device: nothing was written; make room")
+    assert not (folder / "report").exists()

@@ -12,6 +12,8 @@ import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
 from jaxid.experiment.experiment import load_experiment
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SPATIAL = """\
 [robot]
 name = "spatial"
@@ -199,6 +201,58 @@ def test_folders_that_hold_no_run_are_refused(folder, run):  # noqa: F811
         run("payload", "experiment.toml", "a.csv", "--loaded", "d.csv", "--body", "elbow"),
         "`--body` must be one of joint1, joint2",
     )
+
+
+def test_searches_that_two_runs_cannot_share_are_refused(folder, run):  # noqa: F811
+    logs = "a.csv", "--loaded", "b.csv"
+    (folder / "shapes.toml").write_text(EXPERIMENT + "[estimator]\nnonlinear_friction = true\n")
+    said = "`estimator.nonlinear_friction` would find other shapes of friction in each run"
+    assert refused(run("payload", "shapes.toml", *logs), said)
+    (folder / "steps.toml").write_text(EXPERIMENT + '[estimator]\nkind = "stepwise"\n')
+    assert refused(run("payload", "steps.toml", *logs), '`estimator.kind = "stepwise"`')
+    (folder / "huber.toml").write_text(EXPERIMENT + '[estimator]\nkind = "huber"\n')
+    code, out, err = run("payload", "huber.toml", *logs)
+    assert (code, err) == (0, "")
+    assert "all runs are weighted least squares here" in out
+
+
+def test_states_share_inertia(folder, run):  # noqa: F811
+    write_log(folder / "warm.csv", 7)
+    code, out, err = run("states", "experiment.toml", "a.csv", "warm.csv")
+    assert (code, err) == (0, "")
+    found = json.loads((folder / "states" / "states.json").read_text(encoding="utf-8"))
+    assert found["states"] == ["a", "warm"]
+    described = load_experiment(folder / "experiment.toml")
+    base, read = described.base, lambda log: described.observe(described.read(folder / log))
+    runs = [
+        jid.Run.of(base, read(log), weights=described.plain.weights, name=name)
+        for log, name in (("a.csv", "a"), ("warm.csv", "warm"))
+    ]
+    expected = jid.identify_states(runs)
+    estimates = {row["name"]: row["estimate"] for row in found["parameters"]}
+    assert tuple(estimates) == expected.names
+    np.testing.assert_allclose(
+        list(estimates.values()), expected.estimates.parameters, rtol=1e-9, atol=1e-12
+    )
+    assert set(found["shared"]) == {base.names[k] for k in expected.shared}
+    assert "fv1 (warm)" in out
+    said = "one log or report for each of two or more states, with different names"
+    assert refused(run("states", "experiment.toml", "a.csv"), said)
+    assert refused(run("states", "experiment.toml", "a.csv", "a.csv"), said)
+
+
+def test_essential_parameters_on_the_command_line(folder, run):  # noqa: F811
+    (folder / "essential.toml").write_text(EXPERIMENT + "[estimator]\nessential = 0.3\n")
+    assert run("identify", "experiment.toml", "a.csv", "-o", "all")[0] == 0
+    code, out, err = run("identify", "essential.toml", "a.csv", "-o", "few")
+    assert (code, err) == (0, "")
+    few, every = (len(result(folder, k)["fit"]["covariance"]) for k in ("few", "all"))
+    assert 0 < few < every
+    said = " ".join(out.split())
+    assert f"{few} of {every} base parameters are essential" in said
+    assert "left out, and taken as zero: " in said
+    assert "`run.npz`, with which later logs" in said
+    assert refused(run("identify", "essential.toml", "all", "b.csv"), "for essential parameters")
 
 
 def test_a_payload_of_which_only_a_part_is_seen(folder, run):  # noqa: F811

@@ -40,6 +40,7 @@ acceleration = [4]
 harmonics = 2
 starts = 2
 polish = 1
+kicks = 1
 samples = 100
 seed = 5
 """
@@ -100,6 +101,9 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "motion.ros.yaml",
         "motion/end_effector.png",
         "motion/joints.png",
+        "motion/path.png",
+        "motion/poses.png",
+        "motion/report.html",
     ]
     t, q, qd, qdd = table(written / "plan" / "motion.csv").T
     np.testing.assert_allclose([qd[0], qdd[0], qd[-1], qdd[-1]], 0.0, atol=1e-12)
@@ -154,6 +158,21 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written
     assert largest_force("weak") <= 6.0 < 7.5 < largest_force("plan")
     assert "the force of joint `hinge` keeps its limit" in out
     assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
+
+
+def test_a_spline_in_place_of_a_series(written, run):
+    path = with_keys(written, "spline.toml", "spline = { points = 6, duration = 5.0 }")
+    code, out, err = run("excite", path, "-o", "spline/motion.csv")
+    assert code == 0, err
+    t, q, qd, qdd = table(written / "spline" / "motion.csv").T
+    assert t[-1] == pytest.approx(5.0)
+    np.testing.assert_allclose([qd[0], qdd[0], qd[-1], qdd[-1]], 0.0, atol=1e-9)
+    rounding = 1 + 1e-14  # the start may lie on a limit, and is written in decimals
+    assert q.min() >= -2 * rounding
+    assert q.max() <= 1.5 * rounding
+    assert 1.0 < np.abs(qd).max() <= 2
+    assert np.abs(qdd).max() <= 4
+    assert "use of the limits [%]" in out
 
 
 def test_an_impossible_motion_is_diagnosed(written, run):
@@ -215,6 +234,8 @@ def test_every_criterion_can_be_compared(written, run, monkeypatch):
     [
         ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
         ("rest = true", "`harmonics` must be at least"),
+        ("rest = true\nspline = {}", "a `spline` rests at its ends"),
+        ("spline = { points = 3 }", "`excitation.spline.points`"),
         ("noise = [1, 2]", "`noise` must hold one positive number for each joint (1)"),
         ('nominal = "nowhere"', "holds no `result.json`"),
         ('earlier = ["nowhere.json"]', "nowhere.json"),

@@ -340,10 +340,26 @@ def test_estimators_of_files(load, tmp_path):
         zip(experiment.model.parameter_names, experiment.estimator.parameters, strict=True)
     )
     assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [5.0, 7.0, 7.0, 6.0, 0.0]
-    consistent = load(robot + 'kind = "consistent"\nmass_max = [20, 30]\ntotal_mass = 12').estimator
+    bounds = """kind = "consistent"
+mass_min = 0.5
+mass_max = [20, 30]
+radius = [0.8, 0.9]
+centre_min = [[-0.2, -inf, -0.1], [-0.3, -0.1, -0.1]]
+centre_max = [0.2, 0.3, 0.4]
+ellipsoid_centre = [0.0, 0.1, 0.0]
+ellipsoid_axes = [[inf, inf, inf], [0.3, 0.2, 0.2]]
+total_mass = 12
+"""
+    consistent = load(robot + bounds).estimator
     assert consistent.pull.bodies[1, 0] == 7.0
     assert consistent.bounds.total_mass == 12.0
+    np.testing.assert_array_equal(consistent.bounds.mass_min, [0.5, 0.5])
     np.testing.assert_array_equal(consistent.bounds.mass_max, [20.0, 30.0])
+    np.testing.assert_array_equal(consistent.bounds.radius, [0.8, 0.9])
+    np.testing.assert_array_equal(consistent.bounds.centre_min[:, 1], [-np.inf, -0.1])
+    np.testing.assert_array_equal(consistent.bounds.centre_max, [[0.2, 0.3, 0.4]] * 2)
+    np.testing.assert_array_equal(consistent.bounds.ellipsoid_centre, [[0.0, 0.1, 0.0]] * 2)
+    np.testing.assert_array_equal(consistent.bounds.has_ellipsoid, [False, True])
 
 
 @pytest.mark.parametrize("name", ["spectral", "jackknife", "independent"])
@@ -376,6 +392,7 @@ def test_logs_are_read_cropped_and_filtered(load, tmp_path):
     )
 
 
+BODIES = '[estimator]\nkind = "consistent"\n'
 REFUSALS = [
     ("robot = 3", "`robot` must be a table, but is 3."),
     ("[robt]\nurdf = 'a'", "`robt` is no known key: did you mean `robot`?"),
@@ -527,6 +544,23 @@ REFUSALS = [
         ARM + "[estimator]\nridge = 0.1\nprior = 'urdf'",
         "takes the inertias of the robot's URDF file",
     ),
+    (ARM + BODIES + "mass_min = -1", "`estimator.mass_min` must be at least 0, but is -1."),
+    (ARM + BODIES + "mass_min = [1, 2, 3]", "`mass_min` must hold numbers for all bodies or for e"),
+    (ARM + BODIES + "mass_min = 2\nmass_max = 1", "`mass_min` must lie between 0 and `mass_max`"),
+    (ARM + BODIES + "radius = 0", "`estimator.radius` must be positive, but is 0."),
+    (ARM + BODIES + "radius = [1, 2, 3]", "`radius` must hold numbers for all bodies or for each"),
+    (ARM + BODIES + "centre_min = [0, 0]", "`centre_min` must hold three numbers for all bodies, "),
+    (ARM + BODIES + "centre_max = [[1, 1, 1]]", "a list of three for each of the 2 bodies."),
+    (
+        ARM + BODIES + "centre_min = [1, 0, 0]\ncentre_max = [0, 1, 1]",
+        "`centre_min` must be below `centre_max` for every body",
+    ),
+    (ARM + BODIES + "ellipsoid_centre = [0, 0, 0]", "`ellipsoid_centre` needs `ellipsoid_axes`"),
+    (ARM + BODIES + "ellipsoid_axes = [0, 1, 1]", "`ellipsoid_axes` must be positive"),
+    (ARM + "[estimator]\nradius = 1", '`estimator`: `radius` belongs to `kind = "consistent"`'),
+    (ARM + "[estimator]\nessential = 1", "`estimator.essential` must be below 1, but is 1."),
+    (ARM + BODIES + "essential = 0.1", '`essential` belongs to `kind = "weighted" or "least_s'),
+    (ARM + "[estimator]\nessential = 0.1\nridge = 0.1", "`essential` does not go with `ridge`"),
     (ARM + "[estimator]\ntruncate = 1", "`estimator.truncate` must be below 1, but is 1."),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge` must be a number or"),
     (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`estimator`: give `truncate` or `ridge`"),

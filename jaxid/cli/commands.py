@@ -11,8 +11,18 @@ import typer
 from rich.text import Text
 
 from jaxid.cli import runs
-from jaxid.cli.options import ExperimentFile, Force, SpreadLogs, open_console, open_stages
+from jaxid.cli.demo import demo
+from jaxid.cli.export import export
+from jaxid.cli.options import (
+    ExperimentFile,
+    Force,
+    SpreadLogs,
+    command_line,
+    open_console,
+    open_stages,
+)
 from jaxid.experiment import terminal
+from jaxid.experiment.doctor import fitted_doubts
 from jaxid.experiment.excite import design, side_by_side, write
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
@@ -21,7 +31,6 @@ from jaxid.experiment.folder import (
     refuse_foreign_folder,
     refuse_foreign_table,
 )
-from jaxid.experiment.lateness import delay_doubts
 from jaxid.experiment.loading import Loaded, choose, load_log, observe_all
 from jaxid.experiment.mistakes import likely_mistake
 from jaxid.experiment.progress import Stages, designing
@@ -43,6 +52,11 @@ from jaxid.report.write import write_report
 from jaxid.validation.validate import validate
 
 DISTRIBUTION = "jaxid-robotics"
+
+KEPT = (
+    "`run.npz`, with which later logs, `payload` and `gains` go on, keeps weighted least squares "
+    "of the file's model, not this estimate."
+)
 
 app = typer.Typer(
     name="jaxid",
@@ -153,9 +167,8 @@ def inspect(
     terminal.show_robot(console, loaded)
     terminal.show_base(console, loaded.base)
     terminal.sentences(console, loaded.notes)
-    for log, fit, mistakes in seen:
+    for log, fit, doubts in seen:
         terminal.show_recording(console, log.recording)
-        doubts = (*negative_friction(fit), *mistakes)
         terminal.show_check(console, loaded.robot, log.check, doubts)
         console.print()
         terminal.show_rows(console, (log.observations,), fit)
@@ -169,8 +182,9 @@ def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fi
     base, observations = experiment.base, log.observations
     fit = estimate(base, observations, experiment.plain, progress)
     stage(f"looking for slips in {path.name}")
-    slips = likely_mistake(base, observations)
-    return log, fit, slips or delay_doubts(base, observations, fit)
+    held = log.recording.columns if isinstance(log.recording, LongLog) else log.recording
+    doubts = fitted_doubts(observations, fit, held.angles_on_motor_side, held.forces_on_motor_side)
+    return log, fit, doubts
 
 
 @app.command()
@@ -238,11 +252,14 @@ def identify(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the report.")
     ] = Path("report"),
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write the figures as PDF too, for papers.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """Estimate the parameters and write a report.
 
-    With their uncertainty, what the logs do not determine, torque errors and figures.
+    A page for the browser, with figures and a verdict; the same numbers for programs.
     """
     console = open_console()
     if split is not None and not 0 < split < 1:
@@ -282,6 +299,8 @@ def identify(
         rows = Rows.of(base, fitted, stage.through(sum(map(_samples, fitted))))
         fit = loaded.fit(rows, stage.through(sum(map(_samples, fitted))))
         run = Run.of_rows(rows, fit)
+        if not run.tells(fit):
+            said.append(KEPT)
         if reports:
             fit, run = _together(loaded, reports, fit, run)
         stage("predicting torques")
@@ -294,6 +313,9 @@ def identify(
             other = fit_rows(same, loaded.other_estimator)
             ways = None if loaded.single_axes is None else ("axis by axis", "at once")
             beside = Beside.of(other, [*fitted, *checked], ways)
+        sides = _sides(loaded)
+        slips = [f"{o.name}: {said}" for o in fitted for said in likely_mistake(base, o, *sides)]
+        suspected = (*negative_friction(fit), *slips)
         stage("writing the report")
         logs_said = [*(n for o in (*fitted, *checked) for n in o.notes), *said]
         files = write_report(
@@ -305,6 +327,7 @@ def identify(
             {
                 "experiment": str(experiment),
                 "experiment_text": loaded.text,
+                "command": command_line(experiment, given, others, split, output, pdf),
                 "identification": [str(p) for p in given],
                 "verification": [str(p) for p in others],
                 "split": split,
@@ -316,18 +339,19 @@ def identify(
             beside,
             choice,
             run,
+            (*doubts, *suspected),
+            pdf,
         )
     terminal.show_robot(console, loaded)
     console.print()
-    terminal.sentences(console, [*loaded.notes, *logs_said, *fit.notes])
+    terminal.show_notes(console, [*loaded.notes, *logs_said], fit)
     terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
     terminal.show_fit(console, fit)
     console.print()
     terminal.show_rows(console, fitted, fit)
     terminal.show_undetermined(console, fit, loaded.regularised)
     terminal.show_residuals(console, loaded.robot, fit)
-    slips = [f"{o.name}: {said}" for o in fitted for said in likely_mistake(base, o)]
-    terminal.sentences(console, (*negative_friction(fit), *slips), terminal.DOUBTFUL, "!")
+    terminal.sentences(console, suspected, terminal.DOUBTFUL, "!")
     terminal.show_consistency(console, loaded.robot, fit)
     terminal.show_validation(console, loaded.robot, found, len(fitted))
     if beside is not None:
@@ -338,13 +362,22 @@ def identify(
 def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -> tuple[Fit, Run]:
     """A run with what earlier reports know, as if all logs had been fitted at once."""
     if not run.tells(fit):
+        kind = fit.estimator if experiment.essential is None else "for essential parameters"
         raise ValueError(
             f"{experiment.path.name}: earlier reports can be added to plain least squares only, "
-            f"but the estimator is {fit.estimator}: leave `[estimator]` out, or give the logs "
+            f"but the estimator is {kind}: leave `[estimator]` out, or give the logs "
             "themselves."
         )
     whole = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), run])
     return whole.fit, whole
+
+
+def _sides(experiment: Experiment) -> tuple[bool, bool]:
+    """Whether angles and forces of its logs are the motors'."""
+    columns = experiment.columns
+    return columns is not None and columns.angles_on_motor_side, (
+        columns is not None and columns.forces_on_motor_side
+    )
 
 
 def _named(observations: Observations | LongLog, name: str) -> Observations | LongLog:
@@ -357,6 +390,9 @@ def _samples(observations: Observations | LongLog) -> int:
     return len(source(observations)[0].time)
 
 
+app.command()(demo)
 app.command()(runs.compare)
 app.command(cls=SpreadLogs)(runs.payload)
 app.command(cls=SpreadLogs)(runs.gains)
+app.command()(runs.states)
+app.command()(export)

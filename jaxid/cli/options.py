@@ -1,5 +1,6 @@
 """What the commands share: options, the terminal, and how far a command is."""
 
+import shlex
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
@@ -31,11 +32,17 @@ class SpreadLogs(TyperCommand):
     SPREAD = ("--verify", "--loaded")
 
     def parse_args(self, ctx, args):
-        """Repeats the option before each log that follows it."""
+        """Repeats the option before each log that follows it.
+
+        Raises:
+            ValueError: If none follows.
+        """
         spread, option = [], None
-        for arg in args:
+        for arg, after in zip(args, [*args[1:], "-"], strict=True):
             if arg in self.SPREAD:
                 option = arg
+                if after.startswith("-"):
+                    raise ValueError(f"`{arg}` needs at least one log behind it, but has none.")
             elif arg.startswith("-"):
                 name, given, _ = arg.partition("=")
                 option = name if given and name in self.SPREAD else None
@@ -64,3 +71,28 @@ def open_stages(total: int) -> AbstractContextManager[Stages]:
         total: Number of stages.
     """
     return stages(open_console(stderr=True), total)
+
+
+def command_line(
+    experiment: Path,
+    logs: list[Path],
+    verify: list[Path],
+    split: float | None,
+    output: Path,
+    pdf: bool,
+) -> str:
+    """The line that makes a report of `jaxid identify` again.
+
+    Args:
+        experiment: The experiment file.
+        logs: To identify with.
+        verify: To verify with.
+        split: Share of a log to identify with.
+        output: The report's folder.
+        pdf: Whether figures are written as PDF too.
+    """
+    words = ["jaxid", "identify", str(experiment), *map(str, logs)]
+    words += ["--verify", *map(str, verify)] if verify else []
+    words += ["--split", f"{split:g}"] if split is not None else []
+    words += ["-o", str(output), *(["--pdf"] if pdf else [])]
+    return shlex.join(words)

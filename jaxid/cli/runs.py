@@ -1,5 +1,6 @@
-"""Commands for several runs of one robot: `jaxid compare`, `payload` and `gains`."""
+"""Commands for several runs of one robot: `jaxid compare`, `payload`, `gains` and `states`."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -13,13 +14,14 @@ from jaxid.experiment import terminal
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
 from jaxid.experiment.loading import choose
-from jaxid.experiment.runs import is_report, read_run
+from jaxid.experiment.runs import is_report, read_run, require_plain
 from jaxid.identification.runs.comparison import Comparison
 from jaxid.identification.runs.drive_gains import identify_drive_gains
 from jaxid.identification.runs.payload import Payload, identify_payload
 from jaxid.identification.runs.run import Run
+from jaxid.identification.runs.states import identify_states
 from jaxid.report.compared_files import read_estimates, write_comparison
-from jaxid.report.found import GAINS, PAYLOAD, estimate_table, write_found
+from jaxid.report.found import GAINS, PAYLOAD, STATES, estimate_table, write_found
 from jaxid.report.numbers import significant
 
 Unloaded = Annotated[
@@ -32,6 +34,8 @@ Loaded = Annotated[
     list[Path],
     typer.Option("--loaded", metavar="LOG...", help="Logs with the load, or folders of reports."),
 ]
+UNLIKELY = 0.01
+"""Chance that states share what they should, of 1, below which that needs a word."""
 UNUSUAL = 4.0
 """Distance of an estimate from what could exist, in standard deviations, that needs a word."""
 
@@ -153,6 +157,57 @@ def gains(
     terminal.show_files(console, output, [p.name for p in files])
 
 
+def states(
+    experiment: ExperimentFile,
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Logs, or folders of reports: one for each state, like cold and warm.",
+            metavar="LOG",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the result.")
+    ] = Path("states"),
+    force: Force = False,
+) -> None:
+    """Fit several states of a robot at once: one inertia, friction for each.
+
+    Like cold and warm. Friction and offsets are each state's own, all else is shared.
+    """
+    refuse_foreign_folder(output, force)
+    described = load_experiment(experiment)
+    names = [path.resolve().stem for path in logs]
+    if len(set(names)) < max(len(names), 2):
+        raise ValueError(
+            f"give one log or report for each of two or more states, with different names: they "
+            f"name the states, but are {', '.join(names)}."
+        )
+    runs, doubts = _runs(described, [[path] for path in logs], names)
+    found = identify_states(runs)
+    chance = found.sharing[1]
+    content = {
+        "states": found.states,
+        "shared": [found.base.names[k] for k in found.shared],
+        "varying": [found.base.names[k] for k in found.varying],
+        "sharing_chance": chance,
+    }
+    files = write_found(output, STATES, [found.estimates], content, {"states": logs})
+    console = open_console()
+    terminal.heading(console, "what all states share, then what each has for itself")
+    console.print(estimate_table(found.estimates))
+    for other in names[1:]:
+        terminal.show_comparison(console, found.compare(names[0], other))
+    console.print()
+    if chance < UNLIKELY:
+        doubts.append(
+            "the states do not agree on what they share (chance "
+            f"{100 * chance:.2g} %): something else than friction and offsets differs"
+        )
+    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
+    terminal.show_files(console, output, [p.name for p in files])
+
+
 def _pair(
     experiment: Experiment, logs: list[Path], loaded: list[Path]
 ) -> tuple[tuple[Run, Run], list[str]]:
@@ -161,15 +216,27 @@ def _pair(
         raise ValueError(
             f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
         )
-    files = [p for p in (*logs, *loaded) if not is_report(p)]
+    runs, doubts = _runs(experiment, [logs, loaded], ["unloaded", "loaded"])
+    return (runs[0], runs[1]), doubts
+
+
+def _runs(
+    experiment: Experiment, each: list[list[Path]], names: list[str]
+) -> tuple[list[Run], list[str]]:
+    """A run of the logs and reports of each state, and doubts."""
+    doubts = [*require_plain(experiment)]
+    files = [p for paths in each for p in paths if not is_report(p)]
     choices = len(files) + 1 if experiment.candidates else 0
-    with open_stages(3 + choices + 2 * len(files)) as stage:
+    runs = []
+    with open_stages(1 + len(each) + choices + 2 * len(files)) as stage:
         stage("finding base parameters")
         _ = experiment.base
         experiment, _ = choose(experiment, files, stage)
-        without, first = read_run(experiment, logs, stage, "unloaded")
-        laden, second = read_run(experiment, loaded, stage, "loaded")
-    return (without, laden), [*first, *second]
+        for paths, name in zip(each, names, strict=True):
+            run, said = read_run(experiment, paths, stage, name)
+            runs.append(dataclasses.replace(run, name=name))
+            doubts += said
+    return runs, doubts
 
 
 def _body(experiment: Experiment, joint: str | None) -> int | None:

@@ -16,9 +16,10 @@ SLOWEST, FASTEST = 5.0, 5e4
 """Samples in a second outside of which the unit of the time is doubtful [Hz]."""
 STANDING = 0.01
 """Part of a joint's largest speed below which it stands."""
-BAND, PILED, OFTEN = 0.02, 3.0, 0.01
+BAND, LEVELS, PILED, OFTEN = 0.02, 3, 3.0, 0.005
 """Forces are cut off where more than `PILED` times as many samples lie on the largest value as in
-the `BAND` of the signal's range next to it, and more than a share `OFTEN` of all."""
+the `BAND` of the signal's range next to it, or on the next `LEVELS` values, and more than a share
+`OFTEN` of all."""
 
 
 def rate_doubts(sample_time: float) -> list[str]:
@@ -99,8 +100,10 @@ def stuck_doubts(robot: Robot, recording: Recording) -> list[str]:
         moving = f[speed > STANDING * speed.max(initial=0.0)]
         band = BAND * (high - low)
         for end, near in ((high, moving > high - band), (low, moving < low + band)):
-            on = int(np.count_nonzero(moving == end))
-            if on > OFTEN * len(f) and on > PILED * (np.count_nonzero(near) - on):
+            values, counts = np.unique(moving[near], return_counts=True)
+            nearest = np.argsort(np.abs(values - end))
+            on, beside = int(np.count_nonzero(moving == end)), counts[nearest][1 : 1 + LEVELS]
+            if on > OFTEN * len(f) and on > PILED * beside.sum():
                 said.append(
                     f"the forces of joint `{name}` stay at {end:.3g} in {on} samples in which it "
                     "moves: a drive or a sensor is at its limit there; leave that part out "

@@ -6,10 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.dynamics.model import Model
+from jaxid.experiment.consistency_tables import BOUNDS, build_consistent
 from jaxid.experiment.tables import EstimatorTable, RobotTable
-from jaxid.identification.consistency.bounds import BodyBounds
-from jaxid.identification.consistency.estimator import PhysicallyConsistent
-from jaxid.identification.consistency.priors import EntropicPull
 from jaxid.identification.correlated import GeneralisedLeastSquares
 from jaxid.identification.estimators import (
     AbstractEstimator,
@@ -50,8 +48,8 @@ BELONGS = {
     "reference_start": ("instrumental",),
     "margin": ("consistent",),
     "pull": ("consistent",),
-    "mass_max": ("consistent",),
-    "total_mass": ("consistent",),
+    **dict.fromkeys(BOUNDS, ("consistent",)),
+    "essential": ("weighted", "least_squares", "huber", "tukey"),
 }
 """The kinds of estimators that know a key; the others refuse it."""
 
@@ -114,7 +112,7 @@ def build_estimator(
             estimator = _instrumental(table, weights, path)
         case "consistent":
             return Chosen(
-                _consistent(table, robot, weights, bodies), plain, _uncertainty(table), notes
+                build_consistent(table, robot, weights, bodies), plain, _uncertainty(table), notes
             )
     if bodies is not None:
         if table.ridge is None and table.truncate is None:
@@ -132,7 +130,6 @@ def _refuse_foreign_keys(table: EstimatorTable) -> None:
             raise ValueError(
                 f"`{key}` belongs to `kind = {known}`: leave it out, or change `kind`."
             )
-
     if table.nonlinear_friction:
         if table.kind not in ("weighted", "least_squares"):
             raise ValueError(
@@ -142,6 +139,11 @@ def _refuse_foreign_keys(table: EstimatorTable) -> None:
             raise ValueError(
                 "`nonlinear_friction` goes with neither `prior` nor `uncertainty`: leave them out."
             )
+    if table.essential is not None:
+        others = ("nonlinear_friction", "prior", "ridge", "truncate")
+        both = next((key for key in others if getattr(table, key)), None)
+        if both is not None:
+            raise ValueError(f"`essential` does not go with `{both}`: choose one.")
 
 
 def build_single_axes(table: EstimatorTable, path: Path) -> tuple[Path, ...] | None:
@@ -225,23 +227,3 @@ def _instrumental(
         weights,
         tuple(float(x) for x in (starts if isinstance(starts, list) else [starts])),
     )
-
-
-def _consistent(
-    table: EstimatorTable,
-    robot: Robot,
-    weights: AbstractWeights,
-    bodies: Float[np.ndarray, "bodies 10"] | None,
-) -> PhysicallyConsistent:
-    bounds = None
-    if table.mass_max is not None or table.total_mass is not None:
-        bounds = BodyBounds.from_geometry(robot)
-        if table.mass_max is not None:
-            bounds = bounds.replace(mass_max=table.mass_max)
-        if table.total_mass is not None:
-            bounds = bounds.replace(total_mass=table.total_mass)
-    pull = None
-    if table.pull is not None or bodies is not None:
-        pull = EntropicPull(bodies, 1.0 if table.pull is None else table.pull)
-    margin = 0.0 if table.margin is None else table.margin
-    return PhysicallyConsistent(weights, bounds, margin, pull)

@@ -30,6 +30,7 @@ from jaxid.trajectory.basis import AbstractBasis, FourierBasis
 from jaxid.trajectory.files import load_trajectory
 from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRestBasis
+from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.types import Float
 
 CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
@@ -62,7 +63,16 @@ def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
         table: Of the experiment file.
         constrained: Whether there is more to keep than limits of joints: then leads are designed
             together with the motion, so that they keep it too.
+
+    Raises:
+        ValueError: If two kinds are asked for.
     """
+    if table.spline is not None:
+        if table.rest:
+            raise ValueError(
+                "`rest` is for Fourier series, and a `spline` rests at its ends: leave one out."
+            )
+        return RestToRestSplineBasis(table.spline.points, table.spline.duration)
     if table.rest:
         return RestToRestBasis(table.harmonics, table.omega)
     kind = LeadsBasis if constrained and table.leads else FourierBasis

@@ -20,7 +20,7 @@ from jaxid.experiment.excitation_tables import (
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.robot_tables import within
 from jaxid.files import written_whole
-from jaxid.report.excitation import write_pictures
+from jaxid.report.excited import write_pictures
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.files import save_trajectory, write_csv
 from jaxid.trajectory.leads import with_leads
@@ -70,6 +70,7 @@ def design(
             experiment.base,
             criterion=CRITERIA[experiment.excitation.criterion](),
             polish=min(experiment.excitation.polish, experiment.excitation.starts),
+            kicks=experiment.excitation.kicks,
             starts=experiment.excitation.starts,
             progress=progress,
             state=state,
@@ -151,7 +152,8 @@ def _played(experiment: Experiment, plan: ExcitationPlan) -> Excited:
     motion, table, times = plan.trajectory, experiment.excitation, _measured(plan)
     window, refused = (float(times[0]), float(times[-1])), ""
     # Where constraints were found, leads were designed together with the motion.
-    if table.leads and not table.rest and not plan.findings:
+    resting = table.rest or table.spline is not None
+    if table.leads and not resting and not plan.findings:
         robot = experiment.robot.replace(limits=plan.limits.limits)
         series = FourierBasis(table.harmonics, table.omega).trajectory(plan.numbers)
         try:

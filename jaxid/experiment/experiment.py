@@ -23,6 +23,7 @@ from jaxid.experiment.method_tables import (
 from jaxid.experiment.reading import read_tables
 from jaxid.experiment.robot_tables import build_load, build_robot, within
 from jaxid.experiment.tables import ExcitationTable, RecordingTable, RobotTable
+from jaxid.identification.essential import essential_parameters
 from jaxid.identification.estimators import (
     AbstractEstimator,
     LeastSquares,
@@ -83,6 +84,7 @@ class Experiment:
         uncertainty: How standard deviations are found.
         regularised: Whether the estimator keeps small what the logs do not decide.
         single_axes: Logs of single axes if axes are identified one by one; None if at once.
+        essential: Held-out error that leaving parameters out may cost, of 1; None to keep all.
         linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
         candidates: Filters to choose from; none if the file names one.
         excitation: The table of the motion to design.
@@ -107,6 +109,7 @@ class Experiment:
     uncertainty: AbstractUncertainty
     regularised: bool
     single_axes: tuple[Path, ...] | None
+    essential: float | None
     linear: tuple[AbstractTerm, ...] | None
     candidates: tuple[FilterCandidate, ...]
     excitation: ExcitationTable
@@ -142,7 +145,13 @@ class Experiment:
             stepwise = Stepwise(alone, GivenWeights(weights))
             return fit_rows(rows, stepwise, uncertainty=self.uncertainty)
         if self.linear is None:
-            return fit_rows(rows, self.estimator, uncertainty=self.uncertainty)
+            fit = fit_rows(rows, self.estimator, uncertainty=self.uncertainty)
+            if self.essential is None:
+                return fit
+            found = essential_parameters(
+                fit, rows.recordings, cost=self.essential, uncertainty=self.uncertainty
+            )
+            return dataclasses.replace(found.fit, notes=(*found.fit.notes, *found.notes))
         linear = base_parameters(Model(self.robot, self.linear))
         estimator = NonlinearFriction(self.plain)
         found = identify_nonlinear(
@@ -318,6 +327,7 @@ def load_experiment(path: str | Path) -> Experiment:
         uncertainty=chosen.uncertainty,
         regularised=tables.estimator.ridge is not None or tables.estimator.truncate is not None,
         single_axes=single_axes,
+        essential=tables.estimator.essential,
         linear=linear,
         candidates=candidates,
         excitation=tables.excitation,

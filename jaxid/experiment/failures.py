@@ -1,6 +1,10 @@
 """Which errors a user can mend, and how they read in one sentence."""
 
 import dis
+import errno
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a disk that has no room for a result."""
 
 
 def is_for_the_user(error: Exception) -> bool:
@@ -20,6 +24,12 @@ def is_for_the_user(error: Exception) -> bool:
 
 def sentence(error: Exception) -> str:
     """What an error says, with the file that it is about."""
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        where = f"`{error.filename}`: " if error.filename else ""
+        return (
+            f"{where}{error.strerror}: nothing was written; make room, or choose another folder "
+            "with -o."
+        )
     if isinstance(error, OSError) and error.strerror:
         where = f"`{error.filename}`: " if error.filename else ""
         return f"{where}{error.strerror}."

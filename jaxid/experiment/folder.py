@@ -6,6 +6,8 @@ import stat
 import sys
 from pathlib import Path
 
+from jaxid.experiment.demo import DEMO
+from jaxid.files import unfinished
 from jaxid.report import compared_files, content, found
 from jaxid.trajectory.files import load_trajectory
 
@@ -14,6 +16,8 @@ WRITTEN = (
     ("comparison.json", compared_files.SCHEMA),
     ("payload.json", found.PAYLOAD),
     ("gains.json", found.GAINS),
+    ("states.json", found.STATES),
+    ("demo.json", DEMO),
 )
 """Files by which earlier results are known, and their schemas."""
 
@@ -66,7 +70,9 @@ def _is_trajectory(path: Path) -> bool:
 
 
 def _is_report(folder: Path) -> bool:
-    return any(_has(folder / file, schema) for file, schema in WRITTEN)
+    # While a report takes the place of another, and where that was killed, both are hidden.
+    places = (folder, *unfinished(folder))
+    return any(_has(place / file, schema) for place in places for file, schema in WRITTEN)
 
 
 def _has(path: Path, schema: str) -> bool:

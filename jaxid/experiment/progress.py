@@ -20,7 +20,8 @@ class _Speed(ProgressColumn):
             return Text("")
         done = 100 * task.completed / (task.total or 1.0)
         left = "" if task.time_remaining is None else f", {_clock(float(task.time_remaining))} left"
-        return Text(f"{done:3.0f} %, {_large(float(task.speed))} rows/s{left}")
+        speed = f", {_large(float(task.speed))} rows/s" if task.fields.get("rows") else ""
+        return Text(f"{done:3.0f} %{speed}{left}")
 
 
 def _clock(seconds: float) -> str:
@@ -46,10 +47,17 @@ class Stages:
 
     def through(self, samples: int) -> Told:
         """Who is told which share of so many samples is done; a second bar shows it."""
-        self._bar.reset(self._samples, total=samples, visible=False)
+        return self._counting(samples, rows=True)
+
+    def part(self) -> Told:
+        """Who is told which share of a stage is done; a second bar shows it."""
+        return self._counting(1, rows=False)
+
+    def _counting(self, total: int, rows: bool) -> Told:
+        self._bar.reset(self._samples, total=total, visible=False, samples=True, rows=rows)
 
         def progress(share: float) -> None:
-            self._bar.update(self._samples, completed=share * samples, visible=True)
+            self._bar.update(self._samples, completed=share * total, visible=True)
 
         return progress
 

@@ -114,6 +114,11 @@ def _source(table: RobotTable, path: Path) -> Robot:
     tolerance = SNAP_TOLERANCE if table.snap_tolerance is None else table.snap_tolerance
     with within(path.name, f"robot.{given[0]}"):
         if table.urdf is not None:
+            if not (path.parent / table.urdf).is_file():
+                raise ValueError(
+                    f"`{path.parent / table.urdf}` is no file: paths in an experiment file are "
+                    "relative to its folder; mend the path, or put the file there."
+                )
             return load_urdf(
                 path.parent / table.urdf,
                 tip=table.tip,

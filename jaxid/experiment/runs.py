@@ -39,6 +39,32 @@ def earlier_run(experiment: Experiment, folder: Path) -> Run:
     return load_run(path, experiment.base)
 
 
+def require_plain(experiment: Experiment) -> tuple[str, ...]:
+    """Refuses estimators whose search two runs cannot share, and says what counts for others.
+
+    Args:
+        experiment: Whose runs are looked at together.
+
+    Raises:
+        ValueError: If friction's shapes are to be found, or axes are identified one by one.
+    """
+    if experiment.linear is not None:
+        raise ValueError(
+            f"{experiment.path.name}: `estimator.nonlinear_friction` would find other shapes of "
+            "friction in each run: leave it out, and give both runs the shapes that `jaxid "
+            "identify` finds, as `epsilon` and `stribeck` of `model.coulomb`."
+        )
+    if experiment.single_axes is not None:
+        raise ValueError(
+            f'{experiment.path.name}: `estimator.kind = "stepwise"` does not tell how the errors '
+            "of two runs belong together: leave it out here."
+        )
+    plain = experiment.estimator is experiment.plain and not experiment.regularised
+    if plain and experiment.essential is None:
+        return ()
+    return ("all runs are weighted least squares here: the rest of `[estimator]` does not count",)
+
+
 def read_run(
     experiment: Experiment, paths: Sequence[Path], stage: Stages, name: str
 ) -> tuple[Run, list[str]]:

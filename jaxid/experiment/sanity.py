@@ -12,6 +12,7 @@ from jaxid.experiment.channels import (
     stuck_doubts,
     unit_doubts,
 )
+from jaxid.experiment.mistakes import FRICTION
 from jaxid.identification.fit import Fit
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
@@ -22,8 +23,8 @@ from jaxid.types import AnyArray, Float
 
 FAST, STRONG = 1.1, 1.2
 """Parts of the limits above which speeds and forces are doubtful."""
-FRICTION = ("fv", "fc")
-"""Parameters that are negative on no robot."""
+WEAK = 0.02
+"""Part of its largest force that some joint of a robot in motion needs at least."""
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
 STANDS = 2**18
@@ -157,7 +158,9 @@ class _Look:
         warnings = unit_doubts(robot, check.lowest, check.highest, not jumps)
         if not warnings:
             warnings = [w for j in range(robot.joints) for w in _range(robot, j, check)]
-        warnings += [w for j in range(robot.joints) for w in _joint(robot, j, check)]
+        warnings += (said := _all_forces(robot, check))
+        for j in range(robot.joints):
+            warnings += _joint(robot, j, check) + ([] if said else _force(robot, j, check))
         # Over a whole log, friction makes a robot consume energy.
         if self._power < -0.05 * np.sqrt(self._forces * self._velocities):
             warnings.append(
@@ -196,12 +199,6 @@ def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
             f"{float(limits.velocity[j]):.3g} {unit}/s: check the units of angles and time, or "
             "lower the filter's cut-off."
         )
-    known = float(robot.known_max_forces[j])
-    if check.force[j] > STRONG * known:
-        said.append(
-            f"joint `{name}` needs {check.force[j]:.3g} {robot.force_unit(j)}, but its limit is "
-            f"{known:.3g} {robot.force_unit(j)}: check `recording.force_unit` and `forces_side`."
-        )
     if check.highest[j] - check.lowest[j] < HARDLY:
         said.append(
             f"joint `{name}` moves by {check.highest[j] - check.lowest[j]:.2g} {unit} only: its "
@@ -210,6 +207,33 @@ def _joint(robot: Robot, j: int, check: LogCheck) -> list[str]:
     if check.force[j] == 0.0:
         said.append(f"the forces of joint `{name}` are zero throughout: is it the right column?")
     return said
+
+
+def _force(robot: Robot, j: int, check: LogCheck) -> list[str]:
+    name, unit, known = robot.joint_names[j], robot.force_unit(j), float(robot.known_max_forces[j])
+    if check.force[j] <= STRONG * known:
+        return []
+    return [
+        f"joint `{name}` needs {check.force[j]:.3g} {unit}, but its limit is {known:.3g} {unit}: "
+        "check `recording.force_unit` and `forces_side`."
+    ]
+
+
+def _all_forces(robot: Robot, check: LogCheck) -> list[str]:
+    """That all forces are of another size than the robot's: one unit or side is wrong."""
+    known = np.asarray(robot.known_max_forces)
+    known = np.where(np.isfinite(known), known, np.nan)
+    share = check.force / known
+    share = share[np.isfinite(share)]
+    cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
+    if share.size > 1 and share.min() > STRONG:
+        return [
+            f"all joints need more than their largest forces, {share.min():.2g} to "
+            f"{share.max():.2g} times as much: {cure}"
+        ]
+    if share.size > 1 and 0 < share.max() < WEAK:
+        return [f"no joint needs more than {100 * share.max():.2g} % of its largest force: {cure}"]
+    return []
 
 
 def _jumps(robot: Robot, largest: np.ndarray) -> list[str]:

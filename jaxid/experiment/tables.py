@@ -231,9 +231,23 @@ class EstimatorTable(_Table, frozen=True):
     reference_start: float | list[float] | None = None
     margin: Share | None = None
     pull: Positive | None = None
+    mass_min: Magnitude | list[Magnitude] | None = None
     mass_max: Positive | list[Positive] | None = None
+    radius: Positive | list[Positive] | None = None
+    centre_min: list[float | list[float]] | None = None
+    centre_max: list[float | list[float]] | None = None
+    ellipsoid_centre: list[float | list[float]] | None = None
+    ellipsoid_axes: list[float | list[float]] | None = None
     total_mass: Positive | None = None
+    essential: Annotated[float, Meta(ge=0, lt=1)] | None = None
     uncertainty: Literal["spectral", "jackknife", "independent"] = "spectral"
+
+
+class SplineTable(_Table, frozen=True):
+    """A spline from standstill to standstill, in place of a Fourier series."""
+
+    points: Annotated[int, Meta(ge=4, le=100)] = 12
+    duration: Positive = 8.0
 
 
 class ExcitationTable(_Table, frozen=True):
@@ -250,10 +264,12 @@ class ExcitationTable(_Table, frozen=True):
     harmonics: Annotated[int, Meta(ge=1, le=50)] = 5
     omega: Annotated[float, Meta(gt=0, le=1000)] = 0.8
     rest: bool = False
+    spline: SplineTable | None = None
     samples: Annotated[int, Meta(ge=2)] = 800
     noise: PerJoint | None = None
     starts: Count = 32
     polish: Annotated[int, Meta(ge=0)] = 4
+    kicks: Annotated[int, Meta(ge=0)] = 8
     seed: Annotated[int, Meta(ge=0)] = 0
     leads: bool = True
     nominal: str | None = None

@@ -154,12 +154,21 @@ kind = "weighted"                     # or "least_squares": every newton metre c
 #                                     # them if they predict unseen parts of the logs better
 # prior = "urdf"                      # what is not decided stays as the URDF's inertias say, with
 #                                     # `ridge`, `truncate`, or of "consistent"
+# essential = 0.02                    # keeps only parameters without which unseen parts of the logs
+#                                     # are predicted worse: by such a share in all, at most
 # limit = 1.345                       # of "huber" or "tukey": residuals beyond count less [1]
 # reference = "trajectory.json"       # of "instrumental": the motion that was commanded; or a list
 # reference_start = 0.0               # with one for each log; the stamp at which it began [s]
 # margin = 0.01                       # of "consistent": share of a ball that each body contains
 # pull = 1.0                          # strength of a pull towards the prior, or towards balls
-# mass_max = 50.0                     # of the bodies [kg]; or a list
+# mass_min = 0.5                      # of the bodies [kg]; or a list
+# mass_max = 50.0                     # likewise
+# radius = 0.6                        # spheres about the origins of the bodies' frames that hold
+#                                     # them [m]; or a list
+# centre_min = [-0.2, -0.2, 0.0]      # box for the centres of mass, in the bodies' frames [m]: two
+# centre_max = [0.2, 0.2, 0.5]        # corners, inf for none; or lists with one for each body
+# ellipsoid_centre = [0.0, 0.0, 0.2]  # ellipsoid for the centres of mass [m]: its own centre and
+# ellipsoid_axes = [0.2, 0.2, 0.4]    # half axes; or lists with one for each body
 # total_mass = 120.0                  # of all bodies together, if it is known [kg]
 # uncertainty = "spectral"            # or "jackknife": from blocks of time left out in turn;
 #                                     # "independent": as if rows were independent, far too small
@@ -172,12 +181,14 @@ criterion = "d_optimal"               # smallest deviations on the whole; or a_o
 harmonics = 5                         # of the Fourier series
 omega = 0.8                           # its ground frequency [rad/s]
 rest = false                          # true: start and stop at rest
+# spline = {{ points = 12, duration = 8.0 }}  # in place of a series: from rest to rest in 8 s
 leads = true                          # a way into the periodic motion from standstill, and out
 samples = 800                         # that one run will measure
 # noise = {ones}        # standard deviation of the forces' noise [N m or N];
 #                                     # by default 1 % of the largest forces
 starts = 32                           # random motions to start from
 polish = 4                            # how many of the best are polished
+kicks = 8                             # how often the best is disturbed and polished again
 seed = 0                              # of the random motions
 # nominal = "report"                  # an earlier result of `jaxid identify`, to compare with
 # earlier = ["trajectory.json"]       # motions whose logs will be used together with this one's

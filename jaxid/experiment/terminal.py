@@ -33,6 +33,7 @@ from jaxid.report.tables import (
     plain_table,
     residual_table,
 )
+from jaxid.report.verdict import LARGE_CONDITION
 from jaxid.robot.robot import Robot
 from jaxid.validation.errors import TorqueErrors
 from jaxid.validation.validate import Validation
@@ -42,8 +43,6 @@ GAP = 2
 """Blanks between two columns."""
 SHORTEST = 12
 """Letters of a combination that are shown at least."""
-LARGE_CONDITION = 1e3
-"""Condition number, with scaled columns, above which parameters are hard to tell apart."""
 
 
 def heading(console: Console, text: str) -> None:
@@ -266,6 +265,12 @@ def show_fit(console: Console, fit: Fit) -> None:
     names.overflow, names.no_wrap = "ellipsis", True
     names.max_width = max(SHORTEST, console.width - others - GAP)
     show_table(console, table)
+
+
+def show_notes(console: Console, notes: Sequence[str], fit: Fit) -> None:
+    """What was assumed and found, but for what the table of bodies is going to say."""
+    shown = () if fit.consistency is None else fit.consistency.tabulated
+    sentences(console, [*notes, *(said for said in fit.notes if said not in shown)])
 
 
 def show_consistency(console: Console, robot: Robot, fit: Fit) -> None:

@@ -9,6 +9,8 @@ import pytest
 
 from jaxid import cli
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 HERE = Path(__file__).resolve().parent
 
 

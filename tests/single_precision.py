@@ -1,0 +1,159 @@
+"""What entry points give, or say, where JAX runs in float32 (0) or in float64 (1).
+
+python tests/single_precision.py 0|1 FOLDER: as JSON in FOLDER/found.json.
+"""
+
+import dataclasses
+import json
+import re
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+HERE = Path(__file__).parent
+DOUBLE = sys.argv[1] == "1"
+FOLDER = Path(sys.argv[2])
+sys.path.insert(0, str(HERE / "identification"))
+# Whatever the environment says.
+jax.config.update("jax_enable_x64", DOUBLE)
+
+from virtual import observations, standard_parameters
+
+import jaxid as jid
+from jaxid.validation.validate import validate
+
+URDF = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" effort="50" velocity="3"/></joint>
+<joint name="k" type="revolute"><parent link="b"/><child link="c"/><axis xyz="0 0 1"/>
+<origin xyz="0.4 0 0" rpy="1.5707963267948966 0 0"/>
+<limit lower="-2" upper="2" effort="20" velocity="3"/></joint></robot>"""
+FOLDER.mkdir()
+(FOLDER / "arm.urdf").write_text(URDF)
+TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
+robot = jid.load_urdf(FOLDER / "arm.urdf")
+model = jid.Model(robot, TERMS)
+p = standard_parameters(model)
+cold, warm = (
+    dataclasses.replace(
+        observations(model, q, noise=0.1, samples=300, seed=k, noise_seed=k), name=name
+    )
+    for k, (name, q) in enumerate((("cold", p), ("warm", 1.1 * p)))
+)
+base = jid.base_parameters(model)
+key = jax.random.key(0)
+
+
+def plain():
+    return jid.identify(base, cold)
+
+
+def rounded():
+    """Of arrays in float32, which are the same numbers in float64."""
+    single = [np.asarray(x, np.float32) for x in (*jax.tree.leaves(cold.motion), cold.forces)]
+    if DOUBLE:
+        single = [x.astype(np.float64) for x in single]
+    *motion, forces = single
+    o = dataclasses.replace(cold, motion=jid.Motion(*motion), forces=forces)
+    return jid.identify(base, o).parameters
+
+
+def runs():
+    return [jid.Run.of(base, o) for o in (cold, warm)]
+
+
+def consistent():
+    return jid.identify(base, cold, jid.PhysicallyConsistent(throw=False))
+
+
+def numbers_of(path):
+    """All numbers of a text but those in its comments."""
+    text = re.sub(r"/\*.*?\*/|//.*|<!--.*?-->|<\?.*?\?>", "", path.read_text(), flags=re.DOTALL)
+    return [float(x) for x in re.findall(r"-?\d+\.\d+(?:e[-+]?\d+)?", text)]
+
+
+def loaded():
+    plain().save(FOLDER / "arm.json")
+    return jid.load(FOLDER / "arm.json").parameters
+
+
+def written_motion():
+    a = np.array([[0.1, 0.2], [0.3, -0.1]])
+    series = jid.FourierSeries(np.array([0.3, 0.1]), a, a[::-1], 1.1)
+    jid.save_trajectory(series, FOLDER / "motion.json")
+    return jid.load_trajectory(FOLDER / "motion.json").motion(np.linspace(0.0, 1.0, 5)).qdd
+
+
+def batch():
+    motion = jid.Motion(*(x[None] for x in jax.tree.leaves(cold.motion)))
+    return jid.identify_batch(base, motion, cold.forces[None]).parameters
+
+
+def designed():
+    return jid.design_excitation(
+        base, harmonics=2, omega=1.0, starts=2, polish=1, kicks=0, samples=50, key=key
+    ).numbers
+
+
+CASES = {
+    "load_urdf": lambda: jax.tree.leaves(jid.load_urdf(FOLDER / "arm.urdf").rotation)[0],
+    "base_parameters": lambda: jid.base_parameters(model).kappa,
+    "expressions": lambda: list(base.lengths.values()),
+    "identify": lambda: plain().parameters,
+    "standard deviations": lambda: plain().standard_deviations,
+    "identify float32 arrays": rounded,
+    "Huber": lambda: jid.identify(base, cold, jid.IterativelyReweighted()).parameters,
+    "GeneralisedLeastSquares": lambda: (
+        jid.identify(base, cold, jid.GeneralisedLeastSquares()).parameters
+    ),
+    "PhysicallyConsistent": lambda: consistent().parameters,
+    "identify_batch": batch,
+    "bootstrap": lambda: jid.bootstrap(jid.factorise(base, [cold]), np.ones(2), 20, key),
+    "factorise_on_devices": lambda: (
+        jid.fit_blocks(
+            base, jid.factorise_on_devices(base, cold.motion, cold.forces), jid.LeastSquares()
+        ).parameters
+    ),
+    "factorise_across_processes": lambda: (
+        jid.fit_blocks(
+            base, jid.factorise_across_processes(base, [cold]), jid.LeastSquares()
+        ).parameters
+    ),
+    "essential_parameters": lambda: jid.essential_parameters(plain(), cold).fit.parameters,
+    "identify_stepwise": lambda: jid.identify_stepwise(base, [cold]).stepwise.parameters,
+    "identify_states": lambda: jid.identify_states(runs()).found.parameters,
+    "update": lambda: jid.update(*runs()).fit.parameters,
+    "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,
+    "validate": lambda: [e.relative for e in validate(plain(), [warm]).errors],
+    "predict": lambda: plain().predict(cold.motion),
+    "design_excitation": designed,
+    "save and load": loaded,
+    "trajectory": written_motion,
+    "export_c": lambda: numbers_of(jid.export_c(plain(), FOLDER / "c")),
+    "export_urdf": lambda: numbers_of(
+        jid.export_urdf(consistent(), FOLDER / "arm.urdf", FOLDER / "new.urdf")
+    ),
+    "export_mjcf": lambda: numbers_of(jid.export_mjcf(consistent(), FOLDER / "new.xml")),
+    "pinocchio_parameters": lambda: jid.pinocchio_parameters(consistent()),
+    "inverse_kinematics": lambda: jid.inverse_kinematics(jid.robots.tx40(), [0.3, 0.1, 0.4]),
+}
+REFUSED = (
+    "identify_batch",
+    "bootstrap",
+    "factorise_on_devices",
+    "factorise_across_processes",
+    "design_excitation",
+)
+"""Cases that compute in JAX, which must not do so in float32."""
+if __name__ == "__main__":
+    found = {}
+    for name, case in CASES.items():
+        if DOUBLE and name in REFUSED:
+            continue
+        try:
+            found[name] = np.asarray(case(), np.float64).ravel().tolist()
+        except Exception as error:
+            found[name] = f"{type(error).__name__}: {error}"
+    (FOLDER / "found.json").write_text(json.dumps(found))

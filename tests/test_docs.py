@@ -1,0 +1,219 @@
+"""Code that stands in the documents runs: blocks of Python one after the other, TOML as a file.
+
+A page may take for granted what its reader has by then (`given`), and nothing else.
+"""
+
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pinocchio as pin
+import polars as pl
+import pytest
+
+import jaxid as jid
+from jaxid.dynamics.machine import in_numpy
+from jaxid.experiment.mistakes import BAD
+from jaxid.experiment.reading import read_tables
+from jaxid.experiment.sanity import SURE
+from jaxid.identification.excited import LARGEST_UNCERTAINTY
+from jaxid.identification.fit import DOUBTFUL, TRUSTED
+from jaxid.report.verdict import (
+    ACCURATE,
+    ACCURATE_SHARE,
+    ALIKE,
+    LARGE_CONDITION,
+    TOLERABLE,
+    TOLERABLE_SHARE,
+    UNLIKE,
+)
+from jaxid.simulation.virtual import random_bodies
+from jaxid.validation.definiteness import POSES
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+SAMPLES, STEP = 8000, 0.001
+
+
+def _blocks(page: Path, language: str) -> list[str]:
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"^ *```{language}\n(.*?)^ *```", text, re.S | re.M)
+
+
+def _with(language: str) -> list:
+    return [pytest.param(page, id=page.name) for page in PAGES if _blocks(page, language)]
+
+
+def _inertial(body) -> str:
+    m, x, y, z = body[0], *(body[1:4] / body[0])
+    A, B, C, D, E, F = body[4:] - m * np.array(
+        [y * y + z * z, x * x + z * z, x * x + y * y, y * z, x * z, x * y]
+    )
+    return (
+        f'<inertial><origin xyz="{x} {y} {z}"/><mass value="{m}"/><inertia ixx="{A}" iyy="{B}" '
+        f'izz="{C}" iyz="{-D}" ixz="{-E}" ixy="{-F}"/></inertial>'
+    )
+
+
+def _urdf(robot: jid.Robot, bodies) -> str:
+    """A robot whose frames are parallel, as text."""
+    parts = ['<robot name="arm"><link name="ground"/>']
+    for j, name in enumerate(robot.joint_names):
+        offset, axis = (" ".join(map(str, x[j])) for x in (robot.offset, robot.axis))
+        parent = f"link{j}" if j else "ground"
+        limits = robot.limits
+        parts.append(
+            f'<link name="link{j + 1}">{_inertial(bodies[j])}</link><joint name="{name}" '
+            f'type="revolute"><origin xyz="{offset}"/><parent link="{parent}"/><child '
+            f'link="link{j + 1}"/><axis xyz="{axis}"/><limit lower="{limits.position_min[j]}" '
+            f'upper="{limits.position_max[j]}" velocity="{limits.velocity[j]}" '
+            f'effort="{limits.force[j]}"/></joint>'
+        )
+    return "".join([*parts, "</robot>"])
+
+
+def _ordered(body, order: str) -> np.ndarray:
+    """Mass, first moments and entries of the tensor about the origin, as others name them."""
+    m, mx, my, mz, A, B, C, D, E, F = body
+    known = {"m": m, "mx": mx, "my": my, "mz": mz, "Ixx": A, "Iyy": B, "Izz": C}
+    known |= {"Iyz": -D, "Ixz": -E, "Ixy": -F}
+    return np.array([known[name] for name in order.split()])
+
+
+def _theirs(body) -> dict[str, np.ndarray]:
+    """One body as other packages hold it, in the orders that docs/coming_from.md names."""
+    tensor = _ordered(body, "Ixx Ixy Ixz Ixy Iyy Iyz Ixz Iyz Izz").reshape(3, 3)
+    m, c = body[0], body[1:4] / body[0]
+    central = tensor - m * (c @ c * np.eye(3) - np.outer(c, c))
+    return {
+        "pinocchio": pin.Inertia(m, c, central).toDynamicParameters(),
+        "idyntree": _ordered(body, "m mx my mz Ixx Ixy Ixz Iyy Iyz Izz"),
+        "figaroh": _ordered(body, "Ixx Ixy Ixz Iyy Iyz Izz mx my mz m"),
+    }
+
+
+def _table(log: jid.Recording, degrees: bool) -> pl.DataFrame:
+    angles = np.rad2deg(log.angles) if degrees else log.angles
+    columns = {"t" if not degrees else "time": log.time}
+    columns |= {f"q{j + 1}": angles[:, j] for j in range(log.joints)}
+    columns |= {f"tau{j + 1}": log.forces[:, j] for j in range(log.joints)}
+    return pl.DataFrame(columns)
+
+
+def _log(model: jid.Model, p, seed: int, alone: int | None = None) -> jid.Recording:
+    """A log of all joints, or of one that moves alone."""
+    n = model.robot.joints
+    still = np.zeros(n) if alone is None else np.arange(n) != alone
+    series = jid.random_fourier_series(model.robot, omega=0.9, seed=seed)
+    motion = jax.tree.map(
+        lambda x: np.asarray(x) * (1 - still), series.motion(STEP * np.arange(SAMPLES))
+    )
+    forces = in_numpy(model, model.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
+    noise = np.random.default_rng(seed).normal(0.0, 0.2, forces.shape)
+    return jid.Recording.of(motion.q, forces + noise, sample_time=STEP, name=f"log {seed}")
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory):
+    """What readers of a page have by then: a robot, its model, logs of it in a folder, a fit."""
+    folder = tmp_path_factory.mktemp("documents")
+    robot = jid.Robot.of(
+        "two joints",
+        revolute=(True,) * 2,
+        axis=[(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)],
+        rotation=np.tile(np.eye(3), (2, 1, 1)),
+        offset=[(0.0, 0.0, 0.3), (0.1, 0.0, 0.2)],
+        tip_offset=(0.0, 0.0, 0.4),
+        limits=jid.Limits.of(
+            2,
+            position_min=[-2.9, -1.5],
+            position_max=[2.9, 1.5],
+            velocity=[2.0, 2.0],
+            force=[60.0, 80.0],
+        ),
+    )
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
+    model = jid.Model(robot, terms)
+    bodies = random_bodies(robot, np.array([8.0, 5.0]), np.random.default_rng(0))
+    p = np.concatenate([bodies.ravel(), 0.02 * robot.max_forces, 0.03 * robot.max_forces])
+    log, second, *single = (_log(model, p, k, j) for k, j in enumerate((None, None, 0, 1)))
+    (folder / "arm.urdf").write_text(_urdf(robot, bodies), encoding="utf-8")
+    _table(log, degrees=True).write_csv(folder / "log.csv")
+    _table(log, degrees=True).write_parquet(folder / "weeks.parquet")
+    (folder / "logs").mkdir()
+    for k, one in enumerate((log, second)):
+        _table(one, degrees=False).write_parquet(folder / "logs" / f"{k}.parquet")
+    base = jid.base_parameters(model)
+    smooth, every = jid.ZeroPhaseButterworth(10.0), jid.Subsample(40)
+    seen = [jid.observe(x, robot, smooth, every) for x in (log, second, *single)]
+    observations, other = seen[:2]
+    rows, forces = observations.reduced_motion, observations.reduced_forces
+    names = {"jax": jax, "np": np, "jid": jid, "robot": robot, "model": model, "base": base}
+    names |= {"observations": observations, "log": log}
+    names |= {"recording": log, "motion": rows, "forces": forces, "p": p}
+    names |= {"motions": jax.tree.map(lambda x: np.stack([x, x]), rows)}
+    names |= {"torques": np.stack([forces, forces]), "single_axes": tuple(seen[2:])}
+    names |= {"other_observations": other, "theirs": _theirs(bodies[0]), "mass": bodies[0][0]}
+    names |= {"centre_of_mass": bodies[0][1:4] / bodies[0][0]}
+    names |= {"matlab_inertia": _ordered(bodies[0], "Ixx Iyy Izz Iyz Ixz Ixy")}
+    names |= {"deviations": np.array([0.0, 1e-3])[:, None, None] * np.ones((2, 3))}
+    return folder, {**names, "fit": jid.identify(base, observations)}
+
+
+@pytest.mark.parametrize("page", _with("python"))
+def test_python_in_a_page_runs(page, given, monkeypatch):
+    folder, names = given
+    monkeypatch.chdir(folder)
+    # One process is a cluster of its own, which needs no coordinator.
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: None)
+    names = {**names, "__name__": "__main__"}
+    for k, block in enumerate(_blocks(page, "python")):
+        exec(compile(block, f"{page.name}, block {k + 1}", "exec"), names)
+
+
+@pytest.mark.parametrize("page", _with("toml"))
+def test_keys_in_a_page_exist(page, tmp_path):
+    for block in _blocks(page, "toml"):
+        lines = [line.strip() for line in block.splitlines()]
+        file = tmp_path / "experiment.toml"
+        robot = "" if "[robot]" in lines else '[robot]\nbuiltin = "panda"\n'
+        file.write_text("\n".join([*lines, robot]), encoding="utf-8")
+        read_tables(file)
+
+
+def test_other_packages_bodies_become_ours(given):
+    _, names = given
+    names = dict(names)
+    for block in _blocks(ROOT / "docs" / "coming_from.md", "python"):
+        exec(block, names)
+    body = np.asarray(names["p"])[:10]
+    for package in ("pinocchio", "idyntree", "figaroh", "sympybotics", "matlab"):
+        np.testing.assert_allclose(names[f"from_{package}"], body, atol=1e-12, err_msg=package)
+
+
+THRESHOLDS = {
+    "3.": (f"{LARGEST_UNCERTAINTY:.0%}",),
+    "4.": (f"below {LARGE_CONDITION:.0f}",),
+    "5.": (f"up to {ACCURATE_SHARE:.0%} of the forces, tolerable to {TOLERABLE_SHARE:.0%}",),
+    "6.": (
+        f"up to {ACCURATE / 100:.0%} of the largest force, tolerable to {TOLERABLE / 100:.0%}",
+        f"up to {ALIKE} times those of the fit, tolerable to {UNLIKE:.0f} times",
+    ),
+    "7.": (f"up to {TRUSTED:.0%}", f"up to {DOUBTFUL:.0%} doubtful"),
+    "10.": (f"all of {POSES} poses",),
+    "11.": (f"{SURE:.0f} standard deviations",),
+}
+
+
+@pytest.mark.parametrize("question", THRESHOLDS)
+def test_thresholds_are_those_of_the_code(question):
+    page = (ROOT / "docs" / "is_my_fit_good.md").read_text(encoding="utf-8")
+    (row,) = (line for line in page.splitlines() if line.startswith(f"| {question} "))
+    for threshold in THRESHOLDS[question]:
+        assert threshold.replace("%", " %") in row
+
+
+def test_the_slip_that_is_looked_for_is_the_codes():
+    page = (ROOT / "docs" / "is_my_fit_good.md").read_text(encoding="utf-8")
+    assert f"leaves more than {100 * BAD:g} % of the forces" in page

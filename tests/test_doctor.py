@@ -1,0 +1,91 @@
+"""The doctor names the one slip that was made, in the columns of the log, and nothing else."""
+
+import numpy as np
+import pytest
+
+from jaxid.dynamics.base import base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction
+from jaxid.experiment.mistakes import likely_mistake
+from jaxid.experiment.sanity import check_log
+from jaxid.measurement.decimation import Subsample
+from jaxid.measurement.filters import ZeroPhaseButterworth
+from jaxid.measurement.observations import observe
+from jaxid.measurement.recording import Recording
+from jaxid.robot.drives import Drives
+from jaxid.robot.library import panda
+from jaxid.trajectory.fourier import random_fourier_series
+
+COUPLED = np.diag([50.0, -60.0, 50.0, 60.0, 40.0, 30.0, 30.0])
+COUPLED[6, 5] = 30.0
+ROBOT = panda().replace(drives=Drives.of(7, reduction=COUPLED))
+BASE = base_parameters(Model(ROBOT, (RigidBodies(), ViscousFriction(), CoulombFriction())))
+DT = 0.005
+
+
+@pytest.fixture(scope="module")
+def motors():
+    """Motor angles and torques of a log with noise: friction is as large as what moves bodies."""
+    model = BASE.model
+    t = DT * np.arange(2400)
+    motion = random_fourier_series(ROBOT, omega=0.6, seed=5).motion(t)
+    sizes = {"m": 2.0, "mx": 0.1, "my": 0.2, "mz": 0.3, "A": 0.1, "B": 0.1, "C": 0.1}
+    sizes |= {"fv": 1.0, "fc": 2.0}
+    p = np.array([sizes.get(name.rstrip("0123456789"), 0.0) for name in model.parameter_names])
+    forces = np.asarray(model.inverse_dynamics(p, motion))
+    forces = forces + np.random.default_rng(0).normal(0.0, 0.3, forces.shape)
+    drives = ROBOT.drives
+    return np.asarray(drives.motor_angles(motion.q)), np.asarray(drives.motor_torques(forces))
+
+
+def said(angles, forces, angles_on_motor_side=True, forces_on_motor_side=True):
+    log = Recording.of(
+        angles,
+        forces,
+        sample_time=DT,
+        angles_on_motor_side=angles_on_motor_side,
+        forces_on_motor_side=forces_on_motor_side,
+    )
+    seen = observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5))
+    sides = angles_on_motor_side, forces_on_motor_side
+    return likely_mistake(BASE, seen, *sides), check_log(ROBOT, log, seen).warnings
+
+
+def test_a_good_log_is_left_in_peace(motors):
+    assert said(*motors)[0] == ()
+
+
+@pytest.mark.parametrize("joint", [0, 5, 6])
+def test_a_sign_is_found_in_the_motors_columns_by_friction_that_must_brake(motors, joint):
+    angles, forces = motors
+    name, signs = ROBOT.joint_names[joint], np.where(np.arange(7) == joint, -1.0, 1.0)
+    (sentence,) = said(angles, forces * signs)[0]
+    assert f"the sign of the force of joint `{name}` seems to be wrong" in sentence
+    (sentence,) = said(angles * signs, forces)[0]
+    assert f"the sign of the angle of joint `{name}` seems to be wrong" in sentence
+
+
+def test_motors_columns_that_are_exchanged_are_found(motors):
+    angles, forces = motors
+    (sentence,) = said(angles, forces[:, [0, 1, 2, 3, 4, 6, 5]])[0]
+    names = f"`{ROBOT.joint_names[5]}` and `{ROBOT.joint_names[6]}`"
+    assert sentence.startswith(f"the forces of joints {names} seem to be exchanged")
+
+
+def test_units_and_sides_are_found(motors):
+    angles, forces = motors
+    (sentence,) = said(np.rad2deg(angles), forces)[0]
+    assert "the angles of the log seem to be in deg (`recording.angle_unit`)" in sentence
+    (sentence,) = said(angles, forces, angles_on_motor_side=False)[0]
+    assert "the angles of the log seem to be the motors' (`recording.side`" in sentence
+    (sentence,) = said(angles, forces, forces_on_motor_side=False)[0]
+    assert "the forces of the log seem to be the motors' (`recording.forces_side = \"mo" in sentence
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1e3, "all joints need"), (1e-3, "no joint needs")])
+def test_forces_in_another_unit_are_one_doubt_and_not_seven(motors, factor, words):
+    angles, forces = motors
+    doubts = [w for w in said(angles, factor * forces)[1] if "force" in w]
+    assert len(doubts) == 1
+    assert doubts[0].startswith(words)
+    assert "check `recording.force_unit`, `forces_side` and `torque_constants`" in doubts[0]
