@@ -6,8 +6,8 @@
 Robot and columns: `jid.robots.tx90l_on_rail()`, seven parameters for each body, viscous and Coulomb
 friction, rotor inertias: 44 base parameters. Limits are the robot's (positions, velocities,
 accelerations). Motions: 5 harmonics, 0.8 rad/s, 800 samples of one period without its end; rest to
-rest by `RestToRestBasis`. Starts and polishes are `STARTS` and `POLISHED`; seed k is
-`jax.random.key(k)`.
+rest by `RestToRestBasis`. Starts, polished ones and kicks: 4, 2, 2 (capsules, cond), 8, 2, 2
+(capsules, D), 8, 2, 4 (rest), 4, 2, 2 (torques); seed k is `jax.random.key(k)`.
 
 Noise is 1 % of (3000 N, 318, 130, 65, 34, 29, 11 N m). The gain of a motion is the geometric mean,
 over parameters, of the standard deviations of weighted least squares in a random motion over those
@@ -136,7 +136,7 @@ class Judge:
         )
 
 
-def designed(base, seed, quick, starts, polish, **settings):
+def designed(base, seed, quick, starts, polish, kicks, **settings):
     """A plan, and the wall and CPU seconds that it took, compiling included for the first seed."""
     import jax
 
@@ -148,6 +148,7 @@ def designed(base, seed, quick, starts, polish, **settings):
         key=jax.random.key(seed),
         starts=2 if quick else starts,
         polish=0 if quick else polish,
+        kicks=kicks,
         throw=False,
         **settings,
     )
@@ -165,7 +166,7 @@ def capsules(criterion, starts):
 
     def one(seed, quick):
         plan, cost = designed(
-            bases[0], seed, quick, starts, 1, criterion=criterion, constraints=kept
+            bases[0], seed, quick, starts, 2, 2, criterion=criterion, constraints=kept
         )
         t = plan.trajectory
         gap = float(np.min(shapes.clearance(robot, judge.fine(t).q)))
@@ -189,7 +190,7 @@ def rest():
     judge = Judge(robot, bases)
 
     def one(seed, quick):
-        plan, cost = designed(bases[0], seed, quick, 8, 1, basis=jid.RestToRestBasis(5, 0.8))
+        plan, cost = designed(bases[0], seed, quick, 8, 2, 4, basis=jid.RestToRestBasis(5, 0.8))
         t = plan.trajectory
         inner = t.series.motion(np.array([0.0, float(t.duration)]))
         return {
@@ -216,7 +217,7 @@ def torques(limited):
     kept = (jid.JointForces(nominal, margin=MARGIN),) if limited else ()
 
     def one(seed, quick):
-        plan, cost = designed(bases[0], seed, quick, 4, 0, constraints=kept)
+        plan, cost = designed(bases[0], seed, quick, 4, 2, 2, constraints=kept)
         t = plan.trajectory
         m = judge.fine(t)
         forces = np.asarray(bases[0].model.inverse_dynamics(p, m) + bases[0].model.tool_forces(m))
@@ -266,8 +267,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", nargs="*", default=list(FIGURES), choices=FIGURES)
     parser.add_argument("--seeds", nargs="*", type=int, default=list(range(10)))
-    parser.add_argument("--quick", action="store_true", help="one seed, two starts, no polishing")
+    parser.add_argument("--quick", action="store_true", help="rest: one seed, two starts")
     arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.only = ["rest"]
     for name in arguments.only:
         one, rows = study(name), []
         for seed in arguments.seeds[:1] if arguments.quick else arguments.seeds:

@@ -7,6 +7,7 @@ the wheel `cmeel-eigen`, and where distributions put it.
 
 import ctypes
 import hashlib
+import importlib.util
 import os
 import subprocess
 import tempfile
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 SOURCE = Path(__file__).with_name("pinocchio_loop.cpp")
+GENERATOR = Path(__file__).with_name("pinocchio_casadi.cpp")
 # Column of Pinocchio's regressor for each of (m, mx, my, mz, A, B, C, D, E, F); D, E and F are
 # integrals, Pinocchio has the entries of the tensor.
 ORDER = [0, 1, 2, 3, 4, 6, 9, 8, 7, 5]
@@ -77,8 +79,8 @@ def prefixes():
     return [*found, Path("/usr"), Path("/usr/local")]
 
 
-def build():
-    """The compiled loop, from an earlier run if it is the same.
+def build(source=SOURCE, *extra):
+    """The compiled loop, or what is made of it, from an earlier run if it is the same.
 
     Raises:
         RuntimeError: If it cannot be built, with the reason.
@@ -91,10 +93,11 @@ def build():
         raise RuntimeError("no headers of Eigen (pip install cmeel-eigen, or set EIGEN3_INCLUDE)")
     include = prefixes()[0] / "include"
     command = ["g++", "-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-shared", "-fPIC"]
-    command += ["-fvisibility=hidden", "-Wl,-Bsymbolic", "-w", str(SOURCE)]
+    command += ["-fvisibility=hidden", "-Wl,-Bsymbolic", "-w", str(source)]
     command += [f"-D{name}={value}" for name, value in BOOST.items()]
-    command += [f"-I{include}", f"-I{eigen}"]
-    key = hashlib.sha256(" ".join(command).encode() + SOURCE.read_bytes()).hexdigest()[:16]
+    command += [f"-I{include}", f"-I{eigen}", *extra]
+    texts = source.read_bytes() + SOURCE.read_bytes()
+    key = hashlib.sha256(" ".join(command).encode() + texts).hexdigest()[:16]
     target = Path(tempfile.gettempdir()) / f"jaxid-pinocchio-loop-{key}.so"
     if not target.exists():
         partial = target.with_suffix(f".{os.getpid()}")
@@ -112,10 +115,10 @@ def build():
 class Loop:
     """Pinocchio in C++ over rows of samples, with results in memory that is already mapped."""
 
-    def __init__(self, robot, bodies, q, qd, qdd):
+    def __init__(self, robot, bodies, q, qd, qdd, built=None):
         if not all(robot.revolute):
             raise ValueError("the loop in C++ knows only joints that turn")
-        self.library = ctypes.CDLL(str(build()))
+        self.library = ctypes.CDLL(str(built or build()))
         self.library.arm_new.restype = ctypes.c_void_p
         joints = robot.joints
         rows = np.concatenate(
@@ -144,6 +147,32 @@ class Loop:
     def _run(self, function, out):
         samples = ctypes.c_long(len(out))
         function(self.arm, samples, *(_address(x) for x in self.inputs), _address(out))
+
+
+def generated(robot, bodies):
+    """The C code that CasADi makes of Pinocchio's rnea: the function `peer`.
+
+    Raises:
+        RuntimeError: If it cannot be built, with the reason.
+    """
+    spec = importlib.util.find_spec("casadi")
+    if spec is None or spec.origin is None:
+        raise RuntimeError("no CasADi (pip install --no-deps casadi)")
+    wheel = Path(spec.origin).parent
+    links = [f"-I{wheel / 'include'}", f"-L{wheel}", "-lcasadi", f"-Wl,-rpath,{wheel}"]
+    # It runs once: compiling it with -O3 takes minutes.
+    built = build(GENERATOR, *links, "-O1")
+    nothing = np.zeros((1, robot.joints))
+    loop = Loop(robot, bodies, nothing, nothing, nothing, built)
+    here = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            # CasADi takes the name of a file, without a folder.
+            os.chdir(folder)
+            loop.library.arm_generate(loop.arm, b"peer.c")
+        finally:
+            os.chdir(here)
+        return Path(folder, "peer.c").read_text()
 
 
 def _address(x):

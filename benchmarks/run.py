@@ -68,6 +68,7 @@ SPEED = (
 METHODS = (
     Script("excitation", 20, ("cond", "d7", "d10", "panda", "gradients", "step", "batch"), False),
     Script("excitation_rivals", 15, (), False),
+    Script("constrained_excitation", 60, (), False),
     Script("consistency", 15),
     Script("weighting", 5),
     Script("coverage", 20),

@@ -20,7 +20,7 @@ friction is 20 % larger with it. Gains are drawn within 20 % of 1. Forces are la
 
     python benchmarks/states.py            # all tables
     python benchmarks/states.py payload    # some of them: cold, payload, delay
-    python benchmarks/states.py --quick    # three draws of each
+    python benchmarks/states.py --quick    # one draw of each
 """
 
 import sys
@@ -337,7 +337,7 @@ def main() -> None:
     quick = "--quick" in sys.argv
     for name in [a for a in sys.argv[1:] if a in STUDIES] or STUDIES:
         study, draws = STUDIES[name]
-        print("\n".join(study(3 if quick else draws)), end="\n\n", flush=True)
+        print("\n".join(study(1 if quick else draws)), end="\n\n", flush=True)
 
 
 if __name__ == "__main__":

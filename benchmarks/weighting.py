@@ -29,30 +29,35 @@ MASSES = (80.0, 40.0, 25.0, 20.0, 8.0, 4.0, 1.0)
 AXES = (0, 4, 6)
 
 
-def virtual(true, trial):
+def virtual(robot, trial):
     """The robot of one trial, whose parameters are known."""
     import numpy as np
 
+    from jaxid import ConstantOffset, RigidBodies, RotorInertia
+    from jaxid.simulation.gear_friction import SmoothFriction
+    from jaxid.simulation.sensors import Sensors
     from jaxid.simulation.virtual import VirtualRobot, random_bodies
 
-    robot, rng = true.robot, np.random.default_rng([trial, 0])
+    rng = np.random.default_rng([trial, 0])
     most = np.asarray(robot.max_forces)
 
     def about(values):
         return values * rng.uniform(0.8, 1.2, robot.joints)
 
     bodies = random_bodies(robot, about(np.array(MASSES)), rng)
-    drives = [about(0.02 * most), about(0.03 * most), about(0.005 * most)]
+    viscous, coulomb, rotors = (about(share * most) for share in (0.02, 0.03, 0.005))
     offsets = 0.01 * most * rng.uniform(-1.0, 1.0, robot.joints)
     return VirtualRobot(
-        model=true,
-        parameters=np.concatenate([bodies.ravel(), *drives, offsets]),
-        stribeck=0.02 * most,
-        stribeck_speed=0.1,
-        encoder_step=2 * np.pi / 2**19,
-        white_noise=0.02 * most,
-        coloured_noise=0.01 * most,
-        memory=0.1,
+        robot=robot,
+        terms=(RigidBodies(), RotorInertia(), ConstantOffset()),
+        values=np.concatenate([bodies.ravel(), rotors, offsets]),
+        friction=SmoothFriction(viscous, coulomb, stribeck=0.02 * most, stribeck_speed=0.1),
+        sensors=Sensors(
+            encoder_step=2 * np.pi / 2**19,
+            white_noise=0.02 * most,
+            coloured_noise=0.01 * most,
+            memory=0.1,
+        ),
     )
 
 
@@ -80,7 +85,6 @@ def trials(count):
     robot = jid.robots.tx90l_on_rail()
     terms = jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia()
     base = jid.base_parameters(jid.Model(robot, terms))
-    true = jid.Model(robot, (*terms, jid.ConstantOffset()))
     estimators = {
         "unweighted": jid.LeastSquares(),
         "weighted": jid.WeightedLeastSquares(),
@@ -90,7 +94,7 @@ def trials(count):
     errors = {name: [] for name in estimators}
     shown = {}
     for trial in range(count):
-        arm = virtual(true, trial)
+        arm = virtual(robot, trial)
         seen, unseen = (recorded(robot, arm, trial, which) for which in (0, 1))
         blocks = jid.factorise(base, (seen,))
         for name, estimator in estimators.items():
@@ -135,14 +139,14 @@ def figure(robot, shown, path):
 def main():
     """Measures, and draws if told where."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="two trials")
+    parser.add_argument("--quick", action="store_true", help="one trial")
     parser.add_argument("--json", help="where to write the rows")
     parser.add_argument("--figure", help="where to draw the torques of the axes 1, 5 and 7")
     options = parser.parse_args()
     timing.pin_to(2)
     import numpy as np
 
-    count = 2 if options.quick else 100
+    count = 1 if options.quick else 100
     robot, indefinite, errors, shown = trials(count)
     if options.figure is not None:
         figure(robot, shown, options.figure)

@@ -1,0 +1,66 @@
+"""Physically consistent fits as conic programs, written down anew for benchmarks and tests."""
+
+import cvxpy as cp
+import numpy as np
+
+from jaxid.identification.consistency.data import Data
+from jaxid.identification.consistency.possible import PossibleParameters
+
+
+def problem(possible: PossibleParameters, data: Data) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
+    """The fit as a conic program, written down in SI units anew; its variables and their units."""
+    bounds = possible.bounds
+    size = data.A.shape[1]
+    norms = np.linalg.norm(data.A, axis=0)
+    unit = np.where(norms > 0, 10.0 * np.linalg.norm(data.b) / np.where(norms > 0, norms, 1), 0)
+    for k, columns in enumerate(possible.bodies):
+        L, m = bounds.radius[k], bounds.mass_max[k]
+        unit[list(columns)] = (m * L ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2]))[: len(columns)]
+    y = cp.Variable(size)
+    p = cp.multiply(unit, y)
+    constraints = []
+    for k, columns in enumerate(possible.bodies):
+        m, h = p[columns[0]], p[list(columns[1:4])]
+        A, B, C = (p[j] for j in columns[4:7])
+        D, E, F = (p[j] for j in columns[7:]) if len(columns) == 10 else (0.0, 0.0, 0.0)
+        L = bounds.radius[k]
+        pseudo = cp.bmat(
+            [
+                [(B + C - A) / 2, F, E, h[0]],
+                [F, (A + C - B) / 2, D, h[1]],
+                [E, D, (A + B - C) / 2, h[2]],
+                [h[0], h[1], h[2], m],
+            ]
+        )
+        shrink = np.diag([1 / L, 1 / L, 1 / L, 1.0]) / np.sqrt(bounds.mass_max[k])
+        constraints += [
+            shrink @ (pseudo - possible.floors[k]) @ shrink >> 0,
+            m / bounds.mass_max[k] <= 1,
+            m >= bounds.mass_min[k],
+            L**2 * m >= (A + B + C) / 2,
+        ]
+        for axis in range(3):
+            if np.isfinite(bounds.centre_min[k, axis]):
+                constraints.append(h[axis] >= bounds.centre_min[k, axis] * m)
+            if np.isfinite(bounds.centre_max[k, axis]):
+                constraints.append(h[axis] <= bounds.centre_max[k, axis] * m)
+        axes = bounds.ellipsoid_axes[k]
+        if np.isfinite(axes).all():
+            away = h - bounds.ellipsoid_centre[k] * m
+            constraints.append(cp.norm(cp.multiply(1 / axes, away)) <= m)
+    drives = list(possible.drives)
+    constraints += [y[drives] >= 0, y[drives] <= 1]
+    for coupling in possible.couplings:
+        parts = [p[j] * basis for j, basis in zip(coupling.columns, coupling.basis, strict=True)]
+        constraints.append(sum(parts[1:], parts[0]) >> 0)
+    if bounds.total_mass is not None:
+        constraints.append(cp.sum(p[[c[0] for c in possible.bodies]]) == bounds.total_mass)
+    objective = 0.5 * cp.sum_squares((data.A * unit) @ y - data.b)
+    return cp.Problem(cp.Minimize(objective), constraints), y, unit
+
+
+def optimum(possible: PossibleParameters, data: Data) -> tuple[float, np.ndarray]:
+    """Smallest half squares, and the parameters, by CLARABEL."""
+    fit, y, unit = problem(possible, data)
+    fit.solve(cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
+    return float(fit.value), unit * np.asarray(y.value)
