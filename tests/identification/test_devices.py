@@ -42,6 +42,9 @@ base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
 def recording(seed):
     p = standard_parameters(base.model)
     return observations(base.model, p, samples=1003, noise=0.3, seed=seed, noise_seed=seed)
+def say(*words):
+    # In one piece: an unbuffered print writes word by word, and JAX's own log comes between.
+    os.write(1, (" ".join(map(str, words)) + "\\n").encode())
 def write(blocks):
     fit = fit_blocks(base, blocks, jid.LeastSquares())
     np.savez(sys.argv[1], p=fit.parameters, s=fit.naive_standard_deviations, rows=fit.rows)
@@ -83,7 +86,7 @@ start = time.monotonic()
 try:
     factorise_across_processes(base, [recording(number)], patience=30.0)
 except (RuntimeError, TimeoutError) as error:
-    print("ended:", type(error).__name__, error, flush=True)
+    say("ended:", type(error).__name__, error)
     os._exit(7)
 """
 PROCESSES = """
@@ -97,7 +100,7 @@ if number == 1:
 try:
     factorise_across_processes(base, [recording(0)], patience=float(sys.argv[4]))
 except (RuntimeError, TimeoutError) as error:
-    print(type(error).__name__, error, flush=True)
+    say(type(error).__name__, error)
     os._exit(7)
 """
 
@@ -108,7 +111,7 @@ if number == 0:
 try:
     factorise_across_processes(base, [recording(1)], patience=40.0)
 except (RuntimeError, TimeoutError) as error:
-    print("ended:", type(error).__name__, error, flush=True)
+    say("ended:", type(error).__name__, error)
     os._exit(7)
 """
 
