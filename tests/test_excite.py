@@ -1,5 +1,6 @@
 """`jaxid excite`: what it writes and says, that it can be killed, and what it refuses."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -15,8 +16,10 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxid import cli
 from jaxid.excitation.plan import CRITERIA
 from jaxid.experiment.excitation_tables import build_nominal
-from jaxid.experiment.excite import side_by_side
+from jaxid.experiment.excite import design, side_by_side
 from jaxid.experiment.experiment import load_experiment
+from jaxid.trajectory.files import save_trajectory
+from jaxid.trajectory.fourier import FourierSeries
 
 PENDULUM = """\
 <robot name="pendulum">
@@ -73,6 +76,21 @@ def run(written, monkeypatch, capsys):
         return stopped.value.code, out, err
 
     return run
+
+
+@pytest.fixture(scope="module")
+def excited(written):
+    """A motion as fast as it can be had, for what is said of it."""
+    text = EXPERIMENT.replace("polish = 1\nkicks = 1", "polish = 0\nkicks = 0")
+    (written / "fast.toml").write_text(text)
+    experiment = load_experiment(written / "fast.toml")
+    return design(experiment, lambda _: None, written / "fast.npz", False)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Drawing takes longer than all else where a motion is there already."""
+    monkeypatch.setattr("jaxid.experiment.excite.write_pictures", lambda *_: [])
 
 
 def listing(folder):
@@ -145,7 +163,7 @@ def test_a_killed_design_goes_on_to_the_same_motion(written, run):
     assert same[0] == same[1]
 
 
-def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written, run):
+def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written, run, no_pictures):
     # The angle turns about y: the rod points ahead at zero, and holding it there takes 7.8 N m.
     def largest_force(folder):
         _, q, _, qdd = table(written / folder / "motion.csv").T
@@ -160,7 +178,7 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written
     assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
 
 
-def test_a_spline_in_place_of_a_series(written, run):
+def test_a_spline_in_place_of_a_series(written, run, no_pictures):
     path = with_keys(written, "spline.toml", "spline = { points = 6, duration = 5.0 }")
     code, out, err = run("excite", path, "-o", "spline/motion.csv")
     assert code == 0, err
@@ -229,6 +247,55 @@ def test_every_criterion_can_be_compared(written, run, monkeypatch):
     assert "criterion 2 of 2" in told[-1].doing
 
 
+def test_ctrl_c_ends_the_comparison_of_criteria_too(excited, run, no_pictures, monkeypatch):
+    stopped = dataclasses.replace(excited.plan, interrupted=True)
+    monkeypatch.setattr("jaxid.cli.excite.design", lambda *_: excited._replace(plan=stopped))
+    code, out, err = run("excite", "experiment.toml", "-o", "short/motion.csv", "--all-criteria")
+    assert code == 0, err
+    assert "wrote short: motion.csv" in out
+    assert "`--resume` goes on where it was" in out
+    assert "no other criterion was tried" in out
+    assert "what each criterion buys" not in out
+
+
+def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
+    excited, run, no_pictures, monkeypatch
+):
+    asked = []
+
+    def one_design(*args, **settings):
+        asked.append(settings["criterion"].name)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return excited.plan
+
+    monkeypatch.setattr("jaxid.cli.excite.design", lambda *_: excited)
+    monkeypatch.setattr("jaxid.experiment.excite.design_excitation", one_design)
+    code, out, err = run("excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria")
+    assert code == 0, err
+    assert asked == [c.name for c in CRITERIA[:2]]
+    assert out.index("wrote some: motion.csv") < out.index("what each criterion buys")
+    assert "stopped after 1 of 6 criteria" in out
+
+
+@pytest.mark.parametrize(
+    ("kept", "said"), [(True, "`--resume` goes on with `early/"), (False, "start again")]
+)
+def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch, kept, said):
+    def stopped(loaded, tell, state, resume):
+        if kept:
+            state.parent.mkdir()
+            state.touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxid.cli.excite.design", stopped)
+    folder = "early" if kept else "never"
+    code, out, err = run("excite", "experiment.toml", "-o", f"{folder}/motion.csv")
+    assert (code, out) == (130, "")
+    assert err.startswith("jaxid: the design was stopped before a motion kept all limits")
+    assert said in err
+
+
 @pytest.mark.parametrize(
     ("key", "said"),
     [
@@ -239,11 +306,18 @@ def test_every_criterion_can_be_compared(written, run, monkeypatch):
         ("noise = [1, 2]", "`noise` must hold one positive number for each joint (1)"),
         ('nominal = "nowhere"', "holds no `result.json`"),
         ('earlier = ["nowhere.json"]', "nowhere.json"),
+        ('earlier = ["arm.json"]', "the motion of `arm.json` moves 2 joints, but the robot"),
+        (
+            'earlier = ["arm.json"]\ncriterion = "condition_number"',
+            '`earlier` and `criterion = "condition_number"` do not go together',
+        ),
     ],
 )
 def test_refuses_what_does_not_fit(written, run, key, said):
     text = EXPERIMENT.replace("harmonics = 2", "harmonics = 1")
     (written / "wrong.toml").write_text(text + key + "\n")
+    arm = FourierSeries(np.zeros(2), np.zeros((2, 1)), np.ones((2, 1)), 1.0)
+    save_trajectory(arm, written / "arm.json")
     code, out, err = run("excite", "wrong.toml")
     assert (code, out) == (2, "")
     assert err.count("\n") == 1

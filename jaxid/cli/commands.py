@@ -1,4 +1,4 @@
-"""The commands `jaxid init`, `example`, `inspect`, `excite`, `identify`; what all run through."""
+"""The commands `jaxid init`, `example`, `inspect`, `identify`; what all run through."""
 
 import dataclasses
 import functools
@@ -12,6 +12,7 @@ from rich.text import Text
 
 from jaxid.cli import runs
 from jaxid.cli.demo import demo
+from jaxid.cli.excite import excite
 from jaxid.cli.export import export
 from jaxid.cli.options import (
     ExperimentFile,
@@ -23,20 +24,17 @@ from jaxid.cli.options import (
 )
 from jaxid.experiment import terminal
 from jaxid.experiment.doctor import fitted_doubts
-from jaxid.experiment.excite import design, side_by_side, write
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import (
     output_folder,
     refuse_foreign_folder,
-    refuse_foreign_table,
 )
 from jaxid.experiment.loading import Loaded, choose, load_log, observe_all
 from jaxid.experiment.mistakes import likely_mistake
-from jaxid.experiment.progress import Stages, designing
+from jaxid.experiment.progress import Stages
 from jaxid.experiment.runs import earlier_run, is_report
 from jaxid.experiment.sanity import negative_friction
-from jaxid.experiment.show_excited import show_excited, show_side_by_side
 from jaxid.experiment.template import write_template
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
@@ -187,41 +185,7 @@ def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fi
     return log, fit, doubts
 
 
-@app.command()
-def excite(
-    experiment: ExperimentFile,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
-    ] = Path("trajectory.csv"),
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on where a design was stopped.")
-    ] = False,
-    all_criteria: Annotated[
-        bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
-    ] = False,
-) -> None:
-    """Design the motion to record, within the limits of the joints.
-
-    Beside the table lie the trajectory itself (.json), the same for ROS (.ros.yaml), pictures of
-    joints and end-effector in a folder, and the state of the design until it is done. Ctrl-C keeps
-    the best motion so far.
-    """
-    console = open_console()
-    refuse_foreign_table(output)
-    loaded = load_experiment(experiment)
-    state = output.with_suffix(".state.npz")
-    with designing(console) as tell:
-        excited = design(loaded, tell, state, resume)
-    written = write(excited, output)
-    if not excited.plan.interrupted:
-        state.unlink(missing_ok=True)
-    show_excited(console, excited)
-    if all_criteria:
-        with designing(console) as tell:
-            plans = side_by_side(loaded, tell)
-        show_side_by_side(console, plans)
-    names = [str(path.relative_to(output.parent)) for path in written]
-    terminal.show_files(console, output.parent, names)
+app.command()(excite)
 
 
 @app.command(cls=SpreadLogs)

@@ -111,6 +111,7 @@ def design_excitation(
     Raises:
         ValueError: If arguments do not fit, or no motion keeps all constraints: the message says
             which limit is exceeded, and by how much.
+        KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
         RuntimeError: If JAX runs in single precision.
     """
     require_float64("designing a motion")
@@ -141,7 +142,10 @@ def design_excitation(
     found, interrupted = design.run(resume)
     plan = _plan(problem, found, key, starts, noise, nominal, interrupted)
     if throw and not plan.feasible:
-        raise ValueError("no motion was found that keeps all limits: " + "; ".join(plan.diagnosis))
+        unkept = "; ".join(plan.diagnosis)
+        if interrupted:
+            raise KeyboardInterrupt(f"stopped before a motion kept all limits: {unkept}")
+        raise ValueError(f"no motion was found that keeps all limits: {unkept}")
     return plan
 
 

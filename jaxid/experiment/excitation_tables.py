@@ -171,10 +171,19 @@ def build_prior(
     Args:
         experiment: With its table `[excitation]`.
         noise: Standard deviations of the forces' noise.
+
+    Raises:
+        ValueError: If the criterion knows no noise, or a file holds no motion of this robot.
     """
     table, folder = experiment.excitation, experiment.path.parent
     if not table.earlier:
         return None
+    if not CRITERIA[table.criterion]().weighted:
+        raise ValueError(
+            f'`earlier` and `criterion = "{table.criterion}"` do not go together: what motions '
+            "tell adds up in units of the noise, which this criterion does not know; leave out "
+            '`earlier`, or choose a criterion like "d_optimal".'
+        )
     return np.sum([_told(experiment, folder / p, noise) for p in table.earlier], axis=0)
 
 
@@ -182,6 +191,15 @@ def _told(
     experiment: Experiment, path: Path, noise: Float[np.ndarray, " joints"]
 ) -> Float[np.ndarray, "base base"]:
     trajectory, samples = load_trajectory(path), experiment.excitation.samples
+    if trajectory.joints != experiment.robot.joints:
+        raise ValueError(
+            f"`earlier`: the motion of `{path}` moves {_joints(trajectory.joints)}, but the robot "
+            f"`{experiment.robot.name}` has {experiment.robot.joints}: name motions of this robot."
+        )
     times = np.arange(samples) * (float(trajectory.duration) / samples)
     motion = trajectory.motion(times)
     return np.asarray(information(experiment.base, motion, 1.0 / noise).weighted)
+
+
+def _joints(count: int) -> str:
+    return f"{count} joint{'' if count == 1 else 's'}"

@@ -83,7 +83,7 @@ def design(
 def side_by_side(
     experiment: Experiment, progress: Callable[[DesignProgress], None]
 ) -> list[ExcitationPlan]:
-    """Designs by every criterion, from few starts and without polishing.
+    """Designs by every criterion, from few starts and without polishing, until Ctrl-C.
 
     Args:
         experiment: With its table `[excitation]`, or the defaults.
@@ -97,16 +97,19 @@ def side_by_side(
             doing = f"criterion {number + 1} of {len(ALL)}, {now.doing}"
             progress(now._replace(share=share, doing=doing))
 
-        with within(experiment.path.name, "excitation"):
-            plan = design_excitation(
-                experiment.base,
-                criterion=criterion,
-                starts=starts,
-                polish=0,
-                progress=tell,
-                throw=False,
-                **_settings(experiment, bool(criterion.weighted)),
-            )
+        try:
+            with within(experiment.path.name, "excitation"):
+                plan = design_excitation(
+                    experiment.base,
+                    criterion=criterion,
+                    starts=starts,
+                    polish=0,
+                    progress=tell,
+                    throw=False,
+                    **_settings(experiment, bool(criterion.weighted)),
+                )
+        except KeyboardInterrupt:
+            break
         found.append(plan)
         if plan.interrupted:
             break

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from jaxid.excitation.plan import VAGUE, ExcitationPlan
+from jaxid.excitation.plan import CRITERIA, VAGUE, ExcitationPlan
 from jaxid.experiment.excite import Excited
 from jaxid.experiment.terminal import DOUBTFUL, sentences, show_table
 from jaxid.report.excitation import (
@@ -28,6 +28,15 @@ def show_excited(console: Console, excited: Excited) -> None:
 
 def show_side_by_side(console: Console, plans: Sequence[ExcitationPlan]) -> None:
     """What minimising each criterion does to all of them."""
+    if plans:
+        _show_criteria(console, plans)
+    if len(plans) < len(CRITERIA) or plans[-1].interrupted:
+        done = sum(not plan.interrupted for plan in plans)
+        text = f"stopped after {done} of {len(CRITERIA)} criteria"
+        sentences(console, [text], DOUBTFUL, "!")
+
+
+def _show_criteria(console: Console, plans: Sequence[ExcitationPlan]) -> None:
     console.print()
     show_table(console, side_by_side_table(plans))
     sentences(
@@ -40,6 +49,7 @@ def show_side_by_side(console: Console, plans: Sequence[ExcitationPlan]) -> None
                 for k, plan in enumerate(plans)
                 if not plan.feasible
             ),
+            *(f"#{k + 1} was stopped before its end" for k, p in enumerate(plans) if p.interrupted),
         ],
     )
 

@@ -119,7 +119,8 @@ def with_leads(
         raise ValueError(
             "no instant of the period can be reached from standstill within the limits: at best "
             f"joint `{robot.joint_names[joint]}` exceeds one of them by "
-            f"{100 * excess[nearest, joint]:.3g} %; design the motion with a little less `reach`."
+            f"{100 * excess[nearest, joint]:.3g} %: take a motion that uses less of the limits, or "
+            "one that starts and ends at rest."
         )
     return WithLeads(series, phases[best], periods * period, lead_in[best], lead_out[best])
 

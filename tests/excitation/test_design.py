@@ -129,6 +129,12 @@ def test_an_impossible_constraint_is_diagnosed(pendulum):
     with pytest.raises(ValueError, match=r"tilt of the tip exceeds its limit by 0\.[5-9]"):
         design_excitation(pendulum, constraints=(LowTip(-2.5),), **SETTINGS)
 
+    def stop(progress):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match=r"stopped before a motion kept all limits: tilt"):
+        design_excitation(pendulum, constraints=(LowTip(-2.5),), progress=stop, **SETTINGS)
+
 
 def test_what_is_known_already_is_not_measured_again(pendulum):
     prior = np.diag(np.linspace(1.0, 1e4, pendulum.size))

@@ -1,0 +1,70 @@
+"""The command `jaxid excite`: a motion to record, and what is left of it when it is stopped."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.text import Text
+
+from jaxid.cli.options import ExperimentFile, open_console
+from jaxid.experiment import terminal
+from jaxid.experiment.excite import design, side_by_side, write
+from jaxid.experiment.experiment import load_experiment
+from jaxid.experiment.folder import refuse_foreign_table
+from jaxid.experiment.progress import designing
+from jaxid.experiment.show_excited import show_excited, show_side_by_side
+
+STOPPED = 130
+"""Exit code of a command that Ctrl-C has ended, as shells expect it."""
+
+
+def excite(
+    experiment: ExperimentFile,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
+    ] = Path("trajectory.csv"),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where a design was stopped.")
+    ] = False,
+    all_criteria: Annotated[
+        bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
+    ] = False,
+) -> None:
+    """Design the motion to record, within the limits of the joints.
+
+    Beside the table lie the trajectory itself (.json), the same for ROS (.ros.yaml), pictures of
+    joints and end-effector in a folder, and the state of the design until it is done. Ctrl-C keeps
+    the best motion so far.
+    """
+    console = open_console()
+    refuse_foreign_table(output)
+    loaded = load_experiment(experiment)
+    state = output.with_suffix(".state.npz")
+    try:
+        with designing(console) as tell:
+            excited = design(loaded, tell, state, resume)
+    except KeyboardInterrupt:
+        open_console(stderr=True).print(Text(f"jaxid: {_nothing(state)}"), soft_wrap=True)
+        raise typer.Exit(STOPPED) from None
+    written = write(excited, output)
+    if not excited.plan.interrupted:
+        state.unlink(missing_ok=True)
+    show_excited(console, excited)
+    names = [str(path.relative_to(output.parent)) for path in written]
+    terminal.show_files(console, output.parent, names)
+    if not all_criteria:
+        return
+    if excited.plan.interrupted:
+        stopped = "the design was stopped, and no other criterion was tried"
+        terminal.sentences(console, [stopped], terminal.DOUBTFUL, "!")
+        return
+    with designing(console) as tell:
+        plans = side_by_side(loaded, tell)
+    show_side_by_side(console, plans)
+
+
+def _nothing(state: Path) -> str:
+    said = "the design was stopped before a motion kept all limits, and nothing was written"
+    if state.is_file():
+        return f"{said}: `--resume` goes on with `{state}`, where it was."
+    return f"{said}: start again, and give it more time."
