@@ -2,12 +2,14 @@
 
 import abc
 import math
+from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
 from scipy import signal
 
 from jaxid.measurement.low_pass import LowPass, as_sections
+from jaxid.measurement.whole import whole
 from jaxid.types import AnyArray, Float
 
 
@@ -54,7 +56,7 @@ class Subsample(AbstractDecimation):
         every: The n.
     """
 
-    every: int = eqx.field(static=True, default=1)
+    every: int = eqx.field(static=True, converter=whole("every"), default=1)
 
     def __check_init__(self) -> None:
         _refuse_factors("every", (self.every,))
@@ -77,6 +79,10 @@ class Subsample(AbstractDecimation):
             )
 
 
+def _factors(values: Iterable[float | int]) -> tuple[int, ...]:
+    return tuple(map(whole("factors"), values))
+
+
 class Decimation(AbstractDecimation):
     """Low-pass filters without phase before every stage: for any filter, or none.
 
@@ -87,7 +93,7 @@ class Decimation(AbstractDecimation):
         factors: Of the stages; each should be 13 or less.
     """
 
-    factors: tuple[int, ...] = eqx.field(static=True, converter=tuple)
+    factors: tuple[int, ...] = eqx.field(static=True, converter=_factors)
 
     def __check_init__(self) -> None:
         _refuse_factors("factors", self.factors)

@@ -19,7 +19,9 @@ from jaxid.measurement.low_pass import (
     first_order,
     lag,
     refuse_above_nyquist,
+    refuse_unsettled,
 )
+from jaxid.measurement.whole import whole
 from jaxid.types import AnyArray, Float
 
 SETTLED = 1e-4
@@ -27,6 +29,8 @@ SETTLED = 1e-4
 
 At a hundredth, what the ends do to accelerations takes estimates some standard deviations away.
 """
+HIGHEST = 20
+"""Order above which a Butterworth filter rings for long, and rounding spoils it."""
 
 
 class AbstractFilter(eqx.Module):
@@ -88,6 +92,14 @@ def _positive(owner: str, **values: float | int | None) -> None:
             raise ValueError(f"`{name}` of `{owner}` must be positive, but is {value:g}.")
 
 
+def _refuse_order(owner: str, order: int) -> None:
+    if order > HIGHEST:
+        raise ValueError(
+            f"`order` of `{owner}` must be {HIGHEST} at most, but is {order}: steeper filters ring "
+            "for longer than they help; 2 to 8 are usual."
+        )
+
+
 def _margin(margin: float | None, sample_time: float, *filters: LowPass) -> int:
     if margin is None:
         return max(f.memory(SETTLED) for f in filters)
@@ -109,13 +121,14 @@ class ZeroPhaseButterworth(AbstractFilter):
     """
 
     cutoff: float = eqx.field(static=True, converter=float)
-    order: int = eqx.field(static=True, default=4)
+    order: int = eqx.field(static=True, converter=whole("order"), default=4)
     force_cutoff: float | None = eqx.field(static=True, converter=_optional, default=None)
     margin: float | None = eqx.field(static=True, converter=_optional, default=None)
 
     def __check_init__(self) -> None:
         _positive("ZeroPhaseButterworth", cutoff=self.cutoff, order=self.order)
         _positive("ZeroPhaseButterworth", force_cutoff=self.force_cutoff)
+        _refuse_order("ZeroPhaseButterworth", self.order)
         _refuse_negative_margin(self.margin)
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
@@ -130,8 +143,9 @@ class ZeroPhaseButterworth(AbstractFilter):
         return Motion(q, velocities[0] + change, first_difference(change, sample_time))
 
     def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
-        cutoff = self.cutoff if self.force_cutoff is None else self.force_cutoff
-        return butterworth(cutoff, self.order, sample_time)
+        if self.force_cutoff is None:
+            return butterworth(self.cutoff, self.order, sample_time)
+        return butterworth(self.force_cutoff, self.order, sample_time, "force_cutoff")
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         own = butterworth(self.cutoff, self.order, sample_time)
@@ -193,6 +207,7 @@ class PaperFilter(AbstractFilter):
     def _refuse_slow_logs(self, sample_time: float) -> None:
         refuse_above_nyquist("velocity", 0.0, sample_time)
         for name, omega in (("velocity", self.velocity), ("acceleration", self.acceleration)):
+            refuse_unsettled(name, omega / (2 * math.pi), sample_time)
             if omega * sample_time >= math.pi:
                 raise ValueError(
                     f"`{name}` of `PaperFilter` is {omega:g} rad/s, which needs samples at more "
@@ -220,14 +235,20 @@ class PeriodicFourier(AbstractFilter):
     """
 
     period: float = eqx.field(static=True, converter=float)
-    harmonics: int = eqx.field(static=True)
+    harmonics: int = eqx.field(static=True, converter=whole("harmonics"))
     force_harmonics: float | None = eqx.field(static=True, converter=_optional, default=None)
-    order: int = eqx.field(static=True, default=4)
+    order: int = eqx.field(static=True, converter=whole("order"), default=4)
     margin: float | None = eqx.field(static=True, converter=_optional, default=None)
 
     def __check_init__(self) -> None:
         _positive("PeriodicFourier", period=self.period, harmonics=self.harmonics)
         _positive("PeriodicFourier", force_harmonics=self.force_harmonics, order=self.order)
+        _refuse_order("PeriodicFourier", self.order)
+        if math.isinf(self.period):
+            raise ValueError(
+                "`period` of `PeriodicFourier` must be a time [s], but is infinite: give the "
+                "motion's own, or use another filter."
+            )
         _refuse_negative_margin(self.margin)
 
     @property
@@ -268,7 +289,8 @@ class PeriodicFourier(AbstractFilter):
 
     def low_pass(self, sample_time: float) -> LowPass:  # noqa: D102
         lines = 10.0 * self.harmonics if self.force_harmonics is None else self.force_harmonics
-        return butterworth(lines / self.period, self.order, sample_time)
+        name = "force_harmonics / period"
+        return butterworth(lines / self.period, self.order, sample_time, name)
 
     def edge(self, sample_time: float) -> int:  # noqa: D102
         return _margin(self.margin, sample_time, self.low_pass(sample_time))

@@ -13,6 +13,8 @@ BLOCK = 2**22
 
 SLOWEST, FASTEST = 10.0, 1e6
 """Samples in a second outside of which the unit of the time is wrong or doubtful [Hz]."""
+LOWEST = 1e-5
+"""Cut-offs over the sampling rate below which no log is long enough for a filter to settle."""
 Sections = tuple[tuple[float, ...], ...]
 
 
@@ -81,15 +83,16 @@ def memory(sections: Sections, tolerance: float) -> int:
     return near + math.ceil(1.1 * math.log(tolerance / 2e-6) / math.log(slowest))
 
 
-def butterworth(cutoff: float, order: int, sample_time: float) -> LowPass:
+def butterworth(cutoff: float, order: int, sample_time: float, name: str = "cutoff") -> LowPass:
     """A Butterworth filter, run forward and backward; `cutoff` [Hz] as scipy counts it, one way.
 
     Raises:
-        ValueError: If the cut-off is not below half of the sampling rate.
+        ValueError: If the cut-off, which is called `name`, does not suit the sampling rate.
     """
     if math.isinf(cutoff):
         return LowPass((), math.inf)
-    refuse_above_nyquist("cutoff", cutoff, sample_time)
+    refuse_above_nyquist(name, cutoff, sample_time)
+    refuse_unsettled(name, cutoff, sample_time)
     sos = signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
     return LowPass(as_sections(np.asarray(sos, np.float64)), cutoff)
 
@@ -127,4 +130,15 @@ def refuse_above_nyquist(name: str, cutoff: float, sample_time: float) -> None:
             f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of "
             f"{rate:.6g} Hz: take a lower one, or log faster than {2 * cutoff:.6g} Hz."
             f"{slow if rate <= SLOWEST else ''}"
+        )
+
+
+def refuse_unsettled(name: str, cutoff: float, sample_time: float) -> None:
+    """Raises ValueError if a filter with this `cutoff` [Hz] would settle in no log."""
+    lowest = LOWEST / sample_time
+    if cutoff < lowest:
+        raise ValueError(
+            f"`{name}` of {cutoff:.6g} Hz is too low for a sampling rate of {1 / sample_time:.6g} "
+            f"Hz, since no log is long enough for such a filter to settle: take one above "
+            f"{lowest:.2g} Hz (about five times the highest frequency of the motion)."
         )
