@@ -13,6 +13,8 @@ BLOCK = 2**22
 
 SLOWEST, FASTEST = 10.0, 1e6
 """Samples in a second outside of which the unit of the time is wrong or doubtful [Hz]."""
+HASTY = 2e4
+"""Samples in a second above which a filter that does not suit the log hints at a wrong unit."""
 LOWEST = 1e-5
 """Cut-offs over the sampling rate below which no log is long enough for a filter to settle."""
 Sections = tuple[tuple[float, ...], ...]
@@ -141,4 +143,16 @@ def refuse_unsettled(name: str, cutoff: float, sample_time: float) -> None:
             f"`{name}` of {cutoff:.6g} Hz is too low for a sampling rate of {1 / sample_time:.6g} "
             f"Hz, since no log is long enough for such a filter to settle: take one above "
             f"{lowest:.2g} Hz (about five times the highest frequency of the motion)."
+            f"{said_hasty(sample_time)}"
         )
+
+
+def said_hasty(sample_time: float) -> str:
+    """A hint at a wrong unit of time, where a log is too short for its filter."""
+    rate = 1 / sample_time
+    if rate <= HASTY:
+        return ""
+    return (
+        f" The log has {rate:.3g} samples in a second, as few robots' have: check `time_unit`, or "
+        "`sample_time`."
+    )

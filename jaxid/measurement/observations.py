@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
 from jaxid.measurement.filters import AbstractFilter
+from jaxid.measurement.low_pass import said_hasty
 from jaxid.measurement.recording import Recording
 from jaxid.robot.limits import per_joint
 from jaxid.robot.robot import Robot
@@ -284,6 +285,7 @@ def usable(
             f"the longest segment of `{name}` has {longest} samples, but {edge} at each "
             f"end are lost to the filter and {FEWEST_ROWS} rows of {decimation.factor} are needed: "
             "record longer, close the gaps (`largest_gap`), or set a smaller `margin`."
+            f"{said_hasty(sample_time)}"
         )
     short = len(segments) - len(used)
     if not short:

@@ -178,7 +178,7 @@ class TextParts(AbstractParts):
 
     def part(self, start, stop):  # noqa: D102
         lines, before = _lines(self.path, self.bytes, self.lines, start, stop)
-        found = self.dialect.numbers(lines, self.names, self.whole)
+        found = self.dialect.numbers(lines, self.names, self.whole, before)
         own = slice(start - before, stop - before)
         table = {name: column[own] for name, column in found.items()}
         return Table(

@@ -48,14 +48,24 @@ class Table:
         """Names of the columns of a selection, in the order of the joints.
 
         Raises:
-            ValueError: If there is no such column, or a number is missing within a pattern.
+            ValueError: If there is no such column, or a number of a pattern is missing or there
+                twice.
         """
         if isinstance(selection, tuple):
             return tuple(self._name(what, one) for one in selection)
         if isinstance(selection, int) or "{}" not in selection:
             return (self._name(what, selection),)
         pattern = re.escape(selection).replace(re.escape("{}"), r"(\d{1,18})")
-        found = {int(m[1]): c for c in self.columns if (m := re.fullmatch(pattern, c))}
+        found: dict[int, str] = {}
+        for column in self.columns:
+            if not (match := re.fullmatch(pattern, column)):
+                continue
+            if other := found.get(int(match[1])):
+                raise ValueError(
+                    f"`{self.source}` has `{other}` and `{column}`, which both are number "
+                    f"{int(match[1])} of `{what}`: name the columns one by one."
+                )
+            found[int(match[1])] = column
         if not found:
             return (self._name(what, selection.replace("{}", "1")),)
         first = min(found)
@@ -160,13 +170,15 @@ class Table:
         if len(column) == 0:
             raise ValueError(f"column `{name}` of `{self.source}` has no rows: is the log cut?")
         if isinstance(column, pl.Series):
-            if isinstance(column.dtype, pl.List | pl.Array):
-                return self._nested(name, column)
-            if column.dtype.is_numeric() or column.dtype == pl.Boolean:
-                numbers = column.cast(pl.Float64)
-            else:
-                numbers = column.cast(pl.String, strict=False).str.strip_chars()
-                numbers = numbers.cast(pl.Float64, strict=False)
+            try:
+                if isinstance(column.dtype, pl.List | pl.Array):
+                    return self._nested(name, column)
+                numbers = _as_numbers(column)
+            except pl.exceptions.PolarsError as error:
+                raise ValueError(
+                    f"column `{name}` of `{self.source}` holds {column.dtype} and no numbers: "
+                    "write it as floating numbers, or name another column."
+                ) from error
             self._refuse_first(name, column.is_null().to_numpy(), column, "is empty")
             self._refuse_first(name, numbers.is_null().to_numpy(), column, "is `{}`, no number")
             array = numbers.to_numpy()
@@ -203,6 +215,14 @@ class Table:
                 f"column `{name}` of `{self.source}`, {self.row(first)}, "
                 f"{complaint.format(column[first])}{more}: repair the log or remove those rows."
             )
+
+
+def _as_numbers(column: pl.Series) -> pl.Series:
+    """A column in float64, with nulls for what is no number."""
+    if column.dtype.is_numeric() or column.dtype == pl.Boolean:
+        return column.cast(pl.Float64)
+    text = column.cast(pl.String, strict=False).str.strip_chars()
+    return text.cast(pl.Float64, strict=False)
 
 
 def read_table(path: str | Path) -> Table:

@@ -43,6 +43,11 @@ class Dialect:
         if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             raise ValueError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
         first, _, _ = head.partition(b"\n")
+        if b"\r" in first.rstrip(b"\r"):
+            raise ValueError(
+                f"`{source}` ends its lines with carriage returns alone, as old Macintosh programs "
+                "do: save it again with line ends of Unix or Windows (LF or CRLF)."
+            )
         line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
         if not line.strip():
             raise ValueError(f"`{source}` must start with a header or with numbers, but is empty.")
@@ -66,15 +71,21 @@ class Dialect:
         """Line of the file that holds the first row."""
         return 1 + int(self.named)
 
-    def columns(self, rows: bytes) -> dict[str, pl.Series]:
+    def columns(self, rows: bytes, before: int = 0) -> dict[str, pl.Series]:
         """The columns of some whole lines, each of the type that its cells have.
 
+        Args:
+            rows: The lines.
+            before: Rows of the file before these.
+
         Raises:
-            ValueError: If lines differ in their number of cells.
+            ValueError: If lines differ in their number of cells, or one reaches into the next.
         """
+        tidied = self._tidied(rows)
+        self._refuse_open_quotes(tidied, before)
         try:
             frame = pl.read_csv(
-                io.BytesIO(self._tidied(rows)),
+                io.BytesIO(tidied),
                 new_columns=list(self.names),
                 infer_schema_length=None,
                 **self._options(),
@@ -96,7 +107,11 @@ class Dialect:
         return frame.to_dict(as_series=True)
 
     def numbers(
-        self, rows: bytes, names: tuple[str, ...], whole: tuple[str, ...] = ()
+        self,
+        rows: bytes,
+        names: tuple[str, ...],
+        whole: tuple[str, ...] = (),
+        before: int = 0,
     ) -> dict[str, pl.Series]:
         """Some columns of some whole lines as numbers: several times as fast as `columns`.
 
@@ -106,12 +121,14 @@ class Dialect:
             rows: The lines.
             names: Of the columns.
             whole: Those of them that hold whole numbers, which float64 may not hold.
+            before: Rows of the file before these.
 
         Raises:
             ValueError: Like `columns`.
         """
         tidied = self._tidied(rows)
         lines = tidied.count(b"\n") + (not tidied.endswith(b"\n"))
+        self._refuse_open_quotes(tidied, before)
         if tidied.count(self.separator.encode()) == lines * (len(self.names) - 1):
             types = {name: pl.Int64() if name in whole else pl.Float64() for name in names}
             schema = {name: types.get(name, pl.String()) for name in self.names}
@@ -123,8 +140,19 @@ class Dialect:
                 return frame.to_dict(as_series=True)
             except pl.exceptions.PolarsError:
                 pass
-        found = self.columns(rows)
+        found = self.columns(rows, before)
         return {name: found[name] for name in self.names if name in names}
+
+    def _refuse_open_quotes(self, rows: bytes, before: int) -> None:
+        """A quotation that goes on in the next line would swallow the rows until it ends."""
+        if b'"' not in rows:
+            return
+        for index, line in enumerate(rows.split(b"\n")):
+            if line.count(b'"') % 2:
+                raise ValueError(
+                    f"line {index + before + self.first_line} of `{self.source}` opens a quotation "
+                    "that does not end in that line: remove the quotation mark, or close it there."
+                )
 
     def _options(self) -> dict:
         return {

@@ -156,6 +156,9 @@ def test_refusals():
         observe(r, a_robot(), ZeroPhaseButterworth(20.0, force_cutoff=np.inf), Subsample(2))
     with pytest.raises(ValueError, match=r"longest segment of `recording` has 6000 samples"):
         observe(r, a_robot(), ZeroPhaseButterworth(0.05))
+    hasty = dataclasses.replace(r, sample_time=1e-2 * r.sample_time)
+    with pytest.raises(ValueError, match=r"longest seg.* 1e\+05 samples in a sec.*`time_unit`"):
+        observe(hasty, a_robot(), ZeroPhaseButterworth(5.0))
 
 
 def test_short_segments_are_left_out_and_reported():
