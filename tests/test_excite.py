@@ -1,8 +1,10 @@
 """`jaxid excite`: what it writes and says, that it can be killed, and what it refuses."""
 
 import dataclasses
+import html
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,10 +16,16 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from jaxid import cli
+from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import CRITERIA
-from jaxid.experiment.excitation_tables import build_nominal
+from jaxid.experiment.excitation_tables import build_constraints
 from jaxid.experiment.excite import design, side_by_side
+from jaxid.experiment.excited_forces import force_remarks
 from jaxid.experiment.experiment import load_experiment
+from jaxid.experiment.nominal import build_nominal
+from jaxid.report.blocks import Tone
+from jaxid.report.excitation_words import remarks
+from jaxid.report.excited import excitation_page
 from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.fourier import FourierSeries
 
@@ -137,8 +145,21 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "± [%]",
         "use of the limits [%]",
         "is in the designed motion from",
+        "of 100 samples in 7.854 s (12.73 Hz), of one run",
+        "standard deviation `hinge` (0.120 N m)",
+        "give `noise` if it is known",
+        "by the nominal parameters they stay within their limits",
     ):
-        assert said in out
+        assert said in " ".join(out.split())
+    page = html.unescape((written / "plan" / "motion" / "report.html").read_text())
+    for said in (
+        "100 samples in 7.854 s",
+        "jaxid excite experiment.toml -o plan/motion.csv",
+        "polish = 1",
+        "seed",
+        "The robot starts at rest and is in the designed motion from",
+    ):
+        assert said in page
 
 
 def test_a_killed_design_goes_on_to_the_same_motion(written, run):
@@ -174,7 +195,11 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written
     code, out, err = run("excite", path, "-o", "weak/motion.csv")
     assert code == 0, err
     assert largest_force("weak") <= 6.0 < 7.5 < largest_force("plan")
-    assert "the force of joint `hinge` keeps its limit" in out
+    assert "use of the other limits" in out
+    assert re.search(
+        r"force of joint `hinge` +5\.\d+ N m +≤ 6 N m +9\d\.\d +12 less a margin of", out
+    )
+    assert "counted as zero in the forces: viscous friction" in " ".join(out.split())
     assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
 
 
@@ -198,12 +223,14 @@ def test_an_impossible_motion_is_diagnosed(written, run):
     code, out, err = run("excite", path, "-o", "far/motion.csv")
     assert (code, out) == (2, "")
     assert err.startswith("jaxid: far.toml: `excitation`: no motion was found")
-    assert "-z of the end-effector exceeds its limit by 2 m" in err
+    assert "z of the end-effector falls short of its limit by 2 m: at least 2 m" in err
+    assert "-z" not in err
     assert "far/motion.csv" not in listing(written)
 
 
-def test_earlier_results_are_nominal(written):
+def test_earlier_results_are_nominal(written, excited):
     experiment = load_experiment(with_keys(written, "after.toml", 'nominal = "report"'))
+    path = with_keys(written, "kept.toml", 'nominal = "report"', "force_margin = 0.1")
     base = experiment.base
     rows = [
         {"name": n, "expression": n, "unit": u, "estimate": 1.0 + k}
@@ -221,10 +248,65 @@ def test_earlier_results_are_nominal(written):
     found = build_nominal(experiment)
     np.testing.assert_array_equal(found.parameters, 1.0 + np.arange(base.size))
     np.testing.assert_array_equal(found.covariance, covariance)
+    assert found.open == ()
+    covariance[1][0] = covariance[0][1] = covariance[0][0] = None
+    result.write_text(json.dumps(content))
+    found = build_nominal(experiment)
+    assert found.open == base.names[:1]
+    np.testing.assert_array_equal(np.isnan(found.sizes), np.arange(base.size) == 0)
+    np.testing.assert_array_equal(np.diag(found.covariance), 0.01 * (np.arange(base.size) > 0))
+    build_constraints(load_experiment(path), found)  # refuses a covariance that is not finite
+    (_, said) = force_remarks(experiment, found, excited.played)
+    assert said.text.startswith(f"`report` does not determine {base.names[0]}: the forces are")
     rows[0]["name"] = "other"
     result.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="are not the"):
         build_nominal(experiment)
+
+
+def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
+    def remarks(force, known=True):
+        text = EXPERIMENT.replace("[4]", f"[4]\nforce = [{force}]")
+        (written / "forces.toml").write_text(text)
+        experiment = load_experiment(written / "forces.toml")
+        nominal = build_nominal(experiment) if known else None
+        return list(force_remarks(experiment, nominal, excited.played))
+
+    # Holding the rod where it points ahead takes 7.8 N m.
+    within, zero = remarks(50.0)
+    assert within.tone is Tone.PLAIN
+    assert re.search(r"hinge` with (1[4-9]|2\d)(\.\d)? % of 50 N m", within.text)
+    unknown = "viscous friction, coulomb friction, constant offset of `hinge`"
+    assert zero.text == f"not known, and counted as zero in the forces: {unknown}"
+    beyond, _ = remarks(5.0)
+    assert beyond.tone is Tone.BAD
+    assert re.search(r"joint `hinge` with 1[4-9]\d % of 5 N m; give `force_margin`", beyond.text)
+    (unknown,) = remarks(5.0, known=False)
+    assert unknown.text.startswith("forces were not looked at, although they have limits")
+    assert remarks("inf") == []
+
+
+def test_limits_that_nobody_gave_are_named(written, excited):
+    (written / "open.toml").write_text(EXPERIMENT.replace("acceleration = [4]", ""))
+    robot = load_experiment(written / "open.toml").robot
+    limits = JointLimits.of(robot, excited.plan.limits.basis)
+    plan = dataclasses.replace(excited.plan, limits=limits)
+    said = [remark.text for remark in remarks(plan)]
+    assert "assumed, because it is not given: acceleration of `hinge` (8 rad/s²)" in said
+    assert not any("assumed" in remark.text for remark in remarks(excited.plan))
+
+
+def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excited, monkeypatch):
+    def refuse(series, robot):
+        raise ValueError("no lead is short enough.")
+
+    monkeypatch.setattr("jaxid.experiment.excite.with_leads", refuse)
+    monkeypatch.setattr("jaxid.experiment.excite.design_excitation", lambda *_, **__: excited.plan)
+    led = design(load_experiment(written / "fast.toml"), lambda _: None, written / "no.npz", False)
+    assert led.window[0] == 0.0
+    page = html.unescape(excitation_page(led.plan, {}, led.aside).html())
+    assert "The motion is without leads, and starts and ends at full speed: no lead is" in page
+    assert "read what stands below before it is recorded" in page
 
 
 def test_a_urdf_claims_inertias_and_knows_no_friction(written):

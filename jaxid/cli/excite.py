@@ -1,5 +1,6 @@
 """The command `jaxid excite`: a motion to record, and what is left of it when it is stopped."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +47,7 @@ def excite(
     except KeyboardInterrupt:
         open_console(stderr=True).print(Text(f"jaxid: {_nothing(state)}"), soft_wrap=True)
         raise typer.Exit(STOPPED) from None
-    written = write(excited, output)
+    written = write(excited, output, _command_line(experiment, output, all_criteria))
     if not excited.plan.interrupted:
         state.unlink(missing_ok=True)
     show_excited(console, excited)
@@ -68,3 +69,9 @@ def _nothing(state: Path) -> str:
     if state.is_file():
         return f"{said}: `--resume` goes on with `{state}`, where it was."
     return f"{said}: start again, and give it more time."
+
+
+def _command_line(experiment: Path, output: Path, all_criteria: bool) -> str:
+    """The line that makes a motion again: without `--resume`, for a design is the same with it."""
+    words = ["jaxid", "excite", str(experiment), "-o", str(output)]
+    return shlex.join([*words, *(["--all-criteria"] if all_criteria else [])])

@@ -54,6 +54,7 @@ class JointLimits(eqx.Module):
         names: Of the joints.
         scale: Of a trajectory's numbers, x = scale * y.
         still: The scaled numbers that move a joint by half of its range, and keep it there.
+        assumed: Fields of the limits and joints (from 0) whose numbers were not given.
     """
 
     basis: AbstractBasis
@@ -61,6 +62,7 @@ class JointLimits(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     scale: Float[AnyArray, "joints variables"]
     still: Float[AnyArray, "joints variables"]
+    assumed: tuple[tuple[str, int], ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(cls, robot: Robot, basis: AbstractBasis, limits: Limits | None = None) -> "JointLimits":
@@ -71,6 +73,11 @@ class JointLimits(eqx.Module):
         """
         limits = robot.limits if limits is None else limits
         low, high, velocity, acceleration = assumed_bounds(robot.replace(limits=limits))
+        assumed = tuple(
+            (name, int(j))
+            for name in ("position_min", "position_max", "velocity", "acceleration")
+            for j in np.flatnonzero(~np.isfinite(np.asarray(getattr(limits, name))))
+        )
         limits = dataclasses.replace(
             limits,
             position_min=low,
@@ -90,7 +97,7 @@ class JointLimits(eqx.Module):
                 "have no constant among them: add one."
             )
         still = size[0][:, None] * one[None] / scale
-        return cls(basis, limits, robot.joint_names, scale, still)
+        return cls(basis, limits, robot.joint_names, scale, still, assumed)
 
     @property
     def shape(self) -> tuple[int, int]:

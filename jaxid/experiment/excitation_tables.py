@@ -1,15 +1,12 @@
-"""The table `[excitation]` becomes constraints, what is known before, and trajectories."""
+"""The table `[excitation]` becomes constraints, what earlier motions told, and trajectories."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.dynamics.terms import INERTIAL_NAMES
 from jaxid.excitation.constraints.clearance import Clearance
 from jaxid.excitation.constraints.constraint import AbstractConstraint
-from jaxid.excitation.constraints.forces import JointForces, MotorTorques, NominalForces
 from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace
 from jaxid.excitation.criteria import (
     AbstractCriterion,
@@ -21,11 +18,10 @@ from jaxid.excitation.criteria import (
     WeightedConditionNumber,
 )
 from jaxid.excitation.information import information
+from jaxid.experiment.excited_forces import force_limits
 from jaxid.experiment.experiment import Experiment
+from jaxid.experiment.nominal import Nominal
 from jaxid.experiment.tables import ExcitationTable
-from jaxid.report.compared_files import read_estimates
-from jaxid.robot.snap import SNAP_TOLERANCE
-from jaxid.robot.urdf import urdf_parameters
 from jaxid.trajectory.basis import AbstractBasis, FourierBasis
 from jaxid.trajectory.files import load_trajectory
 from jaxid.trajectory.leads_basis import LeadsBasis
@@ -42,18 +38,6 @@ CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
     "scaled_condition_number": ScaledConditionNumber,
 }
 """What `excitation.criterion` may be."""
-
-
-class Nominal(NamedTuple):
-    """Base parameters as far as they are known before the experiment.
-
-    Attributes:
-        parameters: NaN where nothing is known.
-        covariance: Of an earlier fit; None if the parameters are only claimed.
-    """
-
-    parameters: Float[np.ndarray, " base"]
-    covariance: Float[np.ndarray, "base base"] | None
 
 
 def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
@@ -79,42 +63,6 @@ def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
     return kind(table.harmonics, table.omega)
 
 
-def build_nominal(experiment: Experiment) -> Nominal | None:
-    """What is known of the parameters: from an earlier result, or what the URDF file claims.
-
-    Args:
-        experiment: With its table `[excitation]`.
-
-    Raises:
-        ValueError: If the earlier result is of other parameters.
-    """
-    base, report, robot = experiment.base, experiment.excitation.nominal, experiment.source
-    if report is not None:
-        found = read_estimates(experiment.path.parent / report)
-        if found.names != base.names:
-            raise ValueError(
-                f"`nominal`: the {len(found.names)} base parameters of `{report}` are not the "
-                f"{base.size} of this experiment: identify with the same robot and model."
-            )
-        return Nominal(np.asarray(found.parameters), np.asarray(found.covariance))
-    if robot.urdf is None:
-        return None
-    claimed = urdf_parameters(
-        experiment.path.parent / robot.urdf,
-        tip=robot.tip,
-        base=robot.base,
-        snap_tolerance=SNAP_TOLERANCE if robot.snap_tolerance is None else robot.snap_tolerance,
-    )
-    if not np.any(claimed):
-        return None
-    names = [f"{n}{i + 1}" for i in range(experiment.robot.joints) for n in INERTIAL_NAMES]
-    known = dict(zip(names, np.asarray(claimed).tolist(), strict=True))
-    standard = experiment.model.parameter_names
-    values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
-    leads = [standard[k] in known for k in base.indices]
-    return Nominal(np.where(leads, values, np.nan), None)
-
-
 def build_constraints(
     experiment: Experiment, nominal: Nominal | None
 ) -> tuple[AbstractConstraint, ...]:
@@ -127,7 +75,8 @@ def build_constraints(
     Raises:
         ValueError: If forces are limited, but no parameters or no largest forces are known.
     """
-    table, found = experiment.excitation, []
+    table = experiment.excitation
+    found: list[AbstractConstraint] = []
     if experiment.collision is not None:
         found.append(Clearance(experiment.collision, experiment.clearance))
     if table.tip_speed is not None:
@@ -136,31 +85,19 @@ def build_constraints(
         found.append(TipAcceleration(table.tip_acceleration))
     if table.workspace is not None:
         found.append(Workspace.of(*table.workspace))
-    if table.force_margin is not None:
-        found += _forces(experiment, nominal, table.force_margin)
-    return tuple(found)
-
-
-def _forces(
-    experiment: Experiment, nominal: Nominal | None, margin: float
-) -> list[AbstractConstraint]:
+    if table.force_margin is None:
+        return tuple(found)
     if nominal is None:
         raise ValueError(
             "`force_margin` needs parameters to compute forces with: say in `nominal` where an "
             "earlier result of `jaxid identify` is."
         )
-    robot = experiment.robot
-    forces = NominalForces.of(
-        experiment.base, np.nan_to_num(nominal.parameters), nominal.covariance
-    )
-    found: list[AbstractConstraint] = []
-    if np.isfinite(robot.limits.force).any():
-        found.append(JointForces(forces, margin))
-    if np.isfinite(robot.drives.max_torques).any():
-        found.append(MotorTorques(forces, margin))
-    if not found:
-        raise ValueError("`force_margin` needs largest forces: give `limits.force`.")
-    return found
+    forces = force_limits(experiment, nominal, table.force_margin)
+    if not forces:
+        raise ValueError(
+            "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
+        )
+    return (*found, *forces)
 
 
 def build_prior(

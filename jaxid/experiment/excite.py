@@ -1,26 +1,28 @@
 """Designs the motion of an experiment file, and makes of it what a robot can play."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from jaxid.excitation.design import DesignProgress, assumed_noise, design_excitation
+from jaxid.excitation.design import NOISE, DesignProgress, assumed_noise, design_excitation
 from jaxid.excitation.plan import CRITERIA as ALL
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.experiment.excitation_tables import (
     CRITERIA,
     build_basis,
     build_constraints,
-    build_nominal,
     build_prior,
 )
+from jaxid.experiment.excited_forces import force_remarks
 from jaxid.experiment.experiment import Experiment
+from jaxid.experiment.nominal import Nominal, build_nominal
 from jaxid.experiment.robot_tables import within
 from jaxid.files import written_whole
-from jaxid.report.excited import write_pictures
+from jaxid.report.blocks import Remark, Tone
+from jaxid.report.excited import Aside, write_pictures
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.files import save_trajectory, write_csv
 from jaxid.trajectory.leads import with_leads
@@ -39,13 +41,13 @@ class Excited(NamedTuple):
         plan: The design.
         played: The motion from standstill to standstill where that could be had.
         window: Times of it between which lies the designed motion [s].
-        refused: Why there is no way into the motion, or an empty text.
+        aside: What else is to be said of it, and how it came about.
     """
 
     plan: ExcitationPlan
     played: AbstractTrajectory
     window: tuple[float, float]
-    refused: str
+    aside: Aside
 
 
 def design(
@@ -66,6 +68,7 @@ def design(
         ValueError: If the table does not fit the robot, or no motion keeps all limits.
     """
     with within(experiment.path.name, "excitation"):
+        nominal = build_nominal(experiment)
         plan = design_excitation(
             experiment.base,
             criterion=CRITERIA[experiment.excitation.criterion](),
@@ -75,9 +78,9 @@ def design(
             progress=progress,
             state=state,
             resume=resume,
-            **_settings(experiment),
+            **_settings(experiment, nominal),
         )
-    return _played(experiment, plan)
+        return _played(experiment, plan, nominal)
 
 
 def side_by_side(
@@ -99,6 +102,7 @@ def side_by_side(
 
         try:
             with within(experiment.path.name, "excitation"):
+                nominal = build_nominal(experiment)
                 plan = design_excitation(
                     experiment.base,
                     criterion=criterion,
@@ -106,7 +110,7 @@ def side_by_side(
                     polish=0,
                     progress=tell,
                     throw=False,
-                    **_settings(experiment, bool(criterion.weighted)),
+                    **_settings(experiment, nominal, bool(criterion.weighted)),
                 )
         except KeyboardInterrupt:
             break
@@ -116,14 +120,16 @@ def side_by_side(
     return found
 
 
-def write(excited: Excited, output: Path) -> list[Path]:
+def write(excited: Excited, output: Path, command: str = "") -> list[Path]:
     """Writes table, trajectory, ROS message and pictures; returns the files.
 
     Args:
         excited: The motion.
         output: Of the table; the others lie beside it.
+        command: The line that makes it again, for the page.
     """
     plan, played = excited.plan, excited.played
+    aside = excited.aside._replace(settings={**excited.aside.settings, "command": command})
     robot, times = plan.base.model.robot, _measured(plan)
     step = float(times[1] - times[0])
     names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.yaml"]
@@ -131,27 +137,27 @@ def write(excited: Excited, output: Path) -> list[Path]:
         write_csv(played, robot, folder / names[0], sample_time=step)
         save_trajectory(jax.tree.map(np.asarray, played), folder / names[1])
         write_ros_yaml(played, robot, folder / names[2], sample_time=step)
-    return [output.parent / n for n in names] + write_pictures(output.with_suffix(""), plan, played)
+    pictures = write_pictures(output.with_suffix(""), plan, played, aside)
+    return [output.parent / n for n in names] + pictures
 
 
-def _settings(experiment: Experiment, weighted: bool = True) -> dict:
+def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = True) -> dict:
     """What all designs of one experiment have in common."""
     table, robot = experiment.excitation, experiment.robot
     noise = assumed_noise(robot) if table.noise is None else np.array(table.noise)
-    nominal = build_nominal(experiment)
     constraints = build_constraints(experiment, nominal)
     return {
         "basis": build_basis(table, bool(constraints)),
         "constraints": constraints,
         "key": jax.random.key(table.seed),
         "noise": noise,
-        "nominal": None if nominal is None else nominal.parameters,
+        "nominal": None if nominal is None else nominal.sizes,
         "prior": build_prior(experiment, noise) if weighted else None,
         "samples": table.samples,
     }
 
 
-def _played(experiment: Experiment, plan: ExcitationPlan) -> Excited:
+def _played(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None) -> Excited:
     motion, table, times = plan.trajectory, experiment.excitation, _measured(plan)
     window, refused = (float(times[0]), float(times[-1])), ""
     # Where constraints were found, leads were designed together with the motion.
@@ -166,7 +172,42 @@ def _played(experiment: Experiment, plan: ExcitationPlan) -> Excited:
         else:
             begin, end = (float(t) for t in motion.window)
             window = (begin, end)
-    return Excited(plan, motion, window, refused)
+    said = (
+        *_said(experiment, plan, float(motion.duration), window, refused),
+        *force_remarks(experiment, nominal, motion),
+    )
+    settings = {"facts": (("seed", str(table.seed)),), "experiment_text": experiment.text}
+    return Excited(plan, motion, window, Aside(said, settings))
+
+
+def _said(
+    experiment: Experiment,
+    plan: ExcitationPlan,
+    whole: float,
+    window: tuple[float, float],
+    refused: str,
+) -> Iterator[Remark]:
+    table, (begin, end) = experiment.excitation, window
+    if begin > 0:
+        yield Remark(
+            Tone.PLAIN,
+            f"the robot starts at rest and is in the designed motion from {begin:.3f} to "
+            f"{end:.3f} s of {whole:.3f} s",
+        )
+    if table.noise is None:
+        share = f"{100 * NOISE:g} % of the largest forces"
+        yield Remark(Tone.PLAIN, f"the noise is assumed as {share}: give `noise` if it is known")
+    if table.earlier:
+        yield Remark(Tone.PLAIN, f"deviations are those together with {', '.join(table.earlier)}")
+    if plan.nominal is None:
+        text = "for relative deviations, say in `excitation.nominal` where an earlier result is"
+        yield Remark(Tone.PLAIN, text)
+    if refused:
+        yield Remark(
+            Tone.BAD,
+            f"the motion is without leads, and starts and ends at full speed: {refused} "
+            "`rest = true` designs one that is at rest there.",
+        )
 
 
 def _measured(plan: ExcitationPlan) -> Float[np.ndarray, " times"]:

@@ -4,26 +4,32 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from jaxid.excitation.plan import CRITERIA, VAGUE, ExcitationPlan
+from jaxid.excitation.plan import CRITERIA, ExcitationPlan
 from jaxid.experiment.excite import Excited
-from jaxid.experiment.terminal import DOUBTFUL, sentences, show_table
+from jaxid.experiment.terminal import BAD, DOUBTFUL, GOOD, sentences, show_table
+from jaxid.report.blocks import Tone
 from jaxid.report.excitation import (
     criteria_table,
     deviation_table,
+    findings_table,
     side_by_side_table,
     use_table,
 )
+from jaxid.report.excitation_words import ordered, remarks
+
+STYLES = {Tone.PLAIN: "", Tone.GOOD: GOOD, Tone.DOUBTFUL: DOUBTFUL, Tone.BAD: BAD}
+"""How remarks look in the terminal."""
 
 
 def show_excited(console: Console, excited: Excited) -> None:
     """A designed motion and how a robot gets into it."""
     plan = excited.plan
-    for table in (criteria_table(plan), deviation_table(plan), use_table(plan)):
+    tables = [criteria_table(plan), deviation_table(plan), use_table(plan)]
+    for table in [*tables, findings_table(plan.findings)] if plan.findings else tables:
         console.print()
         show_table(console, table)
-    sentences(console, [str(f) for f in plan.findings])
-    sentences(console, _said(excited))
-    sentences(console, _warned(excited), DOUBTFUL, "!")
+    for remark in ordered((*remarks(plan), *excited.aside.remarks)):
+        sentences(console, [remark.text], STYLES[remark.tone], remark.tone.value)
 
 
 def show_side_by_side(console: Console, plans: Sequence[ExcitationPlan]) -> None:
@@ -52,36 +58,3 @@ def _show_criteria(console: Console, plans: Sequence[ExcitationPlan]) -> None:
             *(f"#{k + 1} was stopped before its end" for k, p in enumerate(plans) if p.interrupted),
         ],
     )
-
-
-def _said(excited: Excited) -> list[str]:
-    plan, (begin, end) = excited.plan, excited.window
-    limits, said = plan.limits.limits, []
-    if begin > 0:
-        whole = float(excited.played.duration)
-        said.append(
-            f"the robot starts at rest and is in the designed motion from {begin:.3f} to "
-            f"{end:.3f} s of {whole:.3f} s"
-        )
-    if limits.assumed:
-        said.append(f"limits that nobody published, assumed: {', '.join(limits.assumed)}")
-    if plan.nominal is None:
-        said.append(
-            "for relative deviations, say in `excitation.nominal` where an earlier result is"
-        )
-    return said
-
-
-def _warned(excited: Excited) -> list[str]:
-    plan, warned = excited.plan, []
-    if plan.undetermined:
-        warned.append(f"this motion does not determine: {', '.join(plan.undetermined)}")
-    if plan.vague:
-        warned.append(
-            f"deviations above {100 * VAGUE:g} % of the nominal value: {', '.join(plan.vague)}"
-        )
-    if excited.refused:
-        warned.append(f"the motion starts at full speed, for {excited.refused}")
-    if plan.interrupted:
-        warned.append("the design was stopped: `--resume` goes on where it was")
-    return warned

@@ -1,12 +1,14 @@
 """What a design has found: tables for the terminal."""
 
+import math
 from collections.abc import Sequence
 
 from rich.table import Table
 from rich.text import Text
 
+from jaxid.excitation.constraints.constraint import Finding
 from jaxid.excitation.plan import VAGUE, ExcitationPlan
-from jaxid.report.numbers import aligned, percent, significant
+from jaxid.report.numbers import MISSING, aligned, percent, significant
 from jaxid.report.tables import plain_table
 
 
@@ -74,4 +76,25 @@ def use_table(plan: ExcitationPlan) -> Table:
         table.add_column(kinds[k], justify="right", no_wrap=True)
     for j, name in enumerate(plan.base.model.robot.joint_names):
         table.add_row(Text(name), *(f"{100 * use[k, j]:.1f}" for k in shown))
+    return table
+
+
+def findings_table(findings: Sequence[Finding]) -> Table:
+    """How near a motion comes to the limits that are not those of joints' motion.
+
+    Args:
+        findings: Of their constraints.
+    """
+    table = plain_table("use of the other limits")
+    table.add_column("what")
+    for title in ("reaches", "limit", "use [%]"):
+        table.add_column(title, justify="right", no_wrap=True)
+    table.add_column("made of", overflow="fold")
+    for one in findings:
+        style = "red" if one.value > 0 else ""
+        limit = f"{'≥' if one.least else '≤'} {one.limit:.4g} {one.unit}"
+        reached = f"{significant(one.reached, 4)} {one.unit}"
+        share = f"{100 * one.used:.1f}" if math.isfinite(one.used) else MISSING
+        cells = (one.name.removeprefix("the "), reached, limit, share, one.note)
+        table.add_row(*(Text(cell, style=style) for cell in cells))
     return table

@@ -2,17 +2,20 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxid.excitation.plan import VAGUE, ExcitationPlan
+from jaxid.excitation.plan import ExcitationPlan
 from jaxid.files import written_whole
-from jaxid.report.blocks import Facts, Headline, Picture, Prose, Remark, Remarks, Tone
-from jaxid.report.content import versions
-from jaxid.report.excitation import criteria_table, deviation_table, use_table
+from jaxid.report.blocks import Headline, Picture, Prose, Remark, Remarks, Tone
+from jaxid.report.excitation import criteria_table, deviation_table, findings_table, use_table
+from jaxid.report.excitation_words import expectation, ordered, remarks
 from jaxid.report.motion_figures import joint_figure, tip_figure
 from jaxid.report.page import Page, Section, write_page
+from jaxid.report.repeat import repeat
 from jaxid.report.sheets import sheet_of
 from jaxid.report.space import path_figure, pose_figure
 from jaxid.report.style import save
@@ -30,8 +33,23 @@ CAPTIONS = {
 """Of the figures, by the names of their files."""
 
 
+class Aside(NamedTuple):
+    """What a page says of a design beside its plan.
+
+    Attributes:
+        remarks: What else is to be known, in sentences without their full stops.
+        settings: How the design came about: `facts`, `command` and `experiment_text`.
+    """
+
+    remarks: tuple[Remark, ...] = ()
+    settings: Mapping[str, Any] = MappingProxyType({})
+
+
 def write_pictures(
-    folder: Path, plan: ExcitationPlan, played: AbstractTrajectory | None = None
+    folder: Path,
+    plan: ExcitationPlan,
+    played: AbstractTrajectory | None = None,
+    aside: Aside | None = None,
 ) -> list[Path]:
     """Writes a page and its figures: joints, end-effector and its path; all of them or nothing.
 
@@ -39,6 +57,7 @@ def write_pictures(
         folder: Where they shall lie.
         plan: With the motion.
         played: The motion with its leads, to be drawn in its place.
+        aside: What else the page says.
     """
     robot, shown = plan.base.model.robot, plan.trajectory if played is None else played
     with double_precision():
@@ -51,28 +70,42 @@ def write_pictures(
         "end_effector": tip_figure(robot, time, motion),
     }
     with written_whole(folder) as staging:
-        write_page(staging / PAGE, excitation_page(plan, figures))
+        write_page(staging / PAGE, excitation_page(plan, figures, aside))
         for name, figure in figures.items():
             save(figure, staging / f"{name}.png")
     return [folder / name for name in (PAGE, *(f"{name}.png" for name in figures))]
 
 
-def excitation_page(plan: ExcitationPlan, figures: Mapping[str, Figure]) -> Page:
+def excitation_page(
+    plan: ExcitationPlan, figures: Mapping[str, Figure], aside: Aside | None = None
+) -> Page:
     """What a design has found, for people.
 
     Args:
         plan: With the motion.
         figures: Of the motion, by the names of their files without suffix.
+        aside: What else the page says.
     """
     robot, base = plan.base.model.robot, plan.base
+    aside = Aside() if aside is None else aside
+    use = [sheet_of(use_table(plan), "percent, for all times")]
+    if plan.findings:
+        use.append(sheet_of(findings_table(plan.findings), "at the instants that were checked"))
+    said = ordered((*remarks(plan), *aside.remarks))
     return Page(
         f"{robot.name}: a motion to record",
         (
-            Section("Verdict", (Headline(_whole(plan)), Remarks(_remarks(plan)))),
+            Section(
+                "Verdict",
+                (
+                    Headline(_whole(plan, aside.remarks)),
+                    Remarks(tuple(Remark(r.tone, _sentence(r.text)) for r in said)),
+                ),
+            ),
             Section(
                 "The motion", tuple(Picture(f, CAPTIONS.get(n, "")) for n, f in figures.items())
             ),
-            Section("Use of the limits", (sheet_of(use_table(plan), "percent, for all times"),)),
+            Section("Use of the limits", tuple(use)),
             Section(
                 "What it buys",
                 (
@@ -83,38 +116,35 @@ def excitation_page(plan: ExcitationPlan, figures: Mapping[str, Figure]) -> Page
                     sheet_of(criteria_table(plan)),
                 ),
             ),
-            Section("Standard deviations to expect", (sheet_of(deviation_table(plan), ""),)),
-            Section("To repeat this", (Facts(tuple(versions().items())),)),
+            Section(
+                "Standard deviations to expect",
+                (Prose(_sentence(expectation(plan))), sheet_of(deviation_table(plan), "")),
+            ),
+            Section("To repeat this", repeat(aside.settings)),
         ),
         f"It shall determine {base.size} base parameters of {robot.joints} joints.",
     )
 
 
-def _whole(plan: ExcitationPlan) -> Remark:
+def _whole(plan: ExcitationPlan, others: tuple[Remark, ...]) -> Remark:
     if plan.undetermined:
         return Remark(Tone.BAD, "This motion does not determine all base parameters.")
     if not plan.feasible:
         return Remark(Tone.BAD, "This motion does not keep all limits.")
     if plan.interrupted:
         return Remark(Tone.DOUBTFUL, "A motion that can be recorded, but its design was stopped.")
-    return Remark(Tone.GOOD, "A motion that keeps all limits and determines all base parameters.")
-
-
-def _remarks(plan: ExcitationPlan) -> tuple[Remark, ...]:
-    mean = f"{plan.mean_gain:.3g}"
-    said = [
-        Remark(Tone.PLAIN, f"Standard deviations are {mean} times smaller than a random motion's.")
-    ]
-    if plan.undetermined:
-        said.append(Remark(Tone.BAD, f"Not determined: {', '.join(plan.undetermined)}."))
-    if plan.vague:
-        text = f"Deviations above {100 * VAGUE:g} % of the nominal value: {', '.join(plan.vague)}."
-        said.append(Remark(Tone.DOUBTFUL, text))
-    said += [Remark(Tone.BAD, text) for text in plan.diagnosis]
-    said += [Remark(Tone.PLAIN, str(finding)) for finding in plan.findings]
-    assumed = plan.limits.limits.assumed
-    if assumed:
-        said.append(
-            Remark(Tone.DOUBTFUL, f"Limits that nobody published, assumed: {', '.join(assumed)}.")
+    if any(remark.tone is Tone.BAD for remark in others):
+        return Remark(
+            Tone.DOUBTFUL,
+            "A motion that determines all base parameters, but read what stands below before it "
+            "is recorded.",
         )
-    return tuple(said)
+    return Remark(
+        Tone.GOOD,
+        "A motion that keeps all limits it was designed for, and determines all base parameters.",
+    )
+
+
+def _sentence(text: str) -> str:
+    stop = "" if text.endswith((".", "?", "!")) else "."
+    return text[:1].upper() + text[1:] + stop

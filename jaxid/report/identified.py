@@ -10,9 +10,7 @@ from jaxid.identification.fit import Fit
 from jaxid.report.blocks import (
     Abreast,
     AbstractBlock,
-    Code,
     Facts,
-    Folded,
     Headline,
     Picture,
     Prose,
@@ -21,9 +19,9 @@ from jaxid.report.blocks import (
     Tone,
 )
 from jaxid.report.bodies import body_table, consistency_facts
-from jaxid.report.content import versions
 from jaxid.report.numbers import percent, significant
 from jaxid.report.page import Page, Section
+from jaxid.report.repeat import repeat
 from jaxid.report.sheets import parameter_sheet, sheet_of
 from jaxid.report.tables import error_table, joint_table, motor_table, residual_table
 from jaxid.report.verdict import verdict
@@ -106,7 +104,7 @@ def identification_page(
         )
     if "filter" in figures:
         sections.append(Section("Choice of the filter", (Picture(figures["filter"]),)))
-    sections.append(Section("To repeat this", _repeat(settings)))
+    sections.append(Section("To repeat this", repeat(settings)))
     logs = f"{len(fit.recordings)} log{'' if len(fit.recordings) == 1 else 's'}"
     return Page(
         f"{robot.name}: identified parameters",
@@ -193,15 +191,4 @@ def _parameters(fit: Fit, figure: Figure) -> tuple[AbstractBlock, ...]:
             for name, value in base.lengths.items()
         )
         blocks.append(Prose(f"In the combinations: {', '.join(shown)}."))
-    return tuple(blocks)
-
-
-def _repeat(settings: Mapping[str, Any]) -> tuple[AbstractBlock, ...]:
-    blocks: list[AbstractBlock] = [Facts(tuple(versions().items()))]
-    command = settings.get("command")
-    if command:
-        blocks.append(Code(str(command)))
-    text = settings.get("experiment_text")
-    if text:
-        blocks.append(Folded("The experiment file", (Code(str(text)),)))
     return tuple(blocks)

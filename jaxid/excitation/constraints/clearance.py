@@ -1,5 +1,7 @@
 """No collisions: a least distance between the surfaces of what may not touch."""
 
+import math
+
 import equinox as eqx
 
 from jaxid.dynamics.machine import on_samples
@@ -45,4 +47,12 @@ class Clearance(AbstractConstraint):
 
     def entries(self, robot: Robot) -> tuple[Entry, ...]:
         """The pairs."""
-        return tuple(Entry(f"the clearance of {name}", SIZE, "m") for name in self.model.pair_names)
+        return tuple(
+            Entry(f"the clearance of {name}", SIZE, "m", self.distance, least=True)
+            for name in self.model.pair_names
+        )
+
+    def used(self, entry: Entry, value: float) -> float:
+        """The least distance over the clearance that is left."""
+        left = self.distance - value * SIZE
+        return self.distance / left if left > 0 else math.inf

@@ -164,10 +164,12 @@ class AbstractForceLimits(AbstractConstraint):
     def entries(self, robot: Robot) -> tuple[Entry, ...]:
         """What has a limit."""
         found = []
-        for number, limit in enumerate((1 - self.margin) * self.limits(robot)):
-            if np.isfinite(limit):
+        for number, whole in enumerate(self.limits(robot).tolist()):
+            if np.isfinite(whole):
                 name, unit = self.named(robot, number)
-                found.append(Entry(name, float(limit), unit))
+                note = f"{whole:.4g} less a margin of {100 * self.margin:.4g} %"
+                limit = (1 - self.margin) * whole
+                found.append(Entry(name, limit, unit, limit, note=note if self.margin else ""))
         return tuple(found)
 
 

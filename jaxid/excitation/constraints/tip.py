@@ -1,5 +1,6 @@
 """Limits of the end-effector: its speed, its acceleration, and the box that it must not leave."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -16,6 +17,8 @@ from jaxid.types import AnyArray, Array, Float, Numbers
 
 STILL = 1e-6
 """Share of a limit by which a length is rounded up, so that it is smooth at zero."""
+OPEN = "the other side is open"
+"""What is said of a box's side that has none opposite."""
 
 
 class TipMotion(NamedTuple):
@@ -80,7 +83,7 @@ class TipSpeed(AbstractConstraint):
 
     def entries(self, robot: Robot) -> tuple[Entry, ...]:
         """One value."""
-        return (Entry("the speed of the end-effector", self.limit, "m/s"),)
+        return (Entry("the speed of the end-effector", self.limit, "m/s", self.limit),)
 
 
 class TipAcceleration(AbstractConstraint):
@@ -101,7 +104,7 @@ class TipAcceleration(AbstractConstraint):
 
     def entries(self, robot: Robot) -> tuple[Entry, ...]:
         """One value."""
-        return (Entry("the acceleration of the end-effector", self.limit, "m/s²"),)
+        return (Entry("the acceleration of the end-effector", self.limit, "m/s²", self.limit),)
 
 
 class Workspace(AbstractConstraint):
@@ -147,11 +150,22 @@ class Workspace(AbstractConstraint):
 
     def entries(self, robot: Robot) -> tuple[Entry, ...]:
         """The sides that have an end."""
-        sides, _, sizes = self._sides()
+        sides, ends, sizes = self._sides()
         return tuple(
-            Entry(f"{'-' if sign < 0 else ''}{'xyz'[axis]} of the end-effector", float(size), "m")
-            for (axis, sign), size in zip(sides, sizes, strict=True)
+            Entry(
+                f"{'xyz'[axis]} of the end-effector",
+                float(size),
+                "m",
+                float(sign * end),
+                least=sign < 0,
+                note="" if np.isfinite(self.low[axis] + self.high[axis]) else OPEN,
+            )
+            for (axis, sign), end, size in zip(sides, ends, sizes, strict=True)
         )
+
+    def used(self, entry: Entry, value: float) -> float:
+        """The distance from the box's middle over half of its edge; nothing where it is open."""
+        return math.nan if entry.note else 1.0 + value
 
     def _sides(self) -> tuple[list[tuple[int, float]], np.ndarray, np.ndarray]:
         low, high = np.asarray(self.low), np.asarray(self.high)
