@@ -23,6 +23,7 @@ from jaxid.experiment.excite import design, side_by_side
 from jaxid.experiment.excited_forces import force_remarks
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.nominal import build_nominal
+from jaxid.experiment.tables import ExcitationTable, SplineTable
 from jaxid.report.blocks import Tone
 from jaxid.report.excitation_words import remarks
 from jaxid.report.excited import excitation_page
@@ -177,6 +178,9 @@ def test_a_killed_design_goes_on_to_the_same_motion(written, run):
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     assert listing(written / "killed") == ["motion.state.npz"]
+    code, out, err = run(*arguments)
+    assert (code, out) == (2, "")
+    assert "`--resume` goes on with it; to begin anew, remove the file" in err
     code, _, err = run(*arguments, "--resume")
     assert code == 0, err
     assert not state.exists()
@@ -216,6 +220,16 @@ def test_a_spline_in_place_of_a_series(written, run, no_pictures):
     assert 1.0 < np.abs(qd).max() <= 2
     assert np.abs(qdd).max() <= 4
     assert "use of the limits [%]" in out
+    assert "`harmonics` does nothing for a `spline`" in out
+
+
+def test_keys_that_others_leave_nothing_to_do_are_named():
+    table = ExcitationTable(spline=SplineTable(), harmonics=3, omega=1.0, polish=0, kicks=2)
+    assert table.idle == [
+        "`harmonics` and `omega` do nothing for a `spline`",
+        "`kicks` do nothing with `polish = 0`, for they are polished too",
+    ]
+    assert ExcitationTable(spline=SplineTable(), polish=0).idle == []
 
 
 def test_an_impossible_motion_is_diagnosed(written, run):
@@ -225,7 +239,7 @@ def test_an_impossible_motion_is_diagnosed(written, run):
     assert err.startswith("jaxid: far.toml: `excitation`: no motion was found")
     assert "z of the end-effector falls short of its limit by 2 m: at least 2 m" in err
     assert "-z" not in err
-    assert "far/motion.csv" not in listing(written)
+    assert not (written / "far").exists() or listing(written / "far") == []
 
 
 def test_earlier_results_are_nominal(written, excited):
@@ -353,8 +367,10 @@ def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
 
     monkeypatch.setattr("jaxid.cli.excite.design", lambda *_: excited)
     monkeypatch.setattr("jaxid.experiment.excite.design_excitation", one_design)
-    code, out, err = run("excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria")
+    arguments = ["excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria", "--resume"]
+    code, out, err = run(*arguments)
     assert code == 0, err
+    assert out.startswith("! `some/motion.state.npz` is not there to go on with: the design begins")
     assert asked == [c.name for c in CRITERIA[:2]]
     assert out.index("wrote some: motion.csv") < out.index("what each criterion buys")
     assert "stopped after 1 of 6 criteria" in out
@@ -384,6 +400,7 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch, kept
         ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
         ("rest = true", "`harmonics` must be at least"),
         ("rest = true\nspline = {}", "a `spline` rests at its ends"),
+        ("spline = { point = 9 }", "`excitation.spline.point` is no known key: did you mean `po"),
         ("spline = { points = 3 }", "`excitation.spline.points`"),
         ("noise = [1, 2]", "`noise` must hold one positive number for each joint (1)"),
         ('nominal = "nowhere"', "holds no `result.json`"),

@@ -39,8 +39,16 @@ def excite(
     """
     console = open_console()
     refuse_foreign_table(output)
-    loaded = load_experiment(experiment)
     state = output.with_suffix(".state.npz")
+    if state.exists() and not resume:
+        raise ValueError(
+            f"`{state}` is there: a design was stopped before its end. `--resume` goes on with it; "
+            "to begin anew, remove the file, or choose another -o."
+        )
+    loaded = load_experiment(experiment)
+    if resume and not state.exists():
+        text = f"`{state}` is not there to go on with: the design begins anew"
+        terminal.sentences(console, [text], terminal.DOUBTFUL, "!")
     try:
         with designing(console) as tell:
             excited = design(loaded, tell, state, resume)

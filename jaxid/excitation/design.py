@@ -145,6 +145,9 @@ def design_excitation(
         unkept = "; ".join(plan.diagnosis)
         if interrupted:
             raise KeyboardInterrupt(f"stopped before a motion kept all limits: {unkept}")
+        if path is not None:
+            # The design is done: to go on with it would end in the same place.
+            path.unlink(missing_ok=True)
         raise ValueError(f"no motion was found that keeps all limits: {unkept}")
     return plan
 

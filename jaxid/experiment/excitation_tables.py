@@ -58,9 +58,9 @@ def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
             )
         return RestToRestSplineBasis(table.spline.points, table.spline.duration)
     if table.rest:
-        return RestToRestBasis(table.harmonics, table.omega)
+        return RestToRestBasis(*table.series)
     kind = LeadsBasis if constrained and table.leads else FourierBasis
-    return kind(table.harmonics, table.omega)
+    return kind(*table.series)
 
 
 def build_constraints(

@@ -32,6 +32,8 @@ from jaxid.types import Float, double_precision
 
 FEW = 8
 """Starts of the designs that only show what a criterion buys."""
+KICKS = 8
+"""How often the best motion is disturbed where the file does not say."""
 
 
 class Excited(NamedTuple):
@@ -73,7 +75,7 @@ def design(
             experiment.base,
             criterion=CRITERIA[experiment.excitation.criterion](),
             polish=min(experiment.excitation.polish, experiment.excitation.starts),
-            kicks=experiment.excitation.kicks,
+            kicks=KICKS if experiment.excitation.kicks is None else experiment.excitation.kicks,
             starts=experiment.excitation.starts,
             progress=progress,
             state=state,
@@ -164,7 +166,7 @@ def _played(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | Non
     resting = table.rest or table.spline is not None
     if table.leads and not resting and not plan.findings:
         robot = experiment.robot.replace(limits=plan.limits.limits)
-        series = FourierBasis(table.harmonics, table.omega).trajectory(plan.numbers)
+        series = FourierBasis(*table.series).trajectory(plan.numbers)
         try:
             motion = with_leads(series, robot)
         except ValueError as error:
@@ -199,6 +201,8 @@ def _said(
         yield Remark(Tone.PLAIN, f"the noise is assumed as {share}: give `noise` if it is known")
     if table.earlier:
         yield Remark(Tone.PLAIN, f"deviations are those together with {', '.join(table.earlier)}")
+    for text in table.idle:
+        yield Remark(Tone.PLAIN, text)
     if plan.nominal is None:
         text = "for relative deviations, say in `excitation.nominal` where an earlier result is"
         yield Remark(Tone.PLAIN, text)

@@ -40,6 +40,7 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "rows": tables.RowsTable,
     "estimator": tables.EstimatorTable,
     "excitation": tables.ExcitationTable,
+    "excitation.spline": tables.SplineTable,
 }
 
 

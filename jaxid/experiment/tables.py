@@ -261,15 +261,15 @@ class ExcitationTable(_Table, frozen=True):
         "weighted_condition_number",
         "scaled_condition_number",
     ] = "d_optimal"
-    harmonics: Annotated[int, Meta(ge=1, le=50)] = 5
-    omega: Annotated[float, Meta(gt=0, le=1000)] = 0.8
+    harmonics: Annotated[int, Meta(ge=1, le=50)] | None = None
+    omega: Annotated[float, Meta(gt=0, le=1000)] | None = None
     rest: bool = False
     spline: SplineTable | None = None
     samples: Annotated[int, Meta(ge=2)] = 800
     noise: PerJoint | None = None
     starts: Count = 32
     polish: Annotated[int, Meta(ge=0)] = 4
-    kicks: Annotated[int, Meta(ge=0)] = 8
+    kicks: Annotated[int, Meta(ge=0)] | None = None
     seed: Annotated[int, Meta(ge=0)] = 0
     leads: bool = True
     nominal: str | None = None
@@ -278,6 +278,27 @@ class ExcitationTable(_Table, frozen=True):
     tip_speed: Positive | None = None
     tip_acceleration: Positive | None = None
     workspace: tuple[Vector, Vector] | None = None
+
+    @property
+    def series(self) -> tuple[int, float]:
+        """Number of harmonics, and ground frequency [rad/s]."""
+        return (
+            5 if self.harmonics is None else self.harmonics,
+            0.8 if self.omega is None else self.omega,
+        )
+
+    @property
+    def idle(self) -> list[str]:
+        """Keys that were given although others leave them nothing to do, in sentences."""
+        said = []
+        if self.spline is not None:
+            given = [f"`{k}`" for k in ("harmonics", "omega") if getattr(self, k) is not None]
+            if given:
+                verb = "do" if len(given) > 1 else "does"
+                said.append(f"{' and '.join(given)} {verb} nothing for a `spline`")
+        if self.kicks and not self.polish:
+            said.append("`kicks` do nothing with `polish = 0`, for they are polished too")
+        return said
 
 
 class Tables(_Table, frozen=True):
