@@ -27,6 +27,7 @@ EXPERIMENT = """\
 [robot]
 builtin = "planar_arm"
 [limits]
+angle_unit = "deg"
 position_min = [-150, -150]
 position_max = [150, 150]
 velocity = [400, 400]

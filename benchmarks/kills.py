@@ -44,6 +44,7 @@ EXPERIMENT = """\
 [robot]
 builtin = "planar_arm"
 [limits]
+angle_unit = "deg"
 position_min = [-120, -120]
 position_max = [120, 120]
 velocity = [120, 120]

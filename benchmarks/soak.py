@@ -35,6 +35,7 @@ convention = "modified"
 name = "soak"
 {rows}
 [limits]
+angle_unit = "deg"
 position_min = [-150, -150, -150]
 position_max = [150, 150, 150]
 velocity = [180, 180, 180]

@@ -10,6 +10,16 @@ pytestmark = pytest.mark.usefixtures("blank_figures")
 KEYS = [
     ("[limits]\nforce = [80, 20]", "[limits]\nforce = [1e-300, 20]", "`force` must be above"),
     ("[limits]\nforce = [80, 20]", "[limits]\nforce = [80, 1e300]", "`force` must be below"),
+    (
+        "[limits]",
+        "[limits]\nposition_max = [150, 150]",
+        "joint `joint1` ranges to 150 rad, which is 23.9 turns: for degrees add `a",
+    ),
+    (
+        "[limits]",
+        "[robot.tool]\nmass = 1e300\ncentre_of_mass = [0, 0, 0]\n[limits]",
+        "`robot.tool`: `mass` of the tool must be a positive number of 100000 kg at most",
+    ),
     ("[robot]", "[robot]\ngravity = [0, 0, nan]", "`robot.gravity` must hold three finite"),
     ("[robot]", "[[robot]]", "but is a list of tables (`[[…]]`)"),
     ("[limits]", "[drives]\ngear_ratios = [nan, 1]\n[limits]", "`gear_ratios` must be finite nu"),

@@ -682,7 +682,7 @@ def test_the_template_breaks_long_lists(tmp_path):
     joints = "".join(
         f'<link name="l{i}"/><joint name="turning_joint_{i}" type="revolute">'
         f'<parent link="l{i - 1}"/><child link="l{i}"/><axis xyz="0 0 1"/>'
-        f'<limit lower="{-i - 1 / 3}" upper="{i + 1 / 7}" velocity="1" effort="2"/></joint>'
+        f'<limit lower="{-i / 3 - 1 / 3}" upper="{i / 3 + 1 / 7}" velocity="1" effort="2"/></joint>'
         for i in range(1, 31)
     )
     (tmp_path / "snake.urdf").write_text(f'<robot name="snake"><link name="l0"/>{joints}</robot>')
@@ -690,7 +690,7 @@ def test_the_template_breaks_long_lists(tmp_path):
     path.write_text(write_template(tmp_path / "snake.urdf", folder=tmp_path))
     assert max(map(len, path.read_text().splitlines())) <= 100
     low = load_experiment(path).robot.limits.position_min
-    np.testing.assert_array_equal(low, [-i - 1 / 3 for i in range(1, 31)])
+    np.testing.assert_array_equal(low, [-i / 3 - 1 / 3 for i in range(1, 31)])
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ from jaxid.identification.uncertainty.methods import (
 )
 from jaxid.identification.weights import AbstractWeights, MaximumForces, ResidualVariances
 from jaxid.robot.robot import Robot
+from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import urdf_parameters
 from jaxid.trajectory.files import load_trajectory
 from jaxid.types import Float
@@ -196,7 +197,10 @@ def _prior(table: EstimatorTable, origin: RobotTable, path: Path) -> Float[np.nd
             f'`prior = "{table.prior}"` takes the inertias of the robot\'s URDF file, but '
             "`[robot]` names none."
         )
-    found = urdf_parameters(path.parent / origin.urdf, tip=origin.tip, base=origin.base)
+    tolerance = SNAP_TOLERANCE if origin.snap_tolerance is None else origin.snap_tolerance
+    found = urdf_parameters(
+        path.parent / origin.urdf, tip=origin.tip, base=origin.base, snap_tolerance=tolerance
+    )
     return np.asarray(found).reshape(-1, 10)
 
 

@@ -59,12 +59,17 @@ def build_nominal(experiment: Experiment) -> Nominal | None:
         return Nominal(base.names, np.asarray(found.parameters), covariance, names)
     if robot.urdf is None:
         return None
-    claimed = urdf_parameters(
-        experiment.path.parent / robot.urdf,
-        tip=robot.tip,
-        base=robot.base,
-        snap_tolerance=SNAP_TOLERANCE if robot.snap_tolerance is None else robot.snap_tolerance,
-    )
+    try:
+        claimed = urdf_parameters(
+            experiment.path.parent / robot.urdf,
+            tip=robot.tip,
+            base=robot.base,
+            snap_tolerance=SNAP_TOLERANCE if robot.snap_tolerance is None else robot.snap_tolerance,
+        )
+    except ValueError:
+        if experiment.excitation.force_margin is not None:
+            raise
+        return None  # nothing is kept by it, and the robot's notes name the body that cannot be
     if not np.any(claimed):
         return None
     names = [f"{n}{i + 1}" for i in range(experiment.robot.joints) for n in INERTIAL_NAMES]

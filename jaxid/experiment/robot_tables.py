@@ -20,6 +20,7 @@ from jaxid.robot import library
 from jaxid.robot.dh import from_dh
 from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
+from jaxid.robot.plausible import beyond_range, far_notes, fast_notes
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.snap import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import load_urdf
@@ -67,7 +68,9 @@ def build_robot(tables: Tables, path: Path) -> Robot:
             robot = robot.replace(tool=build_load(robot, table.tool))
     if tables.limits is not None:
         with within(file, "limits"):
-            robot = robot.replace(limits=_limits(robot, tables.limits))
+            limits = _limits(robot, tables.limits)
+        said = _limit_notes(robot, tables.limits, limits)
+        robot = robot.replace(limits=limits, notes=(*robot.notes, *said))
     if tables.drives is not None:
         with within(file, "drives"):
             robot = robot.replace(drives=_drives(robot, tables.drives))
@@ -203,8 +206,26 @@ def _limits(robot: Robot, table: LimitsTable) -> Limits:
             if not np.isnan(given).any():
                 said.append(name)
         fields[name] = known
+    for j, name in enumerate(robot.joint_names):
+        low, high = fields["position_min"][j], fields["position_max"][j]
+        if why := beyond_range(low, high, robot.revolute[j]):
+            cure = "give the limits in metres, inf for none"
+            if robot.revolute[j]:
+                cure = 'for degrees add `angle_unit = "deg"`, and inf means no limit'
+            raise ValueError(f"joint `{name}` {why}: {cure}.")
     assumed = tuple(what for what in robot.limits.assumed if what not in said)
     return Limits.of(robot.joints, **fields, assumed=assumed)
+
+
+def _limit_notes(robot: Robot, table: LimitsTable, limits: Limits) -> Iterator[str]:
+    """Sentences about limits of the file that exist, but look as if they were in other units."""
+    for j, name in enumerate(robot.joint_names):
+        ends = (float(limits.position_min[j]), float(limits.position_max[j]))
+        given = table.position_min is not None or table.position_max is not None
+        if given and not robot.revolute[j]:
+            yield from far_notes(f"joint `{name}`: an end of its range", ends)
+        if table.velocity is not None and table.angle_unit == "rad":
+            yield from fast_notes(name, float(limits.velocity[j]), robot.revolute[j])
 
 
 def _drives(robot: Robot, table: DrivesTable) -> Drives:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxid.arrays import as_array, is_traced, namespace
 from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
+from jaxid.robot.plausible import FAR, FARTHEST, HEAVIEST, far_notes
 from jaxid.types import AnyArray, Float, Numbers
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -46,12 +47,21 @@ class Tool(eqx.Module):
         """
         m, r = as_array("mass", mass), as_array("centre_of_mass", centre_of_mass)
         J = np.zeros((3, 3)) if inertia is None else as_array("inertia", inertia)
-        if m.shape != () or not (is_traced(m) or 0.0 < m < np.inf):
-            raise ValueError(f"`mass` of the tool must be a positive number [kg], but is {mass}.")
+        if m.shape != () or not (is_traced(m) or 0.0 < m <= HEAVIEST):
+            raise ValueError(
+                f"`mass` of the tool must be a positive number of {HEAVIEST:g} kg at most, but is "
+                f"{mass}."
+            )
         if r.shape != (3,) or not (is_traced(r) or np.isfinite(r).all()):
             raise ValueError("`centre_of_mass` of the tool must hold three finite numbers [m].")
+        if not is_traced(r) and np.abs(r).max() > FARTHEST:
+            raise ValueError(
+                f"`centre_of_mass` of the tool lies {np.abs(r).max():g} m away: give it in metres."
+            )
         if J.shape != (3, 3) or not (is_traced(J) or _is_symmetric(np.asarray(J))):
             raise ValueError("`inertia` of the tool must be a symmetric 3 x 3 matrix [kg m²].")
+        if not is_traced(J) and np.abs(J).max() > FAR**2 * HEAVIEST:
+            raise ValueError(f"`inertia` of the tool holds {np.abs(J).max():g}: give it in kg m².")
         if not is_traced(J):
             cls._refuse_impossible(np.linalg.eigvalsh(J))
         return cls(body, m, r, J)
@@ -216,6 +226,12 @@ class Robot(eqx.Module):
             _require_rotation(f"`rotation` of joint {j + 1}", R)
         _require_rotation("`tip_rotation`", arrays["tip_rotation"])
         names = tuple(f"joint{i + 1}" for i in range(n)) if joint_names is None else joint_names
+        places = [f"`offset` of joint `{one}`" for one in names]
+        places = dict(zip(places, arrays["offset"], strict=False))
+        places["`tip_offset`"] = arrays["tip_offset"]
+        for what, r in places.items():
+            if np.abs(r).max() > FARTHEST:
+                raise ValueError(f"{what} is {np.abs(r).max():g} m long: give it in metres.")
         return cls(
             name=name,
             joint_names=tuple(names),
@@ -226,7 +242,7 @@ class Robot(eqx.Module):
             tool=tool,
             tip_body=n - 1 if tip_body is None else tip_body,
             source=source,
-            notes=tuple(notes),
+            notes=(*notes, *(said for what, r in places.items() for said in far_notes(what, r))),
             **arrays,
         )
 

@@ -6,6 +6,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxid.robot.limits import Limits
+from jaxid.robot.plausible import (
+    ENDLESS,
+    FARTHEST,
+    LARGEST_ANGLE,
+    beyond_range,
+    far_notes,
+    fast_notes,
+    impossible,
+)
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.snap import (
     SNAP_TOLERANCE,
@@ -41,7 +50,9 @@ def load_urdf(
     carries them. Joints come depth first, and in the order of the file where a link carries
     several; so a parent comes before its children.
 
-    Limits that the file does not state, or states as zero, are infinite.
+    Limits that the file does not state, or states as zero, are infinite. Angles that can only be
+    degrees are refused, and so are lengths that no robot has; what looks like millimetres, and
+    inertias that no body has, are named in the robot's notes.
 
     Args:
         path: The file, expanded if it was a xacro file.
@@ -58,8 +69,8 @@ def load_urdf(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If it is no URDF, is no open tree, or has a mimic, floating or planar joint on
-            the way.
+        ValueError: If it is no URDF, is no open tree, has a mimic, floating or planar joint on
+            the way, or angles or lengths in other units.
     """
     tree = UrdfTree(path)
     body = _merge(tree, base, tip, snap_tolerance)
@@ -88,7 +99,7 @@ def load_urdf(
         tip_rotation=end_rotation,
         tip_offset=end_offset,
         source=tree.path,
-        notes=(*body.notes, *limit_notes, *massless),
+        notes=(*body.notes, *limit_notes, *massless, *_impossible_links(tree, body)),
     )
     return robot.mounted(base_rotation, base_position)
 
@@ -99,6 +110,7 @@ def urdf_parameters(
     tip: str | None = None,
     base: str | None = None,
     snap_tolerance: float = SNAP_TOLERANCE,
+    possible: bool = True,
 ) -> Float[AnyArray, " inertial"]:
     """Reads the inertial parameters of a URDF file: what its authors think, often from CAD (Eq. 9).
 
@@ -112,29 +124,77 @@ def urdf_parameters(
         tip: As in `load_urdf`.
         base: As in `load_urdf`.
         snap_tolerance: As in `load_urdf` [rad].
+        possible: Whether links that no body could be are refused; otherwise what the file claims of
+            them is taken as it is.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file cannot be loaded, or an inertia is not finite.
+        ValueError: If the file cannot be loaded, an inertia is not finite, or one belongs to no
+            body.
     """
     tree = UrdfTree(path)
     body = _merge(tree, base, tip, snap_tolerance)
     parameters = np.zeros((len(body.joints), 10))
     for name, (i, R, r) in body.links.items():
-        inertial = tree.urdf.link_map[name].inertial
-        if i < 0 or inertial is None:
+        found = _inertial(tree, name)
+        if i < 0 or found is None:
             continue
-        J = np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia.to_matrix()
-        xyz = _ZERO if inertial.origin is None else inertial.origin.xyz
-        rpy = _ZERO if inertial.origin is None else inertial.origin.rpy
-        if not all(np.isfinite(v).all() for v in (inertial.mass, J, xyz, rpy)):
+        mass, J, xyz, rpy = found
+        if not all(np.isfinite(v).all() for v in found):
             raise ValueError(f"`{tree.path}`: link `{name}` has an inertial that is not finite.")
+        if possible and (why := _impossible(found)):
+            raise ValueError(
+                f"`{tree.path}`: the inertial of link `{name}` belongs to no body: {why}; correct "
+                "the file, or do without its inertias."
+            )
         attitude = R @ rpy_rotation(rpy)
         link = Tool(
-            i, np.array(inertial.mass), r + R @ np.array(xyz), attitude @ J @ attitude.T
-        )  # unchecked: what a file claims may belong to no body at all
+            i, mass, r + R @ xyz, attitude @ J @ attitude.T
+        )  # not `Tool.of`: files round, and what they claim may be wanted as it is
         parameters[i] += link.parameters
     return parameters.ravel()
+
+
+class _Inertial(NamedTuple):
+    """Mass, moments about the centre of mass, and its place and attitude in the link's frame."""
+
+    mass: np.ndarray
+    inertia: np.ndarray
+    xyz: np.ndarray
+    rpy: np.ndarray
+
+
+def _inertial(tree: UrdfTree, link: str) -> _Inertial | None:
+    inertial = tree.urdf.link_map[link].inertial
+    if inertial is None:
+        return None
+    J = np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia.to_matrix()
+    xyz, rpy = inertial.origin and inertial.origin.xyz, inertial.origin and inertial.origin.rpy
+    values = inertial.mass, J, _ZERO if xyz is None else xyz, _ZERO if rpy is None else rpy
+    return _Inertial(*(np.array(value, np.float64) for value in values))
+
+
+def _impossible(inertial: _Inertial) -> str:
+    if np.abs(inertial.rpy).max() > LARGEST_ANGLE:
+        return f"its `rpy` is {_numbers(inertial.rpy)}, which are degrees, not radians"
+    return impossible(float(inertial.mass), inertial.inertia, inertial.xyz)
+
+
+def _impossible_links(tree: UrdfTree, body: "_Bodies") -> tuple[str, ...]:
+    """A sentence about each link whose inertial no body could have."""
+    notes = []
+    for name, (i, _, _) in body.links.items():
+        found = _inertial(tree, name)
+        if i >= 0 and found is not None and (why := _impossible(found)):
+            notes.append(
+                f"link `{name}`: its inertial, which identification does not need, belongs to no "
+                f"body: {why}."
+            )
+    return tuple(notes)
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{x:g}" for x in values)
 
 
 def merged_links(
@@ -223,6 +283,18 @@ def _origin(
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     offset = tree.numbers(joint, "xyz", joint.origin and joint.origin.xyz, _ZERO)
     rpy = tree.numbers(joint, "rpy", joint.origin and joint.origin.rpy, _ZERO)
+    if np.abs(offset).max() > FARTHEST:
+        raise tree.error(
+            joint,
+            f'has `xyz="{_numbers(offset)}"`, which is {np.abs(offset).max():g} m: lengths in a '
+            "URDF are in metres",
+        )
+    if np.abs(rpy).max() > LARGEST_ANGLE:
+        raise tree.error(
+            joint,
+            f'has `rpy="{_numbers(rpy)}"`, which is more than a turn: angles in a URDF are in '
+            "radians, not degrees",
+        )
     snapped = snap_angles(rpy, tolerance)
     notes = angle_notes(joint.name, ("roll", "pitch", "yaw"), rpy, snapped)
     return rpy_rotation(snapped), offset, notes
@@ -265,6 +337,11 @@ def _limits(tree: UrdfTree, joints: list[Any]) -> tuple[Limits, tuple[str, ...]]
             notes.append(f"joint `{joint.name}`: a range from 0 to 0 is taken as unknown.")
         elif joint.type != "continuous":
             low[i], high[i] = limit.lower, limit.upper
+            if joint.type in _TURNING and high[i] - low[i] >= 2 * ENDLESS:
+                low[i], high[i] = -np.inf, np.inf
+            if why := beyond_range(low[i], high[i], joint.type in _TURNING):
+                unit = "radians, not degrees" if joint.type in _TURNING else "metres"
+                raise tree.error(joint, f"{why}: limits in a URDF are in {unit}")
             if low[i] >= high[i]:
                 raise tree.error(
                     joint,
@@ -279,6 +356,13 @@ def _limits(tree: UrdfTree, joints: list[Any]) -> tuple[Limits, tuple[str, ...]]
                 array[i] = value
             else:
                 notes.append(f"joint `{joint.name}`: {name} {value:g} is taken as unknown.")
+        turns = joint.type in _TURNING
+        notes += fast_notes(joint.name, speed[i], turns)
+        notes += (
+            ()
+            if turns
+            else far_notes(f"joint `{joint.name}`: an end of its range", (low[i], high[i]))
+        )
     return (
         Limits.of(n, position_min=low, position_max=high, velocity=speed, force=force),
         tuple(notes),

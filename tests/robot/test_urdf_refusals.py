@@ -52,6 +52,22 @@ REFUSED = {
         arm(inner='<limit lower="1" upper="-1"/>'),
         "joint `j1` ranges from 1 to -1, but the lower end must be below",
     ),
+    "a range in degrees": (
+        arm(inner='<limit lower="-170" upper="170"/>'),
+        "joint `j1` ranges to -170 rad, which is 27.1 turns: .* in radians, not degrees",
+    ),
+    "a rail in millimetres": (
+        arm(kind="prismatic", inner='<limit lower="0" upper="1500"/>'),
+        "joint `j1` ranges to 1500 m, which no robot does: limits in a URDF are in metres",
+    ),
+    "an attitude in degrees": (
+        arm(rpy="90 0 0"),
+        'joint `j1` has `rpy="90 0 0"`, .* in radians, not degrees',
+    ),
+    "a place beyond the horizon": (
+        arm(xyz="0 0 1e300"),
+        'joint `j1` has `xyz="0 0 1e.300"`, which is 1e.300 m: lengths in a URDF are in metres',
+    ),
     "nothing that moves": (arm(kind="fixed"), "has no moving joint below link `base`"),
     "no links": (robot(), "has no links"),
     "an unknown type": (arm(kind="spherical"), "is not a URDF that can be read: .*spherical"),
@@ -159,3 +175,53 @@ def test_an_inertia_that_is_not_finite_is_refused(tmp_path):
     path.write_text(robot(link("base"), link("a", heavy), joint("j1", "base", "a")))
     with pytest.raises(ValueError, match="link `a` has an inertial that is not finite"):
         urdf_parameters(path)
+
+
+ROUND = (1e-2, 0, 0, 1e-2, 0, 1e-2)
+IMPOSSIBLE = {
+    "a negative mass": (-5.0, (0, 0, 0), (0, 0, 0), ROUND, "its mass is -5 kg"),
+    "a mass beyond all": (1e300, (0, 0, 0), (0, 0, 0), ROUND, r"1e\+300 kg, and no part of a rob"),
+    "a negative moment": (1.0, (0, 0, 0), (0, 0, 0), (-1, 0, 0, 1, 0, 1), "moments are -1, 1, 1"),
+    "a flat triangle": (1.0, (0, 0, 0), (0, 0, 0), (1, 0, 0, 1, 0, 3), "larger than the sum"),
+    "millimetres": (1.0, (0, 0, 0), (0, 0, 0), (1e4, 0, 0, 1e4, 0, 1e4), "are these kg mm²"),
+    "a centre far away": (1.0, (0, 3e3, 0), (0, 0, 0), ROUND, "centre of mass lies 3000 m away"),
+    "degrees": (1.0, (0, 0, 0), (0, 90, 0), ROUND, "`rpy` is 0 90 0, which are degrees"),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE.values(), ids=IMPOSSIBLE.keys())
+def test_what_no_body_could_be_is_named_and_not_used(tmp_path, case):
+    *claimed, sentence = case
+    path = tmp_path / "arm.urdf"
+    path.write_text(robot(link("base"), link("a", inertial(*claimed)), joint("j1", "base", "a")))
+    with pytest.raises(
+        ValueError, match=f"the inertial of link `a` belongs to no body: .*{sentence}"
+    ):
+        urdf_parameters(path)
+    (note,) = load_urdf(path).notes
+    assert re.search(f"link `a`: .* belongs to no body: .*{sentence}", note)
+    assert urdf_parameters(path, possible=False)[0] == claimed[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "note"),
+    [
+        ({"inner": '<limit velocity="180"/>'}, "180 rad/s is 1719 turns a minute: .* in degrees"),
+        ({"xyz": "0 0 300"}, "`offset` of joint `j1` is 300 m: is the length in millimetres"),
+        (
+            {"kind": "prismatic", "inner": '<limit lower="0" upper="500"/>'},
+            "joint `j1`: an end of its range is 500 m: is the length in millimetres",
+        ),
+    ],
+)
+def test_what_could_be_in_another_unit_is_named(tmp_path, options, note):
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm(**options))
+    assert any(re.search(note, said) for said in load_urdf(path).notes)
+
+
+def test_a_joint_that_turns_without_end_has_no_range(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm(inner='<limit lower="-1e16" upper="1e16"/>'))
+    limits = load_urdf(path).limits
+    assert (limits.position_min.item(), limits.position_max.item()) == (-float("inf"), float("inf"))
