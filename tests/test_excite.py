@@ -18,12 +18,12 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxid import cli
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import CRITERIA
-from jaxid.experiment.excitation_tables import build_constraints
-from jaxid.experiment.excite import design, side_by_side
+from jaxid.experiment.excitation_tables import build_basis, build_constraints
+from jaxid.experiment.excite import design, side_by_side, write
 from jaxid.experiment.excited_forces import force_remarks
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.nominal import build_nominal
-from jaxid.experiment.tables import ExcitationTable, SplineTable
+from jaxid.experiment.tables import ExcitationTable, LeadsTable, SplineTable
 from jaxid.report.blocks import Tone
 from jaxid.report.excitation_words import remarks
 from jaxid.report.excited import excitation_page
@@ -300,6 +300,33 @@ def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
     assert remarks("inf") == []
 
 
+def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pictures, monkeypatch):
+    monkeypatch.setattr("jaxid.experiment.excite.design_excitation", lambda *_, **__: excited.plan)
+    keys = ("sample_time = 0.03", "leads = { periods = 2 }", 'ros = "json"')
+    experiment = load_experiment(with_keys(written, "cycles.toml", *keys))
+    found = design(experiment, lambda _: None, written / "no.npz", False)
+    assert found.window[1] - found.window[0] == pytest.approx(4 * np.pi / 0.8)
+    files = write(found, written / "cycles" / "motion.csv")
+    t, q, qd, qdd = table(files[0]).T
+    np.testing.assert_allclose(t, 0.03 * np.arange(len(t)), atol=1e-12)
+    assert 0.0 <= t[-1] - float(found.played.duration) < 0.03
+    np.testing.assert_allclose(q[-1], found.played.motion(found.played.duration).q[0])
+    assert np.abs([qd[-1], qdd[-1]]).max() < 1e-9
+    message = json.loads(files[2].read_text())
+    assert files[2].name == "motion.ros.json"
+    assert len(message["points"]) == len(t)
+    said = [remark.text for remark in found.aside.remarks]
+    assert "the motion runs through 2 periods; the deviations are of one" in said
+
+
+def test_leads_may_be_given_their_time():
+    basis = build_basis(ExcitationTable(leads=LeadsTable(time=0.7, periods=3)), False)
+    assert (basis.lead, basis.periods) == (0.7, 3)
+    assert build_basis(ExcitationTable(leads=LeadsTable(periods=3)), True).periods == 3
+    rest = ExcitationTable(leads=LeadsTable(), rest=True)
+    assert rest.idle == ["`leads` do nothing for a motion that rests at its ends"]
+
+
 def test_limits_that_nobody_gave_are_named(written, excited):
     (written / "open.toml").write_text(EXPERIMENT.replace("acceleration = [4]", ""))
     robot = load_experiment(written / "open.toml").robot
@@ -311,7 +338,7 @@ def test_limits_that_nobody_gave_are_named(written, excited):
 
 
 def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excited, monkeypatch):
-    def refuse(series, robot):
+    def refuse(series, robot, periods):
         raise ValueError("no lead is short enough.")
 
     monkeypatch.setattr("jaxid.experiment.excite.with_leads", refuse)
@@ -398,6 +425,9 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch, kept
     ("key", "said"),
     [
         ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
+        ("leads = { period = 2 }", "`excitation.leads.period` is no known key: did you mean `pe"),
+        ("leads = false\nsample_time = 0.01", "choose `omega` = 0.79"),
+        ("sample_time = 0", "`excitation.sample_time` must be at least 1e-05"),
         ("rest = true", "`harmonics` must be at least"),
         ("rest = true\nspline = {}", "a `spline` rests at its ends"),
         ("spline = { point = 9 }", "`excitation.spline.point` is no known key: did you mean `po"),

@@ -24,6 +24,7 @@ from jaxid.experiment.nominal import Nominal
 from jaxid.experiment.tables import ExcitationTable
 from jaxid.trajectory.basis import AbstractBasis, FourierBasis
 from jaxid.trajectory.files import load_trajectory
+from jaxid.trajectory.held import ROUNDING, cycles
 from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRestBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
@@ -38,6 +39,8 @@ CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
     "scaled_condition_number": ScaledConditionNumber,
 }
 """What `excitation.criterion` may be."""
+LEAD = 0.5
+"""Time of leads that are designed together with the motion where the file does not say [s]."""
 
 
 def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
@@ -49,7 +52,7 @@ def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
             together with the motion, so that they keep it too.
 
     Raises:
-        ValueError: If two kinds are asked for.
+        ValueError: If two kinds are asked for, or one whose end no sample would meet.
     """
     if table.spline is not None:
         if table.rest:
@@ -59,8 +62,27 @@ def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
         return RestToRestSplineBasis(table.spline.points, table.spline.duration)
     if table.rest:
         return RestToRestBasis(*table.series)
-    kind = LeadsBasis if constrained and table.leads else FourierBasis
-    return kind(*table.series)
+    series = FourierBasis(*table.series)
+    if table.led is None:
+        _require_division(table.sample_time, series.duration)
+        return series
+    if not constrained and table.led.time is None:
+        return series
+    lead = LEAD if table.led.time is None else table.led.time
+    return LeadsBasis(*table.series, lead=lead, periods=table.led.periods)
+
+
+def _require_division(sample_time: float | None, period: float) -> None:
+    """Refuses samples of a motion at full speed that would end before it or go on after it."""
+    if sample_time is None:
+        return
+    count = cycles(period, sample_time)
+    if abs(count * sample_time - period) > ROUNDING * sample_time:
+        raise ValueError(
+            f"`sample_time` must divide the period of {period:.9g} s where there are no `leads`, "
+            f"for the motion repeats at full speed, but is {sample_time:g} s: choose `omega` = "
+            f"{2 * np.pi / (count * sample_time):.9g}, or leave `leads` as they are."
+        )
 
 
 def build_constraints(

@@ -25,8 +25,9 @@ from jaxid.report.blocks import Remark, Tone
 from jaxid.report.excited import Aside, write_pictures
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.files import save_trajectory, write_csv
+from jaxid.trajectory.held import Held
 from jaxid.trajectory.leads import with_leads
-from jaxid.trajectory.ros import write_ros_yaml
+from jaxid.trajectory.ros import write_ros_json, write_ros_yaml
 from jaxid.trajectory.trajectory import AbstractTrajectory
 from jaxid.types import Float, double_precision
 
@@ -44,12 +45,18 @@ class Excited(NamedTuple):
         played: The motion from standstill to standstill where that could be had.
         window: Times of it between which lies the designed motion [s].
         aside: What else is to be said of it, and how it came about.
+        sampled: The motion as it is written in samples: until a sample meets its end.
+        sample_time: Of those samples [s].
+        ros: Language of the file for ROS: yaml or json.
     """
 
     plan: ExcitationPlan
     played: AbstractTrajectory
     window: tuple[float, float]
     aside: Aside
+    sampled: AbstractTrajectory
+    sample_time: float
+    ros: str
 
 
 def design(
@@ -132,13 +139,13 @@ def write(excited: Excited, output: Path, command: str = "") -> list[Path]:
     """
     plan, played = excited.plan, excited.played
     aside = excited.aside._replace(settings={**excited.aside.settings, "command": command})
-    robot, times = plan.base.model.robot, _measured(plan)
-    step = float(times[1] - times[0])
-    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.yaml"]
+    robot, step = plan.base.model.robot, excited.sample_time
+    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{excited.ros}"]
+    write_ros = write_ros_json if excited.ros == "json" else write_ros_yaml
     with double_precision(), written_whole(output.parent) as folder:
-        write_csv(played, robot, folder / names[0], sample_time=step)
+        write_csv(excited.sampled, robot, folder / names[0], sample_time=step)
         save_trajectory(jax.tree.map(np.asarray, played), folder / names[1])
-        write_ros_yaml(played, robot, folder / names[2], sample_time=step)
+        write_ros(excited.sampled, robot, folder / names[2], sample_time=step)
     pictures = write_pictures(output.with_suffix(""), plan, played, aside)
     return [output.parent / n for n in names] + pictures
 
@@ -160,26 +167,32 @@ def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = 
 
 
 def _played(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None) -> Excited:
-    motion, table, times = plan.trajectory, experiment.excitation, _measured(plan)
-    window, refused = (float(times[0]), float(times[-1])), ""
+    motion, table, led = plan.trajectory, experiment.excitation, experiment.excitation.led
+    begin, last, end = _measured(plan)[[0, 1, -1]].tolist()
+    step, refused = last - begin, ""
     # Where constraints were found, leads were designed together with the motion.
-    resting = table.rest or table.spline is not None
-    if table.leads and not resting and not plan.findings:
+    if led is not None and led.time is None and not plan.findings:
         robot = experiment.robot.replace(limits=plan.limits.limits)
         series = FourierBasis(*table.series).trajectory(plan.numbers)
         try:
-            motion = with_leads(series, robot)
+            motion = with_leads(series, robot, periods=led.periods)
         except ValueError as error:
             refused = str(error)
         else:
             begin, end = (float(t) for t in motion.window)
-            window = (begin, end)
+    elif led is not None:
+        end = begin + led.periods * (end - begin)
+    window = begin, end
     said = (
         *_said(experiment, plan, float(motion.duration), window, refused),
         *force_remarks(experiment, nominal, motion),
     )
     settings = {"facts": (("seed", str(table.seed)),), "experiment_text": experiment.text}
-    return Excited(plan, motion, window, Aside(said, settings))
+    step = step if table.sample_time is None else table.sample_time
+    rests = led is not None or table.rest or table.spline is not None
+    whole_cycles = table.sample_time is not None and rests and not refused
+    sampled = Held(motion, step) if whole_cycles else motion
+    return Excited(plan, motion, window, Aside(said, settings), sampled, step, table.ros)
 
 
 def _said(
@@ -201,6 +214,9 @@ def _said(
         yield Remark(Tone.PLAIN, f"the noise is assumed as {share}: give `noise` if it is known")
     if table.earlier:
         yield Remark(Tone.PLAIN, f"deviations are those together with {', '.join(table.earlier)}")
+    if table.led is not None and table.led.periods > 1:
+        text = f"the motion runs through {table.led.periods} periods; the deviations are of one"
+        yield Remark(Tone.PLAIN, text)
     for text in table.idle:
         yield Remark(Tone.PLAIN, text)
     if plan.nominal is None:

@@ -40,6 +40,7 @@ _STRUCTS: dict[str, type[msgspec.Struct]] = {
     "rows": tables.RowsTable,
     "estimator": tables.EstimatorTable,
     "excitation": tables.ExcitationTable,
+    "excitation.leads": tables.LeadsTable,
     "excitation.spline": tables.SplineTable,
 }
 

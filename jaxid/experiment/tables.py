@@ -250,6 +250,13 @@ class SplineTable(_Table, frozen=True):
     duration: Positive = 8.0
 
 
+class LeadsTable(_Table, frozen=True):
+    """How the robot gets from standstill into a periodic motion, and out of it."""
+
+    time: Positive | None = None
+    periods: Annotated[int, Meta(ge=1, le=1000)] = 1
+
+
 class ExcitationTable(_Table, frozen=True):
     """The motion to design."""
 
@@ -271,7 +278,9 @@ class ExcitationTable(_Table, frozen=True):
     polish: Annotated[int, Meta(ge=0)] = 4
     kicks: Annotated[int, Meta(ge=0)] | None = None
     seed: Annotated[int, Meta(ge=0)] = 0
-    leads: bool = True
+    leads: bool | LeadsTable = True
+    sample_time: Annotated[float, Meta(ge=1e-5)] | None = None
+    ros: Literal["yaml", "json"] = "yaml"
     nominal: str | None = None
     earlier: list[str] = []
     force_margin: Annotated[float, Meta(ge=0, lt=1)] | None = None
@@ -288,6 +297,13 @@ class ExcitationTable(_Table, frozen=True):
         )
 
     @property
+    def led(self) -> LeadsTable | None:
+        """How the robot gets into the motion; None if it starts as it is."""
+        if not self.leads or self.rest or self.spline is not None:
+            return None
+        return self.leads if isinstance(self.leads, LeadsTable) else LeadsTable()
+
+    @property
     def idle(self) -> list[str]:
         """Keys that were given although others leave them nothing to do, in sentences."""
         said = []
@@ -296,6 +312,8 @@ class ExcitationTable(_Table, frozen=True):
             if given:
                 verb = "do" if len(given) > 1 else "does"
                 said.append(f"{' and '.join(given)} {verb} nothing for a `spline`")
+        if isinstance(self.leads, LeadsTable) and self.led is None:
+            said.append("`leads` do nothing for a motion that rests at its ends")
         if self.kicks and not self.polish:
             said.append("`kicks` do nothing with `polish = 0`, for they are polished too")
         return said

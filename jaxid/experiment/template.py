@@ -182,7 +182,12 @@ harmonics = 5                         # of the Fourier series
 omega = 0.8                           # its ground frequency [rad/s]
 rest = false                          # true: start and stop at rest
 # spline = {{ points = 12, duration = 8.0 }}  # in place of a series: from rest to rest in 8 s
-leads = true                          # a way into the periodic motion from standstill, and out
+leads = true                          # a way into the periodic motion from standstill, and out;
+#                                     # {{ time = 0.5, periods = 2 }}: of so many seconds, designed
+#                                     # together with the motion, and two periods between them
+# sample_time = 0.004                 # between two rows of the table: the controller's cycle [s];
+#                                     # by default that of the samples
+# ros = "json"                        # language of the file for ROS; by default "yaml"
 samples = 800                         # that one run will measure
 # noise = {ones}        # standard deviation of the forces' noise [N m or N];
 #                                     # by default 1 % of the largest forces

@@ -11,6 +11,7 @@ from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.fourier import FourierSeries, random_fourier_series
 from jaxid.trajectory.iso9283 import iso9283_path
 from jaxid.trajectory.joint_path import joint_path
+from jaxid.trajectory.held import Held
 from jaxid.trajectory.leads import WithLeads, with_leads
 from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRest, RestToRestBasis, rest_basis
@@ -45,6 +46,7 @@ FAMILY = {
     "spline": Spline(POINTS, 2.5),
     "spline at rest": Spline.at_rest(POINTS, 2.5),
     "spline through points": Spline.through(POINTS, 4.0),
+    "held": Held(Spline.through(POINTS, 4.0), 0.03),
     "segments": chain(),
     "path of the end-effector": joint_path(
         library.tx90l_on_rail(),
@@ -58,6 +60,7 @@ AT_REST = (
     "with leads",
     "spline at rest",
     "spline through points",
+    "held",
     "segments",
     "path of the end-effector",
 )
