@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -325,6 +326,14 @@ def test_leads_may_be_given_their_time():
     assert build_basis(ExcitationTable(leads=LeadsTable(periods=3)), True).periods == 3
     rest = ExcitationTable(leads=LeadsTable(), rest=True)
     assert rest.idle == ["`leads` do nothing for a motion that rests at its ends"]
+
+
+def test_the_guide_shows_every_key():
+    guide = Path(__file__).parent.parent / "docs" / "excitation.md"
+    shown = guide.read_text(encoding="utf-8").partition("```toml")[2].partition("```")[0]
+    for kind in (ExcitationTable, LeadsTable, SplineTable):
+        for key in kind.__struct_fields__:
+            assert re.search(rf"\b{key} = ", shown), key
 
 
 def test_limits_that_nobody_gave_are_named(written, excited):

@@ -9,9 +9,9 @@ from jaxid.robot import library
 from jaxid.robot.limits import Limits
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.fourier import FourierSeries, random_fourier_series
+from jaxid.trajectory.held import Held
 from jaxid.trajectory.iso9283 import iso9283_path
 from jaxid.trajectory.joint_path import joint_path
-from jaxid.trajectory.held import Held
 from jaxid.trajectory.leads import WithLeads, with_leads
 from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRest, RestToRestBasis, rest_basis
