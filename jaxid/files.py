@@ -1,6 +1,7 @@
-"""Folders that are written whole or not at all; archives of arrays that cannot run code."""
+"""Folders that are written whole or not at all; files that cannot run code or exhaust a reader."""
 
 import contextlib
+import json
 import os
 import platform
 import shutil
@@ -9,6 +10,7 @@ import uuid
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +20,23 @@ HIDDEN = ".jaxid-"
 """How names of folders begin that hold a result until it is whole."""
 NEW, OLD = "new", "old"
 """Folders in them: of the result, and of what it replaces."""
+
+
+def read_json(path: str | Path, hook: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
+    """Reads a JSON file, however deep it claims to be.
+
+    Args:
+        path: Of the file.
+        hook: Makes what stands for an object of its pairs; a dict if None.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If it is no JSON in UTF-8; the message says why.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=hook)
+    except RecursionError as error:
+        raise ValueError("its brackets are nested too deeply") from error
 
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:

@@ -1,9 +1,14 @@
 """What no experiment file, log or report may hold: one sentence each, never a traceback."""
 
+import io
 import json
+import sys
 
 import pytest
 from test_cli import EXPERIMENT, folder, refused, run  # noqa: F401
+
+from jaxid.cli.commands import main
+from jaxid.trajectory.files import load_trajectory
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -96,6 +101,35 @@ def test_damaged_results(folder, run):  # noqa: F811
     first = whole["base_parameters"][0]
     assert first["name"]
     assert damaged(lambda c: c["base_parameters"][0].update(estimate="x"), "must hold numbers")
+
+
+def test_files_of_nothing_but_brackets(folder, run):  # noqa: F811
+    for name in ("deep", "deeper"):
+        (folder / name).mkdir()
+    for path in (folder / "deep" / "result.json", folder / "deep.json"):
+        path.write_text(100_000 * "[")
+    said = "brackets are nested too deeply"
+    assert refused(run("compare", "deep", "deeper"), "result.json", said)
+    assert refused(run("identify", "experiment.toml", "a.csv", "-o", "deep"), "but no report")
+    assert refused(run("excite", "experiment.toml", "-o", "deep.csv"), "`deep.json` is there al")
+    with pytest.raises(ValueError, match=said):
+        load_trajectory(folder / "deep.json")
+    nested = '{"kind": "WithLeads", "series": '
+    head = '{"format": "jaxid trajectory", "version": 1, "kind": "WithLeads", "series": '
+    (folder / "deep.json").write_text(head + 900 * nested + "1" + 901 * "}")
+    with pytest.raises(ValueError, match="is damaged"):
+        load_trajectory(folder / "deep.json")
+
+
+def test_a_terminal_of_few_characters_shows_the_rest_as_marks(folder, monkeypatch):  # noqa: F811
+    terminal = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setattr(sys, "argv", ["jaxid", "inspect", "experiment.toml"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    terminal.flush()
+    assert b"kg m?" in terminal.buffer.getvalue()
 
 
 def test_one_column_is_one_channel(folder, run):  # noqa: F811

@@ -1,12 +1,15 @@
 """Experiment files: what they become, and how each mistake is refused in one sentence."""
 
 import re
+import tomllib
 
 import numpy as np
 import pytest
 
 import jaxid as jid
+from jaxid.experiment import tables
 from jaxid.experiment.experiment import load_experiment
+from jaxid.experiment.reading import _STRUCTS
 from jaxid.experiment.template import render, write_template
 from jaxid.measurement import units
 
@@ -566,6 +569,37 @@ REFUSALS = [
     (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`estimator`: give `truncate` or `ridge`"),
     ("[robot\n", "is no TOML: "),
     (ARM + ARM, "is no TOML: "),
+    (
+        ARM + "[excitation.spline]\npionts = 3",
+        "`excitation.spline.pionts` is no known key: did you mean `points`?",
+    ),
+    (
+        ARM + "[excitation.spline]\npoints = 3",
+        "`excitation.spline.points` must be at least 4, but is 3.",
+    ),
+    (ARM + "[excitation]\nspline = 3", "`excitation.spline` must be a table, but is 3."),
+    (
+        ARM + "[excitation]\nseed = 1180591620717411303424",
+        "`excitation.seed` must be at most 4294967295, but is 1180591620717411303424.",
+    ),
+    (
+        ARM + "[excitation]\nsamples = 1_000_000_000_000_000",
+        "`excitation.samples` must be at most 10000000, but is 1000000000000000.",
+    ),
+    (
+        ARM + "[excitation]\nnoise = [inf, 1]",
+        "`excitation.noise[0]` must be below 1000000000, but is inf.",
+    ),
+    (ARM + "x = " + 3000 * "[", "is no TOML: brackets are nested too deeply."),
+    (ARM + "x = " + 3000 * "{a = ", "is no TOML: brackets are nested too deeply."),
+    (
+        ARM + "x = " + 9999 * "9",
+        "holds a number of thousands of digits.",
+    ),
+    (
+        ARM + 'name = "a\\u001b[31m"',
+        "`robot.name` holds the control character U+001B: remove it.",
+    ),
 ]
 
 
@@ -676,6 +710,31 @@ def test_the_template_keeps_the_chosen_chain(tmp_path):
     experiment = load_experiment(path)
     assert experiment.robot.joint_names == ("rail",)
     assert experiment.columns.angle_unit == units.M
+
+
+def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
+    folder = tmp_path / 'a"b\\c  # d'
+    folder.mkdir()
+    urdf = folder / "arm.urdf"
+    text = URDF.replace("rail and arm", "x&#10;[limits]&#13;#").replace("shoulder", "j  # k = 1")
+    urdf.write_text(text)
+    found = tomllib.loads(write_template(urdf, tip="tool", folder=tmp_path))
+    assert found["robot"] == {"urdf": 'a"b\\c  # d/arm.urdf', "tip": "tool"}
+    plain = tmp_path / "arm.urdf"
+    plain.write_text(URDF)
+    assert found.keys() == tomllib.loads(write_template(plain, folder=tmp_path)).keys()
+    for sign in ("&#10;gravity = [0, 0, 9.81]&#10;#", "&#13;", "&#x9b;31m", "&#x2028;"):
+        urdf.write_text(URDF.replace("shoulder", f"j{sign}"))
+        with pytest.raises(ValueError, match=r"the name of joint `j .* control character U\+"):
+            write_template(urdf, folder=tmp_path)
+        urdf.write_text(URDF.replace('"tool"', f'"t{sign}"'))
+        with pytest.raises(ValueError, match=r"the name of link `t .* control character U\+"):
+            write_template(urdf, folder=tmp_path)
+
+
+def test_every_table_has_its_place_in_the_messages():
+    known = {*_STRUCTS.values(), *tables.FILTERS.values()}
+    assert known == set(tables._Table.__subclasses__())
 
 
 def test_the_template_breaks_long_lists(tmp_path):

@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from jaxid.excitation.state import load_state
 from jaxid.experiment.folder import refuse_foreign_folder
 from jaxid.files import written_whole
 from jaxid.report.content import SCHEMA
@@ -308,3 +310,9 @@ def test_a_run_takes_away_what_is_there_when_its_turn_comes(tmp_path):
         (staging / "result.json").write_text(json.dumps({"files": ["b"]}))
         write(folder, "c", text="third")
     assert {p.name for p in folder.iterdir()} == {"b", "result.json"}
+
+
+def test_a_state_without_arrays_is_none(tmp_path):
+    np.savez(tmp_path / "state.npz")
+    with pytest.raises(ValueError, match="is no saved state of a design: remove it"):
+        load_state(tmp_path / "state.npz", "digest", ())

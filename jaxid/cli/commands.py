@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import importlib.metadata
+import io
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -70,6 +72,8 @@ def main() -> None:
     """Runs a command; what a user can mend is one sentence on stderr and exit code 2."""
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
+    if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals know few characters
+        sys.stdout.reconfigure(errors="replace")
     try:
         app()
     except (ValueError, OSError, RuntimeError) as error:
@@ -110,7 +114,8 @@ def init(
 
     Like this: jaxid init arm.urdf > experiment.toml
     """
-    typer.echo(write_template(urdf, tip=tip, base=base, folder=output_folder()), nl=False)
+    text = write_template(urdf, tip=tip, base=base, folder=output_folder())
+    typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 
 @app.command()

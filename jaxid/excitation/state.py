@@ -52,10 +52,11 @@ def load_state(path: Path, digest: str, like: Any) -> Any:
     try:
         content = read_arrays(path)
         arrays = [content[f"arr_{k}"] for k in range(len(content))]
-    except (ValueError, KeyError) as error:
+        saved = str(arrays[0])
+    except (ValueError, KeyError, IndexError) as error:
         raise ValueError(f"`{path}` is no saved state of a design: remove it.") from error
     structure = jax.tree.structure(like)
-    if str(arrays[0]) != digest or len(arrays) - 1 != structure.num_leaves:
+    if saved != digest or len(arrays) - 1 != structure.num_leaves:
         raise ValueError(
             f"`{path}` was saved by a design with other settings: use those again, or remove the "
             "file to start anew."

@@ -1,13 +1,12 @@
 """Folders: whether one may take a report or a comparison, and where the output ends up."""
 
-import json
 import os
 import stat
 import sys
 from pathlib import Path
 
 from jaxid.experiment.demo import DEMO
-from jaxid.files import unfinished
+from jaxid.files import read_json, unfinished
 from jaxid.report import compared_files, content, found
 from jaxid.trajectory.files import load_trajectory
 
@@ -77,7 +76,7 @@ def _is_report(folder: Path) -> bool:
 
 def _has(path: Path, schema: str) -> bool:
     try:
-        held = json.loads(path.read_text(encoding="utf-8"))
+        held = read_json(path)
         return str(held["schema"]).startswith(schema.split("/")[0])
     except (OSError, ValueError, KeyError, TypeError):
         return False

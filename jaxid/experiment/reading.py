@@ -5,13 +5,14 @@ import re
 import tomllib
 import types
 import typing
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
 
-from jaxid.experiment import tables
 from jaxid.experiment.tables import FILTERS, Tables
+from jaxid.robot.names import control_characters
 
 _WORDS = {
     "float": "a number",
@@ -21,28 +22,26 @@ _WORDS = {
     "array": "a list",
     "object": "a table",
 }
-_STRUCTS: dict[str, type[msgspec.Struct]] = {
-    "": Tables,
-    "robot": tables.RobotTable,
-    "robot.dh": tables.DhRow,
-    "robot.tool": tables.ToolTable,
-    "robot.tool.inertia": tables.InertiaTable,
-    "limits": tables.LimitsTable,
-    "drives": tables.DrivesTable,
-    "collision": tables.CollisionTable,
-    "collision.capsules": tables.CapsuleTable,
-    "collision.boxes": tables.BoxTable,
-    "model": tables.ModelTable,
-    "model.coulomb": tables.CoulombTable,
-    "recording": tables.RecordingTable,
-    "load": tables.ToolTable,
-    "load.inertia": tables.InertiaTable,
-    "rows": tables.RowsTable,
-    "estimator": tables.EstimatorTable,
-    "excitation": tables.ExcitationTable,
-    "excitation.leads": tables.LeadsTable,
-    "excitation.spline": tables.SplineTable,
-}
+
+
+def _structs(table: type[msgspec.Struct], key: str = "") -> dict[str, type[msgspec.Struct]]:
+    """A table and those in it by their keys; not the filters, of which one key has several."""
+    found = {key: table}
+    for name, hint in typing.get_type_hints(table).items():
+        inner = list(_tables_in(hint))
+        if len(inner) == 1:
+            found |= _structs(inner[0], f"{key}.{name}" if key else name)
+    return found
+
+
+def _tables_in(hint: Any) -> Iterator[type[msgspec.Struct]]:
+    if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+        yield hint
+    for one in typing.get_args(hint):
+        yield from _tables_in(one)
+
+
+_STRUCTS = _structs(Tables)
 
 
 def read_tables(path: Path) -> tuple[Tables, str]:
@@ -63,14 +62,34 @@ def read_tables(path: Path) -> tuple[Tables, str]:
         raw = tomllib.loads(text)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path.name}: is no text in UTF-8 (byte {error.start}).") from error
+    except RecursionError as error:
+        raise ValueError(f"{path.name}: is no TOML: brackets are nested too deeply.") from error
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path.name}: is no TOML: {_lowered(str(error))}.") from error
+    except ValueError as error:
+        raise ValueError(f"{path.name}: holds a number of thousands of digits.") from error
     try:
-        return msgspec.convert(raw, Tables), text
+        found = msgspec.convert(raw, Tables)
     except msgspec.ValidationError as error:
         sentence = _sentence(str(error), raw)
         stop = "" if sentence.endswith("?") else "."
         raise ValueError(f"{path.name}: {sentence}{stop}") from error
+    for key, value in _texts(raw):
+        if sign := control_characters(value):
+            raise ValueError(f"{path.name}: `{key}` holds the control character {sign}: remove it.")
+    return found, text
+
+
+def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """All texts in a table, with their keys."""
+    if isinstance(value, str):
+        yield key, value
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _texts(inner, f"{key}.{name}" if key else name)
+    if isinstance(value, list):
+        for k, inner in enumerate(value):
+            yield from _texts(inner, f"{key}[{k}]")
 
 
 def _lowered(text: str) -> str:
@@ -99,7 +118,7 @@ def _expected(what: str, key: str) -> str:
         if found[2] == ">" and bound == 0:
             return "be positive"
         words = {">": "above", ">=": "at least", "<": "below", "<=": "at most"}
-        return f"be {words[found[2]]} {bound:g}"
+        return f"be {words[found[2]]} {bound:.10g}"
     if found := re.match(r"Expected `([^`]*)`", what):
         kinds = [_WORDS.get(k, k) for k in found[1].split(" | ") if k != "null"]
         return f"be {' or '.join(kinds)}"

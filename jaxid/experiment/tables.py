@@ -6,7 +6,7 @@ from msgspec import Meta, Struct
 
 Positive = Annotated[float, Meta(gt=0)]
 Magnitude = Annotated[float, Meta(ge=0)]
-Count = Annotated[int, Meta(ge=1)]
+Count = Annotated[int, Meta(ge=1, le=10_000)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
 Sign = Literal[1, -1]
 Side = Literal["joint", "motor"]
@@ -247,7 +247,7 @@ class SplineTable(_Table, frozen=True):
     """A spline from standstill to standstill, in place of a Fourier series."""
 
     points: Annotated[int, Meta(ge=4, le=100)] = 12
-    duration: Positive = 8.0
+    duration: Annotated[float, Meta(gt=0, le=10_000)] = 8.0
 
 
 class LeadsTable(_Table, frozen=True):
@@ -272,12 +272,12 @@ class ExcitationTable(_Table, frozen=True):
     omega: Annotated[float, Meta(gt=0, le=1000)] | None = None
     rest: bool = False
     spline: SplineTable | None = None
-    samples: Annotated[int, Meta(ge=2)] = 800
-    noise: PerJoint | None = None
+    samples: Annotated[int, Meta(ge=2, le=10_000_000)] = 800
+    noise: list[Annotated[float, Meta(gt=0, lt=1e9)]] | None = None
     starts: Count = 32
-    polish: Annotated[int, Meta(ge=0)] = 4
-    kicks: Annotated[int, Meta(ge=0)] | None = None
-    seed: Annotated[int, Meta(ge=0)] = 0
+    polish: Annotated[int, Meta(ge=0, le=10_000)] = 4
+    kicks: Annotated[int, Meta(ge=0, le=10_000)] | None = None
+    seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 0
     leads: bool | LeadsTable = True
     sample_time: Annotated[float, Meta(ge=1e-5)] | None = None
     ros: Literal["yaml", "json"] = "yaml"

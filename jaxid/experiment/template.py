@@ -261,7 +261,7 @@ def render(robot: Robot, urdf: str, tip: str | None = None, base: str | None = N
     )
     return _aligned(
         _TEMPLATE.format(
-            name=robot.name.replace("\n", " "),
+            name=robot.name,
             file="experiment.toml",
             urdf=_text(urdf),
             tip=f"tip = {_text(tip)}" if tip else '# tip = "flange"',
@@ -285,7 +285,7 @@ def render(robot: Robot, urdf: str, tip: str | None = None, base: str | None = N
 def _aligned(text: str) -> str:
     """Comments behind keys begin in one column, or stand on the line before a long one."""
     lines = []
-    for line in text.splitlines():
+    for line in text.split("\n")[:-1]:
         found = re.fullmatch(r"(.*?\S) {2,}# (.*)", line)
         if found is None:
             lines.append(line)
@@ -365,7 +365,9 @@ def _number(value: float | int) -> str:
 
 
 def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)
+    """A text of TOML; nothing in it ends a line, or looks like a comment behind a key."""
+    quoted = json.dumps(value, ensure_ascii=False).replace("  #", "  \\u0023")
+    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in quoted)
 
 
 def _unit(units: list[str], others: str) -> str:

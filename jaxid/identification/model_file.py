@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 
 from jaxid.documents import decoded, encoded, text_of
-from jaxid.files import written_whole
+from jaxid.files import read_json, written_whole
 
 FORMAT = "jaxid model"
 VERSION = 1
@@ -53,10 +53,8 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
         ValueError: If it is no model file, of another version, or not as it was written.
     """
     try:
-        document = json.loads(
-            Path(path).read_text(encoding="utf-8"), object_pairs_hook=_without_repetition
-        )
-    except (ValueError, RecursionError) as error:
+        document = read_json(path, _without_repetition)
+    except ValueError as error:
         raise ValueError(f"`{path}` is no model file: it cannot be read as JSON.") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError(
@@ -73,7 +71,11 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
             f"`{path}` must have the keys {', '.join(KEYS)}, but differs by {', '.join(other)}."
         )
     content = document["model"]
-    if document["checksum"] != checksum_of(content):
+    try:
+        checksum = checksum_of(content)
+    except RecursionError as error:
+        raise ValueError(f"`{path}` is no model file: it is nested too deeply.") from error
+    if document["checksum"] != checksum:
         raise ValueError(
             f"`{path}` is damaged or was changed by hand: its checksum does not fit its content; "
             "save the model again."
@@ -81,7 +83,7 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
     try:
         model = decoded(content, kind)
         check(model)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         said = " ".join(str(error).split()).rstrip(".")
         raise ValueError(f"`{path}` holds no model that can be used: {said}.") from error
     return model

@@ -1,14 +1,13 @@
 """Reads the results of two identifications, and writes what has changed between them."""
 
 import datetime
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxid.files import written_whole
+from jaxid.files import read_json, written_whole
 from jaxid.identification.runs.comparison import Comparison
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.report.compared import comparison_figure
@@ -39,7 +38,7 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
             "`result.json`."
         )
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except ValueError as error:
         raise ValueError(f"`{path}` is no JSON file: {error}; identify again.") from None
     if not isinstance(content, dict) or not str(content.get("schema")).startswith(RESULT):

@@ -1,7 +1,6 @@
 """Writes the report of an identification: numbers for programs, figures for people."""
 
 import csv
-import json
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
@@ -9,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxid.documents import text_of
-from jaxid.files import written_whole
+from jaxid.files import read_json, written_whole
 from jaxid.identification.filter_choice import FilterChoice
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.run import Run
@@ -149,7 +148,7 @@ def safe_name(name: str) -> str:
 def _earlier(folder: Path) -> set[str]:
     """What an earlier report in this folder says it has written, and not every report has."""
     try:
-        content = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        content = read_json(folder / "result.json")
         if not str(content["schema"]).startswith("jaxid-result/"):
             return set()
         return {f for f in content["files"] if re.fullmatch(OWN, f)}

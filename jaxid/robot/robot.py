@@ -9,6 +9,7 @@ import numpy as np
 from jaxid.arrays import as_array, is_traced, namespace
 from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
+from jaxid.robot.names import cleaned, control_characters
 from jaxid.robot.plausible import FAR, FARTHEST, HEAVIEST, far_notes
 from jaxid.types import AnyArray, Float, Numbers
 
@@ -141,6 +142,11 @@ class Robot(eqx.Module):
             raise ValueError(
                 f"`joint_names` must be {n} different names, but is {self.joint_names}."
             )
+        for name in (self.name, *self.joint_names):
+            if sign := control_characters(name):
+                raise ValueError(
+                    f"the name `{cleaned(name)}` holds the control character {sign}: remove it."
+                )
         carrier = self.tip_body if self.tool is None else self.tool.body
         for what, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
             if not 0 <= body < n:

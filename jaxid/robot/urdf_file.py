@@ -7,6 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from urdf_parser_py.urdf import URDF
 
+from jaxid.robot.names import cleaned, control_characters
 from jaxid.types import Numbers
 
 _LARGEST_FILE = 64 * 2**20
@@ -45,7 +46,7 @@ class UrdfTree:
         self.path = str(path)
         element = _read_xml(Path(path))
         for name in ("link", "joint"):
-            _require_unique(self.path, name, [e.get("name") for e in element.iterfind(name)])
+            _require_names(self.path, name, [e.get("name") for e in element.iterfind(name)])
         try:
             self.urdf = URDF.from_xml_string(etree.tostring(element))
         except Exception as error:  # the library raises bare exceptions, among others
@@ -172,7 +173,7 @@ def _read_xml(path: Path) -> etree._Element:
         )
     if robot.tag != "robot":
         raise ValueError(f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`.")
-    robot.set("name", robot.get("name") or path.stem)
+    robot.set("name", cleaned(robot.get("name") or path.stem))
     _keep_what_is_read(path, robot)
     for limit in robot.iter("limit"):
         for unlimited in ("effort", "velocity"):
@@ -210,9 +211,14 @@ def _number(text: str | None) -> float:
         return np.inf  # the library reports it, with its place
 
 
-def _require_unique(path: str, what: str, names: list[str | None]) -> None:
+def _require_names(path: str, what: str, names: list[str | None]) -> None:
     seen: set[str | None] = set()
     for name in names:
+        if name is not None and (sign := control_characters(name)):
+            raise ValueError(
+                f"`{path}`: the name of {what} `{cleaned(name)}` holds the control character "
+                f"{sign}: rename it."
+            )
         if name is not None and name in seen:
             raise ValueError(f"`{path}` has two {what}s named `{name}`: rename one.")
         seen.add(name)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.files import written_whole
+from jaxid.files import read_json, written_whole
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierSeries
 from jaxid.trajectory.joint_path import JointPath
@@ -60,7 +60,7 @@ def load_trajectory(
     if not path.is_file():
         raise FileNotFoundError(f"the trajectory file `{path}` does not exist.")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except ValueError as error:
         raise ValueError(f"`{path}` is no trajectory file: {error}.") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -72,7 +72,7 @@ def load_trajectory(
         )
     try:
         return _restore(content, {member.__name__: member for member in members})
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"`{path}` is damaged: {' '.join(map(str, error.args))}.") from error
 
 
