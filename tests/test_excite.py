@@ -295,7 +295,9 @@ def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
     assert zero.text == f"not known, and counted as zero in the forces: {unknown}"
     beyond, _ = remarks(5.0)
     assert beyond.tone is Tone.BAD
-    assert re.search(r"joint `hinge` with 1[4-9]\d % of 5 N m; give `force_margin`", beyond.text)
+    assert re.search(
+        r"joint `hinge` with 1[4-9]\d\.\d % of 5 N m; give `force_margin`", beyond.text
+    )
     (unknown,) = remarks(5.0, known=False)
     assert unknown.text.startswith("forces were not looked at, although they have limits")
     assert remarks("inf") == []

@@ -103,7 +103,7 @@ def _looked_at(experiment: Experiment, nominal: Nominal, played: AbstractTraject
 
 
 def _share(one: Finding) -> str:
-    return f"{one.name} with {100 * one.used:.3g} % of {one.limit:.4g} {one.unit}"
+    return f"{one.name} with {100 * one.used:.1f} % of {one.limit:.4g} {one.unit}"
 
 
 def unknown_words(experiment: Experiment, nominal: Nominal) -> str:
