@@ -98,6 +98,18 @@ def test_damaged_results(folder, run):  # noqa: F811
 
     assert damaged(lambda c: c.update(fit=None), "has no `covariance`")
     assert damaged(lambda c: c["fit"]["covariance"][0].pop(), "`fit.covariance` must hold numbers")
+    said = "`base_parameters[0].estimate` is"
+    for number in ("NaN", "Infinity"):
+        assert damaged(lambda c, x=number: c["base_parameters"][0].update(estimate=float(x)), said)
+    said = "`base_parameters[0].degrees_of_freedom` is -1"
+    assert damaged(lambda c: c["base_parameters"][0].update(degrees_of_freedom=-1), said)
+
+    def stretched(content):
+        C = content["fit"]["covariance"]
+        C[0][1] = C[1][0] = 2.0 * (C[0][0] * C[1][1]) ** 0.5
+
+    assert damaged(stretched, "`fit.covariance` is none")
+    assert damaged(lambda c: c["fit"]["covariance"][0].__setitem__(0, -1.0), "`fit.covariance`")
     first = whole["base_parameters"][0]
     assert first["name"]
     assert damaged(lambda c: c["base_parameters"][0].update(estimate="x"), "must hold numbers")

@@ -181,6 +181,12 @@ def test_a_report_takes_later_logs(folder, run):  # noqa: F811
     assert added["fit"]["rows"] == together["fit"]["rows"]
     assert added["settings"]["identification"] == ["first", "b.csv"]
     assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
+    said = "the two runs `a` have seen the same data"
+    assert refused(run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said)
+    said = "a report that was given has seen the data of `a`"
+    seen = ("first", "b.csv", "--verify", "a.csv", "-o", "twice")
+    assert refused(run("identify", "experiment.toml", *seen), said)
+    assert not (folder / "twice").exists()
     assert run("identify", "experiment.toml", "both", "c.csv", "-o", "three")[0] == 0
     assert result(folder, "three")["fit"]["recordings"] == ["a", "b", "c"]
 

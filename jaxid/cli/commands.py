@@ -43,6 +43,7 @@ from jaxid.identification.identify import fit_rows
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.rows import Rows
 from jaxid.identification.runs.run import Run
+from jaxid.identification.runs.twice import share_data
 from jaxid.identification.runs.update import update
 from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
@@ -272,6 +273,12 @@ def identify(
             said.append(KEPT)
         if reports:
             fit, run = _together(loaded, reports, fit, run)
+            for o in checked:
+                if share_data(run.blocks, Rows.of(base, [o]).blocks):
+                    raise ValueError(
+                        f"a report that was given has seen the data of `{o.name}`: a model that "
+                        "has seen a log is not verified by it; verify with another."
+                    )
         stage("predicting torques")
         through = stage.through(max(map(_samples, [*fitted, *checked])))
         found = validate(fit, [*fitted, *checked], progress=through)

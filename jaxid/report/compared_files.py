@@ -17,6 +17,8 @@ from jaxid.report.write import write_csv, write_json
 
 SCHEMA = "jaxid-comparison/1"
 RESULT = "jaxid-result/"
+ROUNDED = 1e-6
+"""Correlation by which a covariance may fail to be one, from rounding."""
 UNGROUPED = "base parameters"
 """Kind of every parameter in files that do not tell it."""
 
@@ -60,17 +62,52 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
             f"`{path}`: `fit.covariance` must be {size} x {size}, one row for each base parameter, "
             f"but has shape {covariance.shape}: identify again."
         )
+    # What is not finite is null in JSON, and nothing is known of it.
+    covariance = np.where(np.isnan(covariance), np.inf, covariance)
+    estimates = _numbers(columns["estimate"], "estimate", path)
+    freedom = _numbers([_freedom(row) for row in rows], "degrees_of_freedom", path)
+    for key, values, sound in (
+        ("estimate", estimates, np.isfinite(estimates)),
+        ("degrees_of_freedom", freedom, freedom >= 0.0),
+    ):
+        if not sound.all():
+            k = int(np.flatnonzero(~sound)[0])
+            raise ValueError(
+                f"`{path}` is damaged: `base_parameters[{k}].{key}` is {values[k]:g}; identify "
+                "again."
+            )
+    if not _is_covariance(covariance):
+        raise ValueError(
+            f"`{path}` is damaged: `fit.covariance` is none, for some combination of parameters "
+            "has a negative variance; identify again."
+        )
     return Estimates(
         label=(path.parent.resolve().name if label is None else label),
         names=tuple(columns["name"]),
         expressions=tuple(columns["expression"]),
         units=tuple(columns["unit"]),
         groups=tuple(str(row.get("group", UNGROUPED)) for row in rows),
-        parameters=_numbers(columns["estimate"], "estimate", path),
-        # What is not finite is null in JSON, and nothing is known of it.
-        covariance=np.where(np.isnan(covariance), np.inf, covariance),
-        freedom=_numbers([_freedom(row) for row in rows], "degrees_of_freedom", path),
+        parameters=estimates,
+        covariance=covariance,
+        freedom=freedom,
     )
+
+
+def _is_covariance(covariance: np.ndarray) -> bool:
+    """Whether variances and covariances, as far as they are known, fit each other."""
+    variances = np.diag(covariance)
+    known = np.isfinite(variances)
+    C = covariance[np.ix_(known, known)]
+    if not known.any():
+        return True
+    if not (np.isfinite(C).all() and (variances >= 0.0).all()):
+        return False
+    deviations = np.sqrt(variances[known])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.where(C == 0.0, 0.0, C / deviations / deviations[:, None])
+    if not np.isfinite(correlation).all() or np.abs(correlation - correlation.T).max() > ROUNDED:
+        return False
+    return bool(np.linalg.eigvalsh(correlation).min() > -ROUNDED)
 
 
 def _list(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:

@@ -150,7 +150,12 @@ def test_runs_with_weights_of_their_own_keep_them(base, truths):
     updated = jid.update(one, other)
     np.testing.assert_allclose(updated.parameters, tied((one, other), (E, E)).parameters)
     np.testing.assert_allclose(updated.fit.parameters, updated.parameters, rtol=1e-9)
-    again = jid.update(updated, one)
+    third = observations(base.model, truths[0], noise=NOISE, seed=3, noise_seed=3)
+    again = jid.update(updated, jid.Run.of(base, third, weights=weights))
+    with pytest.raises(ValueError, match="have seen the same data, which would count twice"):
+        jid.update(again, one)
+    with pytest.raises(ValueError, match=r"the two runs `.*` have seen the same data"):
+        jid.identify_payload(one, one)
     R, z = again.factor
     np.testing.assert_allclose(np.linalg.lstsq(R, z, rcond=None)[0], again.parameters, rtol=1e-9)
 

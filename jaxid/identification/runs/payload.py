@@ -128,8 +128,8 @@ def identify_payload(
             wide ones from the robot's reach, which count only if the estimate could not exist.
 
     Raises:
-        ValueError: If the runs have different base parameters, or the model does not have ten
-            parameters for the body.
+        ValueError: If the runs have different base parameters or have seen the same data, or the
+            model does not have ten parameters for the body.
         RuntimeError: If no body within the bounds was proved to be the nearest.
     """
     runs = (unloaded, loaded)

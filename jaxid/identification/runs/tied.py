@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxid.identification.runs.left_out import Block, block_covariance
 from jaxid.identification.runs.run import Run
+from jaxid.identification.runs.twice import refuse_shared
 from jaxid.identification.solutions import NUMERICAL, Complete, Decomposition
 from jaxid.types import AnyArray, Float
 
@@ -48,7 +49,11 @@ def tied(
         runs: Independent of each other.
         maps: For each run how its base parameters follow from the unknowns.
         known: For each run what is known of its base parameters; nothing if None.
+
+    Raises:
+        ValueError: If two runs have seen the same data.
     """
+    refuse_shared([(run.name, run.blocks) for run in runs])
     known = [np.zeros(run.base.size) for run in runs] if known is None else known
     maps = [np.asarray(E, np.float64) for E in maps]
     factors = [run.factor for run in runs]

@@ -60,7 +60,7 @@ def update(earlier: Run, later: Run, name: str | None = None) -> Run:
         name: Of both together; their names in a row if None.
 
     Raises:
-        ValueError: If the runs have different base parameters.
+        ValueError: If the runs have different base parameters, or have seen the same data.
     """
     runs = (earlier, later)
     require_same_base(runs)
