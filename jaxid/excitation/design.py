@@ -15,7 +15,7 @@ from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.polish import Polish
 from jaxid.excitation.problem import Problem
-from jaxid.excitation.search import Search, Searched, kicked, random_starts
+from jaxid.excitation.search import Search, Searched, crossed, kicked, random_starts
 from jaxid.excitation.state import fingerprint, load_state, save_state
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
@@ -26,6 +26,8 @@ NOISE = 0.01
 """Standard deviation of the noise that is assumed, as a share of the largest forces."""
 REFERENCES = 8
 """Random motions that give the parameters their sizes."""
+DISTURBED = 4
+"""Of so many further motions to polish one is disturbed at random; the others are crossings."""
 
 
 class DesignProgress(NamedTuple):
@@ -84,7 +86,8 @@ def design_excitation(
 
     Args:
         base: Whose parameters the motion shall determine.
-        limits: Of the joints; the robot's own if None. What is unknown is assumed as in
+        limits: Of the joints, and of their forces for constraints that keep those; the robot's own
+            if None. What is unknown is assumed as in
             `random_fourier_series`.
         harmonics: Number of harmonics of the Fourier series.
         omega: Its ground frequency [rad/s].
@@ -94,7 +97,8 @@ def design_excitation(
         constraints: What must be kept beside the joints' limits.
         starts: Random motions to start from.
         polish: How many of the best are polished; 0 for the path that is JAX alone.
-        kicks: How often the best motion after that is disturbed and polished again.
+        kicks: How often the best motion after that is crossed with another polished one, joint by
+            joint, or disturbed, and polished again.
         key: Of the random motions; `jax.random.key(0)` if None.
         noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
             if None. The weights of the criterion are its inverse, like the estimator's.
@@ -252,10 +256,25 @@ class _Design:
             place = int(state.order[done])
             start = np.asarray(state.searched.best.y[place])
         else:
-            place = int(state.best.order()[0])
-            start = kicked(self._problem.limits, state.best.y[place], self._key, done)
+            place, start = self._another(state, done - self._polished)
         best = state.best.improved_at(place, self._polish(start))
         return state._replace(polished=done + 1, best=best)
+
+    def _another(self, state: _State, number: int) -> tuple[int, np.ndarray]:
+        """Near the best motion, from where to polish once more; and whose place a gain takes.
+
+        Mostly it is crossed with the other polished ones in turn, whose places better motions then
+        take; every `DISTURBED`th time it is disturbed at random.
+        """
+        limits, order = self._problem.limits, state.best.order()
+        first, others = int(order[0]), [int(k) for k in order[1 : self._polished]]
+        y = state.best.y
+        if not others:
+            return first, kicked(limits, y[first], self._key, number)
+        if number % DISTURBED == DISTURBED - 1:
+            return first, kicked(limits, y[first], self._key, number // DISTURBED)
+        other = others[number % len(others)]
+        return other, crossed(limits, y[first], y[other], self._key, number)
 
     def _tell(self, state: _State, total: int) -> None:
         if self._progress is None:

@@ -1,5 +1,6 @@
 """What a motion is worth: brought within all limits, then judged by the whole run, exactly."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -80,10 +81,12 @@ class Judge:
     def __init__(self, problem: Problem):
         self._problem = problem
         limits, fine = problem.limits, problem.limits.grid(CERTIFIED)
-        growth = 1.0 if problem.constraints else GROWTH
-        self._held = jax.jit(
-            jax.vmap(lambda y: held_within(fine, limits.still, y, fine.bound, growth))
-        )
+        # A larger motion mostly tells more, but a condition number may well become worse by it.
+        growths = (1.0,) if problem.constraints else (1.0, GROWTH)
+        self._held = [
+            jax.jit(jax.vmap(lambda y, g=g: held_within(fine, limits.still, y, fine.bound, g)))
+            for g in growths
+        ]
         self._calmed = jax.jit(lambda y, share: calmed(fine, limits.still, y, share))
 
     def __call__(self, y: Float[AnyArray, "starts scaled"]) -> Best:
@@ -98,9 +101,13 @@ class Judge:
     def within(self, y: Float[AnyArray, "starts scaled"]) -> Best:
         """The motions after they were made to keep the limits of the joints for all times.
 
-        Where they all but keep the other constraints, they are made smaller until they do.
+        Where they all but keep the other constraints, they are made smaller until they do; without
+        constraints they fill their limits where that is better.
         """
-        return self(np.array([self._smaller(one) for one in np.asarray(self._held(y))]))
+        held = (np.asarray(hold(y)) for hold in self._held)
+        return functools.reduce(
+            Best.improved, (self(np.array([self._smaller(one) for one in some])) for some in held)
+        )
 
     def shrunk(self, y: Float[AnyArray, " scaled"]) -> Best:
         """The motion made so small that it keeps all constraints; as it is if no size does.

@@ -20,6 +20,8 @@ from jaxid.types import AnyArray, Array, Float
 
 CERTIFIED = 512
 """Rows of each order by which a motion is made to keep its limits at all times."""
+FEW = 11
+"""Numbers of a joint up to which such counts are enough: those of five harmonics."""
 CONSTANT = 1e-9
 """How well a basis must be able to stand still, relative."""
 
@@ -86,7 +88,7 @@ class JointLimits(eqx.Module):
             acceleration=acceleration,
         )
         size = _sizes(limits)
-        rows = basis.envelope(CERTIFIED).rows
+        rows = basis.envelope(enough(CERTIFIED, basis)).rows
         reach = np.array([np.abs(r).max(axis=0) for r in rows])
         with np.errstate(divide="ignore"):
             scale = np.min(size[:, :, None] / reach[:, None, :], axis=0)
@@ -122,8 +124,12 @@ class JointLimits(eqx.Module):
         return np.asarray(self.scale)[(None,) * batch]
 
     def grid(self, points: int) -> Grid:
-        """The limits on about so many times, with the bound that certifies all times."""
-        envelope = self.basis.envelope(points)
+        """The limits on about so many times, with the bound that certifies all times.
+
+        Args:
+            points: How many are enough for few numbers; more numbers get more.
+        """
+        envelope = self.basis.envelope(enough(points, self.basis))
         size, limits = _sizes(self.limits), self.limits
         orders = 4 if np.isfinite(size[3]).any() else 3
         scale = np.asarray(self.scale)
@@ -144,7 +150,7 @@ class JointLimits(eqx.Module):
 
         Of a range it is the distance from its middle, over half of the range.
         """
-        envelope, size = self.basis.envelope(CERTIFIED), _sizes(self.limits)
+        envelope, size = self.basis.envelope(enough(CERTIFIED, self.basis)), _sizes(self.limits)
         low, high = np.asarray(self.limits.position_min), np.asarray(self.limits.position_max)
         centre = np.vstack([0.5 * (low + high), np.zeros((3, len(low)))])
         x = np.asarray(x)
@@ -154,6 +160,16 @@ class JointLimits(eqx.Module):
                 for r, c, s in zip(envelope.rows, centre, size, strict=True)
             ]
         )
+
+
+def enough(samples: int, basis: AbstractBasis) -> int:
+    """As many samples as a motion with many numbers needs to be seen like one with few.
+
+    Args:
+        samples: That are enough for few numbers.
+        basis: Of the motion.
+    """
+    return samples * max(FEW, basis.variables) // FEW
 
 
 def held_within(

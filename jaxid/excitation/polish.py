@@ -11,7 +11,7 @@ import numpy as np
 import scipy.optimize
 
 from jaxid.excitation.judge import Best, Judge
-from jaxid.excitation.limits import CERTIFIED, Grid
+from jaxid.excitation.limits import CERTIFIED, Grid, enough
 from jaxid.excitation.problem import CHECKED, MARGIN, Context, Problem
 from jaxid.types import AnyArray, Float
 
@@ -50,7 +50,7 @@ class Polish:
         self._problem = problem
         limits = problem.limits
         self._fine = limits.grid(CERTIFIED)
-        objective, none = problem.objective(SEEN), np.zeros((1, 0), int)
+        objective, none = problem.objective(enough(SEEN, problem.basis)), np.zeros((1, 0), int)
         self._smooth = jax.jit(lambda y, p: objective(y[None], Context(p, none)))
         self._exact = jax.jit(lambda y: objective(y[None], Context(None, none)))
         self._judge = Judge(problem)
@@ -65,6 +65,7 @@ class Polish:
         rounds = ROUNDS if self._problem.criterion.extreme else ROUNDS[1:]
         for sharpness, iterations, runs in rounds:
             limits.add(y, NEAR)
+            smooth = np.inf
             for _ in range(runs):
                 if constraints is not None:
                     constraints.add(y)
@@ -75,6 +76,9 @@ class Polish:
                 peak, before = limits.add(y, NEW), best
                 best = best.improved(self._judge.within(y[None]))
                 gained = float(before.value[0] - best.value[0])
+                if sharpness is not None:
+                    # A smooth round's steps need not show in the exact value at once.
+                    gained, smooth = smooth - float(result.fun), float(result.fun)
                 kept = constraints is None or constraints.worst(y) <= 0.0
                 if peak < CLOSED and kept and (result.nit <= 3 or gained < GAINED):
                     break

@@ -13,7 +13,7 @@ from jaxid.excitation.constraints.constraint import AbstractConstraint, Finding
 from jaxid.excitation.criteria import AbstractCriterion
 from jaxid.excitation.information import Information, InformationMap, information
 from jaxid.excitation.interior_point import Evaluation, each_start
-from jaxid.excitation.limits import JointLimits
+from jaxid.excitation.limits import JointLimits, enough
 from jaxid.excitation.spectral import Sharpness
 from jaxid.types import AnyArray, Array, Float, Int
 
@@ -53,7 +53,7 @@ class Problem:
         prior: Information of earlier experiments.
         sizes: A size of each parameter.
         measured: Samples that the experiment will take of one run of the trajectory.
-        seen: Samples on which motions are judged during the search.
+        seen: Samples on which motions of few numbers are judged during the search.
     """
 
     def __init__(
@@ -70,10 +70,11 @@ class Problem:
         seen: int = SEEN,
     ):
         self.base, self.limits, self.criterion = base, limits, criterion
-        self.robot, self.basis = base.model.robot, limits.basis
+        # Constraints ask the robot for its limits of force.
+        self.robot, self.basis = base.model.robot.replace(limits=limits.limits), limits.basis
         self.constraints = constraints
         self.weights, self.prior, self.sizes = weights, prior, sizes
-        self.measured, self.seen = measured, seen
+        self.measured, self.seen = measured, enough(seen, limits.basis)
         self._all_rows = self.basis.rows(self.basis.instants(CHECKED))[:3]
         self._check = jax.jit(self._constrained)
         self._peaks = jax.jit(lambda y: jax.lax.map(self._highest, y))

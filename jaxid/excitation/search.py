@@ -187,3 +187,31 @@ def kicked(
     else:
         motion += KICK * np.abs(motion).mean() * noise
     return motion.ravel()
+
+
+def crossed(
+    limits: JointLimits,
+    y: Float[AnyArray, " scaled"],
+    other: Float[AnyArray, " scaled"],
+    key: PRNGKeyArray,
+    number: int,
+) -> Float[np.ndarray, " scaled"]:
+    """A good motion with some joints, fewer than half on average, that move as in another one.
+
+    Limits of joints are kept by each joint alone, so that the child of two motions that keep them
+    keeps them too.
+
+    Args:
+        limits: Of the joints.
+        y: The good motion.
+        other: The other one.
+        key: Of the design.
+        number: Of the crossing.
+    """
+    of_joint, of_share, of_others = jax.random.split(jax.random.fold_in(key, number), 3)
+    joints = limits.shape[0]
+    share = jax.random.uniform(of_share, (), float, 0.1, 0.5)
+    taken = np.array(jax.random.uniform(of_others, (joints,), float) < share)
+    taken[int(jax.random.randint(of_joint, (), 0, joints))] = True
+    own, foreign = (np.reshape(np.asarray(z), limits.shape) for z in (y, other))
+    return np.where(taken[:, None], foreign, own).ravel()

@@ -1,10 +1,13 @@
 """The state of a design as a file: written whole, and only read back for the same problem."""
 
+import dataclasses
 import hashlib
 import io
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -14,13 +17,37 @@ from jaxid.files import read_arrays, written_whole
 def fingerprint(*parts: Any) -> str:
     """A digest of everything that a result depends on: numbers by their bits, the rest by name."""
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(parts, is_leaf=lambda x: x is None):
+    for leaf in (*jax.tree.leaves(parts, is_leaf=lambda x: x is None), *_settings(parts)):
         array = np.asarray(leaf) if not isinstance(leaf, str) and leaf is not None else None
         if array is None or array.dtype == object:
             digest.update(str(leaf).encode())
         else:
             digest.update(f"{array.shape}{array.dtype.str}".encode() + array.tobytes())
     return digest.hexdigest()
+
+
+def _settings(part: Any) -> Iterator[str]:
+    """What of modules is no array: names, numbers of bodies, pairs that are watched.
+
+    Not what else they hold: of functions and programs only the address would be known.
+    """
+    if isinstance(part, list | tuple):
+        for one in part:
+            yield from _settings(one)
+    elif isinstance(part, eqx.Module):
+        yield type(part).__name__
+        for field in dataclasses.fields(part):
+            value = getattr(part, field.name)
+            if not field.metadata.get("static", False):
+                yield from _settings(value)
+            elif _is_plain(value):
+                yield f"{field.name}={value!r}"
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return all(_is_plain(one) for one in value)
+    return value is None or isinstance(value, str | int | float | bool)
 
 
 def save_state(path: Path, digest: str, state: Any) -> None:

@@ -1,5 +1,7 @@
 """Constraints as a search sees them: by a motion's numbers, at its peaks; and with leads."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from jaxid.excitation.constraints.clearance import Clearance
 from jaxid.excitation.constraints.forces import JointForces, NominalForces
 from jaxid.excitation.constraints.tip import TipSpeed
-from jaxid.excitation.criteria import DOptimal
+from jaxid.excitation.criteria import ConditionNumber, DOptimal
 from jaxid.excitation.design import design_excitation
 from jaxid.excitation.judge import PRICE, Best, Judge
 from jaxid.excitation.limits import CERTIFIED, JointLimits, calmed
@@ -16,6 +18,7 @@ from jaxid.excitation.problem import CHECKED, MARGIN, PEAKS, WATCHED, Context, P
 from jaxid.excitation.search import random_starts
 from jaxid.robot.capsules import Capsule, HalfSpace
 from jaxid.robot.collision import CollisionModel
+from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.leads_basis import LeadsBasis
 
 BASIS = LeadsBasis(3, 1.1, lead=0.4)
@@ -120,6 +123,45 @@ def test_a_small_excess_does_not_outweigh_a_better_value():
     assert list(best.order()) == [0, 1, 2]
     assert list(best.promising()) == [1, 0, 2]
     assert 0.01 * PRICE < 0.5
+
+
+def test_a_motion_is_enlarged_to_its_limits_only_where_that_is_better(pendulum):
+    """A condition number may well become worse: what a polished motion gained would be lost."""
+    for criterion in (ConditionNumber(), DOptimal()):
+        free = Problem(
+            pendulum,
+            JointLimits.of(pendulum.model.robot, FourierBasis(3, 1.1)),
+            criterion,
+            (),
+            weights=np.ones(1),
+            prior=np.zeros((pendulum.size, pendulum.size)),
+            sizes=np.ones(pendulum.size),
+            measured=100,
+        )
+        y = 0.97 * np.asarray(random_starts(free.limits, jax.random.key(8), 20))
+        judge = Judge(free)
+        as_they_are, within = judge(y), judge.within(y)
+        assert (within.value <= as_they_are.value + 1e-9).all()
+        larger = np.abs(within.y).max(axis=1) > 1.02 * np.abs(y).max(axis=1)
+        assert larger.any()
+        assert not larger.all()
+
+
+def test_limits_of_force_are_those_that_were_given(pendulum, constraints):
+    weak = dataclasses.replace(pendulum.model.robot.limits, force=np.array([1.0]))
+    plan = design_excitation(
+        pendulum, limits=weak, constraints=constraints[:1], starts=2, polish=0, harmonics=2
+    )
+    nominal = constraints[0].nominal.parameters
+    times = np.linspace(0.0, float(plan.trajectory.duration), 2000)
+    forces = np.asarray(pendulum.regressor(plan.trajectory.motion(times))) @ nominal
+    assert np.abs(forces).max() <= 1.0
+
+
+def test_motions_of_many_numbers_are_seen_as_well_as_those_of_few(pendulum):
+    limits = [JointLimits.of(pendulum.model.robot, FourierBasis(n, 0.5)) for n in (5, 31)]
+    assert [x.grid(64).kinds[0].stop for x in limits] == [64, 366]
+    assert all(x.grid(64).bound > 0.96 for x in limits)
 
 
 def test_a_design_with_leads_keeps_all_constraints_in_them_too(pendulum, constraints, shapes):

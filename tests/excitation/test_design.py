@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from jaxid.dynamics.motion import Motion
+from jaxid.excitation.constraints.clearance import Clearance
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
 from jaxid.excitation.criteria import ConditionNumber, DOptimal
 from jaxid.excitation.design import design_excitation
 from jaxid.excitation.information import information
+from jaxid.excitation.state import fingerprint
+from jaxid.robot.capsules import GROUND, Capsule
+from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.files import load_trajectory
 
 SETTINGS = {"harmonics": 3, "omega": 1.1, "starts": 3, "polish": 1, "kicks": 2, "samples": 200}
@@ -166,3 +170,17 @@ def test_a_constraint_sees_each_sample_by_itself(arm):
     motion = Motion(*np.random.default_rng(0).standard_normal((3, 5, 2)))
     whole = LowTip(0.3)(arm, motion)
     np.testing.assert_allclose(whole[2], LowTip(0.3)(arm, motion[2]))
+
+
+def test_a_state_belongs_to_the_pairs_that_are_watched(pendulum):
+    """They are no arrays, and decide all the same."""
+    robot = pendulum.model.robot
+    shapes = (
+        Capsule.of("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),
+        Capsule.of("post", GROUND, start=(2.0, 0, 0), end=(2.0, 0, 1.0), radius=0.05),
+        Capsule.of("far", GROUND, start=(9.0, 0, 0), end=(9.0, 0, 1.0), radius=0.05),
+    )
+    models = [CollisionModel.of(robot, shapes, (), (("hand", x),)) for x in ("post", "far", "far")]
+    post, far, again = (fingerprint(Clearance(m, distance=0.02)) for m in models)
+    assert post != far
+    assert far == again
