@@ -159,7 +159,17 @@ class Fit(eqx.Module):
         return full
 
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
-        """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39)."""
+        """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39).
+
+        Raises:
+            ValueError: If the motion is of another number of joints.
+        """
+        robot = self.base.model.robot
+        if motion.joints != robot.joints:
+            raise ValueError(
+                f"`motion` must be of the {robot.joints} joints of `{robot.name}`, but is of "
+                f"{motion.joints}."
+            )
         return compiled.forces(self.base, self.parameters, motion)
 
     @property

@@ -1,7 +1,8 @@
 """Identification: from observations to parameters with their uncertainty (Eqs. 26-33)."""
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -39,11 +40,11 @@ def identify(
         The estimates; `undetermined` names what these recordings do not determine.
 
     Raises:
+        TypeError: If a model stands for base parameters, or a recording for observations.
         ValueError: If the observations belong to another number of joints, have fewer rows than
             there are parameters, or weights are not known.
     """
-    single = isinstance(observations, Observations | LongLog)
-    recordings = (observations,) if single else tuple(observations)
+    recordings = tuple(observations) if isinstance(observations, Iterable) else (observations,)
     estimator = WeightedLeastSquares() if estimator is None else estimator
     _check(base, recordings)
     return fit_rows(Rows.of(base, recordings, progress), estimator, uncertainty=uncertainty)
@@ -133,11 +134,21 @@ def fit_rows(
     )
 
 
-def _check(base: BaseParameters, recordings: Sequence[Observations | LongLog]) -> None:
+def _check(base: Any, recordings: Sequence[Any]) -> None:
     if not recordings:
         raise ValueError("`observations` must hold at least one recording, but is empty.")
+    if not isinstance(base, BaseParameters):
+        raise TypeError(
+            f"`base` must be base parameters, but is a `{type(base).__name__}`: take those that "
+            "`base_parameters(model)` finds."
+        )
     n = base.model.robot.joints
     for observations in recordings:
+        if not isinstance(observations, Observations | LongLog):
+            raise TypeError(
+                "`observations` must be what `observe` makes of a recording, or a sequence of "
+                f"such, but hold a `{type(observations).__name__}`."
+            )
         if observations.joints != n:
             raise ValueError(
                 f"the observations `{observations.name}` have {observations.joints} joints, but "

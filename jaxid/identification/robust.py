@@ -32,6 +32,14 @@ class AbstractLoss(eqx.Module):
         """The derivative of residual times weight."""
 
 
+def _require_limit(loss: AbstractLoss, limit: float) -> None:
+    if not limit > 0.0:
+        raise ValueError(
+            f"`limit` of `{type(loss).__name__}` must be a positive number of standard deviations, "
+            f"but is {limit}."
+        )
+
+
 class Huber(AbstractLoss):
     """Large residuals count by their size and not by its square (Huber 1964).
 
@@ -41,6 +49,9 @@ class Huber(AbstractLoss):
     """
 
     limit: float = eqx.field(static=True, default=1.345)
+
+    def __check_init__(self):
+        _require_limit(self, self.limit)
 
     def share(self, x):
         """One, then falling with the residual's size."""
@@ -60,6 +71,9 @@ class Tukey(AbstractLoss):
     """
 
     limit: float = eqx.field(static=True, default=4.685)
+
+    def __check_init__(self):
+        _require_limit(self, self.limit)
 
     def share(self, x):
         """Falls smoothly to zero."""

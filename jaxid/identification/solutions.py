@@ -109,6 +109,13 @@ class Truncated(AbstractSpectralSolution):
 
     share: float = eqx.field(static=True, default=1e-2)
 
+    def __check_init__(self):
+        if not 0.0 <= self.share < 1.0:
+            raise ValueError(
+                f"`share` of `Truncated` must be at least 0 and below 1, but is {self.share}: from "
+                "1 on nothing would be left."
+            )
+
     def inverse(self, values):
         """Leaves out weak directions."""
         return _above(values, max(self.share, NUMERICAL))
@@ -123,6 +130,12 @@ class Ridge(AbstractSpectralSolution):
     """
 
     share: float = eqx.field(static=True, default=1e-2)
+
+    def __check_init__(self):
+        if not 0.0 <= self.share < np.inf:
+            raise ValueError(
+                f"`share` of `Ridge` must be a finite number of at least 0, but is {self.share}."
+            )
 
     def inverse(self, values):
         """Bounds the inverse."""

@@ -5,6 +5,7 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import is_traced, one_or_each
 from jaxid.identification.factors import Factors
 from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.robot.robot import Robot
@@ -34,10 +35,30 @@ class GivenWeights(AbstractWeights):
         weights: One for each joint [1/(N m) or 1/N].
     """
 
-    weights: Float[AnyArray, " joints"]
+    weights: Float[AnyArray, " joints"] = eqx.field(converter=one_or_each)
+
+    def __check_init__(self):
+        # Trees of what is no array, such as `in_axes` of `vmap`, have no values; nor have tracers.
+        if not isinstance(self.weights, AnyArray) or is_traced(self.weights):
+            return
+        w = np.asarray(self.weights)
+        if w.ndim != 1 or not (np.isfinite(w).all() and (w >= 0.0).all() and w.any()):
+            raise ValueError(
+                "`weights` must be one finite number for each joint, none below zero and not all "
+                f"zero, but are {w}."
+            )
 
     def __call__(self, robot, factors):
-        """As they are."""
+        """As they are.
+
+        Raises:
+            ValueError: If there are more or fewer than joints.
+        """
+        if np.shape(self.weights) != (robot.joints,):
+            raise ValueError(
+                f"`weights` must be one number for each of the {robot.joints} joints of "
+                f"`{robot.name}`, but have shape {np.shape(self.weights)}."
+            )
         return np.asarray(self.weights)
 
 

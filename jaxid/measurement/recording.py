@@ -79,6 +79,10 @@ class Recording(eqx.Module):
             ValueError: If shapes differ, a value is not finite, time runs backwards or stands
                 still, or there are fewer than ten samples.
         """
+        if any(np.iscomplexobj(x) for x in (angles, forces, velocities, time) if x is not None):
+            raise ValueError(f"`{name}` holds complex numbers: give real ones.")
+        if not largest_gap > 1.0:
+            raise ValueError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
         data = {"angles": np.array(angles, np.float64), "forces": np.array(forces, np.float64)}
         if velocities is not None:
             data["velocities"] = np.array(velocities, np.float64)

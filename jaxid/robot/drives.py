@@ -39,7 +39,7 @@ class Drives(Hashable):
         """Builds drives from gear ratios (one for each joint) or a full matrix; direct if None.
 
         Raises:
-            ValueError: If a length is wrong, or the matrix cannot be inverted.
+            ValueError: If a length is wrong, the matrix cannot be inverted, or a number cannot be.
         """
         matrix = np.eye(joints) if reduction is None else np.array(reduction, dtype=np.float64)
         if matrix.shape == (joints,):
@@ -55,12 +55,22 @@ class Drives(Hashable):
                 "`reduction` must be invertible, but some joint is moved by no motor of its own: "
                 "is a gear ratio zero?"
             )
-        return cls(
-            matrix,
-            per_joint("zero", zero, joints, 0.0),
-            per_joint("max_torques", max_torques, joints, np.inf),
-            per_joint("rotor_inertia", rotor_inertia, joints, np.nan),
-        )
+        found = {
+            "zero": per_joint("zero", zero, joints, 0.0),
+            "max_torques": per_joint("max_torques", max_torques, joints, np.inf),
+            "rotor_inertia": per_joint("rotor_inertia", rotor_inertia, joints, np.nan),
+        }
+        for key, wrong, rule in (
+            ("zero", ~np.isfinite(found["zero"]), "finite"),
+            ("max_torques", found["max_torques"] <= 0.0, "positive"),
+            ("rotor_inertia", found["rotor_inertia"] < 0.0, "zero or more"),
+        ):
+            if wrong.any():
+                j = int(np.flatnonzero(wrong)[0])
+                raise ValueError(
+                    f"`{key}` must be {rule}, but that of joint {j + 1} is {found[key][j]:g}."
+                )
+        return cls(matrix, **found)
 
     @property
     def is_direct(self) -> bool:
