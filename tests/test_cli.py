@@ -531,6 +531,30 @@ def test_long_logs_give_what_short_ones_give(folder, run, monkeypatch, kind, com
     assert_same_words(out, run("inspect", folder / "slow.toml", folder / f"a.{kind}")[1])
 
 
+def test_slips_are_found_in_a_part_of_a_long_log(folder, run, monkeypatch):
+    monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
+    monkeypatch.setattr("jaxid.experiment.excerpt.EXAMINED", 800)
+    log = pl.read_csv("a.csv")
+    log.with_columns(-pl.col("tau2")).write_csv("turned.csv")
+    code, out, _ = run("inspect", "experiment.toml", "turned.csv")
+    said = " ".join(out.split())
+    assert code == 0
+    assert f"800 of the {len(log)} samples were examined for slips" in said
+    assert "the sign of the force of joint `joint2` seems to be wrong" in said
+    held = pl.when(pl.col("t") < 2.0).then(pl.col("q2")).otherwise(0.1)
+    log.with_columns(held.alias("q2")).write_csv("held.csv")
+    said = " ".join(run("inspect", "experiment.toml", "held.csv")[1].split())
+    assert "the angle of joint `joint2` stays at 0.1 from" in said
+    assert "seem" not in said
+
+
+def test_states_and_the_like_doubt_their_logs_too(folder, run):
+    pl.read_csv("a.csv").with_columns(-pl.col("tau2")).write_csv("turned.csv")
+    said = " ".join(run("states", "experiment.toml", "b.csv", "turned.csv")[1].split())
+    assert "turned: the sign of the force of joint `joint2` seems to be wrong" in said
+    assert "b: " not in said
+
+
 def assert_same_words(a, b):
     """The same up to the last digit of a rounded number."""
     for x, y in zip(a.split(), b.split(), strict=True):

@@ -25,18 +25,17 @@ from jaxid.cli.options import (
     open_stages,
 )
 from jaxid.experiment import terminal
-from jaxid.experiment.doctor import fitted_doubts
+from jaxid.experiment.doctor import fitted_doubts, slips_of
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import (
     output_folder,
     refuse_foreign_folder,
 )
-from jaxid.experiment.loading import Loaded, choose, load_log, observe_all
-from jaxid.experiment.mistakes import likely_mistake
+from jaxid.experiment.loading import Loaded, choose, doubts_of, load_log, load_logs
+from jaxid.experiment.mistakes import BAD
 from jaxid.experiment.progress import Stages
 from jaxid.experiment.runs import earlier_run, is_report
-from jaxid.experiment.sanity import negative_friction
 from jaxid.experiment.template import write_template
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
@@ -57,6 +56,11 @@ DISTRIBUTION = "jaxid-robotics"
 KEPT = (
     "`run.npz`, with which later logs, `payload` and `gains` go on, keeps weighted least squares "
     "of the file's model, not this estimate."
+)
+
+DELAYS = (
+    "whether the forces stand later in the logs than the angles takes longer to tell: `jaxid "
+    "inspect` says so for each log."
 )
 
 app = typer.Typer(
@@ -183,12 +187,9 @@ def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fi
     log = load_log(experiment, path, stage)
     stage(f"factorising {path.name}")
     progress = stage.through(log.recording.samples)
-    base, observations = experiment.base, log.observations
-    fit = estimate(base, observations, experiment.plain, progress)
+    fit = estimate(experiment.base, log.observations, experiment.plain, progress)
     stage(f"looking for slips in {path.name}")
-    held = log.recording.columns if isinstance(log.recording, LongLog) else log.recording
-    doubts = fitted_doubts(observations, fit, held.angles_on_motor_side, held.forces_on_motor_side)
-    return log, fit, doubts
+    return log, fit, fitted_doubts(log, fit)
 
 
 app.command()(excite)
@@ -257,7 +258,10 @@ def identify(
     choices = len(logs) + 1 if loaded.candidates else 0
     with open_stages(4 + choices + 2 * (len(logs) + len(others))) as stage:
         loaded, choice = choose(loaded, logs, stage, split)
-        fitted, checked, said, doubts = observe_all(loaded, logs, others, stage)
+        read = load_logs(loaded, [*logs, *others], stage)
+        said, doubts = [note for log in read for note in log.notes], doubts_of(read)
+        observed = [log.observations for log in read]
+        fitted, checked = observed[: len(logs)], observed[len(logs) :]
         if split is not None:
             parts = [o.split(split) for o in fitted]
             percent = f"{100 * split:g}"
@@ -289,9 +293,9 @@ def identify(
             other = fit_rows(same, loaded.other_estimator)
             ways = None if loaded.single_axes is None else ("axis by axis", "at once")
             beside = Beside.of(other, [*fitted, *checked], ways)
-        sides = _sides(loaded)
-        slips = [f"{o.name}: {said}" for o in fitted for said in likely_mistake(base, o, *sides)]
-        suspected = (*negative_friction(fit), *slips)
+        suspected = slips_of(read[: len(logs)], fit)
+        if fit.residual > BAD and not suspected:
+            said.append(DELAYS)
         stage("writing the report")
         logs_said = [*(n for o in (*fitted, *checked) for n in o.notes), *said]
         files = write_report(
@@ -346,14 +350,6 @@ def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -
         )
     whole = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), run])
     return whole.fit, whole
-
-
-def _sides(experiment: Experiment) -> tuple[bool, bool]:
-    """Whether angles and forces of its logs are the motors'."""
-    columns = experiment.columns
-    return columns is not None and columns.angles_on_motor_side, (
-        columns is not None and columns.forces_on_motor_side
-    )
 
 
 def _named(observations: Observations | LongLog, name: str) -> Observations | LongLog:

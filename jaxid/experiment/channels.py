@@ -1,5 +1,7 @@
 """Signs that a key of the experiment file is wrong: units, sides, dead and cut channels."""
 
+from collections.abc import Collection
+
 import numpy as np
 
 from jaxid.measurement.recording import Recording
@@ -83,11 +85,19 @@ def unit_doubts(
     ]
 
 
-def stuck_doubts(robot: Robot, recording: Recording) -> list[str]:
-    """Forces that are one number throughout, or cut off at their largest value."""
+def stuck_doubts(robot: Robot, recording: Recording, faulty: Collection[int] = ()) -> list[str]:
+    """Forces that are one number throughout, or cut off at their largest value.
+
+    Args:
+        robot: Whose log it is.
+        recording: As it was read.
+        faulty: Joints of which more is known already.
+    """
     forces, angles = np.asarray(recording.forces), np.asarray(recording.angles)
     said = []
     for j, name in enumerate(robot.joint_names):
+        if j in faulty:
+            continue
         f, speed = forces[:, j], np.abs(np.gradient(angles[:, j]))
         low, high = float(f.min()), float(f.max())
         if low == high:

@@ -1,13 +1,14 @@
 """The doctor: everything that a log gives away about slips in its experiment file."""
 
+from collections.abc import Sequence
+
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.lateness import delay_doubts
+from jaxid.experiment.loading import Loaded
 from jaxid.experiment.mistakes import likely_mistake
 from jaxid.experiment.sanity import check_log, negative_friction
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import identify
-from jaxid.identification.streaming_log import LongLog
-from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 
 
@@ -24,25 +25,38 @@ def examine(experiment: Experiment, recording: Recording) -> tuple[str, ...]:
     observations = experiment.observe(recording)
     check = check_log(experiment.robot, recording, observations)
     fit = identify(experiment.base, observations, experiment.plain)
-    sides = recording.angles_on_motor_side, recording.forces_on_motor_side
-    return (*fitted_doubts(observations, fit, *sides), *check.warnings)
+    log = Loaded(recording, observations, check, observations)
+    return (*fitted_doubts(log, fit), *check.warnings)
 
 
-def fitted_doubts(
-    observations: Observations | LongLog,
-    fit: Fit,
-    angles_on_motor_side: bool,
-    forces_on_motor_side: bool,
-) -> tuple[str, ...]:
-    """What a fit to one log gives away.
+def fitted_doubts(log: Loaded, fit: Fit) -> tuple[str, ...]:
+    """What a fit to one log gives away, a delay included.
 
     Args:
-        observations: Of the log.
+        log: As it was read.
         fit: Of this log alone.
-        angles_on_motor_side: Whether its angles are taken for the motors'.
-        forces_on_motor_side: Whether its forces are taken for the motors'.
     """
-    sides = angles_on_motor_side, forces_on_motor_side
-    slips = likely_mistake(fit.base, observations, *sides)
-    # A slip that is known explains both of the others.
-    return slips or (*negative_friction(fit), *delay_doubts(fit.base, observations, fit))
+    # Slips and faults of channels that are known explain the rest.
+    if log.check.faulty:
+        return ()
+    slips = () if log.examined is None else likely_mistake(fit.base, log.examined, *log.sides)
+    if slips or log.examined is None:
+        return slips or negative_friction(fit)
+    return (*negative_friction(fit), *delay_doubts(fit.base, log.examined, fit))
+
+
+def slips_of(logs: Sequence[Loaded], fit: Fit) -> tuple[str, ...]:
+    """What a fit to several logs gives away, apart from delays, with the names of the logs.
+
+    Args:
+        logs: All of which it was made of.
+        fit: Of these logs together.
+    """
+    sound = [log for log in logs if not log.check.faulty]
+    slips = [
+        f"{log.recording.name}: {said}"
+        for log in sound
+        if log.examined is not None
+        for said in likely_mistake(fit.base, log.examined, *log.sides)
+    ]
+    return (*(negative_friction(fit) if len(sound) == len(logs) else ()), *slips)

@@ -6,7 +6,6 @@ from scipy import stats
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.delay import estimate_delay
-from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.observations import Observations
 
@@ -18,17 +17,15 @@ ALIKE = 0.001
 """Chance of joints that differ so much, of 1, below which one delay does not explain them."""
 
 
-def delay_doubts(
-    base: BaseParameters, observations: Observations | LongLog, fit: Fit
-) -> tuple[str, ...]:
+def delay_doubts(base: BaseParameters, observations: Observations, fit: Fit) -> tuple[str, ...]:
     """A sentence about a delay that the model sees, or nothing.
 
     Args:
         base: What is identified.
-        observations: Of one log; a long one is not looked at.
+        observations: Of one log, or of a part of it.
         fit: Of this log.
     """
-    if isinstance(observations, LongLog) or not fit.residual < EXPLAINED:
+    if not fit.residual < EXPLAINED:
         return ()
     try:
         found = estimate_delay(base, observations, GivenWeights(np.asarray(fit.weights)))

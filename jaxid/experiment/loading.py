@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxid.experiment.excerpt import excerpt
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.progress import Stages
 from jaxid.experiment.robot_tables import within
@@ -24,13 +25,21 @@ class Loaded:
         recording: As it was read.
         observations: What the filter makes of it.
         check: What it holds beside the robot's limits.
+        examined: What slips are looked for in: of a long log, a part; None if that tells nothing.
         notes: How it was read, in sentences.
     """
 
     recording: Recording | LongLog
     observations: Observations | LongLog
     check: LogCheck
+    examined: Observations | None
     notes: tuple[str, ...] = ()
+
+    @property
+    def sides(self) -> tuple[bool, bool]:
+        """Whether its angles and forces are taken for the motors'."""
+        held = self.recording.columns if isinstance(self.recording, LongLog) else self.recording
+        return held.angles_on_motor_side, held.forces_on_motor_side
 
 
 def load_log(experiment: Experiment, path: Path, stage: Stages, name: str | None = None) -> Loaded:
@@ -58,7 +67,7 @@ def load_log(experiment: Experiment, path: Path, stage: Stages, name: str | None
     stage(f"filtering {path.name}")
     observations = experiment.observe(recording)
     check = check_log(experiment.robot, recording, observations)
-    return Loaded(recording, observations, check, notes)
+    return Loaded(recording, observations, check, observations, notes)
 
 
 def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None) -> Loaded:
@@ -66,12 +75,21 @@ def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None)
     log = experiment.open(path)
     log = log if name is None else log.named(name)
     stage(f"looking through {path.name}")
-    check = check_long_log(experiment.robot, log, stage.through(log.samples))
+    part = excerpt(log)
+    check = check_long_log(experiment.robot, log, part, stage.through(log.samples))
+    try:
+        examined, why = experiment.observe(part), ""
+    except ValueError as error:
+        examined, why = None, f" of single channels only: {error}"
+    if part.samples < log.samples or examined is None:
+        note = f"{part.samples} of the {log.samples} samples were examined for slips{why}"
+        outline = dataclasses.replace(log.outline, notes=(*log.notes, note))
+        log = dataclasses.replace(log, outline=outline)
     every = compared_rows(log)
     if every == 1:
-        return Loaded(log, log, check)
+        return Loaded(log, log, check, examined)
     note = f"{log.name}: torque errors and figures take one of every {every} of its {log.rows} rows"
-    return Loaded(log, log, check, (note,))
+    return Loaded(log, log, check, examined, (note,))
 
 
 def choose(
@@ -116,29 +134,26 @@ def choose(
     return chosen, choice
 
 
-def observe_all(
-    experiment: Experiment, logs: Sequence[Path], others: Sequence[Path], stage: Stages
-) -> tuple[list[Observations | LongLog], list[Observations | LongLog], list[str], list[str]]:
-    """Reads all logs, and doubts them; equal names take their folders' in front.
+def load_logs(experiment: Experiment, paths: Sequence[Path], stage: Stages) -> list[Loaded]:
+    """Reads and looks through logs; equal names take their folders' in front.
 
     Args:
         experiment: Whose logs they are.
-        logs: Those to identify with.
-        others: Those to verify with.
+        paths: Of the logs.
         stage: Is told what is done.
 
-    Returns:
-        What the filter makes of the first and of the others; how they were read, and doubts, in
-        sentences.
+    Raises:
+        ValueError: If a log is not as the experiment's file says.
     """
-    paths = [*logs, *others]
     stems = [p.stem for p in paths]
-    observed, said, doubts = [], [], []
+    found = []
     for path in paths:
         twice = stems.count(path.stem) > 1
         name = f"{path.resolve().parent.name}/{path.stem}" if twice else None
-        log = load_log(experiment, path, stage, name)
-        observed.append(log.observations)
-        said += log.notes
-        doubts += [f"{log.recording.name}: {warning}" for warning in log.check.warnings]
-    return observed[: len(logs)], observed[len(logs) :], said, doubts
+        found.append(load_log(experiment, path, stage, name))
+    return found
+
+
+def doubts_of(logs: Sequence[Loaded]) -> list[str]:
+    """What is strange about the channels of logs, by their names."""
+    return [f"{log.recording.name}: {said}" for log in logs for said in log.check.warnings]

@@ -14,7 +14,6 @@ import numpy as np
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 from jaxid.types import Float
@@ -51,7 +50,7 @@ class Slip(NamedTuple):
 
 def likely_mistake(
     base: BaseParameters,
-    observations: Observations | LongLog,
+    observations: Observations,
     angles_on_motor_side: bool = False,
     forces_on_motor_side: bool = False,
 ) -> tuple[str, ...]:
@@ -59,15 +58,13 @@ def likely_mistake(
 
     Args:
         base: What is identified.
-        observations: Of one log; a long one is not looked at.
+        observations: Of one log, or of a part of it.
         angles_on_motor_side: Whether the columns of the log are taken for the motors' angles.
         forces_on_motor_side: Whether they are taken for the motors' torques.
 
     Returns:
         A sentence, or nothing where the model fits or no single slip explains why it does not.
     """
-    if isinstance(observations, LongLog):
-        return ()
     step = -(-observations.rows // ROWS)
     forces = observations.reduced_forces[::step]
     motion = observations.motion[observations.instants[::step]]

@@ -4,8 +4,9 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxid.experiment.doctor import slips_of
 from jaxid.experiment.experiment import Experiment
-from jaxid.experiment.loading import load_log
+from jaxid.experiment.loading import doubts_of, load_log
 from jaxid.experiment.progress import Stages
 from jaxid.identification.identify import fit_rows
 from jaxid.identification.rows import Rows
@@ -81,11 +82,13 @@ def read_run(
     """
     earlier = [earlier_run(experiment, path) for path in paths if is_report(path)]
     logs = [load_log(experiment, path, stage) for path in paths if not is_report(path)]
-    doubts = [f"{log.recording.name}: {said}" for log in logs for said in log.check.warnings]
+    doubts = doubts_of(logs)
     if logs:
         observed = [log.observations for log in logs]
         stage(f"factorising the rows, {name}")
         through = stage.through(sum(len(source(o)[0].time) for o in observed))
         rows = Rows.of(experiment.base, observed, through)
-        earlier.append(Run.of_rows(rows, fit_rows(rows, experiment.plain)))
+        fit = fit_rows(rows, experiment.plain)
+        doubts += slips_of(logs, fit)
+        earlier.append(Run.of_rows(rows, fit))
     return functools.reduce(update, earlier), doubts

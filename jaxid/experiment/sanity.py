@@ -1,6 +1,7 @@
 """Is this log sane? Ranges, speeds and forces of a log beside the limits of its robot."""
 
 import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from jaxid.experiment.channels import (
     stuck_doubts,
     unit_doubts,
 )
+from jaxid.experiment.faults import channel_faults
 from jaxid.experiment.mistakes import FRICTION
 from jaxid.identification.fit import Fit
 from jaxid.identification.streaming import Progress
@@ -48,6 +50,7 @@ class LogCheck:
         standing: Share of the samples in which each joint stands, of 1.
         all_standing: Share of the samples in which all joints stand, of 1.
         warnings: What is strange, in sentences.
+        faulty: Joints with channels that are held, spiky or wrapped: the model cannot fit them.
     """
 
     lowest: Float[np.ndarray, " joints"]
@@ -58,6 +61,7 @@ class LogCheck:
     standing: Float[np.ndarray, " joints"]
     all_standing: float
     warnings: tuple[str, ...]
+    faulty: tuple[int, ...] = ()
 
 
 def check_log(robot: Robot, recording: Recording, observations: Observations) -> LogCheck:
@@ -74,20 +78,20 @@ def check_log(robot: Robot, recording: Recording, observations: Observations) ->
         look.steps(angles[a:b])
     for a, b in observations.segments:
         look.motion(observations.motion[a:b], observations.forces[a:b], observations.sample_time)
-    measured = recording.velocities is not None
-    check = look.check(robot, not recording.angles_on_motor_side, measured)
-    more = (*rate_doubts(recording.sample_time), *stuck_doubts(robot, recording))
-    return dataclasses.replace(check, warnings=(*check.warnings, *more))
+    return _with_channels(look, robot, recording)
 
 
-def check_long_log(robot: Robot, log: LongLog, progress: Progress | None = None) -> LogCheck:
+def check_long_log(
+    robot: Robot, log: LongLog, part: Recording, progress: Progress | None = None
+) -> LogCheck:
     """The same for a log that is gone through part by part.
 
-    Whether joints stand is judged by every n-th sample.
+    Whether joints stand is judged by every n-th sample, and channels by a part of the log.
 
     Args:
         robot: Whose log it is.
         log: The log.
+        part: Of it, as it was recorded.
         progress: Is told now and then which share is done, of 1.
     """
     look = _Look(robot.joints, -(-log.samples // STANDS))
@@ -101,9 +105,18 @@ def check_long_log(robot: Robot, log: LongLog, progress: Progress | None = None)
             last = angles[-1:]
             if progress is not None:
                 progress(stop / log.samples)
-    return look.check(
-        robot, not log.columns.angles_on_motor_side, log.columns.velocities is not None
-    )
+    return _with_channels(look, robot, part)
+
+
+def _with_channels(look: "_Look", robot: Robot, recording: Recording) -> LogCheck:
+    """What was seen, and what single channels give away."""
+    faults = channel_faults(robot, recording)
+    faulty = tuple(dict.fromkeys(fault.joint for fault in faults))
+    measured = recording.velocities is not None
+    check = look.check(robot, recording.angles_on_motor_side, measured, faulty)
+    more = (*rate_doubts(recording.sample_time), *stuck_doubts(robot, recording, faulty))
+    warnings = (*(fault.said for fault in faults), *check.warnings, *more)
+    return dataclasses.replace(check, warnings=warnings, faulty=faulty)
 
 
 class _Look:
@@ -141,8 +154,10 @@ class _Look:
         self._kept.append(qd[-self._samples % self._every :: self._every])
         self._samples += len(q)
 
-    def check(self, robot: Robot, jumps: bool, velocities: bool) -> LogCheck:
-        """What is strange about it."""
+    def check(
+        self, robot: Robot, on_motor_side: bool, velocities: bool, faulty: Collection[int] = ()
+    ) -> LogCheck:
+        """What is strange about it, apart from what faults of channels bring with them."""
         kept = np.concatenate(self._kept)
         stands = np.abs(kept) < STANDING * np.maximum(self._speed, 1e-12)
         check = LogCheck(
@@ -155,20 +170,24 @@ class _Look:
             all_standing=float(stands.all(axis=1).mean()),
             warnings=(),
         )
-        warnings = unit_doubts(robot, check.lowest, check.highest, not jumps)
+        sound = [j for j in range(robot.joints) if j not in faulty]
+        warnings: list[str] = []
+        if not faulty:
+            warnings = unit_doubts(robot, check.lowest, check.highest, on_motor_side)
         if not warnings:
-            warnings = [w for j in range(robot.joints) for w in _range(robot, j, check)]
-        warnings += (said := _all_forces(robot, check))
-        for j in range(robot.joints):
+            warnings = [w for j in sound for w in _range(robot, j, check)]
+        warnings += (said := [] if faulty else _all_forces(robot, check))
+        for j in sound:
             warnings += _joint(robot, j, check) + ([] if said else _force(robot, j, check))
         # Over a whole log, friction makes a robot consume energy.
-        if self._power < -0.05 * np.sqrt(self._forces * self._velocities):
+        least = -0.05 * np.sqrt(self._forces * self._velocities)
+        if not faulty and self._power < least:
             warnings.append(
                 "the robot gives off energy over the whole log: check the signs of its angles and "
                 "forces (`recording.angle_signs`, `force_signs`)."
             )
-        warnings += _jumps(robot, self._jump) if jumps else []
-        warnings += _velocities(robot, self._rates, self._along) if velocities else []
+        warnings += [] if on_motor_side else _jumps(robot, self._jump, sound)
+        warnings += _velocities(robot, self._rates, self._along, sound) if velocities else []
         if check.all_standing > 0.5:
             warnings.append(
                 f"the robot stands still for {100 * check.all_standing:.0f} % of the log: crop it "
@@ -236,13 +255,13 @@ def _all_forces(robot: Robot, check: LogCheck) -> list[str]:
     return []
 
 
-def _jumps(robot: Robot, largest: np.ndarray) -> list[str]:
+def _jumps(robot: Robot, largest: np.ndarray, joints: list[int]) -> list[str]:
     """A joint does not turn by half a turn or more from one sample to the next."""
     return [
-        f"the angle of joint `{name}` jumps by {largest[j]:.3g} rad from one sample to the next: "
-        "undo the wrapping at a full turn before the log is filtered."
-        for j, (name, turns) in enumerate(zip(robot.joint_names, robot.revolute, strict=True))
-        if turns and largest[j] > np.pi
+        f"the angle of joint `{robot.joint_names[j]}` jumps by {largest[j]:.3g} rad from one "
+        "sample to the next: undo the wrapping at a full turn before the log is filtered."
+        for j in joints
+        if robot.revolute[j] and largest[j] > np.pi
     ]
 
 
@@ -259,11 +278,14 @@ def negative_friction(fit: Fit) -> tuple[str, ...]:
     )
 
 
-def _velocities(robot: Robot, squares: np.ndarray, along: np.ndarray) -> list[str]:
+def _velocities(
+    robot: Robot, squares: np.ndarray, along: np.ndarray, joints: list[int]
+) -> list[str]:
     """Measured velocities must be the derivatives of the angles."""
     ratio = along / np.where(squares > 0, squares, 1.0)
     return [
         f"the measured velocities of joint `{robot.joint_names[j]}` are {ratio[j]:.3g} times the "
         "derivatives of its angles: check `recording.velocity_unit` and the order of the columns."
-        for j in np.flatnonzero((squares > 0) & (np.abs(ratio - 1.0) > 0.2))
+        for j in joints
+        if squares[j] > 0 and abs(ratio[j] - 1.0) > 0.2
     ]

@@ -132,9 +132,24 @@ class LongLog(eqx.Module):
         Raises:
             ValueError: Like `read`.
         """
+        angles, velocities, forces = self.recorded(samples)
+        drives = self.robot.drives
+        if self.columns.angles_on_motor_side:
+            angles = np.asarray(drives.joint_angles(angles))
+            velocities = None if velocities is None else drives.joint_velocities(velocities)
+        if self.columns.forces_on_motor_side:
+            forces = np.asarray(drives.joint_forces(forces))
+        return angles, None if velocities is None else np.asarray(velocities), forces
+
+    def recorded(self, samples: slice) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """The same in SI units, on the sides on which they were recorded.
+
+        Raises:
+            ValueError: Like `read`.
+        """
         begin, _, first = self._placed(samples)
         rows = first + samples.start - begin, first + samples.stop - begin
-        columns, n, drives = self.columns, self.joints, self.robot.drives
+        columns, n = self.columns, self.joints
         table = self.angles.part(*rows)
         angles = table.array("angles", columns.angles)
         angles = angles * columns.angle_scale(n) + columns.angle_shift(n)
@@ -144,12 +159,7 @@ class LongLog(eqx.Module):
         if columns.velocities is not None:
             other = table if self.velocities is None else self.velocities.part(*rows)
             velocities = other.array("velocities", columns.velocities) * columns.velocity_scale(n)
-        if columns.angles_on_motor_side:
-            angles = np.asarray(drives.joint_angles(angles))
-            velocities = None if velocities is None else drives.joint_velocities(velocities)
-        if columns.forces_on_motor_side:
-            forces = np.asarray(drives.joint_forces(forces))
-        return angles, None if velocities is None else np.asarray(velocities), forces
+        return angles, velocities, forces
 
     def _placed(self, samples: slice) -> tuple[int, int, int]:
         """Where the segment of some samples begins and ends, and its first row in the file."""
