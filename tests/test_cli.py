@@ -289,7 +289,7 @@ def test_wrapped_angles_are_doubted_by_both_commands(folder, run):
     for row in rows[600:]:
         row[1] = f"{float(row[1]) - 6.283185:.7f}"
     (folder / "wrapped.csv").write_text("\n".join(",".join(row) for row in rows))
-    sentence = "the angle of joint `joint1` jumps by 6.2"
+    sentence = "the angle of joint `joint1` jumps by a full turn (6.283) once, first at 2.99"
     for command in ("inspect", "identify"):
         code, out, err = run(command, "experiment.toml", "wrapped.csv")
         assert code == 0, err
