@@ -80,14 +80,10 @@ def written_whole(
         ValueError: If `folder`, or what should be above it, is a file; or a file's place is taken
             by a folder; or another process writes into it for `PATIENCE` seconds.
     """
-    folder = folder.absolute()
-    ancestor = folder
-    while not ancestor.exists():
-        ancestor = ancestor.parent
-    if not ancestor.is_dir():
-        raise ValueError(f"`{ancestor}` must be a folder, but is a file: choose another place.")
+    given, folder = folder, folder.absolute()
+    ancestor = _standing(folder)
     # Beside their place, for only within one file system files move in one step.
-    with _hidden(ancestor) as hidden:
+    with _hidden(ancestor, given) as hidden:
         staging, replaced = hidden / NEW, hidden / OLD
         staging.mkdir()
         yield staging
@@ -98,6 +94,35 @@ def written_whole(
                 _replace(staging, folder, replaced, earlier)
     for place in {ancestor, folder.parent}:
         _clear(place)
+
+
+def require_place(folder: Path) -> None:
+    """Refuses a place where no result can appear: before the work, not after it.
+
+    Args:
+        folder: Where files shall be; it need not be there yet.
+
+    Raises:
+        OSError: If nothing can be written there.
+        ValueError: If something else is in its place, or above it.
+    """
+    with _hidden(_standing(folder.absolute()), folder):
+        pass
+
+
+def _standing(folder: Path) -> Path:
+    """The folder itself if it is there, else the first one above it that is."""
+    ancestor = folder
+    while not ancestor.exists():
+        if ancestor.is_symlink():
+            raise ValueError(
+                f"`{ancestor}` is a link to `{os.readlink(ancestor)}`, which is not there: choose "
+                "another place."
+            )
+        ancestor = ancestor.parent
+    if not ancestor.is_dir():
+        raise ValueError(f"`{ancestor}` must be a folder, but is a file: choose another place.")
+    return ancestor
 
 
 def unfinished(folder: Path) -> list[Path]:
@@ -126,11 +151,20 @@ def _moved(folder: Path, outdated: Callable[[Path], Iterable[str]]) -> Iterator[
 
 
 @contextlib.contextmanager
-def _hidden(place: Path) -> Iterator[Path]:
-    """A folder that is this process's own as long as it lives, and is removed in the end."""
+def _hidden(place: Path, given: Path) -> Iterator[Path]:
+    """A folder that is this process's own as long as it lives, and is removed in the end.
+
+    Args:
+        place: Where it lies.
+        given: What a user called the place for which it stands in.
+    """
     while True:
         path = place / f"{_of_this_machine()}{uuid.uuid4().hex[:12]}"
-        path.mkdir()
+        try:
+            path.mkdir()
+        except OSError as error:
+            # Nobody has heard of the hidden folder.
+            raise OSError(error.errno, error.strerror, str(given)) from error
         try:
             handle = _taken(path)
         except FileNotFoundError:  # removed by a process that found it before it was taken

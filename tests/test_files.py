@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from jaxid.excitation.state import load_state
-from jaxid.experiment.folder import refuse_foreign_folder
-from jaxid.files import written_whole
+from jaxid.experiment.folder import refuse_foreign_folder, refuse_foreign_table
+from jaxid.files import require_place, written_whole
 from jaxid.report.content import SCHEMA
 
 
@@ -173,7 +173,7 @@ def outdated(folder):
 WAITS = """
 import sys
 from pathlib import Path
-from jaxid.files import written_whole
+from jaxid.files import require_place, written_whole
 with written_whole(Path(sys.argv[1])) as staging:
     (staging / "a").write_text("theirs")
     print(staging.parent.name, flush=True)
@@ -316,3 +316,25 @@ def test_a_state_without_arrays_is_none(tmp_path):
     np.savez(tmp_path / "state.npz")
     with pytest.raises(ValueError, match="is no saved state of a design: remove it"):
         load_state(tmp_path / "state.npz", "digest", ())
+
+
+def test_a_place_where_nothing_can_be_is_named_before_the_work(tmp_path):
+    link = tmp_path / "report"
+    link.symlink_to(tmp_path / "gone")
+    with pytest.raises(ValueError, match=r"`.*report` is a link to `.*gone`, which is not there"):
+        refuse_foreign_folder(link, force=False)
+    with pytest.raises(ValueError, match="is a link to"), written_whole(link / "deep"):
+        pass
+    require_place(tmp_path / "new" / "deep")
+    assert [p.name for p in tmp_path.iterdir()] == ["report"]
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc")
+def test_what_cannot_be_written_has_the_name_that_was_given():
+    for refuse in (
+        lambda: refuse_foreign_folder(Path("/proc/self/report"), force=False),
+        lambda: refuse_foreign_table(Path("/proc/report/table.csv")),
+    ):
+        with pytest.raises(OSError) as caught:
+            refuse()
+        assert caught.value.filename in ("/proc/self/report", "/proc/report")

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from jaxid.experiment.demo import DEMO
-from jaxid.files import read_json, unfinished
+from jaxid.files import read_json, require_place, unfinished
 from jaxid.report import compared_files, content, found
 from jaxid.trajectory.files import load_trajectory
 
@@ -29,11 +29,13 @@ def refuse_foreign_folder(target: Path, force: bool) -> None:
         force: Whether the report may stand beside other files.
 
     Raises:
+        OSError: If nothing can be written there.
         ValueError: If there is something else in its place.
     """
     if target.exists() and not target.is_dir():
         raise ValueError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
     if force or not target.is_dir() or not any(target.iterdir()) or _is_report(target):
+        require_place(target)
         return
     raise ValueError(
         f"`{target}` holds files but no report: choose another folder with -o, or add --force to "
@@ -48,6 +50,7 @@ def refuse_foreign_table(target: Path) -> None:
         target: The table, beside which the trajectory lies with the suffix `.json`.
 
     Raises:
+        OSError: If nothing can be written there.
         ValueError: If the name is not that of a table, or something else is in its place.
     """
     if target.suffix.lower() != ".csv":
@@ -58,6 +61,7 @@ def refuse_foreign_table(target: Path) -> None:
         raise ValueError(
             f"`{taken}` is there already, and no motion of `jaxid excite`: choose another -o."
         )
+    require_place(target.parent)
 
 
 def _is_trajectory(path: Path) -> bool:
