@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+from pathlib import Path
 
 import pytest
 from test_cli import EXPERIMENT, folder, refused, run  # noqa: F401
@@ -82,6 +83,12 @@ def test_a_motion_is_not_written_over_other_files(folder, run):  # noqa: F811
     assert refused(run("excite", "experiment.toml", "-o", "motion"), "`motion` must end in .csv")
     (folder / "truth.json").write_text("{}")
     assert refused(run("excite", "experiment.toml", "-o", "truth.csv"), "`truth.json` is there al")
+    (folder / "mine.ros.yaml").write_text("mine")
+    assert refused(run("excite", "experiment.toml", "-o", "mine.csv"), "`mine.ros.yaml` is there al")
+    (folder / "pictures").mkdir()
+    (folder / "pictures" / "joints.png").write_text("mine")
+    said = f"`{Path('pictures') / 'joints.png'}` is there already"
+    assert refused(run("excite", "experiment.toml", "-o", "pictures.csv"), said)
 
 
 def test_damaged_results(folder, run):  # noqa: F811

@@ -1,6 +1,7 @@
 """`jaxid excite`: what it writes and says, that it can be killed, and what it refuses."""
 
 import dataclasses
+import errno
 import html
 import json
 import os
@@ -463,3 +464,13 @@ def test_refuses_what_does_not_fit(written, run, key, said):
     assert err.count("\n") == 1
     assert said in err
     assert "trajectory.csv" not in listing(written)
+
+
+def test_where_pictures_find_no_room_nothing_is_written(excited, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("jaxid.experiment.excite.write_pictures", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(excited, tmp_path / "motion.csv")
+    assert list(tmp_path.iterdir()) == []

@@ -146,7 +146,8 @@ def write(excited: Excited, output: Path, command: str = "") -> list[Path]:
         write_csv(excited.sampled, robot, folder / names[0], sample_time=step)
         save_trajectory(jax.tree.map(np.asarray, played), folder / names[1])
         write_ros(excited.sampled, robot, folder / names[2], sample_time=step)
-    pictures = write_pictures(output.with_suffix(""), plan, played, aside)
+        # Before the others take their places: where there is no room for pictures, nothing changes.
+        pictures = write_pictures(output.with_suffix(""), plan, played, aside)
     return [output.parent / n for n in names] + pictures
 
 

@@ -47,7 +47,8 @@ def refuse_foreign_table(target: Path) -> None:
     """Refuses to write a motion over other files; an earlier motion may go.
 
     Args:
-        target: The table, beside which the trajectory lies with the suffix `.json`.
+        target: The table, beside which the trajectory lies with the suffix `.json`, the message for
+            ROS, and a folder of pictures.
 
     Raises:
         OSError: If nothing can be written there.
@@ -55,11 +56,15 @@ def refuse_foreign_table(target: Path) -> None:
     """
     if target.suffix.lower() != ".csv":
         raise ValueError(f"`{target}` must end in .csv: choose another -o.")
-    beside = target.with_suffix(".json")
-    if (target.exists() or beside.exists()) and not _is_trajectory(beside):
-        taken = target if target.exists() else beside
+    beside, pictures = target.with_suffix(".json"), target.with_suffix("")
+    if _is_trajectory(beside):
+        return
+    ros = (target.with_suffix(f".ros.{kind}") for kind in ("yaml", "json"))
+    drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
+    found = next((path for path in (target, beside, *ros, *drawn) if path.exists()), None)
+    if found is not None:
         raise ValueError(
-            f"`{taken}` is there already, and no motion of `jaxid excite`: choose another -o."
+            f"`{found}` is there already, and no motion of `jaxid excite`: choose another -o."
         )
     require_place(target.parent)
 
