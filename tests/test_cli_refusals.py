@@ -84,7 +84,9 @@ def test_a_motion_is_not_written_over_other_files(folder, run):  # noqa: F811
     (folder / "truth.json").write_text("{}")
     assert refused(run("excite", "experiment.toml", "-o", "truth.csv"), "`truth.json` is there al")
     (folder / "mine.ros.yaml").write_text("mine")
-    assert refused(run("excite", "experiment.toml", "-o", "mine.csv"), "`mine.ros.yaml` is there al")
+    assert refused(
+        run("excite", "experiment.toml", "-o", "mine.csv"), "`mine.ros.yaml` is there al"
+    )
     (folder / "pictures").mkdir()
     (folder / "pictures" / "joints.png").write_text("mine")
     said = f"`{Path('pictures') / 'joints.png'}` is there already"
