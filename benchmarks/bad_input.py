@@ -49,6 +49,8 @@ JOINT = (
     '<axis xyz="0 1 0"/>{4}</joint>'
 )
 INSPECT = ("inspect", "e.toml", "x.csv")
+IMPOSSIBLE = "no motion was found that keeps all limits: the force of joint `j` exceeds"
+UNKNOWN = "j turns \u2013 \u2013 \u2013"
 DIAGNOSED, REFUSED = 0, 2
 
 
@@ -105,6 +107,16 @@ def logs(good):
     head = ",".join(["t", *(f"q{k}" for k in range(1, 8)), *(f"tau{k}" for k in range(1, 8))])
     wrapped = (q1 + 0.6 + np.pi) % (2 * np.pi) - np.pi
     wrapped = np.where(np.arange(len(t)) > 600, wrapped - 2 * np.pi, wrapped)
+    spike = np.array(good)
+    spike[501, 1] += 0.5
+    quoted = [f"{line},moving" for line in lines]
+    quoted[100], quoted[900] = f'{lines[100]},"start', f'{lines[900]},end"'
+
+    def held(column, first, last, value=None):
+        out = np.array(good)
+        out[first:last, column] = out[first, column] if value is None else value
+        return text(out)
+
     return [
         (
             "a column is missing",
@@ -151,6 +163,18 @@ def logs(good):
         ("text in UTF-16", text(good).encode("utf-16"), 2, "save it again in UTF-8"),
         ("bytes that are no text", bytes(range(256)) * 9, 2, "`x.csv`"),
         ("a delay of 40 ms", text(_late(good)), 0, "force_delay"),
+        ("a force that is held", held(4, 600, None), 0, "stay at 5.68 from 3 s to 5.995 s"),
+        ("an angle that is held", held(2, 600, None), 0, "stays at 0.382 from 3 s to 5.995 s"),
+        ("a force that drops out", held(3, 400, 600, 0.0), 0, "stay at 0 from 2 s to 2.995 s"),
+        ("a spike", text(spike), 0, "`joint1` jumps by 0.497 and back at 2.505 s"),
+        ("a quotation over many rows", "\n".join(quoted), 2, "line 101 of `x.csv` opens a quo"),
+        ("carriage returns alone", "\r".join(lines), 2, "carriage returns alone"),
+        (
+            "one number in two columns",
+            "\n".join([f"{lines[0]},q01", *(f"{line},0" for line in lines[1:])]),
+            2,
+            "`q1` and `q01`, which both are number 1",
+        ),
     ]
 
 
@@ -183,6 +207,15 @@ def files():
         ("an unknown robot", '"planar_arm"', '"panada"', "none of the robots"),
         ("a URDF that is not there", 'builtin = "planar_arm"', 'urdf = "x/arm.urdf"', "no file"),
         ("no TOML", "[robot]", "[robot", "is no TOML"),
+        ("an order beyond all", "cutoff = 10", "cutoff = 10\norder = 3000", "20 at most"),
+        ("a cut-off of nearly zero", "cutoff = 10", "cutoff = 1e-12", "`cutoff` of 1e-12 Hz is"),
+        (
+            "an infinite period",
+            'kind = "butterworth"\ncutoff = 10',
+            'kind = "periodic"\nharmonics = 5\nperiod = inf',
+            "`period`",
+        ),
+        ("seconds taken for milliseconds", '"t"', '"t"\ntime_unit = "ms"', "check `time_unit`"),
         ("a filter above half the rate", "cutoff = 10", "cutoff = 120", "sampling rate of 200 Hz"),
     ]
 
@@ -228,14 +261,14 @@ def robots():
             2,
             "the zero vector as its axis",
         ),
-        ("limits missing", arm(joint("j", "a", "b", "revolute"), chain[1]), 0, "2 joints"),
+        ("limits missing", arm(joint("j", "a", "b", "revolute"), chain[1]), 0, UNKNOWN),
         (
             "limits that contradict",
             arm(joint("j", "a", "b", "revolute", '<limit lower="1" upper="-1"/>'), chain[1]),
             2,
             "the lower end must be below",
         ),
-        ("absurd inertias", arm(*chain, body=absurd), 0, "2 joints"),
+        ("absurd inertias", arm(*chain, body=absurd), 0, "belongs to no body: its mass is -1e"),
         ("rounded angles", arm(joint("j", "a", "b", more=rounded), chain[1]), 0, "snapped"),
         ("two roots", arm(chain[0]), 2, "several root links"),
         ("a link that is not there", arm(joint("j", "a", "z")), 2, "does not define"),
@@ -274,7 +307,12 @@ def commands():
         ("a report onto a file", (*identify, "-o", "x.csv"), "is a file"),
         ("a report among other files", (*identify, "-o", "."), "no report"),
         ("a motion onto a log", ("excite", "e.toml", "-o", "x.csv"), "no motion"),
-        ("a design that cannot be", ("excite", "tight.toml", "-o", "m.csv"), ""),
+        ("a design that cannot be", ("excite", "weak.toml", "-o", "m.csv"), IMPOSSIBLE),
+        (
+            "a margin without parameters",
+            ("excite", "margin.toml", "-o", "m.csv"),
+            "`force_margin` needs par",
+        ),
     ]
 
 
@@ -307,10 +345,17 @@ def cases(good):
     for name, held, code, words in robots():
         toml = '[robot]\nurdf = "arm.urdf"\n'
         yield name, {"e.toml": toml, "arm.urdf": held}, ("inspect", "e.toml"), code, words
-    tight = EXPERIMENT.replace("[150, 150]", "[-149.999999, -149.999999]")
-    tight += '[excitation]\nstarts = 1\npolish = 0\nforce_margin = 0.9\nnominal = "x"\n'
+    inertial = '<inertial><origin xyz="1 0 0"/><mass value="100"/><inertia ixx="1" ixy="0" ixz="0" '
+    inertial += 'iyy="1" iyz="0" izz="1"/></inertial>'
+    limit = '<limit lower="-1" upper="1" velocity="2" effort="1"/>'
+    arm = f'<robot name="arm"><link name="a"/><link name="b">{inertial}</link>'
+    arm += f"{JOINT.format('j', 'a', 'b', 'revolute', limit)}</robot>"
+    weak = '[robot]\nurdf = "arm.urdf"\n[excitation]\nharmonics = 2\nstarts = 1\npolish = 0\n'
+    weak += "kicks = 0\nsamples = 50\nforce_margin = 0.1\n"
     for name, args, words in commands():
-        yield name, {"x.csv": text(good), "tight.toml": tight}, args, REFUSED, words
+        held = {"x.csv": text(good), "weak.toml": weak, "arm.urdf": arm}
+        held["margin.toml"] = EXPERIMENT + "[excitation]\nforce_margin = 0.9\n"
+        yield name, held, args, REFUSED, words
 
 
 def main():
