@@ -243,6 +243,6 @@ def _number(x: float, double: bool) -> str:
 
 def _ascii(text: str) -> str:
     """Words that can stand in a comment of any compiler."""
-    for symbol, word in (("²", "^2"), ("³", "^3"), ("°", "deg"), ("*/", "* /"), ("\\", "/")):
+    for symbol, word in (("²", "^2"), ("³", "^3"), ("°", "deg"), ("\\", "/"), ("*/", "* /")):
         text = text.replace(symbol, word)
     return " ".join(text.encode("ascii", "replace").decode().split())

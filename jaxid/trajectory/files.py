@@ -101,8 +101,13 @@ def write_csv(
             for j, name in enumerate(robot.joint_names)
         ]
     rows = np.column_stack([times, motion.q, motion.qd, motion.qdd]).tolist()
-    lines = [",".join(header), *(",".join(map(repr, row)) for row in rows)]
+    lines = [",".join(map(_quoted, header)), *(",".join(map(repr, row)) for row in rows)]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _quoted(field: str) -> str:
+    """A field of a CSV file: names may hold what separates fields."""
+    return '"' + field.replace('"', '""') + '"' if {",", '"'} & set(field) else field
 
 
 def require_joints(trajectory: AbstractTrajectory, robot: Robot) -> None:

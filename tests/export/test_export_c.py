@@ -11,6 +11,7 @@ from export_samples import fit_of, motion, possible
 
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
+from jaxid.export.c_code import _ascii
 from jaxid.export.compiled_model import CompiledModel
 from jaxid.export.feed_forward import forms
 
@@ -199,3 +200,8 @@ def test_a_file_that_does_not_compile_is_one_sentence(tmp_path):
     with pytest.raises(RuntimeError, match=r"refuses `arm\.c`: .*error") as error:
         CompiledModel(tmp_path / "arm.c", 2, 3)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["j*/ int x; /*", "j*\\ int x; /*"])
+def test_no_name_ends_a_comment(name):
+    assert "*/" not in _ascii(name)

@@ -1,5 +1,6 @@
 """Files of trajectories: what is read back is what was written, and errors name the file."""
 
+import csv
 import json
 
 import jax
@@ -100,3 +101,14 @@ def test_tiny_numbers_stay_numbers_in_yaml(tmp_path):
 def test_another_robots_trajectory_is_refused(tmp_path):
     with pytest.raises(ValueError, match="6 joints of `UR10`, but moves 7"):
         write_csv(series(), library.ur10(), tmp_path / "t.csv", sample_time=0.1)
+
+
+def test_names_of_joints_may_hold_what_separates_fields(tmp_path):
+    yaml = pytest.importorskip("yaml")
+    names = ('rail, "x"', "a: b # c", "- d", "e", "null", "g", "h")
+    robot = PANDA.replace(joint_names=names)
+    write_csv(series(), robot, tmp_path / "t.csv", sample_time=1.0)
+    header = next(csv.reader((tmp_path / "t.csv").read_text().splitlines()))
+    assert header[1:8] == [f"q_{name} [rad]" for name in names]
+    write_ros_yaml(series(), robot, tmp_path / "t.yaml", sample_time=1.0)
+    assert yaml.safe_load((tmp_path / "t.yaml").read_text())["joint_names"] == list(names)
