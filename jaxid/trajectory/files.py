@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.files import read_json, written_whole
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierSeries
+from jaxid.trajectory.held import Held
 from jaxid.trajectory.joint_path import JointPath
 from jaxid.trajectory.leads import WithLeads
 from jaxid.trajectory.rest import RestToRest
@@ -19,7 +20,7 @@ from jaxid.trajectory.trajectory import AbstractTrajectory
 
 FORMAT = "jaxid trajectory"
 VERSION = 1
-MEMBERS = (FourierSeries, RestToRest, WithLeads, Spline, Segments, JointPath)
+MEMBERS = (FourierSeries, RestToRest, WithLeads, Spline, Segments, JointPath, Held)
 """What a file may hold, each by the name of its class."""
 
 
