@@ -119,30 +119,41 @@ def _held_angles(
     """An angle that stops or starts harder than anything else does, while other joints move."""
     others = np.delete(angles, j, axis=1)
     for a, b in segments:
-        x, rest = angles[a:b, j], others[a:b]
+        x, rest, usual = angles[a:b, j], others[a:b], None
+        speed = np.abs(np.diff(rest, axis=0))
+        moving = (speed > STANDING * speed.max(axis=0, initial=0.0)).any(axis=1)
         for first, last in _runs(x, max(FEWEST, int(SHARE * (b - a)))):
-            speed = np.abs(np.diff(rest, axis=0))
-            moving = (speed > STANDING * speed.max(axis=0, initial=0.0)).any(axis=1)
-            if np.mean(moving[first:last]) > 0.5 and _is_hard(x, first, last):
+            if np.mean(moving[first:last]) <= 0.5:
+                continue
+            usual = _usual_bends(x) if usual is None else usual
+            if _is_hard(x, first, last, usual):
                 return [_said_held(channel, x[first], time[a + first], time[a + last])]
     return []
 
 
-def _is_hard(x: Float[np.ndarray, " samples"], first: int, last: int) -> bool:
+def _is_hard(
+    x: Float[np.ndarray, " samples"], first: int, last: int, usual: dict[int, float]
+) -> bool:
     """Whether a channel enters or leaves a constant stretch with a kink."""
-    stretches = list(_runs(x, FEWEST))
-    for width in SCALES:
-        bends = np.abs(x[2 * width :] - 2 * x[width:-width] + x[: -2 * width])
-        free = np.ones(len(bends), bool)
-        for i, k in stretches:
-            free[max(0, i - 2 * width) : i + 1] = False
-            free[max(0, k - 2 * width) : k + 1] = False
-        usual = bends[free].max(initial=0.0)
+    for width, bend in usual.items():
         kinks = [abs(x[first] - x[first - width])] if first >= width else []
         kinks += [abs(x[last + width] - x[last])] if last + width < len(x) else []
-        if free.any() and max(kinks, default=0.0) > HARDER * usual > 0:
+        if max(kinks, default=0.0) > HARDER * bend > 0:
             return True
     return False
+
+
+def _usual_bends(x: Float[np.ndarray, " samples"]) -> dict[int, float]:
+    """How hard a channel bends over some samples, where it does not stay at one value."""
+    found = {}
+    ends = np.array(list(_runs(x, FEWEST)), int).reshape(-1, 2)
+    for width in SCALES:
+        bends = np.abs(x[2 * width :] - 2 * x[width:-width] + x[: -2 * width])
+        taken = np.zeros(len(x) + 1, int)
+        np.add.at(taken, np.maximum(0, ends - 2 * width), 1)
+        np.add.at(taken, ends + 1, -1)
+        found[width] = float(bends[np.cumsum(taken)[: len(bends)] == 0].max(initial=0.0))
+    return found
 
 
 def _held_forces(
