@@ -82,6 +82,8 @@ def test_turns_that_start_again_are_named(on_motor_side):
     (found,) = faults(angles, angles_on_motor_side=on_motor_side)
     assert found.joint == 1
     assert "jumps by a full turn (6.283)" in found.said
+    owner = "the motor of joint" if on_motor_side else "joint"
+    assert f"the angle of {owner} `{ROBOT.joint_names[1]}` jumps" in found.said
     assert "undo the wrapping" in found.said
     degrees = np.rad2deg(angles)
     assert any("a full turn (360)" in f.said for f in faults(degrees))

@@ -52,7 +52,7 @@ def channel_faults(robot: Robot, recording: Recording) -> list[Fault]:
     """
     angles, forces = np.asarray(recording.angles), np.asarray(recording.forces)
     time, found = np.asarray(recording.time), []
-    owner = "motor of joint" if recording.angles_on_motor_side else "joint"
+    owner = "the motor of joint" if recording.angles_on_motor_side else "joint"
     for j, name in enumerate(robot.joint_names):
         angle, force = f"the angle of {owner} `{name}`", f"the forces of joint `{name}`"
         x = angles[:, j]
