@@ -40,6 +40,7 @@ from jaxid.excitation.criteria import DOptimal as DOptimal
 from jaxid.excitation.criteria import EOptimal as EOptimal
 from jaxid.excitation.criteria import ScaledConditionNumber as ScaledConditionNumber
 from jaxid.excitation.criteria import WeightedConditionNumber as WeightedConditionNumber
+from jaxid.excitation.design import DesignProgress as DesignProgress
 from jaxid.excitation.design import design_excitation as design_excitation
 from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
 from jaxid.export.c_code import export_c as export_c
@@ -183,6 +184,8 @@ from jaxid.simulation.tracking import Tracking as Tracking
 from jaxid.simulation.tx90l import cad_tx90l_on_rail as cad_tx90l_on_rail
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail as virtual_tx90l_on_rail
 from jaxid.simulation.virtual import VirtualRobot as VirtualRobot
+from jaxid.trajectory.basis import AbstractBasis as AbstractBasis
+from jaxid.trajectory.basis import FourierBasis as FourierBasis
 from jaxid.trajectory.files import load_trajectory as load_trajectory
 from jaxid.trajectory.files import save_trajectory as save_trajectory
 from jaxid.trajectory.files import write_csv as write_csv

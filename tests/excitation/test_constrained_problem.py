@@ -147,15 +147,22 @@ def test_a_motion_is_enlarged_to_its_limits_only_where_that_is_better(pendulum):
         assert not larger.all()
 
 
-def test_limits_of_force_are_those_that_were_given(pendulum, constraints):
+def test_limits_of_force_are_those_that_were_given(problem, pendulum, constraints):
     weak = dataclasses.replace(pendulum.model.robot.limits, force=np.array([1.0]))
-    plan = design_excitation(
-        pendulum, limits=weak, constraints=constraints[:1], starts=2, polish=0, harmonics=2
+    given = Problem(
+        pendulum,
+        JointLimits.of(pendulum.model.robot, BASIS, weak),
+        DOptimal(),
+        constraints[:1],
+        weights=np.ones(1),
+        prior=np.zeros((pendulum.size, pendulum.size)),
+        sizes=np.ones(pendulum.size),
+        measured=100,
     )
-    nominal = constraints[0].nominal.parameters
-    times = np.linspace(0.0, float(plan.trajectory.duration), 2000)
-    forces = np.asarray(pendulum.regressor(plan.trajectory.motion(times))) @ nominal
-    assert np.abs(forces).max() <= 1.0
+    y = np.asarray(random_starts(problem.limits, jax.random.key(7), 1))[0]
+    # The robot's own limit of force is 9.
+    highest = problem.checked(y)[:, 0].max() + 1.0
+    np.testing.assert_allclose(given.checked(y)[:, 0].max() + 1.0, 9.0 * highest, rtol=1e-6)
 
 
 def test_motions_of_many_numbers_are_seen_as_well_as_those_of_few(pendulum):
