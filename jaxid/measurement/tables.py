@@ -188,10 +188,16 @@ class Table:
                     f"`{name}` of `{self.source}` must be an array of real numbers of one or two "
                     f"axes, but holds {column.dtype} with {column.ndim} axes."
                 )
-            array = np.asarray(column, np.float64)
+            # Some bits of NaN are a signal to whoever copies them.
+            with np.errstate(invalid="ignore"):
+                array = np.asarray(column, np.float64)
+        if array.size == 0:
+            raise ValueError(f"`{name}` of `{self.source}` has rows, but no columns.")
         array = np.array(array.reshape(len(array), -1), np.float64)
         bad = np.asarray(np.logical_not(np.isfinite(array)).any(axis=1))
-        self._refuse_first(name, bad, array.min(axis=1) + array.max(axis=1), "is not finite ({})")
+        with np.errstate(invalid="ignore"):
+            said = array.min(axis=1) + array.max(axis=1)
+        self._refuse_first(name, bad, said, "is not finite ({})")
         size = np.abs(array).max(axis=1)
         self._refuse_first(name, size > LARGEST, size, "is {} in size, which nothing measures")
         return array

@@ -230,6 +230,22 @@ def test_bad_rows_of_binary_files(tmp_path):
     refused(tmp_path / "log.parquet", columns, "`q`", "row 6", "has 1 numbers")
 
 
+def test_arrays_of_what_cannot_be_measured(tmp_path):
+    """A warning of NumPy would be an error here."""
+    columns = Columns("q", "tau", sample_time=0.01)
+    both = np.zeros((5, 2))
+    both[3] = np.inf, -np.inf
+    signal = np.zeros((5, 2), np.float32)
+    signal.view(np.uint32)[3, 1] = 0x7F800001
+    for array, said in (
+        (both, "not finite (nan)"),
+        (signal, "not finite (nan)"),
+        (np.zeros((5, 0)), "has rows, but no columns"),
+    ):
+        np.savez(tmp_path / "log.npz", q=array, tau=np.ones((5, 2)))
+        refused(tmp_path / "log.npz", columns, "`q`", "`log.npz`", said)
+
+
 def test_missing_columns_name_the_others_and_the_closest(tmp_path):
     path = write_csv(tmp_path / "log.csv", a_log())
     refused(
