@@ -225,3 +225,5 @@ def _check(fit: Fit) -> None:
     ):
         if np.shape(array) != shape:
             raise ValueError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")
+    if not np.isfinite(fit.parameters).all():
+        raise ValueError("`parameters` must hold finite numbers")

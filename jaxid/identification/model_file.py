@@ -60,7 +60,7 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
         raise ValueError(
             f'`{path}` is no model file (`"format": "{FORMAT}"`), as `save` writes it.'
         )
-    if document.get("version") != VERSION:
+    if document.get("version") is True or document.get("version") != VERSION:
         raise ValueError(
             f"`{path}` is a model file of version {document.get('version')!r:.20}, but this jaxid "
             f"reads version {VERSION}: use the jaxid that wrote it, or identify again."

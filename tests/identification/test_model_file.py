@@ -159,11 +159,17 @@ def changed(path, change, sealed=True):
     ("change", "sealed", "message"),
     [
         (lambda d: d.update(version=2), True, "version 2, but this jaxid reads version 1"),
+        (lambda d: d.update(version=True), True, "version True, but this jaxid reads version 1"),
         (lambda d: d.update(format="arm"), True, "is no model file"),
         (lambda d: d.update(more=1), True, "must have the keys .* differs by more"),
         (lambda d: d.pop("model"), True, "differs by model"),
         (lambda d: d["model"]["parameters"]["float64"].append(1.0), False, "changed by hand"),
         (lambda d: d["model"]["parameters"]["float64"].append(1.0), True, "shape"),
+        (
+            lambda d: d["model"]["parameters"]["float64"].__setitem__(0, "inf"),
+            True,
+            "`parameters` must hold finite numbers",
+        ),
         (lambda d: d["model"].update(extra=1), True, "unknown key `extra`"),
         (lambda d: d["model"].pop("base"), True, "lacks `base`"),
         (lambda d: d["model"].update(kind="BaseParameters"), True, "not known"),
