@@ -115,7 +115,7 @@ def test_every_number_survives(number):
     assert np.array(again).tobytes() == np.array(number).tobytes()
 
 
-class CubicFriction(jid.AbstractTerm):
+class TermOfOnesOwn(jid.AbstractTerm):
     power: float = 3.0
 
     def parameters(self, robot):
@@ -126,8 +126,8 @@ class CubicFriction(jid.AbstractTerm):
 
 
 def test_a_term_of_ones_own_is_found_where_it_is_known():
-    values = encoded(CubicFriction(2.0))
-    assert decoded(values, jid.AbstractTerm) == CubicFriction(2.0)
+    values = encoded(TermOfOnesOwn(2.0))
+    assert decoded(values, jid.AbstractTerm) == TermOfOnesOwn(2.0)
     with pytest.raises(ValueError, match=r"`Cubic` , which|is a `Cubic`, which is not known"):
         decoded({**values, "kind": "Cubic"}, jid.AbstractTerm)
 
