@@ -48,7 +48,7 @@ def run(folder, seed, cache):
         environment["JAXID_CACHE_DIR"] = str(cache)
     begin = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-m", "jaxid.cli", "demo", "--seed", str(seed), "-o", str(folder)],
+        [sys.executable, "-m", "jaxid", "demo", "--seed", str(seed), "-o", str(folder)],
         stdout=subprocess.DEVNULL,
         env=environment,
     )

@@ -300,7 +300,7 @@ def test_wrapped_angles_are_doubted_by_both_commands(folder, run):
 
 
 def test_run_as_a_module_mistakes_are_sentences_too(folder):
-    command = [sys.executable, "-m", "jaxid.cli", "identify", "experiment.toml", "a.csv"]
+    command = [sys.executable, "-m", "jaxid", "identify", "experiment.toml", "a.csv"]
     environment = {**os.environ, "PYTHONPATH": ROOT}
     done = subprocess.run(
         [*command, "--split", "2"], capture_output=True, text=True, env=environment
@@ -325,7 +325,7 @@ def test_init_into_a_folder_finds_its_robot(tmp_path, target):
     (tmp_path / "sub").mkdir()
     (tmp_path / "link").symlink_to("sub")
     (tmp_path / "dangling").symlink_to("nowhere")
-    command = [sys.executable, "-m", "jaxid.cli", "init", "arm.urdf"]
+    command = [sys.executable, "-m", "jaxid", "init", "arm.urdf"]
     with open(tmp_path / target, "w") as file:
         environment = {**os.environ, "PYTHONPATH": ROOT}
         subprocess.run(command, cwd=tmp_path, stdout=file, check=True, env=environment)
@@ -357,7 +357,7 @@ def test_double_precision_is_turned_on(folder):
     """In a process of its own, where nobody else has done it."""
     environment = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
     environment["PYTHONPATH"] = ROOT
-    command = [sys.executable, "-m", "jaxid.cli", "inspect", "experiment.toml"]
+    command = [sys.executable, "-m", "jaxid", "inspect", "experiment.toml"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "base parameters" in done.stdout

@@ -1,5 +1,0 @@
-"""Runs the command line as `python -m jaxid.cli`."""
-
-from jaxid.cli.commands import main
-
-main()
