@@ -351,7 +351,7 @@ def cases(good):
     arm = f'<robot name="arm"><link name="a"/><link name="b">{inertial}</link>'
     arm += f"{JOINT.format('j', 'a', 'b', 'revolute', limit)}</robot>"
     weak = '[robot]\nurdf = "arm.urdf"\n[excitation]\nharmonics = 2\nstarts = 1\npolish = 0\n'
-    weak += "kicks = 0\nsamples = 50\nforce_margin = 0.1\n"
+    weak += "generations = 0\nsamples = 50\nforce_margin = 0.1\n"
     for name, args, words in commands():
         held = {"x.csv": text(good), "weak.toml": weak, "arm.urdf": arm}
         held["margin.toml"] = EXPERIMENT + "[excitation]\nforce_margin = 0.9\n"

@@ -6,8 +6,8 @@
 Robot and columns: `jid.robots.tx90l_on_rail()`, seven parameters for each body, viscous and Coulomb
 friction, rotor inertias: 44 base parameters. Limits are the robot's (positions, velocities,
 accelerations). Motions: 5 harmonics, 0.8 rad/s, 800 samples of one period without its end; rest to
-rest by `RestToRestBasis`. Starts, polished ones and kicks: 4, 2, 2 (capsules, cond), 8, 2, 2
-(capsules, D), 8, 2, 4 (rest), 4, 2, 2 (torques); seed k is `jax.random.key(k)`.
+rest by `RestToRestBasis`. Starts, generations and polished ones: 8, 4, 2 (capsules, torques) or
+8, 8, 2 (rest); seed k is `jax.random.key(k)`.
 
 Noise is 1 % of (3000 N, 318, 130, 65, 34, 29, 11 N m). The gain of a motion is the geometric mean,
 over parameters, of the standard deviations of weighted least squares in a random motion over those
@@ -136,7 +136,7 @@ class Judge:
         )
 
 
-def designed(base, seed, quick, starts, polish, kicks, **settings):
+def designed(base, seed, quick, starts, generations, polish, **settings):
     """A plan, and the wall and CPU seconds that it took, compiling included for the first seed."""
     import jax
 
@@ -147,8 +147,8 @@ def designed(base, seed, quick, starts, polish, kicks, **settings):
         base,
         key=jax.random.key(seed),
         starts=2 if quick else starts,
+        generations=1 if quick else generations,
         polish=0 if quick else polish,
-        kicks=kicks,
         throw=False,
         **settings,
     )
@@ -156,7 +156,7 @@ def designed(base, seed, quick, starts, polish, kicks, **settings):
     return plan, {"wall": round(wall, 1), "cpu": round(cpu, 1)}
 
 
-def capsules(criterion, starts):
+def capsules(criterion):
     """Designs that keep 0.03 m of clearance."""
     import jaxid as jid
 
@@ -165,9 +165,7 @@ def capsules(criterion, starts):
     kept = (jid.Clearance(shapes, DISTANCE),)
 
     def one(seed, quick):
-        plan, cost = designed(
-            bases[0], seed, quick, starts, 2, 2, criterion=criterion, constraints=kept
-        )
+        plan, cost = designed(bases[0], seed, quick, 8, 4, 2, criterion=criterion, constraints=kept)
         t = plan.trajectory
         gap = float(np.min(shapes.clearance(robot, judge.fine(t).q)))
         return {
@@ -190,7 +188,7 @@ def rest():
     judge = Judge(robot, bases)
 
     def one(seed, quick):
-        plan, cost = designed(bases[0], seed, quick, 8, 2, 4, basis=jid.RestToRestBasis(5, 0.8))
+        plan, cost = designed(bases[0], seed, quick, 8, 8, 2, basis=jid.RestToRestBasis(5, 0.8))
         t = plan.trajectory
         inner = t.series.motion(np.array([0.0, float(t.duration)]))
         return {
@@ -217,7 +215,7 @@ def torques(limited):
     kept = (jid.JointForces(nominal, margin=MARGIN),) if limited else ()
 
     def one(seed, quick):
-        plan, cost = designed(bases[0], seed, quick, 4, 2, 2, constraints=kept)
+        plan, cost = designed(bases[0], seed, quick, 8, 4, 2, constraints=kept)
         t = plan.trajectory
         m = judge.fine(t)
         forces = np.asarray(bases[0].model.inverse_dynamics(p, m) + bases[0].model.tool_forces(m))
@@ -242,7 +240,7 @@ def study(name):
     import jaxid as jid
 
     if name.startswith("capsules"):
-        return capsules(*((jid.ConditionNumber(), 4) if "cond" in name else (jid.DOptimal(), 8)))
+        return capsules(jid.ConditionNumber() if "cond" in name else jid.DOptimal())
     return rest() if name == "rest" else torques(name == "torques")
 
 

@@ -37,7 +37,7 @@ from jaxid.excitation.information import information
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import CRITERIA, deviations
 from jaxid.excitation.problem import CHECKED, Context, Problem
-from jaxid.excitation.search import LEGS, Search, random_starts
+from jaxid.excitation.search import LAST, LEGS, Search, random_starts
 from jaxid.excitation.spectral import log_condition, log_largest_inverse
 from jaxid.trajectory.basis import FourierBasis
 
@@ -84,22 +84,23 @@ def gain_over_random(plan):
     return float(np.exp(np.mean(logs)))
 
 
-def designed(base, criterion, keys, measure, polish, starts, kicks=0):
+def designed(base, criterion, keys, measure, polish, asked):
     found = []
     for key in keys:
         wall, cpu = time.perf_counter(), time.process_time()
         plan = jid.design_excitation(
             base,
             criterion=criterion,
-            starts=starts,
+            starts=asked.starts,
+            generations=asked.generations,
             polish=polish,
-            kicks=kicks,
             key=jax.random.key(key),
         )
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         found.append(measure(plan))
         print(
-            f"  key {key}, polish {polish}: {found[-1]:.6g}, violation {violation(plan):.1e}, "
+            f"  key {key}, polish {polish}: {found[-1]:.6g}, "
+            f"criterion {criterion.value(plan.information):.5g}, violation {violation(plan):.1e}, "
             f"wall {wall:.1f} s, CPU {cpu:.1f} s",
             flush=True,
         )
@@ -110,34 +111,33 @@ def report(name, found, best):
     print(f"{name}: median {np.median(found):.5g}, best {best(found):.5g}", flush=True)
 
 
-def cond(keys, starts, polished, kicked):
+def cond(keys, asked):
     base = base_of(True)
-    for polish, kicks in ((0, 0), (polished, kicked)):
+    for polish in (0, asked.polish):
         found = designed(
             base,
             jid.ConditionNumber(),
             keys,
             lambda p: np.linalg.cond(p.information.plain),
             polish,
-            starts,
-            kicks,
+            asked,
         )
-        report(f"cond, polish {polish}, kicks {kicks}", found, min)
+        report(f"cond, {asked.generations} generations, polish {polish}", found, min)
 
 
-def d_optimal(principal_axes, keys, starts, polished, kicked):
+def d_optimal(principal_axes, keys, asked):
     base = base_of(principal_axes)
-    for polish, kicks in ((0, 0), (polished, kicked)):
-        found = designed(base, jid.DOptimal(), keys, gain_over_random, polish, starts, kicks)
-        what = f"D gain, {base.size} base parameters, polish {polish}, kicks {kicks}"
-        report(what, found, max)
+    for polish in (0, asked.polish):
+        found = designed(base, jid.DOptimal(), keys, gain_over_random, polish, asked)
+        what = f"D gain, {base.size} base parameters, {asked.generations} generations"
+        report(f"{what}, polish {polish}", found, max)
 
 
-def panda(keys, starts):
+def panda(keys, asked):
     base = jid.base_parameters(jid.Model(jid.robots.panda()))
     for criterion in (jid.DOptimal(), jid.ConditionNumber()):
         found = designed(
-            base, criterion, keys, lambda p, c=criterion: c.value(p.information), 0, starts
+            base, criterion, keys, lambda p, c=criterion: c.value(p.information), 0, asked
         )
         report(f"Panda, {criterion.name}, JAX alone", found, min)
 
@@ -302,16 +302,16 @@ def step():
 
 def batch(sizes):
     problem = problem_of(base_of(True), jid.DOptimal())
-    iterations = sum(leg.stage.iterations for leg in LEGS)
+    iterations = sum(leg.stage.iterations for leg in (*LEGS, LAST))
     for starts in sizes:
-        search = Search(problem, starts)
+        search = Search(problem, starts, 0)
         wall = time.perf_counter()
         state = search.begin(jax.random.key(0))
-        state = search.advance(state)
+        state = search.advance(state, jax.random.key(0))
         compiled = time.perf_counter() - wall
         wall, cpu = time.perf_counter(), time.process_time()
         while state.leg < search.legs:
-            state = search.advance(state)
+            state = search.advance(state, jax.random.key(0))
         rest = 1 - LEGS[0].stage.iterations / iterations
         wall, cpu = (time.perf_counter() - wall) / rest, (time.process_time() - cpu) / rest
         print(
@@ -325,23 +325,24 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="*", default=["cond", "d7"])
     parser.add_argument("--keys", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0, help="the first key")
     parser.add_argument("--starts", type=int, default=32)
-    parser.add_argument("--polish", type=int, default=8, help="beside 0: JAX alone")
-    parser.add_argument("--kicks", type=int, default=16, help="of the polished motion")
+    parser.add_argument("--generations", type=int, default=12)
+    parser.add_argument("--polish", type=int, default=4, help="beside 0: JAX alone")
     parser.add_argument("--quick", action="store_true")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jid.keep_compiled()
-    keys, starts = range(asked.keys), asked.starts
     if asked.quick:
-        keys, starts, asked.parts = range(1), 2, ["d7"]
-        asked.polish, asked.kicks = 1, 1
+        asked.parts, asked.keys = ["d7"], 1
+        asked.starts, asked.generations, asked.polish = 2, 1, 1
+    keys = range(asked.first, asked.first + asked.keys)
     sizes = (1, 8, 64) if jax.default_backend() == "cpu" else (64, 512, 4096)
     parts = {
-        "cond": lambda: cond(keys, starts, asked.polish, asked.kicks),
-        "d7": lambda: d_optimal(True, keys, starts, asked.polish, asked.kicks),
-        "d10": lambda: d_optimal(False, keys, starts, asked.polish, asked.kicks),
-        "panda": lambda: panda(keys, starts),
+        "cond": lambda: cond(keys, asked),
+        "d7": lambda: d_optimal(True, keys, asked),
+        "d10": lambda: d_optimal(False, keys, asked),
+        "panda": lambda: panda(keys, asked),
         "gradients": gradients,
         "constraints": constraint_gradients,
         "step": step,

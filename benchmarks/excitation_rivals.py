@@ -1,7 +1,7 @@
 """What other optimizers reach in the time that a whole design takes, on the same problem.
 
 Robot, series, limits, samples and criterion (the condition number of Eq. 36) as in `excitation.py`.
-The budget of each rival is the CPU time of the whole design (32 starts, 8 polished, 16 kicks,
+The budget of each rival is the CPU time of the whole design (32 starts, 8 generations, 4 polished,
 one key; its second run, so that nothing is compiled); compile time is not counted for anybody.
 
 * SLSQP with forward differences, 800 samples, limits on 64 times for each order: what toolboxes do.
@@ -218,7 +218,7 @@ RIVALS = {"slsqp": slsqp, "cma": cma, "evolution": evolution, "ipopt": ipopt}
 NEEDS = {"cma": "cma", "ipopt": "casadi"}
 
 
-def own(starts: int, polish: int, kicks: int) -> float:
+def own(starts: int, generations: int, polish: int) -> float:
     """CPU seconds of a whole design, compiled before."""
     base = base_of(True)
     for _ in range(2):
@@ -227,8 +227,8 @@ def own(starts: int, polish: int, kicks: int) -> float:
             base,
             criterion=jid.ConditionNumber(),
             starts=starts,
+            generations=generations,
             polish=polish,
-            kicks=kicks,
             key=jax.random.key(SEED),
         )
         cpu = time.process_time() - cpu
@@ -247,7 +247,7 @@ def main():
     jid.keep_compiled()
     seconds = 1.0 if asked.quick else asked.seconds
     if seconds is None:
-        seconds = own(32, 8, 16)
+        seconds = own(32, 8, 4)
     rivals = Rivals(15)
     print(f"best of 15 random motions: cond {rivals.judged(rivals.best_start()):.5g}", flush=True)
     for name in ["slsqp"] if asked.quick else asked.only:

@@ -202,6 +202,7 @@ class Jobs:
             ),
             noise=np.ones(3),
             starts=2,
+            generations=1,
             polish=0,
             harmonics=3,
             samples=200,

@@ -63,6 +63,7 @@ plans = {
         omega=0.8,
         criterion=criterion,
         starts=8,
+        generations=4,
         polish=0,
         samples=400,
         key=jax.random.key(1),

@@ -55,6 +55,7 @@ plan = jid.design_excitation(
     limits=limits,
     basis=jid.RestToRestBasis(5, 0.8),
     starts=8,
+    generations=4,
     polish=0,
     key=jax.random.key(2),
 )

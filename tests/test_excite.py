@@ -53,8 +53,8 @@ acceleration = [4]
 [excitation]
 harmonics = 2
 starts = 2
+generations = 1
 polish = 1
-kicks = 1
 samples = 100
 seed = 5
 """
@@ -92,7 +92,7 @@ def run(written, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def excited(written):
     """A motion as fast as it can be had, for what is said of it."""
-    text = EXPERIMENT.replace("polish = 1\nkicks = 1", "polish = 0\nkicks = 0")
+    text = EXPERIMENT.replace("generations = 1\npolish = 1", "generations = 0\npolish = 0")
     (written / "fast.toml").write_text(text)
     experiment = load_experiment(written / "fast.toml")
     return design(experiment, lambda _: None, written / "fast.npz", False)
@@ -226,12 +226,11 @@ def test_a_spline_in_place_of_a_series(written, run, no_pictures):
 
 
 def test_keys_that_others_leave_nothing_to_do_are_named():
-    table = ExcitationTable(spline=SplineTable(), harmonics=3, omega=1.0, polish=0, kicks=2)
+    table = ExcitationTable(spline=SplineTable(), harmonics=3, omega=1.0)
     assert table.idle == [
         "`harmonics` and `omega` do nothing for a `spline`",
-        "`kicks` do nothing with `polish = 0`, for they are polished too",
     ]
-    assert ExcitationTable(spline=SplineTable(), polish=0).idle == []
+    assert ExcitationTable(spline=SplineTable()).idle == []
 
 
 def test_an_impossible_motion_is_diagnosed(written, run):

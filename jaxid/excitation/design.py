@@ -15,7 +15,7 @@ from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.polish import Polish
 from jaxid.excitation.problem import Problem
-from jaxid.excitation.search import Search, Searched, crossed, kicked, random_starts
+from jaxid.excitation.search import Search, Searched, random_starts
 from jaxid.excitation.state import fingerprint, load_state, save_state
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
@@ -26,8 +26,6 @@ NOISE = 0.01
 """Standard deviation of the noise that is assumed, as a share of the largest forces."""
 REFERENCES = 8
 """Random motions that give the parameters their sizes."""
-DISTURBED = 4
-"""Of so many further motions to polish one is disturbed at random; the others are crossings."""
 
 
 class DesignProgress(NamedTuple):
@@ -48,7 +46,7 @@ class DesignProgress(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Everything that a design has done so far; kicks count as polished."""
+    """Everything that a design has done so far."""
 
     searched: Searched
     order: np.ndarray
@@ -66,8 +64,8 @@ def design_excitation(
     criterion: AbstractCriterion | None = None,
     constraints: tuple[AbstractConstraint, ...] = (),
     starts: int = 32,
+    generations: int = 12,
     polish: int = 4,
-    kicks: int = 8,
     key: PRNGKeyArray | None = None,
     noise: Float[AnyArray, " joints"] | None = None,
     prior: Float[AnyArray, "base base"] | None = None,
@@ -80,7 +78,8 @@ def design_excitation(
 ) -> ExcitationPlan:
     r"""Finds the motion that determines the base parameters best within all limits (Eq. 36).
 
-    Many random starts are improved at once by an interior point method that is JAX from end to end;
+    Many random starts are improved at once by an interior point method that is JAX from end to end,
+    and so are their descendants, which move some joints as one parent does and some as the other;
     the best of them are polished one by one. Joint limits hold for all times, not only at samples.
     Ctrl-C ends the design with the best motion so far. The same key gives the same motion.
 
@@ -96,9 +95,8 @@ def design_excitation(
         criterion: What is made small; D-optimality if None.
         constraints: What must be kept beside the joints' limits.
         starts: Random motions to start from.
+        generations: How often the motions found have children, of which the best live on.
         polish: How many of the best are polished; 0 for the path that is JAX alone.
-        kicks: How often the best motion after that is crossed with another polished one, joint by
-            joint, or disturbed, and polished again.
         key: Of the random motions; `jax.random.key(0)` if None.
         noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
             if None. The weights of the criterion are its inverse, like the estimator's.
@@ -122,7 +120,7 @@ def design_excitation(
     criterion = DOptimal() if criterion is None else criterion
     basis = FourierBasis(harmonics, omega) if basis is None else basis
     key = jax.random.key(0) if key is None else key
-    _check(base, criterion, starts, polish, kicks, samples, prior)
+    _check(base, criterion, starts, generations, polish, samples, prior)
     robot = base.model.robot
     noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
     if noise.shape != (robot.joints,) or not (noise > 0).all():
@@ -142,7 +140,7 @@ def design_excitation(
     )
     problem.sizes = _sizes(problem)
     path = None if state is None else Path(state)
-    design = _Design(problem, starts, polish, kicks, key, progress, path)
+    design = _Design(problem, starts, generations, polish, key, progress, path)
     found, interrupted = design.run(resume)
     plan = _plan(problem, found, key, starts, noise, nominal, interrupted)
     if throw and not plan.feasible:
@@ -165,11 +163,11 @@ def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
     return NOISE * np.asarray(robot.max_forces)
 
 
-def _check(base, criterion, starts, polish, kicks, samples, prior) -> None:
+def _check(base, criterion, starts, generations, polish, samples, prior) -> None:
     for name, value, least in (
         ("starts", starts, 1),
+        ("generations", generations, 0),
         ("polish", polish, 0),
-        ("kicks", kicks, 0),
         ("samples", samples, 2),
     ):
         if value < least:
@@ -189,42 +187,39 @@ def _check(base, criterion, starts, polish, kicks, samples, prior) -> None:
 _last: list[tuple[Any, Search, Polish]] = []
 
 
-def _tools(problem: Problem, starts: int, digest: str) -> tuple[Search, Polish]:
+def _tools(problem: Problem, starts: int, generations: int, digest: str) -> tuple[Search, Polish]:
     """What solves a problem; the last ones are kept, for designs that differ in their keys only."""
     parts = problem.base, problem.limits, problem.criterion, problem.constraints
     identity = digest, jax.tree.structure(parts)
     if not _last or _last[0][0] != identity:
-        _last[:] = [(identity, Search(problem, starts), Polish(problem))]
+        _last[:] = [(identity, Search(problem, starts, generations), Polish(problem))]
     return _last[0][1:]
 
 
 class _Design:
     """The steps of a design, one after the other."""
 
-    def __init__(self, problem, starts, polish, kicks, key, progress, path):
+    def __init__(self, problem, starts, generations, polish, key, progress, path):
         self._progress, self._path, self._key = progress, path, key
-        self._polished, self._starts = min(polish, starts), starts
-        self._kicks = kicks if polish else 0
+        self._polished = min(polish, starts)
         p = problem
         self._digest = fingerprint(
             (p.base, p.limits, p.criterion, p.constraints, p.weights, p.prior),
             [type(x).__name__ for x in (p.criterion, p.basis, *p.constraints)],
-            (repr(p.basis), p.measured, starts),
+            (repr(p.basis), p.measured, starts, generations),
         )
-        self._search, self._polish = _tools(problem, starts, self._digest)
+        self._search, self._polish = _tools(problem, starts, generations, self._digest)
         self._problem = self._search.problem
 
     def run(self, resume: bool) -> tuple[_State, bool]:
         """All steps; the last state, and whether Ctrl-C has ended them."""
-        digest = fingerprint(
-            self._digest, (self._polished, self._kicks), jax.random.key_data(self._key)
-        )
+        digest = fingerprint(self._digest, self._polished, jax.random.key_data(self._key))
         searched = self._search.begin(self._key)
         state = _State(searched, searched.best.promising(), 0, searched.best)
         if resume and self._path is not None and self._path.is_file():
             state = load_state(self._path, digest, state)
             state = jax.tree.map(np.asarray, state)
-        total = self._search.legs + 4 * (self._polished + self._kicks)
+        total = self._search.legs + 4 * self._polished
         try:
             self._tell(state, total)
             while (step := self._next(state)) is not None:
@@ -247,34 +242,15 @@ class _Design:
 
     def _next(self, state: _State) -> _State | None:
         if int(state.searched.leg) < self._search.legs:
-            searched = self._search.advance(state.searched)
+            searched = self._search.advance(state.searched, self._key)
             return _State(searched, searched.best.promising(), 0, searched.best)
         done = int(state.polished)
-        if done >= self._polished + self._kicks:
+        if done >= self._polished:
             return None
-        if done < self._polished:
-            place = int(state.order[done])
-            start = np.asarray(state.searched.best.y[place])
-        else:
-            place, start = self._another(state, done - self._polished)
+        place = int(state.order[done])
+        start = np.asarray(state.searched.best.y[place])
         best = state.best.improved_at(place, self._polish(start))
         return state._replace(polished=done + 1, best=best)
-
-    def _another(self, state: _State, number: int) -> tuple[int, np.ndarray]:
-        """Near the best motion, from where to polish once more; and whose place a gain takes.
-
-        Mostly it is crossed with the other polished ones in turn, whose places better motions then
-        take; every `DISTURBED`th time it is disturbed at random.
-        """
-        limits, order = self._problem.limits, state.best.order()
-        first, others = int(order[0]), [int(k) for k in order[1 : self._polished]]
-        y = state.best.y
-        if not others:
-            return first, kicked(limits, y[first], self._key, number)
-        if number % DISTURBED == DISTURBED - 1:
-            return first, kicked(limits, y[first], self._key, number // DISTURBED)
-        other = others[number % len(others)]
-        return other, crossed(limits, y[first], y[other], self._key, number)
 
     def _tell(self, state: _State, total: int) -> None:
         if self._progress is None:

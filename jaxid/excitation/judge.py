@@ -20,6 +20,8 @@ PRICE = 3.0
 """What a motion's excess counts beside its value, where it is to be improved further."""
 SHARES = np.arange(0.95, 0.0, -0.05)
 """Shares of its size that are tried where nothing else keeps the constraints."""
+SAME = 2e-5
+"""Difference of values up to which two motions count as one found twice."""
 HALVED = 6
 """How often the step between such a share and the one before it is then halved."""
 
@@ -52,6 +54,19 @@ class Best(NamedTuple):
         a, b = np.maximum(self.excess, 0.0), np.maximum(other.excess, 0.0)
         better = (b < a) | ((b == a) & (other.value < self.value))
         return self._replaced(better, other)
+
+    def survivors(self, other: "Best") -> "Best":
+        """As many of both together as these are, the best first; what was found twice comes last.
+
+        Args:
+            other: Of the same problem.
+        """
+        both = Best(*(np.concatenate([a, b]) for a, b in zip(self, other, strict=True)))
+        order = both.order()
+        value, excess = both.value[order], np.maximum(both.excess[order], 0.0)
+        again = (np.diff(value, prepend=np.nan) <= SAME) & (np.diff(excess, prepend=np.nan) == 0.0)
+        order = np.concatenate([order[~again], order[again]])[: len(self.value)]
+        return Best(*(np.asarray(part)[order] for part in both))
 
     def improved_at(self, place: int, other: "Best") -> "Best":
         """With one motion in the place of one start, if it is better.

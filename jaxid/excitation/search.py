@@ -1,6 +1,8 @@
-"""The search from many starts at once: relaxed limits first, then tight ones; the best is kept.
+"""The search from many starts at once: relaxed limits first, then tight ones; then generations.
 
-Everything a search knows between two legs is in its state, so it can be stopped, saved and resumed.
+The children of what was found are improved in the same way, and of parents and children the best
+live on. In the end limits are kept on a finer grid, so that less of them is left unused. Everything
+a search knows between two legs is in its state, so it can be stopped, saved and resumed.
 """
 
 from typing import NamedTuple
@@ -12,19 +14,22 @@ import numpy as np
 from jaxid.excitation.interior_point import COOLING, InteriorPoint, Stage, State
 from jaxid.excitation.judge import Best, Judge
 from jaxid.excitation.limits import CERTIFIED, JointLimits, random_motion
+from jaxid.excitation.offspring import Offspring
 from jaxid.excitation.problem import Context, Problem
 from jaxid.types import AnyArray, Array, Bool, Float, PRNGKeyArray
 
 GRID = 64
 """Rows of each order by which limits are kept during the search."""
+FINE = 256
+"""Rows of each order by which they are kept in the end."""
 CALM = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
 """Sizes of further random motions, for starts that find no way to keep the constraints."""
-KICK = 0.15
-"""Size of a disturbance of all joints, by the mean size of a motion's numbers."""
 STRETCH = 25
 """Iterations after which the peaks of constraints are looked for anew."""
 TIGHT = 0.998
 """Share of the limits within which legs end: what is left is for rounding."""
+DEAR = 100.0
+"""What exceeding constraints costs from where it must come to an end."""
 
 
 class Leg(NamedTuple):
@@ -57,8 +62,13 @@ LEGS = (
 )
 """Relaxed limits, then the limits; once more a little relaxed; sharper in the end."""
 
-SETTLING = tuple(Leg(Stage(TIGHT, 1e-4, 1e-6, n, 100.0), 20.0, True) for n in (100, 50, 50))
+SETTLING = tuple(Leg(Stage(TIGHT, 1e-4, 1e-6, n, DEAR), 20.0, True) for n in (100, 50, 50))
 """What follows where there are constraints: their peaks move, and what cannot be kept is dear."""
+
+GENERATION = Leg(Stage(TIGHT, 1e-3, 1e-6, 150, DEAR), 20.0, True)
+"""How children are improved."""
+LAST = Leg(Stage(TIGHT, 1e-4, 1e-6, 300, DEAR), 20.0, True)
+"""On the fine grid."""
 
 
 class Searched(NamedTuple):
@@ -76,17 +86,21 @@ class Search:
     Args:
         problem: What is to be found.
         starts: Number of starts.
+        generations: How often the motions have children.
 
     Attributes:
         problem: The same.
         judge: Of its motions.
     """
 
-    def __init__(self, problem: Problem, starts: int):
+    def __init__(self, problem: Problem, starts: int, generations: int):
         self.problem, self._starts = problem, starts
         self._legs = LEGS + SETTLING if problem.constraints else LEGS
-        limits = problem.limits
-        self._solver = InteriorPoint(problem.evaluation(), limits.grid(GRID), limits.still)
+        self._generations = generations
+        evaluation, limits = problem.evaluation(), problem.limits
+        self._solver = InteriorPoint(evaluation, limits.grid(GRID), limits.still)
+        self._fine = InteriorPoint(evaluation, limits.grid(FINE), limits.still)
+        self._offspring = Offspring(problem)
         self.judge = Judge(problem)
         self._worst = jax.jit(problem.worst)
 
@@ -94,23 +108,50 @@ class Search:
         """Random motions that fill their limits."""
         y = random_starts(self.problem.limits, key, self._starts)
         best = self.judge(y)
-        state = self._solver.start(y, self.problem.conditions)
+        state = self._anew(self._solver, y)
         return Searched(state, 0, best.value, best)
 
-    def advance(self, searched: Searched) -> Searched:
-        """The next leg."""
-        leg = self._legs[searched.leg]
-        state = searched.state
-        broken = np.asarray(searched.best.excess) > 0
+    def advance(self, searched: Searched, key: PRNGKeyArray) -> Searched:
+        """The next leg.
+
+        Args:
+            searched: What is known so far.
+            key: Of the random numbers, that with which the search began.
+        """
+        number = int(searched.leg)
+        bred = number - len(self._legs)
+        if bred < 0:
+            searched = self._continued(searched, self._legs[number])
+        elif bred < self._generations:
+            children = self._offspring(searched.best.y, jax.random.fold_in(key, bred))
+            state = self._improved(self._solver, self._anew(self._solver, children), GENERATION)
+            judged = self.judge.within(state.y)
+            searched = searched._replace(best=searched.best.survivors(judged))
+        else:
+            state = self._improved(self._fine, self._anew(self._fine, searched.best.y), LAST)
+            judged = self.judge.within(state.y)
+            searched = searched._replace(best=searched.best.improved(judged))
+        return searched._replace(leg=number + 1)
+
+    def _continued(self, searched: Searched, leg: Leg) -> Searched:
+        """A leg of the starts themselves."""
+        state, best = searched.state, searched.best
+        broken = np.asarray(best.excess) > 0
         if searched.leg == len(LEGS) and broken.any():
             state = self._calmed(state, broken)
-        for stage in self._stretches(leg.stage):
-            context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(state.y))
-            state = self._solver.run(state, stage, context)
-        best = searched.best
+        state = self._improved(self._solver, state, leg)
         if leg.judged:
             best = best.improved(self.judge.within(state.y))
-        return Searched(state, searched.leg + 1, searched.first, best)
+        return searched._replace(state=state, best=best)
+
+    def _anew(self, solver: InteriorPoint, y: Float[AnyArray, "starts scaled"]) -> State:
+        return solver.start(y, self.problem.conditions)
+
+    def _improved(self, solver: InteriorPoint, state: State, leg: Leg) -> State:
+        for stage in self._stretches(leg.stage):
+            context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(state.y))
+            state = solver.run(state, stage, context)
+        return state
 
     def _stretches(self, stage: Stage) -> list[Stage]:
         """A stage in parts, between which the instants of constraints follow their peaks."""
@@ -135,15 +176,15 @@ class Search:
         )
         best = jnp.argsort(jnp.maximum(self._worst(many), 0.0))
         chosen = many[best[np.arange(self._starts) % len(many)]]
-        anew = self._solver.start(chosen, self.problem.conditions)
+        anew = self._anew(self._solver, chosen)
         return jax.tree.map(
             lambda a, b: jnp.where(broken.reshape(-1, *(1,) * (a.ndim - 1)), a, b), anew, state
         )
 
     @property
     def legs(self) -> int:
-        """Number of legs."""
-        return len(self._legs)
+        """Number of legs: of the starts, of their descendants, and the last one."""
+        return len(self._legs) + self._generations + 1
 
 
 def random_starts(
@@ -163,55 +204,3 @@ def random_starts(
     draws = jax.random.normal(shape, (starts, joints * variables), float)
     places = jax.random.uniform(place, (starts, joints), float)
     return jax.vmap(lambda a, b: random_motion(fine, limits.still, a, b, size=size))(draws, places)
-
-
-def kicked(
-    limits: JointLimits, y: Float[AnyArray, " scaled"], key: PRNGKeyArray, number: int
-) -> Float[np.ndarray, " scaled"]:
-    """A motion near a good one, from which another optimum may be found.
-
-    By turns all joints are disturbed a little, and one joint much.
-
-    Args:
-        limits: Of the joints.
-        y: The good motion.
-        key: Of the design.
-        number: Of the disturbance.
-    """
-    of_shape, of_joint = jax.random.split(jax.random.fold_in(key, number))
-    motion = np.reshape(np.array(y), limits.shape)
-    noise = np.asarray(jax.random.normal(of_shape, limits.shape, float))
-    if number % 2:
-        joint = int(jax.random.randint(of_joint, (), 0, limits.shape[0]))
-        motion[joint] += np.abs(motion[joint]).mean() * noise[joint]
-    else:
-        motion += KICK * np.abs(motion).mean() * noise
-    return motion.ravel()
-
-
-def crossed(
-    limits: JointLimits,
-    y: Float[AnyArray, " scaled"],
-    other: Float[AnyArray, " scaled"],
-    key: PRNGKeyArray,
-    number: int,
-) -> Float[np.ndarray, " scaled"]:
-    """A good motion with some joints, fewer than half on average, that move as in another one.
-
-    Limits of joints are kept by each joint alone, so that the child of two motions that keep them
-    keeps them too.
-
-    Args:
-        limits: Of the joints.
-        y: The good motion.
-        other: The other one.
-        key: Of the design.
-        number: Of the crossing.
-    """
-    of_joint, of_share, of_others = jax.random.split(jax.random.fold_in(key, number), 3)
-    joints = limits.shape[0]
-    share = jax.random.uniform(of_share, (), float, 0.1, 0.5)
-    taken = np.array(jax.random.uniform(of_others, (joints,), float) < share)
-    taken[int(jax.random.randint(of_joint, (), 0, joints))] = True
-    own, foreign = (np.reshape(np.asarray(z), limits.shape) for z in (y, other))
-    return np.where(taken[:, None], foreign, own).ravel()

@@ -33,8 +33,8 @@ from jaxid.types import Float, double_precision
 
 FEW = 8
 """Starts of the designs that only show what a criterion buys."""
-KICKS = 8
-"""How often the best motion is disturbed where the file does not say."""
+FEWER = 4
+"""Generations of these designs."""
 
 
 class Excited(NamedTuple):
@@ -81,9 +81,9 @@ def design(
         plan = design_excitation(
             experiment.base,
             criterion=CRITERIA[experiment.excitation.criterion](),
-            polish=min(experiment.excitation.polish, experiment.excitation.starts),
-            kicks=KICKS if experiment.excitation.kicks is None else experiment.excitation.kicks,
             starts=experiment.excitation.starts,
+            generations=experiment.excitation.generations,
+            polish=min(experiment.excitation.polish, experiment.excitation.starts),
             progress=progress,
             state=state,
             resume=resume,
@@ -101,7 +101,8 @@ def side_by_side(
         experiment: With its table `[excitation]`, or the defaults.
         progress: Is told how far the designs are.
     """
-    found, starts = [], min(FEW, experiment.excitation.starts)
+    found, table = [], experiment.excitation
+    starts, generations = min(FEW, table.starts), min(FEWER, table.generations)
     for number, criterion in enumerate(ALL):
 
         def tell(now: DesignProgress, number: int = number) -> None:
@@ -116,6 +117,7 @@ def side_by_side(
                     experiment.base,
                     criterion=criterion,
                     starts=starts,
+                    generations=generations,
                     polish=0,
                     progress=tell,
                     throw=False,

@@ -275,8 +275,8 @@ class ExcitationTable(_Table, frozen=True):
     samples: Annotated[int, Meta(ge=2, le=10_000_000)] = 800
     noise: list[Annotated[float, Meta(gt=0, lt=1e9)]] | None = None
     starts: Count = 32
+    generations: Annotated[int, Meta(ge=0, le=10_000)] = 12
     polish: Annotated[int, Meta(ge=0, le=10_000)] = 4
-    kicks: Annotated[int, Meta(ge=0, le=10_000)] | None = None
     seed: Annotated[int, Meta(ge=0, le=2**32 - 1)] = 0
     leads: bool | LeadsTable = True
     sample_time: Annotated[float, Meta(ge=1e-5)] | None = None
@@ -314,8 +314,6 @@ class ExcitationTable(_Table, frozen=True):
                 said.append(f"{' and '.join(given)} {verb} nothing for a `spline`")
         if isinstance(self.leads, LeadsTable) and self.led is None:
             said.append("`leads` do nothing for a motion that rests at its ends")
-        if self.kicks and not self.polish:
-            said.append("`kicks` do nothing with `polish = 0`, for they are polished too")
         return said
 
 

@@ -192,8 +192,8 @@ samples = 800                         # that one run will measure
 # noise = {ones}        # standard deviation of the forces' noise [N m or N];
 #                                     # by default 1 % of the largest forces
 starts = 32                           # random motions to start from
+generations = 12                      # how often the motions found have children
 polish = 4                            # how many of the best are polished
-kicks = 8                             # how often the best is disturbed and polished again
 seed = 0                              # of the random motions
 # nominal = "report"                  # an earlier result of `jaxid identify`, to compare with
 # earlier = ["trajectory.json"]       # motions whose logs will be used together with this one's

@@ -13,6 +13,10 @@ from jaxid.types import AnyArray, Float
 
 ORDERS = 4
 """Position, velocity, acceleration and jerk."""
+SHIFTS = 40
+"""Parts of a motion's time by which it is tried to begin it later."""
+ANEW = 1e-9
+"""How well a motion must be met when it is begun later or run backwards, relative."""
 
 
 class Envelope(NamedTuple):
@@ -78,6 +82,27 @@ class AbstractBasis(eqx.Module):
             samples: How many.
         """
         return np.arange(samples) * (self.duration / samples)
+
+    @property
+    def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:
+        """Maps of a joint's numbers to those of the same motion begun later, or run backwards.
+
+        Those that stay in the family: a periodic motion may begin at any time, one between
+        standstills may run backwards. The first changes nothing. All keep the limits of the joint.
+        """
+        part = -(-4 * self.variables // SHIFTS)
+        step = self.duration / (SHIFTS * part)
+        rows = self.rows((np.arange(SHIFTS * part) + 0.5) * step)[0]
+        inverse, size = np.linalg.pinv(rows), np.abs(rows).max()
+        moved = [np.roll(r, k * part, axis=0) for r in (rows, rows[::-1]) for k in range(SHIFTS)]
+        maps = [inverse @ wanted for wanted in moved]
+        return np.array(
+            [
+                T
+                for T, wanted in zip(maps, moved, strict=True)
+                if np.abs(rows @ T - wanted).max() <= ANEW * size
+            ]
+        )
 
     def instants(self, points: int) -> Float[np.ndarray, " points"]:
         """Equidistant times over everything that is moved, for what must hold all along [s].

@@ -125,6 +125,17 @@ def test_a_small_excess_does_not_outweigh_a_better_value():
     assert 0.01 * PRICE < 0.5
 
 
+def test_the_best_of_two_generations_live_on_and_none_twice():
+    parents = Best(np.arange(3.0)[:, None], np.array([-1.0, -2.0, -3.0]), np.array([-1.0, -1, 0.2]))
+    children = Best(
+        np.arange(10.0, 13.0)[:, None], np.array([-2.0, -1.5, np.inf]), np.array([-1.0, -1, np.inf])
+    )
+    best = parents.survivors(children)
+    assert list(best.y[:, 0]) == [1.0, 11.0, 0.0]
+    assert list(best.value) == [-2.0, -1.5, -1.0]
+    assert list(parents.survivors(parents).y[:, 0]) == [1.0, 0.0, 2.0]
+
+
 def test_a_motion_is_enlarged_to_its_limits_only_where_that_is_better(pendulum):
     """A condition number may well become worse: what a polished motion gained would be lost."""
     for criterion in (ConditionNumber(), DOptimal()):
@@ -174,7 +185,13 @@ def test_motions_of_many_numbers_are_seen_as_well_as_those_of_few(pendulum):
 def test_a_design_with_leads_keeps_all_constraints_in_them_too(pendulum, constraints, shapes):
     robot = pendulum.model.robot
     plan = design_excitation(
-        pendulum, basis=BASIS, constraints=constraints, starts=3, polish=0, samples=100
+        pendulum,
+        basis=BASIS,
+        constraints=constraints,
+        starts=3,
+        generations=2,
+        polish=0,
+        samples=100,
     )
     assert plan.feasible
     t = np.linspace(0.0, float(plan.trajectory.duration), 8000)

@@ -18,7 +18,14 @@ from jaxid.robot.capsules import GROUND, Capsule
 from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.files import load_trajectory
 
-SETTINGS = {"harmonics": 3, "omega": 1.1, "starts": 3, "polish": 1, "kicks": 2, "samples": 200}
+SETTINGS = {
+    "harmonics": 3,
+    "omega": 1.1,
+    "starts": 3,
+    "generations": 2,
+    "polish": 1,
+    "samples": 200,
+}
 
 
 class LowTip(AbstractConstraint):
@@ -113,8 +120,8 @@ def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(base, pl
         design_excitation(base, resume=True, **arguments)
 
 
-def test_kicks_never_make_a_motion_worse(base, plan):
-    calm = design_excitation(base, key=jax.random.key(3), **{**SETTINGS, "kicks": 0})
+def test_generations_never_make_a_motion_worse(base, plan):
+    calm = design_excitation(base, key=jax.random.key(3), **{**SETTINGS, "generations": 0})
     d = DOptimal()
     assert d.value(plan.information) <= d.value(calm.information)
     assert d.value(plan.information) < 0.9 * d.value(plan.reference)
@@ -157,7 +164,7 @@ def test_what_is_known_already_is_not_measured_again(pendulum):
     [
         ({"starts": 0}, "`starts` must be at least 1"),
         ({"polish": -1}, "`polish` must be at least 0"),
-        ({"kicks": -1}, "`kicks` must be at least 0"),
+        ({"generations": -1}, "`generations` must be at least 0"),
         ({"noise": np.array([1.0, -1.0])}, "`noise` must hold one positive"),
     ],
 )

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from jaxid.trajectory.basis import FourierBasis
+from jaxid.trajectory.basis import SHIFTS, FourierBasis
+from jaxid.trajectory.leads_basis import LeadsBasis
+from jaxid.trajectory.rest import RestToRestBasis
+from jaxid.trajectory.spline import RestToRestSplineBasis
 
 BASES = [FourierBasis(5, 0.8), FourierBasis(1, 3.0)]
 
@@ -53,3 +56,34 @@ def test_refuses_what_is_no_frequency():
         FourierBasis(5, 0.0)
     with pytest.raises(ValueError, match="`harmonics` must be at least 1"):
         FourierBasis(0, 0.8)
+
+
+def test_a_periodic_motion_begins_later_or_runs_backwards(basis):
+    retimings, x = basis.retimings, numbers(basis)
+    t, step = basis.times(23), basis.duration / SHIFTS
+    assert len(retimings) == 2 * SHIFTS
+    np.testing.assert_allclose(retimings[0], np.eye(basis.variables), atol=1e-12)
+    for k in (1, 7, SHIFTS - 1):
+        later, backwards = (
+            basis.rows(t) @ (x @ T.T).T for T in (retimings[k], retimings[SHIFTS + k])
+        )
+        np.testing.assert_allclose(later, basis.rows(t - k * step) @ x.T, atol=1e-9)
+        turned = basis.rows(k * step - t) @ x.T
+        turned[1::2] *= -1
+        np.testing.assert_allclose(backwards, turned, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "basis",
+    [RestToRestBasis(4, 0.9), RestToRestSplineBasis(9, 5.0), LeadsBasis(3, 1.1, lead=0.4)],
+    ids=lambda basis: type(basis).__name__,
+)
+def test_a_motion_between_standstills_only_runs_backwards(basis):
+    retimings, x = basis.retimings, numbers(basis)
+    t = np.linspace(0.0, basis.duration, 41)
+    assert len(retimings) == 2
+    np.testing.assert_allclose(retimings[0], np.eye(basis.variables), atol=1e-8)
+    own, turned = basis.rows(t) @ x.T, basis.rows(basis.duration - t) @ (x @ retimings[1].T).T
+    for order, sign in enumerate((1.0, -1.0, 1.0)):
+        scale = np.abs(own[order]).max()
+        np.testing.assert_allclose(turned[order], sign * own[order], atol=1e-7 * scale)

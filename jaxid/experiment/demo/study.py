@@ -305,6 +305,7 @@ def _designed(
             limits=limits,
             constraints=kept,
             starts=effort.starts,
+            generations=0,
             polish=0,
             samples=SAMPLES,
             key=jax.random.key(seed),
