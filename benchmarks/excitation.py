@@ -113,7 +113,7 @@ def report(name, found, best):
 
 def cond(keys, asked):
     base = base_of(True)
-    for polish in (0, asked.polish):
+    for polish in asked.polish:
         found = designed(
             base,
             jid.ConditionNumber(),
@@ -127,7 +127,7 @@ def cond(keys, asked):
 
 def d_optimal(principal_axes, keys, asked):
     base = base_of(principal_axes)
-    for polish in (0, asked.polish):
+    for polish in asked.polish:
         found = designed(base, jid.DOptimal(), keys, gain_over_random, polish, asked)
         what = f"D gain, {base.size} base parameters, {asked.generations} generations"
         report(f"{what}, polish {polish}", found, max)
@@ -328,14 +328,14 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="the first key")
     parser.add_argument("--starts", type=int, default=32)
     parser.add_argument("--generations", type=int, default=12)
-    parser.add_argument("--polish", type=int, default=4, help="beside 0: JAX alone")
+    parser.add_argument("--polish", type=int, nargs="+", default=[0, 4], help="0: JAX alone")
     parser.add_argument("--quick", action="store_true")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jid.keep_compiled()
     if asked.quick:
         asked.parts, asked.keys = ["d7"], 1
-        asked.starts, asked.generations, asked.polish = 2, 1, 1
+        asked.starts, asked.generations, asked.polish = 2, 1, [0, 1]
     keys = range(asked.first, asked.first + asked.keys)
     sizes = (1, 8, 64) if jax.default_backend() == "cpu" else (64, 512, 4096)
     parts = {
