@@ -108,7 +108,7 @@ class Search:
         """Random motions that fill their limits."""
         y = random_starts(self.problem.limits, key, self._starts)
         best = self.judge(y)
-        state = self._anew(self._solver, y)
+        state = self._solver.start(y, self.problem.conditions)
         return Searched(state, 0, best.value, best)
 
     def advance(self, searched: Searched, key: PRNGKeyArray) -> Searched:
@@ -118,19 +118,17 @@ class Search:
             searched: What is known so far.
             key: Of the random numbers, that with which the search began.
         """
-        number = int(searched.leg)
+        number, best = int(searched.leg), searched.best
         bred = number - len(self._legs)
         if bred < 0:
             searched = self._continued(searched, self._legs[number])
         elif bred < self._generations:
-            children = self._offspring(searched.best.y, jax.random.fold_in(key, bred))
-            state = self._improved(self._solver, self._anew(self._solver, children), GENERATION)
-            judged = self.judge.within(state.y)
-            searched = searched._replace(best=searched.best.survivors(judged))
+            children = self._offspring(best.y, jax.random.fold_in(key, bred))
+            best = best.survivors(self._anew(self._solver, children, GENERATION))
+            searched = searched._replace(best=best)
         else:
-            state = self._improved(self._fine, self._anew(self._fine, searched.best.y), LAST)
-            judged = self.judge.within(state.y)
-            searched = searched._replace(best=searched.best.improved(judged))
+            best = best.improved(self._anew(self._fine, best.y, LAST))
+            searched = searched._replace(best=best)
         return searched._replace(leg=number + 1)
 
     def _continued(self, searched: Searched, leg: Leg) -> Searched:
@@ -144,8 +142,10 @@ class Search:
             best = best.improved(self.judge.within(state.y))
         return searched._replace(state=state, best=best)
 
-    def _anew(self, solver: InteriorPoint, y: Float[AnyArray, "starts scaled"]) -> State:
-        return solver.start(y, self.problem.conditions)
+    def _anew(self, solver: InteriorPoint, y: Float[AnyArray, "starts scaled"], leg: Leg) -> Best:
+        """What a leg makes of motions that it begins with."""
+        state = self._improved(solver, solver.start(y, self.problem.conditions), leg)
+        return self.judge.within(state.y)
 
     def _improved(self, solver: InteriorPoint, state: State, leg: Leg) -> State:
         for stage in self._stretches(leg.stage):
@@ -176,7 +176,7 @@ class Search:
         )
         best = jnp.argsort(jnp.maximum(self._worst(many), 0.0))
         chosen = many[best[np.arange(self._starts) % len(many)]]
-        anew = self._anew(self._solver, chosen)
+        anew = self._solver.start(chosen, self.problem.conditions)
         return jax.tree.map(
             lambda a, b: jnp.where(broken.reshape(-1, *(1,) * (a.ndim - 1)), a, b), anew, state
         )
