@@ -63,7 +63,7 @@ plans = {
         omega=0.8,
         criterion=criterion,
         starts=8,
-        generations=4,
+        generations=12,
         polish=0,
         samples=400,
         key=jax.random.key(1),
@@ -81,7 +81,7 @@ for name, plan in plans.items():
     )
 
 # %% [markdown]
-# Each design is the best one in its own column, and all use their limits to the full. But what the first one has won depends on a choice that has nothing to
+# Each design is the best one in its own column (the A- and the D-optimal one share A's to half a percent), and all use their limits to the full. But what the first one has won depends on a choice that has nothing to
 # do with robots: in grams, it is no longer the best. The other two criteria do not depend on units.
 
 # %%
@@ -100,7 +100,7 @@ plt.show()
 #
 # Sixty random motions beside the designs. *Standard deviations* are a geometric mean over all parameters, 1 for the median random motion. Among random
 # motions the condition number is a fair guide: the points rise. Whoever follows it to its end leaves that path: fewer than two thirds of the condition number
-# of the best random motion, and hardly smaller deviations than that one has. The other two designs are far below all of them.
+# of the best random motion, and no smaller deviations than that one has. The other two designs are far below all of them.
 
 # %%
 from jaxid.excitation.information import information
