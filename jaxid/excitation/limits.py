@@ -18,7 +18,7 @@ from jaxid.trajectory.basis import AbstractBasis
 from jaxid.trajectory.fourier import assumed_bounds
 from jaxid.types import AnyArray, Array, Float
 
-CERTIFIED = 1024
+CERTIFIED = 512
 """Rows of each order by which a motion is made to keep its limits at all times."""
 FEW = 11
 """Numbers of a joint up to which such counts are enough: those of five harmonics."""
