@@ -81,7 +81,7 @@ for name, plan in plans.items():
     )
 
 # %% [markdown]
-# Each design is the best one in its own column (the A- and the D-optimal one share A's to half a percent), and all use their limits to the full. But what the first one has won depends on a choice that has nothing to
+# Each design is the best one in its own column, and all use their limits to the full. But what the first one has won depends on a choice that has nothing to
 # do with robots: in grams, it is no longer the best. The other two criteria do not depend on units.
 
 # %%
