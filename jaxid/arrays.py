@@ -1,5 +1,11 @@
-"""Arrays of NumPy and of JAX side by side: constants, inputs, and what JAX is tracing."""
+"""Shape vocabulary of annotations, and arrays of NumPy and JAX side by side.
 
+Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (columns of the base
+regressor), `samples` (rows of a log), `rows` (rows left after filtering), `batch`.
+"""
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from types import ModuleType
 from typing import Any
 
@@ -8,22 +14,60 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array as Array
+from jaxtyping import Bool as Bool
+from jaxtyping import Float as Float
+from jaxtyping import Int as Int
+from jaxtyping import PRNGKeyArray as PRNGKeyArray
 
-from jaxid.types import AnyArray, Numbers
+from jaxid.errors import InputError
+
+AnyArray = jax.Array | np.ndarray
+"""A JAX array, or a NumPy array: what stays in NumPy stays a constant when JAX traces."""
+
+# NumPy's own `ArrayLike` turns tuples away when types are checked at run time.
+Numbers = AnyArray | Sequence[Any] | float | int
+"""What users may pass where an array is meant: an array, nested lists or tuples, one number."""
+
+
+def require_float64(what: str) -> None:
+    """Refuses to go on in single precision.
+
+    Args:
+        what: The task that needs double precision, as it reads in a sentence.
+
+    Raises:
+        RuntimeError: If JAX's 64-bit mode is off.
+    """
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise RuntimeError(
+            f"{what} needs float64, but JAX runs in float32: call "
+            '`jax.config.update("jax_enable_x64", True)` at the start of the program, '
+            "or set the environment variable JAX_ENABLE_X64=1."
+        )
+
+
+def double_precision() -> AbstractContextManager:
+    """Lets JAX compute in float64 within a `with`, whatever its setting is outside."""
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(True)
+    from jax.experimental import enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+    return enable_x64(True)
 
 
 def as_array(name: str, value: Numbers) -> AnyArray:
     """An array as it is, and everything else as a NumPy array of float64.
 
     Raises:
-        ValueError: If it does not consist of numbers, or its rows are not equally long.
+        InputError: If it does not consist of numbers, or its rows are not equally long.
     """
     if isinstance(value, AnyArray):
         return value
     try:
         return np.array(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` must be an array of numbers, but is {value!r:.60}.") from error
+        raise InputError(f"`{name}` must be an array of numbers, but is {value!r:.60}.") from error
 
 
 def one_or_each(value: Any) -> Any:
@@ -35,11 +79,11 @@ def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | flo
     """A number for all joints, or one for each of those that move with `qd`.
 
     Raises:
-        ValueError: If there are more or fewer than joints.
+        InputError: If there are more or fewer than joints.
     """
     shape = np.shape(value)
     if shape and shape != qd.shape[-1:]:
-        raise ValueError(
+        raise InputError(
             f"`{name}` must be one number for all joints or one for each ({qd.shape[-1]}), but "
             f"has shape {shape}."
         )

@@ -19,7 +19,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.types import AnyArray
+from jaxid.arrays import AnyArray
+from jaxid.errors import InputError
 
 KIND = "kind"
 SHAPE = "shape"
@@ -102,7 +103,7 @@ def decoded(value: Any, hint: Any, place: str = "") -> Any:
         place: Where this stands in the document, for messages.
 
     Raises:
-        ValueError: If the values are not of a module that fits, with the place.
+        InputError: If the values are not of a module that fits, with the place.
     """
     if isinstance(value, dict):
         found = _decoded_object(value, hint, place)
@@ -119,7 +120,7 @@ def decoded(value: Any, hint: Any, place: str = "") -> Any:
         # A number and an array without axes are the same thing to who made them.
         found = np.array(found) if isinstance(found, float) else found[()]
     if not any(_fits(found, option) for option in options):
-        raise ValueError(f"`{place}` holds {value!r:.60}, which does not belong there")
+        raise InputError(f"`{place}` holds {value!r:.60}, which does not belong there")
     return found
 
 
@@ -134,15 +135,15 @@ def _decoded_object(value: dict[str, Any], hint: Any, place: str) -> Any:
                 family, _, member = str(value[ENUM]).partition(".")
                 if family == option.__name__ and member in option.__members__:
                     return option[member]
-        raise ValueError(f"`{place}` names `{value[ENUM]}`, which is not known")
+        raise InputError(f"`{place}` names `{value[ENUM]}`, which is not known")
     names = set(value) - {SHAPE}
     if len(names) != 1 or not names <= set(DTYPES):
-        raise ValueError(f"`{place}` has the keys {', '.join(sorted(map(str, value)))}")
+        raise InputError(f"`{place}` has the keys {', '.join(sorted(map(str, value)))}")
     (name,) = names
     try:
         return _array(value[name], name, value.get(SHAPE), place)
     except (TypeError, OverflowError) as error:
-        raise ValueError(f"`{place}` is no array of {name}") from error
+        raise InputError(f"`{place}` is no array of {name}") from error
 
 
 def _array(entries: Any, name: str, shape: Any, place: str) -> np.ndarray:
@@ -155,19 +156,19 @@ def _array(entries: Any, name: str, shape: Any, place: str) -> np.ndarray:
             return [leaf(y) for y in x]
         x = _not_finite(x, place) if isinstance(x, str) and exact is float else x
         if type(x) is not exact:
-            raise ValueError(f"`{place}` holds {x!r:.30} in an array of {name}")
+            raise InputError(f"`{place}` holds {x!r:.30} in an array of {name}")
         return x
 
     checked = leaf(entries)
     try:
         return np.array(checked, name)
     except ValueError as error:
-        raise ValueError(f"`{place}` has rows of different lengths") from error
+        raise InputError(f"`{place}` has rows of different lengths") from error
 
 
 def _not_finite(word: Any, place: str) -> float:
     if word not in _NOT_FINITE:
-        raise ValueError(f"`{place}` holds {word!r:.30} in the place of a number")
+        raise InputError(f"`{place}` holds {word!r:.30} in the place of a number")
     return _NOT_FINITE[word]
 
 
@@ -178,7 +179,7 @@ def _decoded_module(value: dict[str, Any], hint: Any, place: str) -> Any:
     # Of classes of one name the last one counts; not a twin that Equinox derives for its own ends.
     found = [c for c in found if not any(b in found for b in c.__mro__[1:])]
     if not found:
-        raise ValueError(
+        raise InputError(
             f"`{place or 'the model'}` is a `{kind}`, which is not known: import the module that "
             "defines it, or use a newer version of jaxid"
         )
@@ -187,7 +188,7 @@ def _decoded_module(value: dict[str, Any], hint: Any, place: str) -> Any:
     needed = [f for f in fields.values() if f.name not in value and _is_needed(f)]
     if unknown or needed:
         complaint = f"has an unknown key `{unknown[0]}`" if unknown else f"lacks `{needed[0].name}`"
-        raise ValueError(f"`{place or kind}` ({kind}) {complaint}")
+        raise InputError(f"`{place or kind}` ({kind}) {complaint}")
     entries = {
         name: decoded(value[name], field.type, f"{place}.{name}".strip("."))
         for name, field in fields.items()

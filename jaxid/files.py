@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.errors import InputError
+
 PATIENCE = 60.0
 """Seconds for which a run waits for another one that writes into the same folder."""
 HIDDEN = ".jaxid-"
@@ -31,12 +33,12 @@ def read_json(path: str | Path, hook: Callable[[list[tuple[str, Any]]], Any] | N
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is no JSON in UTF-8; the message says why.
+        InputError: If it is no JSON in UTF-8; the message says why.
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=hook)
     except RecursionError as error:
-        raise ValueError("its brackets are nested too deeply") from error
+        raise InputError("its brackets are nested too deeply") from error
 
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
@@ -47,7 +49,7 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
 
     Raises:
         OSError: If the file cannot be opened.
-        ValueError: If it is no archive of plain arrays, or is damaged; the message says how.
+        InputError: If it is no archive of plain arrays, or is damaged; the message says how.
     """
     with Path(path).open("rb") as file:
         try:
@@ -56,9 +58,9 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
                 # What is no array comes as bytes, and was not put there by NumPy.
                 return {name: x for name, x in held.items() if isinstance(x, np.ndarray)}
         except AttributeError as error:
-            raise ValueError("it is one array, not an archive of them") from error
+            raise InputError("it is one array, not an archive of them") from error
         except Exception as error:  # of some ten kinds: it depends on which bytes are damaged
-            raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
+            raise InputError(" ".join(str(error).split()) or type(error).__name__) from error
 
 
 @contextlib.contextmanager
@@ -77,7 +79,7 @@ def written_whole(
         outdated: Tells the names of files of an earlier result in a folder, which go with it.
 
     Raises:
-        ValueError: If `folder`, or what should be above it, is a file; or a file's place is taken
+        InputError: If `folder`, or what should be above it, is a file; or a file's place is taken
             by a folder; or another process writes into it for `PATIENCE` seconds.
     """
     given, folder = folder, folder.absolute()
@@ -104,7 +106,7 @@ def require_place(folder: Path) -> None:
 
     Raises:
         OSError: If nothing can be written there.
-        ValueError: If something else is in its place, or above it.
+        InputError: If something else is in its place, or above it.
     """
     with _hidden(_standing(folder.absolute()), folder):
         pass
@@ -115,13 +117,13 @@ def _standing(folder: Path) -> Path:
     ancestor = folder
     while not ancestor.exists():
         if ancestor.is_symlink():
-            raise ValueError(
+            raise InputError(
                 f"`{ancestor}` is a link to `{os.readlink(ancestor)}`, which is not there: choose "
                 "another place."
             )
         ancestor = ancestor.parent
     if not ancestor.is_dir():
-        raise ValueError(f"`{ancestor}` must be a folder, but is a file: choose another place.")
+        raise InputError(f"`{ancestor}` must be a folder, but is a file: choose another place.")
     return ancestor
 
 
@@ -222,7 +224,7 @@ def _alone(folder: Path) -> Iterator[None]:
     try:
         while (handle := _taken(folder)) is None:
             if time.monotonic() > end:
-                raise ValueError(
+                raise InputError(
                     f"another run has been writing into `{folder}` for {PATIENCE:g} s: end it, "
                     "or choose another folder."
                 )
@@ -273,7 +275,7 @@ def _replace(staging: Path, folder: Path, replaced: Path, earlier: Iterable[str]
     paths = sorted(staging.iterdir(), key=lambda path: (path.suffix == ".json", path.name))
     for path in paths:
         if (folder / path.name).is_dir():
-            raise ValueError(f"`{folder / path.name}` must be a file, but is a folder: remove it.")
+            raise InputError(f"`{folder / path.name}` must be a file, but is a folder: remove it.")
     moved: list[Path] = []
     try:
         if len(paths) > 1:

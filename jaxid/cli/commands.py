@@ -24,6 +24,7 @@ from jaxid.cli.options import (
     open_console,
     open_stages,
 )
+from jaxid.errors import InputError
 from jaxid.experiment import terminal
 from jaxid.experiment.doctor import fitted_doubts, slips_of
 from jaxid.experiment.experiment import Experiment, load_experiment
@@ -234,14 +235,14 @@ def identify(
     """
     console = open_console()
     if split is not None and not 0 < split < 1:
-        raise ValueError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
+        raise InputError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
     places = [p.resolve() for p in logs]
     repeated = next((p for k, p in enumerate(logs) if places[k] in places[:k]), None)
     if repeated is not None:
-        raise ValueError(f"`{repeated}` is given twice: what it tells would count double.")
+        raise InputError(f"`{repeated}` is given twice: what it tells would count double.")
     twice = set(places) & {p.resolve() for p in verify or []}
     if twice:
-        raise ValueError(
+        raise InputError(
             f"`{sorted(twice)[0].name}` is given both to identify and to verify with: a model that "
             "has seen a log is not verified by it; use `--split` to divide one log."
         )
@@ -251,7 +252,7 @@ def identify(
     given, logs = logs, [p for p in logs if not is_report(p)]
     reports = [p for p in given if is_report(p)]
     if not logs:
-        raise ValueError(
+        raise InputError(
             "folders of earlier reports stand for their logs, but at least one log must be given "
             "as a file, for torque errors and figures."
         )
@@ -279,7 +280,7 @@ def identify(
             fit, run = _together(loaded, reports, fit, run)
             for o in checked:
                 if share_data(run.blocks, Rows.of(base, [o]).blocks):
-                    raise ValueError(
+                    raise InputError(
                         f"a report that was given has seen the data of `{o.name}`: a model that "
                         "has seen a log is not verified by it; verify with another."
                     )
@@ -343,7 +344,7 @@ def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -
     """A run with what earlier reports know, as if all logs had been fitted at once."""
     if not run.tells(fit):
         kind = fit.estimator if experiment.essential is None else "for essential parameters"
-        raise ValueError(
+        raise InputError(
             f"{experiment.path.name}: earlier reports can be added to plain least squares only, "
             f"but the estimator is {kind}: leave `[estimator]` out, or give the logs "
             "themselves."

@@ -8,6 +8,7 @@ import typer
 from rich.text import Text
 
 from jaxid.cli.options import ExperimentFile, open_console
+from jaxid.errors import InputError
 from jaxid.experiment import terminal
 from jaxid.experiment.excite import design, side_by_side, write
 from jaxid.experiment.experiment import load_experiment
@@ -41,7 +42,7 @@ def excite(
     refuse_foreign_table(output)
     state = output.with_suffix(".state.npz")
     if state.exists() and not resume:
-        raise ValueError(
+        raise InputError(
             f"`{state}` is there: a design was stopped before its end. `--resume` goes on with it; "
             "to begin anew, remove the file, or choose another -o."
         )

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from jaxid.cli.options import open_console
+from jaxid.errors import InputError
 from jaxid.experiment import terminal
 from jaxid.export.c_code import export_c
 from jaxid.export.jax_function import export_jax
@@ -77,12 +78,12 @@ def export(
     path = DEFAULTS[to] if output is None else output
     made = [path, path.with_suffix(".h")] if to is Target.C else [path]
     if to is Target.C and path.suffix != ".c":
-        raise ValueError(f"`--output` must be a C file like arm.c, but is `{path}`.")
+        raise InputError(f"`--output` must be a C file like arm.c, but is `{path}`.")
     for one in made:
         if one.is_dir():
-            raise ValueError(f"`{one}` is a folder: choose another `--output`.")
+            raise InputError(f"`{one}` is a folder: choose another `--output`.")
         if one.exists() and not force:
-            raise ValueError(f"`{one}` is there already: choose another `--output`, or `--force`.")
+            raise InputError(f"`{one}` is there already: choose another `--output`, or `--force`.")
     require_place(path.parent)
     fit = load(_model_file(report))
     match to:
@@ -103,14 +104,14 @@ def export(
 
 def _model_file(report: Path) -> Path:
     if not report.exists():
-        raise ValueError(
+        raise InputError(
             f"`{report}` is not there: give a folder that `jaxid identify` has written, or a model "
             "file."
         )
     if not report.is_dir():
         return report
     if not (report / MODEL).is_file():
-        raise ValueError(
+        raise InputError(
             f"`{report}` holds no `{MODEL}`: give a folder that `jaxid identify` has written."
         )
     return report / MODEL
@@ -121,5 +122,5 @@ def _own_file(fit: Fit, urdf: Path | None) -> Path:
         return urdf
     source = Path(fit.base.model.robot.source)
     if source.suffix != ".urdf" or not source.is_file():
-        raise ValueError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
+        raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
     return source

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperCommand
 
+from jaxid.errors import InputError
 from jaxid.experiment.progress import Stages, stages
 
 WIDTH = 100
@@ -35,14 +36,14 @@ class SpreadLogs(TyperCommand):
         """Repeats the option before each log that follows it.
 
         Raises:
-            ValueError: If none follows.
+            InputError: If none follows.
         """
         spread, option = [], None
         for arg, after in zip(args, [*args[1:], "-"], strict=True):
             if arg in self.SPREAD:
                 option = arg
                 if after.startswith("-"):
-                    raise ValueError(f"`{arg}` needs at least one log behind it, but has none.")
+                    raise InputError(f"`{arg}` needs at least one log behind it, but has none.")
             elif arg.startswith("-"):
                 name, given, _ = arg.partition("=")
                 option = name if given and name in self.SPREAD else None

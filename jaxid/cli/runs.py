@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from jaxid.cli.options import ExperimentFile, Force, open_console, open_stages
+from jaxid.errors import InputError
 from jaxid.experiment import terminal
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
@@ -61,7 +62,7 @@ def compare(
     """
     console = open_console()
     if first.resolve() == second.resolve():
-        raise ValueError(f"`{first}` is given twice: compare two different runs.")
+        raise InputError(f"`{first}` is given twice: compare two different runs.")
     refuse_foreign_folder(output, force)
     twins = first.resolve().name == second.resolve().name
     cold, warm = (read_estimates(path, str(path) if twins else None) for path in (first, second))
@@ -137,7 +138,7 @@ def gains(
     refuse_foreign_folder(output, force)
     described = load_experiment(experiment)
     if described.load is None:
-        raise ValueError(
+        raise InputError(
             f"{described.path.name}: the table `[load]` is missing: `mass`, `centre_of_mass` and "
             "`inertia` of what is on the robot in the logs behind `--loaded`."
         )
@@ -179,7 +180,7 @@ def states(
     described = load_experiment(experiment)
     names = [path.resolve().stem for path in logs]
     if len(set(names)) < max(len(names), 2):
-        raise ValueError(
+        raise InputError(
             f"give one log or report for each of two or more states, with different names: they "
             f"name the states, but are {', '.join(names)}."
         )
@@ -213,7 +214,7 @@ def _pair(
 ) -> tuple[tuple[Run, Run], list[str]]:
     twice = {p.resolve() for p in logs} & {p.resolve() for p in loaded}
     if twice:
-        raise ValueError(
+        raise InputError(
             f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
         )
     runs, doubts = _runs(experiment, [logs, loaded], ["unloaded", "loaded"])
@@ -244,7 +245,7 @@ def _body(experiment: Experiment, joint: str | None) -> int | None:
     if joint is None:
         return None
     if joint not in names:
-        raise ValueError(f"`--body` must be one of {', '.join(names)}, but is `{joint}`.")
+        raise InputError(f"`--body` must be one of {', '.join(names)}, but is `{joint}`.")
     return names.index(joint)
 
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable, as_array
+from jaxid.arrays import AnyArray, Float, Hashable, Numbers, as_array
 from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
 from jaxid.dynamics.machine import columns_of, on_samples
 from jaxid.dynamics.model import Coordinates, Model
@@ -23,7 +23,7 @@ from jaxid.dynamics.rank import (
     SingularValues,
     regrouping,
 )
-from jaxid.types import AnyArray, Float, Numbers
+from jaxid.errors import InputError
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
@@ -114,7 +114,7 @@ class BaseParameters(Hashable):
         r"""The stacked base regressor of many samples without its zeros (Eqs. 23, 26).
 
         Raises:
-            ValueError: If the motion does not have one axis of samples, or JAX is tracing the
+            InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 robot's geometry.
         """
         self.model.check(motion.q)
@@ -170,7 +170,7 @@ def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch param
     # What is no array of JAX stays in NumPy, and in float64 where JAX runs in float32.
     p = as_array("p", p)
     if p.shape[-1:] != (size,):
-        raise ValueError(
+        raise InputError(
             f"`p` must hold one number for each {kind} parameter ({size}) along its last axis, but "
             f"has shape {p.shape}."
         )

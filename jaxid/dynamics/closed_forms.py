@@ -12,11 +12,11 @@ from fractions import Fraction
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.dimensions import dimension
 from jaxid.dynamics.expressions import ONE, Coefficient, Expression, Monomial
 from jaxid.dynamics.lengths import Length, Regrouping, changing_lengths, draws
 from jaxid.dynamics.model import Model
-from jaxid.types import Float
 
 MOST_TERMS = 6
 LARGEST_DENOMINATOR = 12

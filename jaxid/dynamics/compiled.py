@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import in_numpy, machines, program_of
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed import PackedRegressor
-from jaxid.types import AnyArray, Float
 
 
 def regressor_rows(

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import matching, one_or_each
+from jaxid.arrays import AnyArray, Float, matching, one_or_each
 from jaxid.dynamics import projection
 from jaxid.dynamics.terms import (
     INERTIAL_NAMES,
@@ -15,8 +15,8 @@ from jaxid.dynamics.terms import (
     each_joint,
 )
 from jaxid.dynamics.transitions import AbstractTransition, Shape, Tanh
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 TINY = 1e-30
 """Keeps the logarithm of a standstill finite."""
@@ -117,12 +117,12 @@ class LoadFriction(AbstractTerm):
             transition: From one direction of motion to the other.
 
         Raises:
-            ValueError: If they are fewer than ten for each body.
+            InputError: If they are fewer than ten for each body.
         """
         size = robot.joints * len(INERTIAL_NAMES)
         p = np.asarray(standard_parameters, np.float64)
         if p.ndim != 1 or len(p) < size:
-            raise ValueError(
+            raise InputError(
                 f"`standard_parameters` must begin with ten numbers for each body ({size}), but "
                 f"has shape {p.shape}."
             )

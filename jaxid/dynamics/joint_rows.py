@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import program_of
 from jaxid.program import Lowered, Reversible, evaluate_packed, lower
-from jaxid.types import AnyArray, Array, Float
 
 
 class JointRows(eqx.Module):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.dimensions import Dimension
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.observation import (
@@ -23,7 +24,6 @@ from jaxid.dynamics.observation import (
 from jaxid.dynamics.rank import solve_from_earlier
 from jaxid.program import FREE, Program, evaluate, trace
 from jaxid.robot.robot import AXES, Robot
-from jaxid.types import Float
 
 EXPLAINED = 1e-9
 _NOTHING = 1e-12

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import as_array, content, is_traced
+from jaxid.arrays import AnyArray, Array, Numbers, as_array, content, is_traced
+from jaxid.errors import InputError
 from jaxid.program import Program, chosen, evaluate, evaluate_packed, lower, trace
-from jaxid.types import AnyArray, Array, Numbers
 
 FEW = 4096
 """Samples up to which NumPy is faster than what compiling costs."""
@@ -136,12 +136,12 @@ def on_samples(
         shared: Parameters that all samples have in common.
 
     Raises:
-        ValueError: If the arguments do not have the same shape, or parameters are no numbers.
+        InputError: If the arguments do not have the same shape, or parameters are no numbers.
     """
     shared = tuple(as_array("p", x) for x in shared)
     if any(x.shape != samples[0].shape for x in samples):
         came = ", ".join(str(x.shape) for x in samples)
-        raise ValueError(
+        raise InputError(
             f"coordinates, velocities and accelerations must have one shape, but have {came}."
         )
     batch = samples[0].shape[:-1]
@@ -165,11 +165,11 @@ def packed_on_samples(owner: eqx.Module, definition: Callable, *samples: AnyArra
     """Applies a method for one sample to rows of samples; zeros and repetitions are left out.
 
     Raises:
-        ValueError: If JAX is tracing the model's own numbers, as a gradient with respect to the
+        InputError: If JAX is tracing the model's own numbers, as a gradient with respect to the
             geometry does: which entries are zero is then unknown.
     """
     if is_traced(owner):
-        raise ValueError(
+        raise InputError(
             "a packed regressor needs a robot whose geometry is known, but JAX is tracing it: use "
             "`regressor` there."
         )

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable, as_array, namespace
+from jaxid.arrays import AnyArray, Float, Hashable, as_array, namespace
 from jaxid.dynamics import projection
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.motion import Motion
@@ -21,8 +21,8 @@ from jaxid.dynamics.terms import (
     RotorInertia,
     ViscousFriction,
 )
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 Coordinates = Float[AnyArray, "*batch joints"] | Sequence[Any]
 Parameters = Float[AnyArray, " standard"] | Sequence[float | int]
@@ -50,10 +50,10 @@ class Model(Hashable):
     def __check_init__(self):
         names = self.parameter_names
         if not self.terms:
-            raise ValueError("`terms` must hold at least one term, but is empty.")
+            raise InputError("`terms` must hold at least one term, but is empty.")
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)
-            raise ValueError(
+            raise InputError(
                 f"`terms` must not contribute the same parameter twice, but `{twice}` comes twice."
             )
 
@@ -81,11 +81,11 @@ class Model(Hashable):
         """The parameters of each term.
 
         Raises:
-            ValueError: If there is not one number for each standard parameter.
+            InputError: If there is not one number for each standard parameter.
         """
         sizes = [len(term.parameters(self.robot)) for term in self.terms]
         if p.shape != (sum(sizes),):
-            raise ValueError(
+            raise InputError(
                 f"`p` must hold one number for each standard parameter ({sum(sizes)}), "
                 f"but has shape {p.shape}."
             )
@@ -147,7 +147,7 @@ class Model(Hashable):
             motion: Joint motion [samples, joints].
 
         Raises:
-            ValueError: If the motion does not have one axis of samples, or JAX is tracing the
+            InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 robot's geometry.
         """
         self.check(motion.q)
@@ -224,11 +224,11 @@ class Model(Hashable):
         """Coordinates as an array; refuses those that are not of the robot's joints.
 
         Raises:
-            ValueError: If the last axis is not one for each joint.
+            InputError: If the last axis is not one for each joint.
         """
         q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
-            raise ValueError(
+            raise InputError(
                 f"the motion must have one coordinate for each joint ({self.robot.joints}) along "
                 f"its last axis, but has shape {q.shape}."
             )

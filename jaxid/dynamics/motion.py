@@ -4,8 +4,7 @@ from typing import Any
 
 import equinox as eqx
 
-from jaxid.arrays import as_array
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, as_array
 
 
 def _coordinates(value: Any) -> AnyArray:

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.dimensions import length_power
 from jaxid.dynamics.machine import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.types import Float
 
 SAMPLES = 25
 ROWS_PER_COLUMN = 3.0

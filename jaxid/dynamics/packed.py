@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import namespace
+from jaxid.arrays import AnyArray, Float, namespace
 from jaxid.dynamics.machine import Packed, packed_on_samples
 from jaxid.dynamics.motion import Motion
-from jaxid.types import AnyArray, Float
+from jaxid.errors import InputError
 
 
 class PackedRegressor(eqx.Module):
@@ -38,11 +38,11 @@ class PackedRegressor(eqx.Module):
         """The regressor that a method of a model defines for one sample, at many.
 
         Raises:
-            ValueError: If the motion does not have one axis of samples, or JAX is tracing the
+            InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 model's own numbers.
         """
         if motion.q.ndim != 2:
-            raise ValueError(
+            raise InputError(
                 f"`motion` must have the shape [samples, joints], but has {motion.q.shape}."
             )
         packed = packed_on_samples(owner, definition, motion.q, motion.qd, motion.qdd)

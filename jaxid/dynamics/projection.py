@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.robot.kinematics import placement_in_parent, placements, skew
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 Vector = Float[AnyArray, "3"]
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 import scipy.linalg
 
-from jaxid.types import AnyArray, Float, Int
+from jaxid.arrays import AnyArray, Float, Int
 
 ROUNDING = 1e-12
 """A column below this share of the largest one is nothing but rounding."""

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float
 
 
 def solve_symmetric(

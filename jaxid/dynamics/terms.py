@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import matching, one_or_each
+from jaxid.arrays import AnyArray, Float, matching, one_or_each
 from jaxid.dynamics import projection
 from jaxid.dynamics.transitions import AbstractTransition, Shape, Tanh, has_dead_zone
+from jaxid.errors import InputError
 from jaxid.robot.robot import AXES, Robot
-from jaxid.types import AnyArray, Float
 
 INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")
 INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
@@ -316,7 +316,7 @@ class CoupledDrives(AbstractTerm):
         scale = np.abs(A).max()
         if not np.diag(A).all():
             motor = int(np.flatnonzero(np.diag(A) == 0)[0]) + 1
-            raise ValueError(
+            raise InputError(
                 f"`drives.reduction` of `{robot.name}` must name the motors in the order of their "
                 f"joints, but motor {motor} does not turn joint {motor}: reorder its rows."
             )
@@ -330,7 +330,7 @@ class CoupledDrives(AbstractTerm):
         """`Iam6`, `fvm6`, `fcm6` for a coupled motor 6."""
         found = [i for i, _ in self.couplings(robot)]
         if not found:
-            raise ValueError(
+            raise InputError(
                 f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` out, or give "
                 "`drives.reduction` as a matrix with entries beside its diagonal."
             )

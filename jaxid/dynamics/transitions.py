@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable, matching, one_or_each
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Hashable, matching, one_or_each
+from jaxid.errors import InputError
 
 
 class Shape(NamedTuple):
@@ -64,7 +64,7 @@ class Tanh(AbstractTransition):
 
     def __check_init__(self):
         if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
-            raise ValueError(
+            raise InputError(
                 f"`epsilon` must be a positive speed, but is {self.epsilon}: "
                 "use `HardSign` for a transition without width."
             )

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.excitation.information import Information
 from jaxid.excitation.spectral import Sharpness, log_condition, log_largest_inverse, spectral
-from jaxid.types import AnyArray, Array, Float
 
 RIDGE = 1e-13
 """Share that keeps a matrix with ones on its diagonal from being singular."""

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float, PRNGKeyArray, require_float64
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.excitation.constraints.constraint import AbstractConstraint
 from jaxid.excitation.criteria import AbstractCriterion, DOptimal
 from jaxid.excitation.judge import Best
@@ -20,7 +22,6 @@ from jaxid.excitation.state import fingerprint, load_state, save_state
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.basis import AbstractBasis, FourierBasis
-from jaxid.types import AnyArray, Float, PRNGKeyArray, require_float64
 
 NOISE = 0.01
 """Standard deviation of the noise that is assumed, as a share of the largest forces."""
@@ -111,7 +112,7 @@ def design_excitation(
             which limits are not kept.
 
     Raises:
-        ValueError: If arguments do not fit, or no motion keeps all constraints: the message says
+        InputError: If arguments do not fit, or no motion keeps all constraints: the message says
             which limit is exceeded, and by how much.
         KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
         RuntimeError: If JAX runs in single precision.
@@ -124,7 +125,7 @@ def design_excitation(
     robot = base.model.robot
     noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
     if noise.shape != (robot.joints,) or not (noise > 0).all():
-        raise ValueError(
+        raise InputError(
             f"`noise` must hold one positive number for each joint ({robot.joints}), "
             f"but is {noise}."
         )
@@ -150,7 +151,7 @@ def design_excitation(
         if path is not None:
             # The design is done: to go on with it would end in the same place.
             path.unlink(missing_ok=True)
-        raise ValueError(f"no motion was found that keeps all limits: {unkept}")
+        raise InputError(f"no motion was found that keeps all limits: {unkept}")
     return plan
 
 
@@ -171,14 +172,14 @@ def _check(base, criterion, starts, generations, polish, samples, prior) -> None
         ("samples", samples, 2),
     ):
         if value < least:
-            raise ValueError(f"`{name}` must be at least {least}, but is {value}.")
+            raise InputError(f"`{name}` must be at least {least}, but is {value}.")
     if prior is not None and np.shape(prior) != (base.size, base.size):
-        raise ValueError(
+        raise InputError(
             f"`prior` must be a matrix of the {base.size} base parameters, but has shape "
             f"{np.shape(prior)}."
         )
     if prior is not None and not criterion.weighted:
-        raise ValueError(
+        raise InputError(
             f"`prior` is in units of the noise, which the {criterion.name} does not know: choose "
             "a weighted criterion."
         )

@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import regressor_rows
 from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
 from jaxid.trajectory.basis import AbstractBasis
-from jaxid.types import AnyArray, Array, Float
 
 
 class Information(eqx.Module):

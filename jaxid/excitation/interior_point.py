@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float, Int
 from jaxid.excitation.limits import Grid, held_within
-from jaxid.types import AnyArray, Array, Float, Int
 
 TO_BOUNDARY = 0.995
 """Share of the way to the next limit that a step may go."""

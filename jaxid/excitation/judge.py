@@ -6,9 +6,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.excitation.limits import CERTIFIED, calmed, held_within
 from jaxid.excitation.problem import Problem
-from jaxid.types import AnyArray, Bool, Float
 
 GROWTH = 1.05
 """Most by which a motion is enlarged to meet its limits in the end."""

@@ -12,11 +12,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float
+from jaxid.errors import InputError
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.basis import AbstractBasis
 from jaxid.trajectory.fourier import assumed_bounds
-from jaxid.types import AnyArray, Array, Float
 
 CERTIFIED = 512
 """Rows of each order by which a motion is made to keep its limits at all times."""
@@ -71,7 +72,7 @@ class JointLimits(eqx.Module):
         """The limits of a robot, or others; unknown ones are assumed.
 
         Raises:
-            ValueError: If no trajectory of the basis stands still anywhere else than at zero.
+            InputError: If no trajectory of the basis stands still anywhere else than at zero.
         """
         limits = robot.limits if limits is None else limits
         low, high, velocity, acceleration = assumed_bounds(robot.replace(limits=limits))
@@ -94,7 +95,7 @@ class JointLimits(eqx.Module):
             scale = np.min(size[:, :, None] / reach[:, None, :], axis=0)
         one = np.linalg.lstsq(rows[0], np.ones(len(rows[0])), rcond=None)[0]
         if np.abs(rows[0] @ one - 1.0).max() > CONSTANT or np.abs(rows[1] @ one).max() > CONSTANT:
-            raise ValueError(
+            raise InputError(
                 "`basis` must hold motions that stand still at any position, but its functions "
                 "have no constant among them: add one."
             )

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.excitation.judge import PRICE
 from jaxid.excitation.problem import Context, Problem
-from jaxid.types import AnyArray, Array, Float, PRNGKeyArray
 
 TRIED = 16
 """Children of each motion, of which the most promising one is kept."""

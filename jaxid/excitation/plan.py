@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxid.arrays import AnyArray, Bool, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.excitation.constraints.constraint import Finding
 from jaxid.excitation.criteria import (
@@ -23,7 +24,6 @@ from jaxid.excitation.information import Information
 from jaxid.excitation.limits import JointLimits
 from jaxid.trajectory.files import save_trajectory, write_csv
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import AnyArray, Bool, Float, double_precision
 
 CRITERIA = (
     ConditionNumber(),

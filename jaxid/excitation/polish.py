@@ -10,10 +10,10 @@ import jax
 import numpy as np
 import scipy.optimize
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.excitation.judge import Best, Judge
 from jaxid.excitation.limits import CERTIFIED, Grid, enough
 from jaxid.excitation.problem import CHECKED, MARGIN, Context, Problem
-from jaxid.types import AnyArray, Float
 
 SEEN = 100
 """Samples on which a motion is judged."""

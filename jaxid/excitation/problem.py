@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float, Int
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Finding
@@ -15,7 +16,6 @@ from jaxid.excitation.information import Information, InformationMap, informatio
 from jaxid.excitation.interior_point import Evaluation, each_start
 from jaxid.excitation.limits import JointLimits, enough
 from jaxid.excitation.spectral import Sharpness
-from jaxid.types import AnyArray, Array, Float, Int
 
 SEEN = 64
 """Samples on which a motion is judged while it is searched."""

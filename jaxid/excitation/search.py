@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Bool, Float, PRNGKeyArray
 from jaxid.excitation.interior_point import COOLING, InteriorPoint, Stage, State
 from jaxid.excitation.judge import Best, Judge
 from jaxid.excitation.limits import CERTIFIED, JointLimits, random_motion
 from jaxid.excitation.offspring import Offspring
 from jaxid.excitation.problem import Context, Problem
-from jaxid.types import AnyArray, Array, Bool, Float, PRNGKeyArray
 
 GRID = 64
 """Rows of each order by which limits are kept during the search."""

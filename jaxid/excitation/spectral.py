@@ -11,7 +11,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxid.types import Array, Float
+from jaxid.arrays import Array, Float
 
 FLOOR = 1e-15
 """Share of the largest eigenvalue below which eigenvalues are rounding."""

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.files import read_arrays, written_whole
 
 
@@ -74,17 +75,17 @@ def load_state(path: Path, digest: str, like: Any) -> Any:
         like: A state of the same structure.
 
     Raises:
-        ValueError: If the file is no state, or belongs to another problem.
+        InputError: If the file is no state, or belongs to another problem.
     """
     try:
         content = read_arrays(path)
         arrays = [content[f"arr_{k}"] for k in range(len(content))]
         saved = str(arrays[0])
     except (ValueError, KeyError, IndexError) as error:
-        raise ValueError(f"`{path}` is no saved state of a design: remove it.") from error
+        raise InputError(f"`{path}` is no saved state of a design: remove it.") from error
     structure = jax.tree.structure(like)
     if saved != digest or len(arrays) - 1 != structure.num_leaves:
-        raise ValueError(
+        raise InputError(
             f"`{path}` was saved by a design with other settings: use those again, or remove the "
             "file to start anew."
         )

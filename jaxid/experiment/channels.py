@@ -4,9 +4,9 @@ from collections.abc import Collection
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 
 SLACK = 0.02
 """How far outside a range, relative to it, a log may reach without a word."""

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.experiment.robot_tables import within
 from jaxid.experiment.tables import BoxTable, CapsuleTable, CollisionTable, Tables
 from jaxid.robot import library
@@ -26,7 +27,7 @@ def build_collision(tables: Tables, robot: Robot, path: Path) -> CollisionModel 
         path: Of the file: other paths are relative to its folder.
 
     Raises:
-        ValueError: If shapes cannot be made; the message names file and table.
+        InputError: If shapes cannot be made; the message names file and table.
     """
     table = tables.collision
     if table is None:
@@ -64,7 +65,7 @@ def _given(
         return list(fitted), [], None
     if table.fit and source.builtin in BUILTIN_SHAPES:
         if source.base_rotation is not None or source.base_position is not None:
-            raise ValueError(
+            raise InputError(
                 "`fit` knows the built-in robot only where it stands by itself: leave out "
                 "`robot.base_rotation` and `robot.base_position`, or give `capsules`."
             )
@@ -77,7 +78,7 @@ def _given(
         obstacles = [o for o in model.obstacles if table.ground is None or o.name != "ground"]
         return list(model.capsules), obstacles, pairs if alone else None
     if table.fit:
-        raise ValueError(
+        raise InputError(
             "`fit` needs `robot.urdf` or a built-in robot whose shapes are known "
             f"({', '.join(BUILTIN_SHAPES)}): give `capsules` instead."
         )
@@ -87,7 +88,7 @@ def _given(
 def _capsule(robot: Robot, table: CapsuleTable) -> Capsule:
     bodies = {"ground": GROUND, **{name: j for j, name in enumerate(robot.joint_names)}}
     if table.body not in bodies:
-        raise ValueError(
+        raise InputError(
             f"`body` of capsule `{table.name}` must be `ground` or the name of the joint that "
             f'moves it ({", ".join(robot.joint_names)}), but is "{table.body}".'
         )

@@ -2,13 +2,14 @@
 
 import numpy as np
 
+from jaxid.arrays import Float
+from jaxid.errors import InputError
 from jaxid.experiment.tables import EstimatorTable
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.estimator import PhysicallyConsistent
 from jaxid.identification.consistency.priors import EntropicPull
 from jaxid.identification.weights import AbstractWeights
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 
 VECTORS = ("centre_min", "centre_max", "ellipsoid_centre", "ellipsoid_axes")
 """Keys with three numbers for all bodies, or for each."""
@@ -31,7 +32,7 @@ def build_consistent(
         bodies: Of the prior, if the file asks for one.
 
     Raises:
-        ValueError: If lists have other lengths than they must, or no body satisfies all bounds.
+        InputError: If lists have other lengths than they must, or no body satisfies all bounds.
     """
     pull = None
     if table.pull is not None or bodies is not None:
@@ -45,7 +46,7 @@ def _bounds(table: EstimatorTable, robot: Robot) -> BodyBounds | None:
     if not given:
         return None
     if "ellipsoid_centre" in given and "ellipsoid_axes" not in given:
-        raise ValueError("`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m].")
+        raise InputError("`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m].")
     for key in VECTORS:
         if key in given:
             _require_vectors(key, given[key], robot)
@@ -57,7 +58,7 @@ def _require_vectors(key: str, value: list, robot: Robot) -> None:
     if len(rows) != (robot.joints if rows is value else 1) or not all(
         isinstance(row, list) and len(row) == 3 for row in rows
     ):
-        raise ValueError(
+        raise InputError(
             f"`{key}` must hold three numbers for all bodies, or a list of three for each of the "
             f"{robot.joints} bodies."
         )

@@ -20,7 +20,7 @@ def examine(experiment: Experiment, recording: Recording) -> tuple[str, ...]:
         recording: The log, as the file says it is to be read.
 
     Raises:
-        ValueError: If the log and the filter do not go together.
+        InputError: If the log and the filter do not go together.
     """
     observations = experiment.observe(recording)
     check = check_log(experiment.robot, recording, observations)

@@ -5,7 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.model import Model
+from jaxid.errors import InputError
 from jaxid.experiment.consistency_tables import BOUNDS, build_consistent
 from jaxid.experiment.tables import EstimatorTable, RobotTable
 from jaxid.identification.correlated import GeneralisedLeastSquares
@@ -35,7 +37,6 @@ from jaxid.robot.robot import Robot
 from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import urdf_parameters
 from jaxid.trajectory.files import load_trajectory
-from jaxid.types import Float
 
 SOLVED = ("weighted", "least_squares", "huber", "tukey", "correlated")
 BELONGS = {
@@ -84,7 +85,7 @@ def build_estimator(
         path: Of the experiment file: other paths are relative to its folder.
 
     Raises:
-        ValueError: If keys do not go together, weights need forces that are not known, or a file
+        InputError: If keys do not go together, weights need forces that are not known, or a file
             cannot be read.
     """
     _refuse_foreign_keys(table)
@@ -117,7 +118,7 @@ def build_estimator(
             )
     if bodies is not None:
         if table.ridge is None and table.truncate is None:
-            raise ValueError(
+            raise InputError(
                 "`prior` needs `ridge` or `truncate`: without them the logs decide everything."
             )
         estimator = RelativeTo(_standard(model, bodies), estimator)
@@ -128,23 +129,23 @@ def _refuse_foreign_keys(table: EstimatorTable) -> None:
     for key, kinds in BELONGS.items():
         if getattr(table, key) is not None and table.kind not in kinds:
             known = " or ".join(f'"{kind}"' for kind in kinds)
-            raise ValueError(
+            raise InputError(
                 f"`{key}` belongs to `kind = {known}`: leave it out, or change `kind`."
             )
     if table.nonlinear_friction:
         if table.kind not in ("weighted", "least_squares"):
-            raise ValueError(
+            raise InputError(
                 f'`nonlinear_friction` does not go with `kind = "{table.kind}"`: choose one.'
             )
         if table.prior is not None or table.uncertainty != "spectral":
-            raise ValueError(
+            raise InputError(
                 "`nonlinear_friction` goes with neither `prior` nor `uncertainty`: leave them out."
             )
     if table.essential is not None:
         others = ("nonlinear_friction", "prior", "ridge", "truncate")
         both = next((key for key in others if getattr(table, key)), None)
         if both is not None:
-            raise ValueError(f"`essential` does not go with `{both}`: choose one.")
+            raise InputError(f"`essential` does not go with `{both}`: choose one.")
 
 
 def build_single_axes(table: EstimatorTable, path: Path) -> tuple[Path, ...] | None:
@@ -156,7 +157,7 @@ def build_single_axes(table: EstimatorTable, path: Path) -> tuple[Path, ...] | N
 
 def _solution(table: EstimatorTable) -> AbstractSolution:
     if table.truncate is not None and table.ridge is not None:
-        raise ValueError("give `truncate` or `ridge`, but not both.")
+        raise InputError("give `truncate` or `ridge`, but not both.")
     if table.truncate is not None:
         return Truncated(table.truncate)
     if table.ridge is None:
@@ -171,7 +172,7 @@ def _weights(table: EstimatorTable, robot: Robot) -> tuple[AbstractWeights, list
         _ = robot.max_forces
     except ValueError as error:
         if table.weights == "maximum_forces":
-            raise ValueError(f'`weights = "maximum_forces"`: {error}') from error
+            raise InputError(f'`weights = "maximum_forces"`: {error}') from error
         said = (
             "the largest forces of the joints are not known: joints are weighted by the residuals' "
             "variances."
@@ -193,7 +194,7 @@ def _uncertainty(table: EstimatorTable) -> AbstractUncertainty:
 def _prior(table: EstimatorTable, origin: RobotTable, path: Path) -> Float[np.ndarray, "bodies 10"]:
     """What the URDF file claims of the bodies."""
     if origin.urdf is None:
-        raise ValueError(
+        raise InputError(
             f'`prior = "{table.prior}"` takes the inertias of the robot\'s URDF file, but '
             "`[robot]` names none."
         )
@@ -220,7 +221,7 @@ def _instrumental(
     table: EstimatorTable, weights: AbstractWeights, path: Path
 ) -> InstrumentalVariables:
     if table.reference is None:
-        raise ValueError(
+        raise InputError(
             '`kind = "instrumental"` needs `reference`: the file of the trajectory that was '
             "commanded, or a list with one for each log."
         )

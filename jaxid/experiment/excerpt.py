@@ -22,7 +22,7 @@ def excerpt(log: LongLog) -> Recording:
         log: That stays on the disk.
 
     Raises:
-        ValueError: If a column holds what is no number.
+        InputError: If a column holds what is no number.
     """
     stretches = _stretches(log)
     angles, velocities, forces = zip(

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.arrays import Float
+from jaxid.errors import InputError
 from jaxid.excitation.constraints.clearance import Clearance
 from jaxid.excitation.constraints.constraint import AbstractConstraint
 from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace
@@ -28,7 +30,6 @@ from jaxid.trajectory.held import ROUNDING, cycles
 from jaxid.trajectory.leads_basis import LeadsBasis
 from jaxid.trajectory.rest import RestToRestBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
-from jaxid.types import Float
 
 CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
     "d_optimal": DOptimal,
@@ -52,11 +53,11 @@ def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
             together with the motion, so that they keep it too.
 
     Raises:
-        ValueError: If two kinds are asked for, or one whose end no sample would meet.
+        InputError: If two kinds are asked for, or one whose end no sample would meet.
     """
     if table.spline is not None:
         if table.rest:
-            raise ValueError(
+            raise InputError(
                 "`rest` is for Fourier series, and a `spline` rests at its ends: leave one out."
             )
         return RestToRestSplineBasis(table.spline.points, table.spline.duration)
@@ -78,7 +79,7 @@ def _require_division(sample_time: float | None, period: float) -> None:
         return
     count = cycles(period, sample_time)
     if abs(count * sample_time - period) > ROUNDING * sample_time:
-        raise ValueError(
+        raise InputError(
             f"`sample_time` must divide the period of {period:.9g} s where there are no `leads`, "
             f"for the motion repeats at full speed, but is {sample_time:g} s: choose `omega` = "
             f"{2 * np.pi / (count * sample_time):.9g}, or leave `leads` as they are."
@@ -95,7 +96,7 @@ def build_constraints(
         nominal: What is known of the parameters.
 
     Raises:
-        ValueError: If forces are limited, but no parameters or no largest forces are known.
+        InputError: If forces are limited, but no parameters or no largest forces are known.
     """
     table = experiment.excitation
     found: list[AbstractConstraint] = []
@@ -110,13 +111,13 @@ def build_constraints(
     if table.force_margin is None:
         return tuple(found)
     if nominal is None:
-        raise ValueError(
+        raise InputError(
             "`force_margin` needs parameters to compute forces with: say in `nominal` where an "
             "earlier result of `jaxid identify` is."
         )
     forces = force_limits(experiment, nominal, table.force_margin)
     if not forces:
-        raise ValueError(
+        raise InputError(
             "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
         )
     return (*found, *forces)
@@ -132,13 +133,13 @@ def build_prior(
         noise: Standard deviations of the forces' noise.
 
     Raises:
-        ValueError: If the criterion knows no noise, or a file holds no motion of this robot.
+        InputError: If the criterion knows no noise, or a file holds no motion of this robot.
     """
     table, folder = experiment.excitation, experiment.path.parent
     if not table.earlier:
         return None
     if not CRITERIA[table.criterion]().weighted:
-        raise ValueError(
+        raise InputError(
             f'`earlier` and `criterion = "{table.criterion}"` do not go together: what motions '
             "tell adds up in units of the noise, which this criterion does not know; leave out "
             '`earlier`, or choose a criterion like "d_optimal".'
@@ -151,7 +152,7 @@ def _told(
 ) -> Float[np.ndarray, "base base"]:
     trajectory, samples = load_trajectory(path), experiment.excitation.samples
     if trajectory.joints != experiment.robot.joints:
-        raise ValueError(
+        raise InputError(
             f"`earlier`: the motion of `{path}` moves {_joints(trajectory.joints)}, but the robot "
             f"`{experiment.robot.name}` has {experiment.robot.joints}: name motions of this robot."
         )

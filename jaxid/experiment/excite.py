@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxid.arrays import Float, double_precision
 from jaxid.excitation.design import NOISE, DesignProgress, assumed_noise, design_excitation
 from jaxid.excitation.plan import CRITERIA as ALL
 from jaxid.excitation.plan import ExcitationPlan
@@ -29,7 +30,6 @@ from jaxid.trajectory.held import Held
 from jaxid.trajectory.leads import with_leads
 from jaxid.trajectory.ros import write_ros_json, write_ros_yaml
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import Float, double_precision
 
 FEW = 8
 """Starts of the designs that only show what a criterion buys."""
@@ -74,7 +74,7 @@ def design(
         resume: Goes on from that file if it is there.
 
     Raises:
-        ValueError: If the table does not fit the robot, or no motion keeps all limits.
+        InputError: If the table does not fit the robot, or no motion keeps all limits.
     """
     with within(experiment.path.name, "excitation"):
         nominal = build_nominal(experiment)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxid.arrays import double_precision
 from jaxid.excitation.constraints.constraint import Finding
 from jaxid.excitation.constraints.forces import (
     AbstractForceLimits,
@@ -18,7 +19,6 @@ from jaxid.identification.runs.estimates import groups
 from jaxid.report.blocks import Remark, Tone
 from jaxid.report.excitation_words import named
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import double_precision
 
 LOOKED_AT = 4000
 """Instants at which the forces of a motion are looked at that was designed without them."""

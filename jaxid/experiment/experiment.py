@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
+from jaxid.errors import InputError
 from jaxid.experiment.collision_tables import build_collision
 from jaxid.experiment.estimator_tables import build_estimator, build_single_axes
 from jaxid.experiment.method_tables import (
@@ -53,7 +55,6 @@ from jaxid.measurement.recording import Recording
 from jaxid.measurement.survey import NeedsMemory
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot, Tool
-from jaxid.types import Float
 
 SHORTEST = 1e-6
 """Time between two samples that no robot's log goes below [s]."""
@@ -166,7 +167,7 @@ class Experiment:
             log: Path of the log; the files of forces and velocities lie beside it.
 
         Raises:
-            ValueError: If the file has no table `[recording]`, or the log is not as it says.
+            InputError: If the file has no table `[recording]`, or the log is not as it says.
         """
         log = Path(log)
         table, columns = self._columns_of(log)
@@ -178,7 +179,7 @@ class Experiment:
             largest_gap=table.largest_gap,
         )
         if recording.joints != self.robot.joints:
-            raise ValueError(
+            raise InputError(
                 f"{self.path.name}: `recording.angles` names {recording.joints} of the "
                 f"columns of `{log.name}`, but the robot `{self.robot.name}` has "
                 f"{self.robot.joints} joints: "
@@ -186,7 +187,7 @@ class Experiment:
             )
         with within(self.path.name, "recording"):
             if recording.sample_time < SHORTEST:
-                raise ValueError(
+                raise InputError(
                     f"`{log.name}` has {1 / recording.sample_time:.3g} samples in a second: check "
                     "`time_unit` or `sample_time`."
                 )
@@ -203,7 +204,7 @@ class Experiment:
         """Filters a recording and makes rows of it, as the tables `[filter]` and `[rows]` say.
 
         Raises:
-            ValueError: If filter and recording do not go together.
+            InputError: If filter and recording do not go together.
         """
         with within(self.path.name, "filter` and `rows"):
             return observe(recording, self.robot, self.filter, self.decimation, self.slow)
@@ -221,7 +222,7 @@ class Experiment:
 
         Raises:
             NeedsMemory: If it can be read only as a whole.
-            ValueError: Like `read` and `observe`.
+            InputError: Like `read` and `observe`.
         """
         log = Path(log)
         table, columns = self._columns_of(log)
@@ -244,7 +245,7 @@ class Experiment:
 
     def _columns_of(self, log: Path) -> tuple[RecordingTable, Columns]:
         if self.recording is None or self.columns is None:
-            raise ValueError(
+            raise InputError(
                 f"{self.path.name}: the table `[recording]` is missing: it says which columns of "
                 f"`{log.name}` hold angles and forces."
             )
@@ -279,7 +280,7 @@ def load_experiment(path: str | Path) -> Experiment:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If the file or something in it is not what it should be: one sentence with the
+        InputError: If the file or something in it is not what it should be: one sentence with the
             names of file and key.
     """
     path = Path(path)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from jaxid.arrays import Float
 from jaxid.experiment.channels import STANDING
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 
 FEWEST, SHARE = 20, 0.01
 """Samples, and share of the log's, for which a held channel keeps one value at least."""

@@ -5,6 +5,7 @@ import stat
 import sys
 from pathlib import Path
 
+from jaxid.errors import InputError
 from jaxid.experiment.demo import DEMO
 from jaxid.files import read_json, require_place, unfinished
 from jaxid.report import compared_files, content, found
@@ -30,14 +31,14 @@ def refuse_foreign_folder(target: Path, force: bool) -> None:
 
     Raises:
         OSError: If nothing can be written there.
-        ValueError: If there is something else in its place.
+        InputError: If there is something else in its place.
     """
     if target.exists() and not target.is_dir():
-        raise ValueError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
+        raise InputError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
     if force or not target.is_dir() or not any(target.iterdir()) or _is_report(target):
         require_place(target)
         return
-    raise ValueError(
+    raise InputError(
         f"`{target}` holds files but no report: choose another folder with -o, or add --force to "
         "put the report beside them."
     )
@@ -52,10 +53,10 @@ def refuse_foreign_table(target: Path) -> None:
 
     Raises:
         OSError: If nothing can be written there.
-        ValueError: If the name is not that of a table, or something else is in its place.
+        InputError: If the name is not that of a table, or something else is in its place.
     """
     if target.suffix.lower() != ".csv":
-        raise ValueError(f"`{target}` must end in .csv: choose another -o.")
+        raise InputError(f"`{target}` must end in .csv: choose another -o.")
     beside, pictures = target.with_suffix(".json"), target.with_suffix("")
     if _is_trajectory(beside):
         return
@@ -63,7 +64,7 @@ def refuse_foreign_table(target: Path) -> None:
     drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
     found = next((path for path in (target, beside, *ros, *drawn) if path.exists()), None)
     if found is not None:
-        raise ValueError(
+        raise InputError(
             f"`{found}` is there already, and no motion of `jaxid excite`: choose another -o."
         )
     require_place(target.parent)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxid.errors import InputError
 from jaxid.experiment.excerpt import excerpt
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.progress import Stages
@@ -52,7 +53,7 @@ def load_log(experiment: Experiment, path: Path, stage: Stages, name: str | None
         name: Of the log; the file's if None.
 
     Raises:
-        ValueError: If the log is not as the experiment's file says.
+        InputError: If the log is not as the experiment's file says.
     """
     notes = ()
     if experiment.is_long(path):
@@ -104,13 +105,13 @@ def choose(
         split: First part of each log to identify with, of 1; the rest stays unseen here too.
 
     Raises:
-        ValueError: If a log and a filter do not go together, or a log is long.
+        InputError: If a log and a filter do not go together, or a log is long.
     """
     if not experiment.candidates or not logs:
         return experiment, None
     long = [log.name for log in logs if experiment.is_long(log)]
     if long:
-        raise ValueError(
+        raise InputError(
             f"{experiment.path.name}: `filter.cutoff` is a list, but `{long[0]}` is long: choose "
             "with a short part of it, and give that one number for the whole."
         )
@@ -143,7 +144,7 @@ def load_logs(experiment: Experiment, paths: Sequence[Path], stage: Stages) -> l
         stage: Is told what is done.
 
     Raises:
-        ValueError: If a log is not as the experiment's file says.
+        InputError: If a log is not as the experiment's file says.
     """
     stems = [p.stem for p in paths]
     found = []

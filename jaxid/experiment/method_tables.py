@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.friction import StribeckFriction
 from jaxid.dynamics.terms import (
     AbstractTerm,
@@ -16,6 +17,7 @@ from jaxid.dynamics.terms import (
     ViscousFriction,
 )
 from jaxid.dynamics.transitions import AbstractTransition, HardSign, Tanh
+from jaxid.errors import InputError
 from jaxid.experiment.robot_tables import each
 from jaxid.experiment.tables import (
     ButterworthTable,
@@ -37,7 +39,6 @@ from jaxid.measurement.filters import (
 )
 from jaxid.measurement.units import NM, Unit, unit
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 
 TURNS = ("deg", "rev", "deg/s", "rpm", "N m")
 SLIDES = ("mm", "mm/s", "N")
@@ -49,7 +50,7 @@ def build_terms(table: ModelTable, robot: Robot) -> tuple[AbstractTerm, ...]:
     """The terms of the model, in the paper's order: bodies, friction, rotors, and the rest.
 
     Raises:
-        ValueError: If a list does not hold one number for each joint.
+        InputError: If a list does not hold one number for each joint.
     """
     coulomb = CoulombTable() if isinstance(table.coulomb, bool) else table.coulomb
     transition = _transition(coulomb, robot)
@@ -83,7 +84,7 @@ def _dry(table: CoulombTable, transition: AbstractTransition, robot: Robot) -> A
         dry = AsymmetricCoulombFriction if table.asymmetric else CoulombFriction
         return dry(transition)
     if table.asymmetric:
-        raise ValueError(
+        raise InputError(
             "give `coulomb.stribeck` or `coulomb.asymmetric`, but not both: one level for each "
             "direction has no Stribeck effect here."
         )
@@ -115,14 +116,14 @@ def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
     """What the columns of the logs hold.
 
     Raises:
-        ValueError: If a unit is unknown or does not fit its joint, a list has a wrong length, or
+        InputError: If a unit is unknown or does not fit its joint, a list has a wrong length, or
             the time is not given.
     """
     if table is None:
         return None
     if (table.time is None) == (table.sample_time is None):
         came = "it has neither" if table.time is None else "not both"
-        raise ValueError(
+        raise InputError(
             "give `time` (the column of the time stamps) or `sample_time` [s] (rows equally far "
             f"apart): {came}."
         )
@@ -183,7 +184,7 @@ def _refuse_mixed(robot: Robot, name: str, value: str | list[str] | None) -> Non
     """Refuses degrees or N m for a joint that slides, and millimetres or N for one that turns.
 
     Raises:
-        ValueError: If there is such a joint.
+        InputError: If there is such a joint.
     """
     if value is None:
         return
@@ -191,7 +192,7 @@ def _refuse_mixed(robot: Robot, name: str, value: str | list[str] | None) -> Non
     for label, turns, symbol in zip(robot.joint_names, robot.revolute, symbols, strict=True):
         if symbol in (SLIDES if turns else TURNS):
             kinds = ("a torque", "a force") if "force" in name else ("an angle", "a length")
-            raise ValueError(
+            raise InputError(
                 f'`{name}` of joint `{label}` is "{symbol}", but the joint '
                 f"{'turns' if turns else 'slides'}: give a list with one unit for each joint, of "
                 f"{kinds[not turns]} for this one."
@@ -223,7 +224,7 @@ def _butterworth(table: ButterworthTable) -> list[ZeroPhaseButterworth]:
     """One filter, or one for each cut-off of a list."""
     cutoffs = table.cutoff if isinstance(table.cutoff, list) else [table.cutoff]
     if not cutoffs:
-        raise ValueError("`cutoff` must be a number, or a list to choose from, but is empty.")
+        raise InputError("`cutoff` must be a number, or a list to choose from, but is empty.")
     return [ZeroPhaseButterworth(f, table.order, table.force_cutoff, table.margin) for f in cutoffs]
 
 
@@ -241,10 +242,10 @@ def build_decimation(table: RowsTable) -> AbstractDecimation:
     """Which samples become rows.
 
     Raises:
-        ValueError: If two ways are asked for, or a factor is too large.
+        InputError: If two ways are asked for, or a factor is too large.
     """
     if table.every is not None and table.factors is not None:
-        raise ValueError(
+        raise InputError(
             "give `every` (takes every n-th sample) or `factors` (low-pass filters before every "
             "stage), but not both."
         )
@@ -257,7 +258,7 @@ def build_slow(table: RowsTable, robot: Robot) -> Float[np.ndarray, " joints"] |
     """Speeds below which rows do not count [rad/s or m/s].
 
     Raises:
-        ValueError: If there is not one number for each joint.
+        InputError: If there is not one number for each joint.
     """
     if table.slow is None:
         return None

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 
 BAD = 0.03
 """Share of the forces that a model leaves unexplained, from which a slip is looked for, of 1."""

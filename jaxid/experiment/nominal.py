@@ -4,12 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.terms import INERTIAL_NAMES
+from jaxid.errors import InputError
 from jaxid.experiment.experiment import Experiment
 from jaxid.report.compared_files import read_estimates
 from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import urdf_parameters
-from jaxid.types import Float
 
 
 class Nominal(NamedTuple):
@@ -42,13 +43,13 @@ def build_nominal(experiment: Experiment) -> Nominal | None:
         experiment: With its table `[excitation]`.
 
     Raises:
-        ValueError: If the earlier result is of other parameters.
+        InputError: If the earlier result is of other parameters.
     """
     base, report, robot = experiment.base, experiment.excitation.nominal, experiment.source
     if report is not None:
         found = read_estimates(experiment.path.parent / report)
         if found.names != base.names:
-            raise ValueError(
+            raise InputError(
                 f"`nominal`: the {len(found.names)} base parameters of `{report}` are not the "
                 f"{base.size} of this experiment: identify with the same robot and model."
             )

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from jaxid.errors import InputError
 from jaxid.experiment.tables import FILTERS, Tables
 from jaxid.robot.names import control_characters
 
@@ -49,34 +50,34 @@ def read_tables(path: Path) -> tuple[Tables, str]:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is no TOML, or a key or a value is not what it should be.
+        InputError: If it is no TOML, or a key or a value is not what it should be.
     """
     if path.is_dir():
-        raise ValueError(f"`{path}` is a folder: name the experiment file in it.")
+        raise InputError(f"`{path}` is a folder: name the experiment file in it.")
     if not path.is_file():
-        raise ValueError(
+        raise InputError(
             f"`{path}` is no file: check its path, or write one with `jaxid init arm.urdf`."
         )
     try:
         text = path.read_bytes().decode("utf-8-sig")
         raw = tomllib.loads(text)
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path.name}: is no text in UTF-8 (byte {error.start}).") from error
+        raise InputError(f"{path.name}: is no text in UTF-8 (byte {error.start}).") from error
     except RecursionError as error:
-        raise ValueError(f"{path.name}: is no TOML: brackets are nested too deeply.") from error
+        raise InputError(f"{path.name}: is no TOML: brackets are nested too deeply.") from error
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path.name}: is no TOML: {_lowered(str(error))}.") from error
+        raise InputError(f"{path.name}: is no TOML: {_lowered(str(error))}.") from error
     except ValueError as error:
-        raise ValueError(f"{path.name}: holds a number of thousands of digits.") from error
+        raise InputError(f"{path.name}: holds a number of thousands of digits.") from error
     try:
         found = msgspec.convert(raw, Tables)
     except msgspec.ValidationError as error:
         sentence = _sentence(str(error), raw)
         stop = "" if sentence.endswith("?") else "."
-        raise ValueError(f"{path.name}: {sentence}{stop}") from error
+        raise InputError(f"{path.name}: {sentence}{stop}") from error
     for key, value in _texts(raw):
         if sign := control_characters(value):
-            raise ValueError(f"{path.name}: `{key}` holds the control character {sign}: remove it.")
+            raise InputError(f"{path.name}: `{key}` holds the control character {sign}: remove it.")
     return found, text
 
 

@@ -8,6 +8,7 @@ from typing import cast
 import equinox as eqx
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.experiment.tables import (
     DhRow,
     DrivesTable,
@@ -46,7 +47,7 @@ def within(file: str, table: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
-        raise ValueError(f"{file}: `{table}`: {error}") from error
+        raise InputError(f"{file}: `{table}`: {error}") from error
 
 
 def build_robot(tables: Tables, path: Path) -> Robot:
@@ -57,7 +58,7 @@ def build_robot(tables: Tables, path: Path) -> Robot:
         path: Of the file: other paths are relative to its folder.
 
     Raises:
-        ValueError: If the robot cannot be made; the message names file and table.
+        InputError: If the robot cannot be made; the message names file and table.
     """
     file, table = path.name, tables.robot
     robot = _source(table, path)
@@ -81,10 +82,10 @@ def each(robot: Robot, name: str, values: list | None) -> list | None:
     """The values themselves, if there is one for each joint.
 
     Raises:
-        ValueError: If there are more or fewer.
+        InputError: If there are more or fewer.
     """
     if values is not None and len(values) != robot.joints:
-        raise ValueError(
+        raise InputError(
             f"`{name}` must hold one value for each of the {robot.joints} joints "
             f"({_shown(robot.joint_names)}), but holds {len(values)}."
         )
@@ -99,18 +100,18 @@ def _source(table: RobotTable, path: Path) -> Robot:
     given = [k for k in ("urdf", "builtin", "dh") if getattr(table, k) is not None]
     if len(given) != 1:
         came = " and ".join(f"`{k}`" for k in given) if given else "none of them"
-        raise ValueError(
+        raise InputError(
             f"{path.name}: `robot` needs one of `urdf`, `builtin` and `dh`, but has {came}."
         )
     for key, owner in (("tip", "urdf"), ("base", "urdf"), ("convention", "dh")):
         if getattr(table, key) is not None and given[0] != owner:
-            raise ValueError(
+            raise InputError(
                 f"{path.name}: `robot.{key}` belongs to `{owner}` and means nothing for "
                 f"`{given[0]}`: leave it out."
             )
     for key in ("gravity", "base_rotation", "base_position"):
         if getattr(table, key) is not None and not np.isfinite(getattr(table, key)).all():
-            raise ValueError(f"{path.name}: `robot.{key}` must hold three finite numbers.")
+            raise InputError(f"{path.name}: `robot.{key}` must hold three finite numbers.")
     gravity = GRAVITY if table.gravity is None else table.gravity
     R = None if table.base_rotation is None else rpy_rotation(np.deg2rad(table.base_rotation))
     position = (0.0, 0.0, 0.0) if table.base_position is None else table.base_position
@@ -118,7 +119,7 @@ def _source(table: RobotTable, path: Path) -> Robot:
     with within(path.name, f"robot.{given[0]}"):
         if table.urdf is not None:
             if not (path.parent / table.urdf).is_file():
-                raise ValueError(
+                raise InputError(
                     f"`{path.parent / table.urdf}` is no file: paths in an experiment file are "
                     "relative to its folder; mend the path, or put the file there."
                 )
@@ -134,9 +135,9 @@ def _source(table: RobotTable, path: Path) -> Robot:
         if table.dh is not None:
             return _from_rows(table, table.dh, R, position, tolerance)
         if table.builtin not in BUILTIN:
-            raise ValueError(f'"{table.builtin}" is none of the robots {", ".join(BUILTIN)}.')
+            raise InputError(f'"{table.builtin}" is none of the robots {", ".join(BUILTIN)}.')
         if table.snap_tolerance is not None:
-            raise ValueError("its angles are exact: leave out `robot.snap_tolerance`.")
+            raise InputError("its angles are exact: leave out `robot.snap_tolerance`.")
         robot = BUILTIN[table.builtin]()
         if table.gravity is not None:
             robot = robot.replace(gravity=np.array(table.gravity))
@@ -145,7 +146,7 @@ def _source(table: RobotTable, path: Path) -> Robot:
 
 def _from_rows(table: RobotTable, rows: list[DhRow], R, position, tolerance: float) -> Robot:
     if table.convention is None:
-        raise ValueError(
+        raise InputError(
             'a table needs `robot.convention`: "modified" lists alpha and a of the link before '
             'each joint, "standard" those of the link after it.'
         )
@@ -168,7 +169,7 @@ def build_load(robot: Robot, table: ToolTable) -> Tool:
     """A known load, in the frame of the body that carries it.
 
     Raises:
-        ValueError: If no joint has the name that is given, or no such load could exist.
+        InputError: If no joint has the name that is given, or no such load could exist.
     """
     J = None
     if table.inertia is not None:
@@ -178,7 +179,7 @@ def build_load(robot: Robot, table: ToolTable) -> Tool:
         loaded = robot.with_tool(mass=table.mass, centre_of_mass=table.centre_of_mass, inertia=J)
         return cast(Tool, loaded.tool)
     if table.body not in robot.joint_names:
-        raise ValueError(
+        raise InputError(
             f"`body` must be the name of the joint that moves it ({_shown(robot.joint_names)}), "
             f'but is "{table.body}".'
         )
@@ -195,9 +196,9 @@ def _limits(robot: Robot, table: LimitsTable) -> Limits:
         if values is not None:
             given = np.array(values) * (1.0 if name == "force" else degrees)
             if name == "force" and (np.isfinite(given) & ~(np.abs(given) < LARGEST)).any():
-                raise ValueError(f"`force` must be below {LARGEST:g} N m or N, but is {values}.")
+                raise InputError(f"`force` must be below {LARGEST:g} N m or N, but is {values}.")
             if name == "force" and ((given > 0) & (given < SMALLEST)).any():
-                raise ValueError(f"`force` must be above {SMALLEST:g} N m or N, but is {values}.")
+                raise InputError(f"`force` must be above {SMALLEST:g} N m or N, but is {values}.")
             # In the file, nan stands for a number that the robot's source knows better.
             said += [
                 f"{name} of {j}" for j, x in zip(robot.joint_names, given, strict=True) if x == x
@@ -212,7 +213,7 @@ def _limits(robot: Robot, table: LimitsTable) -> Limits:
             cure = "give the limits in metres, inf for none"
             if robot.revolute[j]:
                 cure = 'for degrees add `angle_unit = "deg"`, and inf means no limit'
-            raise ValueError(f"joint `{name}` {why}: {cure}.")
+            raise InputError(f"joint `{name}` {why}: {cure}.")
     assumed = tuple(what for what in robot.limits.assumed if what not in said)
     return Limits.of(robot.joints, **fields, assumed=assumed)
 
@@ -231,22 +232,22 @@ def _limit_notes(robot: Robot, table: LimitsTable, limits: Limits) -> Iterator[s
 def _drives(robot: Robot, table: DrivesTable) -> Drives:
     n, drives = robot.joints, robot.drives
     if table.gear_ratios is not None and table.matrix is not None:
-        raise ValueError("give `gear_ratios` or `matrix`, but not both.")
+        raise InputError("give `gear_ratios` or `matrix`, but not both.")
     reduction = drives.reduction
     if table.gear_ratios is not None:
         reduction = each(robot, "gear_ratios", table.gear_ratios)
         if not np.isfinite(np.array(table.gear_ratios)).all():
-            raise ValueError(f"`gear_ratios` must be finite numbers, but are {table.gear_ratios}.")
+            raise InputError(f"`gear_ratios` must be finite numbers, but are {table.gear_ratios}.")
     if table.matrix is not None:
         widths = {len(row) for row in table.matrix}
         if len(table.matrix) != n or widths != {n}:
-            raise ValueError(f"`matrix` must hold {n} rows of {n} numbers, one for each joint.")
+            raise InputError(f"`matrix` must hold {n} rows of {n} numbers, one for each joint.")
         reduction = table.matrix
     zero = drives.zero
     if each(robot, "zero", table.zero) is not None:
         turns = np.array(robot.revolute) & (table.angle_unit == "deg")
         if not np.isfinite(np.array(table.zero)).all():
-            raise ValueError(f"`zero` must hold finite numbers, but is {table.zero}.")
+            raise InputError(f"`zero` must hold finite numbers, but is {table.zero}.")
         zero = np.array(table.zero) * np.where(turns, np.pi / 180, 1.0)
     torques = each(robot, "max_torques", table.max_torques)
     inertia = each(robot, "rotor_inertia", table.rotor_inertia)

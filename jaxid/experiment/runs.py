@@ -4,6 +4,7 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxid.errors import InputError
 from jaxid.experiment.doctor import slips_of
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.loading import doubts_of, load_log
@@ -29,11 +30,11 @@ def earlier_run(experiment: Experiment, folder: Path) -> Run:
         folder: That `jaxid identify` has written.
 
     Raises:
-        ValueError: If it keeps nothing, or of another robot or model.
+        InputError: If it keeps nothing, or of another robot or model.
     """
     path = folder / RUN
     if not path.is_file():
-        raise ValueError(
+        raise InputError(
             f"`{folder}` is a folder, but holds no `{RUN}`: name a log, or the folder of a report "
             "that `jaxid identify` has written."
         )
@@ -47,16 +48,16 @@ def require_plain(experiment: Experiment) -> tuple[str, ...]:
         experiment: Whose runs are looked at together.
 
     Raises:
-        ValueError: If friction's shapes are to be found, or axes are identified one by one.
+        InputError: If friction's shapes are to be found, or axes are identified one by one.
     """
     if experiment.linear is not None:
-        raise ValueError(
+        raise InputError(
             f"{experiment.path.name}: `estimator.nonlinear_friction` would find other shapes of "
             "friction in each run: leave it out, and give both runs the shapes that `jaxid "
             "identify` finds, as `epsilon` and `stribeck` of `model.coulomb`."
         )
     if experiment.single_axes is not None:
-        raise ValueError(
+        raise InputError(
             f'{experiment.path.name}: `estimator.kind = "stepwise"` does not tell how the errors '
             "of two runs belong together: leave it out here."
         )
@@ -78,7 +79,7 @@ def read_run(
         name: Of the run.
 
     Raises:
-        ValueError: If a log is not as the experiment's file says, or a folder holds no report.
+        InputError: If a log is not as the experiment's file says, or a folder holds no report.
     """
     earlier = [earlier_run(experiment, path) for path in paths if is_report(path)]
     logs = [load_log(experiment, path, stage) for path in paths if not is_report(path)]

@@ -5,6 +5,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.experiment.channels import (
     SLACK,
@@ -21,7 +22,6 @@ from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 FAST, STRONG = 1.1, 1.2
 """Parts of the limits above which speeds and forces are doubtful."""

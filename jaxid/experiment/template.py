@@ -232,7 +232,7 @@ def write_template(
 
     Raises:
         FileNotFoundError: If the URDF file does not exist.
-        ValueError: If it cannot be loaded.
+        InputError: If it cannot be loaded.
     """
     robot = load_urdf(urdf, tip=tip, base=base)
     path = Path(urdf).resolve()

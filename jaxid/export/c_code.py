@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.export.feed_forward import Form, forms
 from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
 from jaxid.program import Library, declaration, definition, evaluate
-from jaxid.types import Float
 
 STATES = 4
 """States at which the file can check itself."""
@@ -33,7 +33,7 @@ def export_c(fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = 
         The C file; the header lies beside it.
 
     Raises:
-        ValueError: If `name` is no identifier of C.
+        InputError: If `name` is no identifier of C.
     """
     source, header = c_code(fit, name, double)
     folder = Path(folder)
@@ -52,7 +52,7 @@ def c_code(fit: Fit, name: str, double: bool) -> tuple[str, str]:
         double: Whether the code computes in `double`; in `float` otherwise.
 
     Raises:
-        ValueError: If `name` is no identifier of C.
+        InputError: If `name` is no identifier of C.
     """
     declaration(name, (), (), double=double)
     found = forms(fit)

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.export.c_code import export_c
 from jaxid.identification.fit import Fit
-from jaxid.types import AnyArray, Float
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-pedantic")
 

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.machine import program_of
 from jaxid.dynamics.model import Model
 from jaxid.export.recursion import Description, simplest
 from jaxid.identification.fit import Fit
 from jaxid.program import Program, applied, program_of_scalars, trace
-from jaxid.types import AnyArray, Float
 
 Q, QD, QDD = "q", "qd", "qdd"
 ALL_TEN = 10

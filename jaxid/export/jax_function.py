@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
+from jaxid.arrays import Array, Float, double_precision
 from jaxid.export.feed_forward import torque_program
 from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
 from jaxid.program import lower
-from jaxid.types import Array, Float, double_precision
 
 PLATFORMS = ("cpu", "cuda")
 

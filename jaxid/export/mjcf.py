@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.export.physical import Inertial, Joints, known_efforts, possible_bodies
 from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 
 def export_mjcf(fit: Fit, path: str | Path) -> Path:
@@ -24,7 +24,7 @@ def export_mjcf(fit: Fit, path: str | Path) -> Path:
         path: Of the file; one that is there already is replaced.
 
     Raises:
-        ValueError: If the bodies of the fit could not exist.
+        InputError: If the bodies of the fit could not exist.
     """
     path = Path(path)
     bodies = possible_bodies(fit, "an MJCF file")

@@ -4,12 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.projection import inertia_tensor
+from jaxid.errors import InputError
 from jaxid.export.feed_forward import bodies_of
 from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
 from jaxid.identification.fit import Fit
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float, double_precision
 
 IMPOSSIBLE = -1e-9
 """Share of a body below which it could not exist, of 1: rounding reaches a little beyond zero."""
@@ -81,14 +82,14 @@ def possible_bodies(fit: Fit, what: str) -> Float[np.ndarray, "joints 10"]:
         what: That is to be written, as it reads in a sentence.
 
     Raises:
-        ValueError: If the bodies could not exist.
+        InputError: If the bodies could not exist.
     """
     way_out = (
         "identify with `jid.PhysicallyConsistent()` (in the experiment file: `[estimator]` "
         '`kind = "consistent"`)'
     )
     if fit.full_parameters is None:
-        raise ValueError(
+        raise InputError(
             f"{what} needs bodies that could exist, but this fit knows only base parameters: "
             f"{way_out}."
         )
@@ -96,14 +97,14 @@ def possible_bodies(fit: Fit, what: str) -> Float[np.ndarray, "joints 10"]:
     shares = np.asarray(share_of_a_body(bodies))
     wrong = np.flatnonzero(~(shares >= IMPOSSIBLE) | ~(bodies[:, 0] > 0))
     if len(wrong):
-        raise ValueError(
+        raise InputError(
             f"{what} needs bodies that could exist, but body {wrong[0] + 1} could not: {way_out}."
         )
     joints = Joints.of(fit)
     for name, values in (("Ia", joints.armature), ("fv", joints.damping), ("fc", joints.friction)):
         if (values < 0).any():
             j = int(np.flatnonzero(values < 0)[0]) + 1
-            raise ValueError(
+            raise InputError(
                 f"{what} needs friction that brakes and rotors that weigh something, but {name}{j} "
                 f"is negative: {way_out}."
             )

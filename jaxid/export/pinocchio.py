@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.documents import text_of
 from jaxid.export.feed_forward import bodies_of
 from jaxid.export.physical import Joints
 from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
-from jaxid.types import Float
 
 NAMES = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 PLACES = (0, 1, 2, 3, 4, 9, 5, 8, 7, 6)

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia
 from jaxid.program import program_of_scalars
 from jaxid.program.operation import Operation
 from jaxid.program.scalar import apply
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 
 Entries = Any
 """A NumPy array of scalars of a program, or of numbers."""

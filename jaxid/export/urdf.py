@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxid.arrays import Float
+from jaxid.errors import InputError
 from jaxid.export.physical import Inertial, Joints, known_efforts, possible_bodies
 from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
 from jaxid.robot.robot import Robot
 from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import load_urdf, merged_links
-from jaxid.types import Float
 
 SAME = 1e-3
 """Difference of lengths [m] and directions up to which two robots are the same."""
@@ -46,7 +47,7 @@ def export_urdf(
 
     Raises:
         FileNotFoundError: If the source does not exist.
-        ValueError: If the bodies of the fit could not exist, or the file is of another robot.
+        InputError: If the bodies of the fit could not exist, or the file is of another robot.
     """
     path, robot = Path(path), fit.base.model.robot
     bodies = possible_bodies(fit, "a URDF file")
@@ -101,7 +102,7 @@ def _comment(fit: Fit, left: list[str]) -> str:
 
 def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
     if robot.joint_names != described.joint_names:
-        raise ValueError(
+        raise InputError(
             f"`{source}` has the joints {', '.join(described.joint_names)}, but the fit of "
             f"`{robot.name}` has {', '.join(robot.joint_names)}: give the file of this robot, or "
             "its `tip`."
@@ -112,7 +113,7 @@ def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
         rows = range(robot.joints) if what == "axis" else inner
         one, other = (np.asarray(getattr(r, what))[list(rows)] for r in (robot, described))
         if one.size and np.abs(one - other).max() > SAME:
-            raise ValueError(
+            raise InputError(
                 f"`{source}` has another geometry than the robot `{robot.name}` of the fit ({what} "
                 "differs): give the file with which the model was identified."
             )

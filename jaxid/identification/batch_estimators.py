@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.estimators import AbstractEstimator
@@ -17,7 +18,6 @@ from jaxid.identification.uncertainty.methods import IndependentRows, SpectralSa
 from jaxid.measurement.decimation import Subsample
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Bool, Float
 
 AS_IT_IS = 0.4
 """Cut-off of a filter that is not used, in units of the sampling rate."""

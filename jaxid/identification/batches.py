@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import is_traced
+from jaxid.arrays import AnyArray, Array, Bool, Float, is_traced, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.identification.batch_estimators import estimate_each
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.factors import CHUNK, Blocks, Factors, JointFactor
@@ -27,7 +28,6 @@ from jaxid.identification.identify import fit_blocks
 from jaxid.identification.normal_equations import BatchFit, DataSets, solve
 from jaxid.identification.weights import GivenWeights
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Array, Bool, Float, require_float64
 
 IN_A_CALL = 16
 """Data sets of one call of the compiled computation."""
@@ -71,7 +71,7 @@ def identify_batch(
         The estimates of all data sets.
 
     Raises:
-        ValueError: If shapes do not fit, there are too few rows, or weights are not known.
+        InputError: If shapes do not fit, there are too few rows, or weights are not known.
         RuntimeError: If JAX's 64-bit mode is off.
     """
     require_float64("a batch of identifications")
@@ -79,7 +79,7 @@ def identify_batch(
     _check(base, motion, forces, mask, robots)
     if estimator is not None:
         if robots is not None or weights is not None:
-            raise ValueError(
+            raise InputError(
                 "`estimator` goes with neither `robots` nor `weights`: the estimator has its own "
                 "weights, and solves for one robot."
             )
@@ -122,25 +122,25 @@ def identify_batch(
 def _check(base, motion, forces, mask, robots) -> None:
     n = base.model.robot.joints
     if forces.shape[-1] != n or motion.q.shape[-1] != n:
-        raise ValueError(
+        raise InputError(
             f"`motion` and `forces` must have the {n} joints of `{base.model.robot.name}`, but "
             f"have {motion.q.shape[-1]} and {forces.shape[-1]}."
         )
     if forces.ndim < 3 or motion.q.shape != (forces.shape[0], *forces.shape[-2:]):
-        raise ValueError(
+        raise InputError(
             "`motion` must have the shape [datasets, samples, joints] of `forces`, but has "
             f"{motion.q.shape} and `forces` has {forces.shape}."
         )
     if mask is not None and mask.shape != motion.q.shape:
-        raise ValueError(
+        raise InputError(
             f"`mask` must have the shape {motion.q.shape} of the motion, but has {mask.shape}."
         )
     if robots is not None and len(robots) != len(forces):
-        raise ValueError(
+        raise InputError(
             f"`robots` must be one for each of {len(forces)} data sets, but are {len(robots)}."
         )
     if forces.shape[-2] * n <= base.size:
-        raise ValueError(
+        raise InputError(
             f"there are {forces.shape[-2] * n} rows for {base.size} base parameters: record longer."
         )
 

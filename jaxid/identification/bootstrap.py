@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, require_float64
+from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks
 from jaxid.identification.normal_equations import RIDGE, inverse_information
 from jaxid.identification.solutions import Complete, Decomposition
-from jaxid.types import AnyArray, Array, Float, PRNGKeyArray, require_float64
 
 
 def bootstrap(
@@ -32,13 +33,13 @@ def bootstrap(
         The parameters of each draw; their covariance is that of the estimates.
 
     Raises:
-        ValueError: If there are fewer than two blocks, or draws do not determine all parameters.
+        InputError: If there are fewer than two blocks, or draws do not determine all parameters.
         RuntimeError: If JAX's 64-bit mode is off.
     """
     require_float64("a bootstrap")
     count = len(blocks.parts)
     if count < 2:
-        raise ValueError("`blocks` must hold at least two blocks of time, but holds one.")
+        raise InputError("`blocks` must hold at least two blocks of time, but holds one.")
     p = Decomposition.of(*blocks.total.weighted(weights))
     start = p.solve(Complete().inverse(p.values))
     information, gradients = [], []
@@ -52,7 +53,7 @@ def bootstrap(
     step, condition = _steps(counts, np.array(information), np.array(gradients))
     poor = int(np.sum(~(np.asarray(condition) < 1 / np.sqrt(RIDGE))))
     if poor:
-        raise ValueError(
+        raise InputError(
             f"{poor} of {draws} draws from {count} blocks do not determine all parameters: take "
             "longer blocks, in each of which every joint moves."
         )

@@ -3,13 +3,13 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.estimators import AbstractEstimator, Estimate
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.influence import AbstractInfluence, Channel
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import AbstractSolution, Complete, Decomposition
 from jaxid.identification.weights import ResidualVariances
-from jaxid.types import AnyArray, Float
 
 LEAST = 1e-6
 """Smallest variance of a combination of joints, each of variance one, that is believed."""
@@ -70,7 +70,7 @@ class GeneralisedLeastSquares(AbstractEstimator):
         """Solves, and estimates the covariance, in turn.
 
         Raises:
-            ValueError: If only factors of the rows are known.
+            InputError: If only factors of the rows are known.
         """
         rows.require_seen("least squares with the full covariance of the joints")
         weights = ResidualVariances()(rows.robot, rows.factors)

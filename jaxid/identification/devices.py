@@ -18,16 +18,17 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxid.arrays import AnyArray, Array, Float, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
 from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks, Factors, JointFactor, condensed, factorise
 from jaxid.identification.sharded import sharded
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Array, Float, require_float64
 
 AT_ONCE = 8192
 """Samples of a device whose columns are held at once."""
@@ -56,17 +57,17 @@ def factorise_on_devices(
         mesh: Of one axis; all devices of this process if None.
 
     Raises:
-        ValueError: If shapes do not fit.
+        InputError: If shapes do not fit.
         RuntimeError: If JAX's 64-bit mode is off.
     """
     require_float64("factors on several devices")
     if mesh is None:
         mesh = Mesh(np.array(jax.local_devices()), (_AXIS,))
     if len(mesh.axis_names) != 1:
-        raise ValueError(f"`mesh` must have one axis, but has {mesh.axis_names}.")
+        raise InputError(f"`mesh` must have one axis, but has {mesh.axis_names}.")
     n = base.model.robot.joints
     if motion.q.shape != forces.shape or forces.shape[-1] != n:
-        raise ValueError(
+        raise InputError(
             f"`motion` and `forces` must have the shape [samples, {n}], but have "
             f"{motion.q.shape} and {forces.shape}."
         )
@@ -138,11 +139,11 @@ def shards(folder: str | Path, pattern: str = "*.parquet") -> tuple[Path, ...]:
         pattern: Of the files' names.
 
     Raises:
-        ValueError: If there is no such file.
+        InputError: If there is no such file.
     """
     files = sorted(p for p in Path(folder).glob(pattern) if p.is_file())
     if not files:
-        raise ValueError(f"`{folder}` holds no file `{pattern}`: check the folder of the data set.")
+        raise InputError(f"`{folder}` holds no file `{pattern}`: check the folder of the data set.")
     bytes_ = [0] * jax.process_count()
     own = []
     for path in sorted(files, key=lambda p: (-p.stat().st_size, p)):
@@ -177,7 +178,7 @@ def factorise_across_processes(
     Raises:
         RuntimeError: If another process is lost, or JAX's 64-bit mode is off.
         TimeoutError: If another process does not arrive in time: it died, or reads for longer.
-        ValueError: If the processes' base parameters differ.
+        InputError: If the processes' base parameters differ.
     """
     require_float64("factors across processes")
     own = factorise(base, recordings, blocks, progress) if recordings else Blocks(())
@@ -187,7 +188,7 @@ def factorise_across_processes(
         _wait(patience)
         heads = multihost_utils.process_allgather(np.array([zlib.crc32(_content(base))]))
         if (heads != heads[0]).any():
-            raise ValueError(
+            raise InputError(
                 "`base` differs between the processes: make it from the same robot, terms and "
                 "version."
             )

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import Fit
 from jaxid.identification.held_out import folds
@@ -16,7 +18,6 @@ from jaxid.identification.solutions import NUMERICAL
 from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.methods import AbstractUncertainty
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 COST = 0.02
 """Held-out error that leaving parameters out may cost, of the smallest on the way, of 1."""
@@ -99,15 +100,15 @@ def essential_parameters(
         uncertainty: How standard deviations are found; the spectral sandwich if None.
 
     Raises:
-        ValueError: If `cost` is negative, or the observations are not those of the fit.
+        InputError: If `cost` is negative, or the observations are not those of the fit.
     """
     if not cost >= 0:
-        raise ValueError(f"`cost` must be a share of zero or more, but is {cost:g}.")
+        raise InputError(f"`cost` must be a share of zero or more, but is {cost:g}.")
     single = isinstance(observations, Observations | LongLog)
     recordings = (observations,) if single else tuple(observations)
     rows = Rows.of(fit.base, recordings)
     if [int(n) for n in rows.factors.rows] != list(fit.rows):
-        raise ValueError(
+        raise InputError(
             "`observations` must be those that the fit was made of, but they have other rows."
         )
     path, kept = _eliminated(fit, rows)

@@ -5,7 +5,9 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.consistency.consistency import Consistency
 from jaxid.identification.factors import Blocks
 from jaxid.identification.influence import AbstractInfluence, ByJoint
@@ -17,7 +19,6 @@ from jaxid.identification.solutions import (
     Decomposition,
 )
 from jaxid.identification.weights import AbstractWeights, MaximumForces, Unweighted
-from jaxid.types import AnyArray, Float
 
 
 class Estimate(eqx.Module):
@@ -103,7 +104,7 @@ class AbstractEstimator(eqx.Module):
         """The estimate from some rows.
 
         Raises:
-            ValueError: If weights are not known, or it needs more than factors and has them only.
+            InputError: If weights are not known, or it needs more than factors and has them only.
         """
 
 
@@ -152,9 +153,9 @@ class EstimatorInWords(AbstractEstimator):
         """Refuses: only the words are left.
 
         Raises:
-            ValueError: Always.
+            InputError: Always.
         """
-        raise ValueError(
+        raise InputError(
             "the estimator of a model file that held recordings or functions is kept in words "
             f"only: make it anew to estimate again. It was {self.words:.200}"
         )

@@ -3,10 +3,10 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.factors import Blocks
 from jaxid.identification.solutions import NUMERICAL, Decomposition
-from jaxid.types import AnyArray, Float
 
 LARGEST_UNCERTAINTY = 0.1
 """Share of the whole forces by which an undetermined combination may be wrong."""

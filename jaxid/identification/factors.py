@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
 from jaxid.identification.kernel import CHUNK as SAMPLES
@@ -20,7 +21,6 @@ from jaxid.identification.sharded import StreamOnDevices, devices
 from jaxid.identification.streaming import Progress, Read, Stream, held, suits
 from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 CHUNK = 65536
 """Samples whose columns are held at once."""

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.held_out import FOLDS, folds
 from jaxid.identification.rows import Rows
@@ -16,7 +18,6 @@ from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 Slow = Sequence[float] | Float[AnyArray, " joints"] | None
 CUTOFFS = 9
@@ -166,13 +167,13 @@ def choose_filter(
         progress: Is told now and then which share of the candidates is done, of 1.
 
     Raises:
-        ValueError: If there are no candidates, or a log and a candidate do not go together.
+        InputError: If there are no candidates, or a log and a candidate do not go together.
     """
     logs = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     if candidates is None:
         candidates = butterworth_candidates(logs[0].sample_time)
     if not candidates:
-        raise ValueError("`candidates` must hold at least one filter, but is empty.")
+        raise InputError("`candidates` must hold at least one filter, but is empty.")
     estimator = WeightedLeastSquares() if estimator is None else estimator
     criterion = HeldOutError() if criterion is None else criterion
     robot, dt = base.model.robot, logs[0].sample_time
@@ -213,7 +214,7 @@ def _inner(observations: Observations, edge: int) -> Observations:
 def _with_motion(judge: Observations, observations: Observations) -> Observations:
     """A candidate's motion with forces and rows of the widest band."""
     if judge.motion.q.shape != observations.motion.q.shape:
-        raise ValueError(
+        raise InputError(
             f"the filters of `candidates` leave different parts of `{judge.name}`, whose gaps are "
             "close together: choose on a log without, or take filters whose edges are alike."
         )

@@ -7,10 +7,12 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.documents import NotAValueError, encoded
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.identification.consistency.consistency import Consistency
 from jaxid.identification.estimators import AbstractEstimator, EstimatorInWords
 from jaxid.identification.excited import UndeterminedDirection
@@ -20,7 +22,6 @@ from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.identification.uncertainty.uncertainty import Uncertainty
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
 """Relative standard deviations up to which an estimate is trusted, or doubtful, of 1."""
@@ -115,7 +116,7 @@ class Fit(eqx.Module):
             level: The share, of 1.
 
         Raises:
-            ValueError: If `level` is not between 0 and 1.
+            InputError: If `level` is not between 0 and 1.
         """
         half = self.uncertainty.half_widths(level)
         p = np.asarray(self.parameters)
@@ -162,11 +163,11 @@ class Fit(eqx.Module):
         """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39).
 
         Raises:
-            ValueError: If the motion is of another number of joints.
+            InputError: If the motion is of another number of joints.
         """
         robot = self.base.model.robot
         if motion.joints != robot.joints:
-            raise ValueError(
+            raise InputError(
                 f"`motion` must be of the {robot.joints} joints of `{robot.name}`, but is of "
                 f"{motion.joints}."
             )
@@ -186,7 +187,7 @@ class Fit(eqx.Module):
             path: Of the file; one that is there already is replaced.
 
         Raises:
-            ValueError: If the model holds something that no file can hold, such as a term with
+            InputError: If the model holds something that no file can hold, such as a term with
                 functions in it.
         """
         return write_model(path, self._kept())
@@ -210,7 +211,7 @@ def load(path: str | Path) -> Fit:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is no model file, of another version, or not as it was written.
+        InputError: If it is no model file, of another version, or not as it was written.
     """
     return read_model(path, Fit, _check)
 
@@ -224,6 +225,6 @@ def _check(fit: Fit) -> None:
         ("weights", fit.weights, (joints,)),
     ):
         if np.shape(array) != shape:
-            raise ValueError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")
+            raise InputError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")
     if not np.isfinite(fit.parameters).all():
-        raise ValueError("`parameters` must hold finite numbers")
+        raise InputError("`parameters` must hold finite numbers")

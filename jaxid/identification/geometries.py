@@ -6,9 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 _FIELDS = ("axis", "rotation", "offset", "gravity")
 
@@ -57,17 +58,17 @@ def geometries(
         The robots as one definition, and for each robot its numbers.
 
     Raises:
-        ValueError: If a robot has another topology, or carries a known tool.
+        InputError: If a robot has another topology, or carries a known tool.
     """
     own = base.model.robot
     for k, robot in enumerate(robots):
         if robot.parent != own.parent or robot.revolute != own.revolute:
-            raise ValueError(
+            raise InputError(
                 f"`robots` must have the topology of `{own.name}`, but number {k}, "
                 f"`{robot.name}`, has other joints: identify it with its own base parameters."
             )
         if robot.tool is not None:
-            raise ValueError(
+            raise InputError(
                 f"number {k} of `robots`, `{robot.name}`, carries a known tool: subtract its "
                 "forces beforehand and take the robot without it."
             )

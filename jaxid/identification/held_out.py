@@ -4,10 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxid.arrays import Float
+from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator
 from jaxid.identification.factors import Blocks
 from jaxid.identification.rows import Rows
-from jaxid.types import Float
 
 FOLDS = 5
 
@@ -16,11 +17,11 @@ def folds(blocks: Blocks, count: int = FOLDS) -> Iterator[tuple[Blocks, Blocks]]
     """Divides blocks of time into contiguous parts: all but one, and the one, in turn.
 
     Raises:
-        ValueError: If there are fewer than two blocks.
+        InputError: If there are fewer than two blocks.
     """
     size = len(blocks.parts)
     if size < 2:
-        raise ValueError("held-out errors need at least two blocks of rows, but there is one.")
+        raise InputError("held-out errors need at least two blocks of rows, but there is one.")
     for part in np.array_split(np.arange(size), min(count, size)):
         out = part.tolist()
         rest = tuple(b for k, b in enumerate(blocks.parts) if k not in out)
@@ -38,7 +39,7 @@ def held_out_squares(
         count: Number of parts [1].
 
     Raises:
-        ValueError: If there is one block only, or the estimator needs the rows themselves.
+        InputError: If there is one block only, or the estimator needs the rows themselves.
     """
     return np.array(
         [

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, Estimate, WeightedLeastSquares
 from jaxid.identification.excited import undetermined_directions
 from jaxid.identification.factors import Blocks, Factors
@@ -41,7 +42,7 @@ def identify(
 
     Raises:
         TypeError: If a model stands for base parameters, or a recording for observations.
-        ValueError: If the observations belong to another number of joints, have fewer rows than
+        InputError: If the observations belong to another number of joints, have fewer rows than
             there are parameters, or weights are not known.
     """
     recordings = tuple(observations) if isinstance(observations, Iterable) else (observations,)
@@ -67,7 +68,7 @@ def fit_blocks(
         recordings: Their names.
 
     Raises:
-        ValueError: If there are fewer rows than parameters, or weights are not known.
+        InputError: If there are fewer rows than parameters, or weights are not known.
     """
     return fit_rows(Rows(base, blocks), estimator, recordings)
 
@@ -87,12 +88,12 @@ def fit_rows(
         uncertainty: How standard deviations are found: the spectral sandwich if None.
 
     Raises:
-        ValueError: If there are fewer rows than parameters, weights are not known, or the estimator
+        InputError: If there are fewer rows than parameters, weights are not known, or the estimator
             needs more than factors and has them only.
     """
     count = int(rows.factors.rows.sum())
     if count <= rows.base.size:
-        raise ValueError(
+        raise InputError(
             f"there are {count} rows for {rows.base.size} base parameters: record longer, decimate "
             "less, or leave out fewer slow rows."
         )
@@ -136,7 +137,7 @@ def fit_rows(
 
 def _check(base: Any, recordings: Sequence[Any]) -> None:
     if not recordings:
-        raise ValueError("`observations` must hold at least one recording, but is empty.")
+        raise InputError("`observations` must hold at least one recording, but is empty.")
     if not isinstance(base, BaseParameters):
         raise TypeError(
             f"`base` must be base parameters, but is a `{type(base).__name__}`: take those that "
@@ -150,7 +151,7 @@ def _check(base: Any, recordings: Sequence[Any]) -> None:
                 f"such, but hold a `{type(observations).__name__}`."
             )
         if observations.joints != n:
-            raise ValueError(
+            raise InputError(
                 f"the observations `{observations.name}` have {observations.joints} joints, but "
                 f"`{base.model.robot.name}` has {n}."
             )

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.rows import RowChunk
-from jaxid.types import AnyArray, Float
 
 
 class Channel(NamedTuple):

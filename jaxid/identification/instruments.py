@@ -3,8 +3,10 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, Estimate
 from jaxid.identification.factors import reduced_rows
 from jaxid.identification.influence import AbstractInfluence, Channel
@@ -14,7 +16,6 @@ from jaxid.identification.streaming_log import source
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import AnyArray, Float
 
 
 class InstrumentRows(AbstractInfluence):
@@ -66,7 +67,7 @@ class InstrumentalVariables(AbstractEstimator):
         """Solves with the references' columns.
 
         Raises:
-            ValueError: If only factors of the rows are known, or the number of references is wrong.
+            InputError: If only factors of the rows are known, or the number of references is wrong.
         """
         rows.require_seen("an estimate with instrumental variables")
         weights = self.weights(rows.robot, rows.factors)
@@ -101,7 +102,7 @@ class InstrumentalVariables(AbstractEstimator):
 def _for(recordings: int, name: str, given: tuple) -> tuple:
     """One for each recording."""
     if len(given) not in (1, recordings):
-        raise ValueError(
+        raise InputError(
             f"`{name}` must hold one entry, or one for each of {recordings} recordings, but holds "
             f"{len(given)}."
         )

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
 from jaxid.dynamics.machine import program_of
 from jaxid.identification.response import Stage
 from jaxid.program import Program, default_fence, lower
-from jaxid.types import AnyArray, Array, double_precision
 
 CHUNK = 2048
 """Samples of an iteration: their columns stay in the cache."""

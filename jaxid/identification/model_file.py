@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 
 from jaxid.documents import decoded, encoded, text_of
+from jaxid.errors import InputError
 from jaxid.files import read_json, written_whole
 
 FORMAT = "jaxid model"
@@ -25,7 +26,7 @@ def write_model(path: str | Path, model: eqx.Module) -> Path:
         model: An identified model.
 
     Raises:
-        ValueError: If the model holds something that no file can hold.
+        InputError: If the model holds something that no file can hold.
     """
     path = Path(path)
     content = encoded(model)
@@ -50,33 +51,33 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is no model file, of another version, or not as it was written.
+        InputError: If it is no model file, of another version, or not as it was written.
     """
     try:
         document = read_json(path, _without_repetition)
     except ValueError as error:
-        raise ValueError(f"`{path}` is no model file: it cannot be read as JSON.") from error
+        raise InputError(f"`{path}` is no model file: it cannot be read as JSON.") from error
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise ValueError(
+        raise InputError(
             f'`{path}` is no model file (`"format": "{FORMAT}"`), as `save` writes it.'
         )
     if document.get("version") is True or document.get("version") != VERSION:
-        raise ValueError(
+        raise InputError(
             f"`{path}` is a model file of version {document.get('version')!r:.20}, but this jaxid "
             f"reads version {VERSION}: use the jaxid that wrote it, or identify again."
         )
     if set(document) != set(KEYS):
         other = sorted(set(document) ^ set(KEYS))
-        raise ValueError(
+        raise InputError(
             f"`{path}` must have the keys {', '.join(KEYS)}, but differs by {', '.join(other)}."
         )
     content = document["model"]
     try:
         checksum = checksum_of(content)
     except RecursionError as error:
-        raise ValueError(f"`{path}` is no model file: it is nested too deeply.") from error
+        raise InputError(f"`{path}` is no model file: it is nested too deeply.") from error
     if document["checksum"] != checksum:
-        raise ValueError(
+        raise InputError(
             f"`{path}` is damaged or was changed by hand: its checksum does not fit its content; "
             "save the model again."
         )
@@ -85,7 +86,7 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
         check(model)
     except (ValueError, TypeError, RecursionError) as error:
         said = " ".join(str(error).split()).rstrip(".")
-        raise ValueError(f"`{path}` holds no model that can be used: {said}.") from error
+        raise InputError(f"`{path}` holds no model that can be used: {said}.") from error
     return model
 
 
@@ -98,5 +99,5 @@ def checksum_of(content: Any) -> str:
 def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
-        raise ValueError("a key comes twice")
+        raise InputError("a key comes twice")
     return content

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog, forgetting
 from jaxid.measurement.columns import Columns, Selection
@@ -65,7 +66,7 @@ def open_log(
     Raises:
         NeedsMemory: If the filter needs the whole log at once, or stamps must be mended: it fits
             `read_recording` only.
-        ValueError: If the file is of another kind, its columns are not the robot's, forces and
+        InputError: If the file is of another kind, its columns are not the robot's, forces and
             columns would be aliased, or no samples are left.
     """
     path, n = Path(path), robot.joints
@@ -77,7 +78,7 @@ def open_log(
     if columns.velocities is not None:
         chosen["velocities"] = files.want("velocities", columns.velocities, velocities_at)
     elif velocities_path is not None:
-        raise ValueError("`velocities_path` is given, but `Columns.velocities` names no columns.")
+        raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")
     if columns.time is not None:
         (chosen["time"],) = files.want("time", columns.time)
     columns = dataclasses.replace(columns, **chosen)
@@ -147,13 +148,13 @@ class _Files:
         if what != "time":
             found = first.array(what, selection).shape[1]
             if found != self._joints:
-                raise ValueError(
+                raise InputError(
                     f"`{what}` of `{path.name}` have {found} columns, but the robot has "
                     f"{self._joints} joints: name one column for each joint."
                 )
         rows = self._parts[self._path].rows
         if parts.rows != rows:
-            raise ValueError(
+            raise InputError(
                 f"`{path.name}` has {parts.rows} rows, but `{self._path.name}` has {rows}: they "
                 "must be of one run, row by row."
             )

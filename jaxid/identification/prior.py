@@ -6,12 +6,13 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.factors import Blocks, Factors
 from jaxid.identification.rows import Rows, Span
 from jaxid.identification.solutions import CrossValidated
-from jaxid.types import AnyArray, Float
 
 
 class RelativeTo(AbstractEstimator):
@@ -38,11 +39,11 @@ class RelativeTo(AbstractEstimator):
         """Subtracts the prior's forces, estimates, and adds the prior.
 
         Raises:
-            ValueError: If there is not one for each standard parameter, or the estimator refuses.
+            InputError: If there is not one for each standard parameter, or the estimator refuses.
         """
         size = rows.base.model.size
         if np.shape(self.parameters) != (size,):
-            raise ValueError(
+            raise InputError(
                 f"`parameters` of `RelativeTo` must be the {size} standard parameters of the "
                 f"model, but have the shape {np.shape(self.parameters)}."
             )

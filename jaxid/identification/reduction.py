@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import regressor_rows, tool_forces
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Chunk
-from jaxid.types import AnyArray, Float
 
 
 def reduced(

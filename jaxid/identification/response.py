@@ -6,10 +6,10 @@ import math
 import numpy as np
 from scipy import signal
 
+from jaxid.arrays import Float
 from jaxid.measurement.decimation import AbstractDecimation
 from jaxid.measurement.filters import AbstractFilter
 from jaxid.measurement.low_pass import LowPass
-from jaxid.types import Float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

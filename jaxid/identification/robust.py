@@ -5,12 +5,13 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, Estimate
 from jaxid.identification.influence import AbstractInfluence, Channel
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import AbstractSolution, Complete, Decomposition
 from jaxid.identification.weights import AbstractWeights, MaximumForces
-from jaxid.types import AnyArray, Float
 
 NORMAL = 1.4826
 """Standard deviation of a normal number over the median of its size."""
@@ -34,7 +35,7 @@ class AbstractLoss(eqx.Module):
 
 def _require_limit(loss: AbstractLoss, limit: float) -> None:
     if not limit > 0.0:
-        raise ValueError(
+        raise InputError(
             f"`limit` of `{type(loss).__name__}` must be a positive number of standard deviations, "
             f"but is {limit}."
         )
@@ -140,7 +141,7 @@ class IterativelyReweighted(AbstractEstimator):
         """Solves until nothing changes.
 
         Raises:
-            ValueError: If only factors of the rows are known.
+            InputError: If only factors of the rows are known.
         """
         rows.require_seen("an iteratively reweighted estimate")
         weights = self.weights(rows.robot, rows.factors)

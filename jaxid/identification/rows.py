@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
+from jaxid.errors import InputError
 from jaxid.identification.factors import (
     Blocks,
     Factors,
@@ -119,10 +120,10 @@ class Rows:
             what: The task that needs rows, as it reads in a sentence.
 
         Raises:
-            ValueError: If only factors are known.
+            InputError: If only factors are known.
         """
         if not self.seen:
-            raise ValueError(
+            raise InputError(
                 f"{what} needs the rows themselves, but only their factors are known: use "
                 "`identify` with the recordings."
             )
@@ -133,7 +134,7 @@ class Rows:
         For estimators that look for constants of the model's terms.
 
         Raises:
-            ValueError: If only factors are known.
+            InputError: If only factors are known.
         """
         self.require_seen("another model")
         return Rows.of(base, self.recordings, self.progress)
@@ -145,7 +146,7 @@ class Rows:
             spans: What has to be among the rows; everything if None.
 
         Raises:
-            ValueError: If only factors are known.
+            InputError: If only factors are known.
         """
         self.require_seen("a pass over the rows")
         if self._held is not None:

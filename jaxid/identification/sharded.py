@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from jaxid.arrays import Array, double_precision
 from jaxid.identification.kernel import Grams, Kernel, _padded
 from jaxid.identification.streaming import Piece, Stream
-from jaxid.types import Array, double_precision
 
 _AXIS = "pieces"
 

@@ -5,8 +5,9 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks
-from jaxid.types import AnyArray, Float
 
 NUMERICAL = 1e-11
 """Singular values below this share of the largest are rounding."""
@@ -111,7 +112,7 @@ class Truncated(AbstractSpectralSolution):
 
     def __check_init__(self):
         if not 0.0 <= self.share < 1.0:
-            raise ValueError(
+            raise InputError(
                 f"`share` of `Truncated` must be at least 0 and below 1, but is {self.share}: from "
                 "1 on nothing would be left."
             )
@@ -133,7 +134,7 @@ class Ridge(AbstractSpectralSolution):
 
     def __check_init__(self):
         if not 0.0 <= self.share < np.inf:
-            raise ValueError(
+            raise InputError(
                 f"`share` of `Ridge` must be a finite number of at least 0, but is {self.share}."
             )
 
@@ -173,10 +174,10 @@ class CrossValidated(AbstractSolution):
         """Sums of the squared weighted residuals of each block left out.
 
         Raises:
-            ValueError: If there are fewer than two blocks.
+            InputError: If there are fewer than two blocks.
         """
         if len(blocks.parts) < 2:
-            raise ValueError(
+            raise InputError(
                 "cross-validation needs at least two blocks of rows, but there is one."
             )
         squares = np.asarray(weights) ** 2

@@ -10,9 +10,11 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import in_numpy
 from jaxid.dynamics.observation import random_motion
+from jaxid.errors import InputError
 from jaxid.identification.estimators import (
     AbstractEstimator,
     Estimate,
@@ -27,7 +29,6 @@ from jaxid.identification.rows import Rows
 from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 DECIDED = 1e-4
 """Share of a column that must be new for an axis to decide its parameter, of 1."""
@@ -173,7 +174,7 @@ def _moving(base: BaseParameters, observations: Observations) -> int:
     j = int(np.argmax(reach))
     others = np.flatnonzero(np.delete(reach, j) > ALONE * reach[j])
     if len(others):
-        raise ValueError(
+        raise InputError(
             f"`single_axes` must hold motions of one axis each, but in `{observations.name}` "
             f"{len(others) + 1} joints of `{base.model.robot.name}` move."
         )
@@ -255,7 +256,7 @@ def identify_stepwise(
         at_once: Weighted least squares with the same weights if None.
 
     Raises:
-        ValueError: If the observations do not fit to the model, or a motion of single axes moves
+        InputError: If the observations do not fit to the model, or a motion of single axes moves
             several.
     """
     single = isinstance(observations, Observations | LongLog)

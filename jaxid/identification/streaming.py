@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import AnyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
 from jaxid.dynamics.motion import Motion
@@ -20,7 +21,6 @@ from jaxid.identification.kernel import CHUNK, Grams, Kernel
 from jaxid.identification.reduction import reduced
 from jaxid.identification.response import Stage, centre, stages
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray
 
 LONG = 100_000
 """Samples from which compiling pays."""

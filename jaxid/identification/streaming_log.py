@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.identification.streaming import Read, held
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import AbstractFilter
@@ -108,7 +109,7 @@ class LongLog(eqx.Module):
         """Motion and forces of some samples of one segment, joint side, as `observe` makes them.
 
         Raises:
-            ValueError: If a column holds what is no number.
+            InputError: If a column holds what is no number.
         """
         motion, forces, _ = self.seen(samples)
         return motion, forces
@@ -117,7 +118,7 @@ class LongLog(eqx.Module):
         """Motion and forces like `read`, and the angles before any filter.
 
         Raises:
-            ValueError: Like `read`.
+            InputError: Like `read`.
         """
         begin, end, _ = self._placed(samples)
         a, b = max(begin, samples.start - self.overlap), min(end, samples.stop + self.overlap)
@@ -130,7 +131,7 @@ class LongLog(eqx.Module):
         """Angles, velocities and forces of some samples of one segment, joint side, unfiltered.
 
         Raises:
-            ValueError: Like `read`.
+            InputError: Like `read`.
         """
         angles, velocities, forces = self.recorded(samples)
         drives = self.robot.drives
@@ -145,7 +146,7 @@ class LongLog(eqx.Module):
         """The same in SI units, on the sides on which they were recorded.
 
         Raises:
-            ValueError: Like `read`.
+            InputError: Like `read`.
         """
         begin, _, first = self._placed(samples)
         rows = first + samples.start - begin, first + samples.stop - begin
@@ -171,10 +172,10 @@ class LongLog(eqx.Module):
         """Divides the rows in time, like `Observations.split`.
 
         Raises:
-            ValueError: If `fraction` is not between 0 and 1, or a part has no rows.
+            InputError: If `fraction` is not between 0 and 1, or a part has no rows.
         """
         if not 0 < fraction < 1:
-            raise ValueError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")
+            raise InputError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")
         (a, b), first = self.outline.segments[-1], self.times[0]
         last = self.times[-1] + (b - a - 1) * self.outline.sample_time
         before = (self.reduced_time < first + fraction * (last - first))[:, None]
@@ -182,7 +183,7 @@ class LongLog(eqx.Module):
         for chosen in (before, ~before):
             mask = np.asarray(self.outline.mask) & chosen
             if not mask.any(axis=0).all():
-                raise ValueError(
+                raise InputError(
                     f"`{self.name}` has no rows for every joint in one of the parts that "
                     f"`fraction` = {fraction:g} leaves: choose another."
                 )

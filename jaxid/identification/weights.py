@@ -5,11 +5,11 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import is_traced, one_or_each
+from jaxid.arrays import AnyArray, Float, is_traced, one_or_each
+from jaxid.errors import InputError
 from jaxid.identification.factors import Factors
 from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 
 class AbstractWeights(eqx.Module):
@@ -43,7 +43,7 @@ class GivenWeights(AbstractWeights):
             return
         w = np.asarray(self.weights)
         if w.ndim != 1 or not (np.isfinite(w).all() and (w >= 0.0).all() and w.any()):
-            raise ValueError(
+            raise InputError(
                 "`weights` must be one finite number for each joint, none below zero and not all "
                 f"zero, but are {w}."
             )
@@ -52,10 +52,10 @@ class GivenWeights(AbstractWeights):
         """As they are.
 
         Raises:
-            ValueError: If there are more or fewer than joints.
+            InputError: If there are more or fewer than joints.
         """
         if np.shape(self.weights) != (robot.joints,):
-            raise ValueError(
+            raise InputError(
                 f"`weights` must be one number for each of the {robot.joints} joints of "
                 f"`{robot.name}`, but have shape {np.shape(self.weights)}."
             )
@@ -69,7 +69,7 @@ class MaximumForces(AbstractWeights):
         """The reciprocals.
 
         Raises:
-            ValueError: If the largest force of some joint is not known.
+            InputError: If the largest force of some joint is not known.
         """
         return 1.0 / np.asarray(robot.max_forces)
 

@@ -6,6 +6,8 @@ import itertools
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from jaxid.errors import InputError
+
 JITTER = 0.05
 """Stamps may leave the uniform grid by this part of the sample time before samples are moved."""
 TWINS = 0.1
@@ -79,13 +81,13 @@ def clock(
         first_row: Number of the first row, as its file counts.
 
     Raises:
-        ValueError: If time runs backwards, or stands still.
+        InputError: If time runs backwards, or stands still.
     """
     notes = []
     back = np.flatnonzero(np.diff(stamps) < 0)
     if back.size:
         i = int(back[0])
-        raise ValueError(
+        raise InputError(
             f"time of `{source}` runs backwards from {stamps[i]:.9g} s to {stamps[i + 1]:.9g} s at "
             f"row {i + 1 + first_row}: sort the log, or split it where the clock was set back."
         )
@@ -95,7 +97,7 @@ def clock(
         near = np.concatenate([[True], np.diff(stamps[kept]) > TWINS * typical])
         kept = kept[near]
     if len(kept) < 2:
-        raise ValueError(f"time of `{source}` stands still: check the column of time stamps.")
+        raise InputError(f"time of `{source}` stands still: check the column of time stamps.")
     twins = len(stamps) - len(kept)
     if twins:
         notes.append(
@@ -115,7 +117,7 @@ def clock(
     ranges = [(a, b) for a, b in itertools.pairwise(edges) if b - a >= 4]
     lonely = len(t) - sum(b - a for a, b in ranges)
     if not ranges:
-        raise ValueError(
+        raise InputError(
             f"`{source}` has no four rows in sequence: its time stamps are {typical:.6g} s apart "
             f"at the median, with {len(gaps)} gaps; check `time_unit`, or give `sample_time`."
         )

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import equinox as eqx
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.measurement import units
 from jaxid.measurement.units import Quantity, Unit
 from jaxid.robot.limits import per_joint
@@ -98,13 +99,13 @@ class Columns(eqx.Module):
     def __check_init__(self) -> None:
         """Refuses what no log could satisfy."""
         if (self.time is None) == (self.sample_time is None):
-            raise ValueError(
+            raise InputError(
                 "`Columns` needs either `time` (the column of the time stamps) or `sample_time` "
                 "[s] (rows are equally far apart), but has "
                 + ("neither." if self.time is None else "both: leave out the one not to trust.")
             )
         if self.sample_time is not None and not 0 < self.sample_time < np.inf:
-            raise ValueError(f"`sample_time` must be positive [s], but is {self.sample_time:g}.")
+            raise InputError(f"`sample_time` must be positive [s], but is {self.sample_time:g}.")
         for name, given, allowed in (
             ("time_unit", self.time_unit, (Quantity.TIME,)),
             ("angle_unit", self.angle_unit, (Quantity.COORDINATE,)),
@@ -113,27 +114,27 @@ class Columns(eqx.Module):
         ):
             for one in _each(given):
                 if one.quantity not in allowed:
-                    raise ValueError(
+                    raise InputError(
                         f"`{name}` must measure {' or '.join(q.value for q in allowed)}, "
                         f"but `{one.symbol}` measures {one.quantity.value}."
                     )
         for name in ("angle_signs", "force_signs"):
             signs = getattr(self, name)
             if signs is not None and any(abs(s) != 1 for s in signs):
-                raise ValueError(f"`{name}` must be +1 or -1 for each joint, but is {signs}.")
+                raise InputError(f"`{name}` must be +1 or -1 for each joint, but is {signs}.")
         constants = self.torque_constants
         if constants is not None and not all(c != 0 and np.isfinite(c) for c in constants):
-            raise ValueError(
+            raise InputError(
                 "`torque_constants` must be numbers other than zero [N m/A], but are "
                 f"{', '.join(f'{c:g}' for c in constants)}."
             )
         if self.force_gains is not None and not all(0 < g < np.inf for g in self.force_gains):
-            raise ValueError(
+            raise InputError(
                 f"`force_gains` must be positive for each joint, but is {self.force_gains}."
             )
         current = any(u.quantity is Quantity.CURRENT for u in _each(self.force_unit))
         if current != (self.torque_constants is not None):
-            raise ValueError(
+            raise InputError(
                 "`torque_constants` [N m/A] are needed when `force_unit` is a current, and only "
                 "then: " + ("add them." if current else "leave them out or set `force_unit`.")
             )

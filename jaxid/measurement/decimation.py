@@ -8,9 +8,10 @@ import equinox as eqx
 import numpy as np
 from scipy import signal
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.measurement.low_pass import LowPass, as_sections
 from jaxid.measurement.whole import whole
-from jaxid.types import AnyArray, Float
 
 
 class AbstractDecimation(eqx.Module):
@@ -71,7 +72,7 @@ class Subsample(AbstractDecimation):
     def check(self, cutoff: float, sample_time: float) -> None:  # noqa: D102
         rate = 1.0 / (sample_time * self.every)
         if self.every > 1 and cutoff > 0.5 * rate:
-            raise ValueError(
+            raise InputError(
                 f"`Subsample({self.every})` leaves {rate:.6g} Hz, but the filter lets forces and "
                 f"columns pass up to {cutoff:.6g} Hz, which must be below half of that: take "
                 f"one of {max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, a "
@@ -115,9 +116,9 @@ class Decimation(AbstractDecimation):
 
 def _refuse_factors(name: str, factors: tuple[int, ...]) -> None:
     if not factors or any(f < 1 for f in factors):
-        raise ValueError(f"`{name}` must be whole numbers from 1 on, but is {factors}.")
+        raise InputError(f"`{name}` must be whole numbers from 1 on, but is {factors}.")
     if any(f > 13 for f in factors) and name == "factors":
-        raise ValueError(
+        raise InputError(
             f"`factors` must be 13 or less each, or the filters lose their accuracy, but are "
             f"{factors}: decimate in several stages."
         )

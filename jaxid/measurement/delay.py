@@ -7,10 +7,11 @@ import equinox as eqx
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import FEWEST, Recording
-from jaxid.types import Float
 
 
 def remove_delay(recording: Recording, seconds: float) -> Recording:
@@ -25,7 +26,7 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
         seconds: By how much they are late [s]; negative if they are early.
 
     Raises:
-        ValueError: If the delay is longer than a segment allows.
+        InputError: If the delay is longer than a segment allows.
     """
     _refuse_endless(seconds)
     lost = math.ceil(abs(seconds) / recording.sample_time - 1e-9)
@@ -37,7 +38,7 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
             kept.append(np.arange(a + early, b - late))
             segments.append((start, start + len(kept[-1])))
     if not kept:
-        raise ValueError(
+        raise InputError(
             f"the delay is {seconds:g} s, but the longest segment of `{recording.name}` lasts "
             f"{max(b - a for a, b in recording.segments) * recording.sample_time:g} s."
         )
@@ -72,7 +73,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
         seconds: By how much [s]; negative if they are early.
 
     Raises:
-        ValueError: If no rows are left.
+        InputError: If no rows are left.
     """
     _refuse_endless(seconds)
     time, dt = np.asarray(observations.time), observations.sample_time
@@ -89,7 +90,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
         first, last = (a + edge + lost, b) if seconds > 0 else (a, b - edge - lost)
         mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
     if not mask.any(axis=0).all():
-        raise ValueError(
+        raise InputError(
             f"the delay is {seconds:g} s, but `{observations.name}` lasts "
             f"{time[-1] - time[0]:g} s: no rows of some joint are left."
         )
@@ -99,7 +100,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
 
 def _refuse_endless(seconds: float) -> None:
     if not math.isfinite(seconds):
-        raise ValueError(f"the delay must be a finite time [s], but is {seconds:g}.")
+        raise InputError(f"the delay must be a finite time [s], but is {seconds:g}.")
 
 
 def _arrays(motion: Motion) -> list[np.ndarray]:

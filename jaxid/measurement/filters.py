@@ -12,7 +12,9 @@ import equinox as eqx
 import numpy as np
 from scipy import signal
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.measurement.low_pass import (
     LowPass,
     butterworth,
@@ -22,7 +24,6 @@ from jaxid.measurement.low_pass import (
     refuse_unsettled,
 )
 from jaxid.measurement.whole import whole
-from jaxid.types import AnyArray, Float
 
 SETTLED = 1e-4
 """Part of the impulse response's peak below which the start of a log no longer matters.
@@ -89,12 +90,12 @@ def _optional(value: float | int | None) -> float | None:
 def _positive(owner: str, **values: float | int | None) -> None:
     for name, value in values.items():
         if value is not None and not value > 0:
-            raise ValueError(f"`{name}` of `{owner}` must be positive, but is {value:g}.")
+            raise InputError(f"`{name}` of `{owner}` must be positive, but is {value:g}.")
 
 
 def _refuse_order(owner: str, order: int) -> None:
     if order > HIGHEST:
-        raise ValueError(
+        raise InputError(
             f"`order` of `{owner}` must be {HIGHEST} at most, but is {order}: steeper filters ring "
             "for longer than they help; 2 to 8 are usual."
         )
@@ -209,7 +210,7 @@ class PaperFilter(AbstractFilter):
         for name, omega in (("velocity", self.velocity), ("acceleration", self.acceleration)):
             refuse_unsettled(name, omega / (2 * math.pi), sample_time)
             if omega * sample_time >= math.pi:
-                raise ValueError(
+                raise InputError(
                     f"`{name}` of `PaperFilter` is {omega:g} rad/s, which needs samples at more "
                     f"than {omega / math.pi:.0f} Hz, but the log has {1 / sample_time:.6g} Hz: "
                     f"take a cut-off below {math.pi / sample_time:.0f} rad/s (a third of that is "
@@ -245,7 +246,7 @@ class PeriodicFourier(AbstractFilter):
         _positive("PeriodicFourier", force_harmonics=self.force_harmonics, order=self.order)
         _refuse_order("PeriodicFourier", self.order)
         if math.isinf(self.period):
-            raise ValueError(
+            raise InputError(
                 "`period` of `PeriodicFourier` must be a time [s], but is infinite: give the "
                 "motion's own, or use another filter."
             )
@@ -259,7 +260,7 @@ class PeriodicFourier(AbstractFilter):
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         samples = len(angles)
         if samples * sample_time < (1 - 1e-9) * self.period:
-            raise ValueError(
+            raise InputError(
                 f"`period` of `PeriodicFourier` is {self.period:g} s, but a segment of the log "
                 f"lasts {samples * sample_time:g} s: record whole periods, or use another filter."
             )
@@ -281,7 +282,7 @@ class PeriodicFourier(AbstractFilter):
         wrong = np.flatnonzero(left > 0.05 * np.maximum(moved, 0.05 * moved.max()))
         if wrong.size:
             j = int(wrong[0])
-            raise ValueError(
+            raise InputError(
                 f"the angles of joint {j + 1} leave a Fourier series of period {self.period:g} s "
                 f"and {self.harmonics} harmonics by {100 * left[j] / moved[j]:.0f} % of their "
                 "motion (RMS): correct `period` or `harmonics`, or crop what is not periodic."
@@ -298,7 +299,7 @@ class PeriodicFourier(AbstractFilter):
 
 def _refuse_negative_margin(margin: float | None) -> None:
     if margin is not None and not 0 <= margin < math.inf:
-        raise ValueError(f"`margin` must be a time [s] of zero or more, but is {margin:g}.")
+        raise InputError(f"`margin` must be a time [s] of zero or more, but is {margin:g}.")
 
 
 def differentiator(omega: float, sample_time: float) -> tuple[np.ndarray, np.ndarray]:

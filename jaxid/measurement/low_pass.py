@@ -6,7 +6,8 @@ import equinox as eqx
 import numpy as np
 from scipy import signal
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 
 BLOCK = 2**22
 """Numbers that are filtered at once: what scipy copies stays small."""
@@ -89,7 +90,7 @@ def butterworth(cutoff: float, order: int, sample_time: float, name: str = "cuto
     """A Butterworth filter, run forward and backward; `cutoff` [Hz] as scipy counts it, one way.
 
     Raises:
-        ValueError: If the cut-off, which is called `name`, does not suit the sampling rate.
+        InputError: If the cut-off, which is called `name`, does not suit the sampling rate.
     """
     if math.isinf(cutoff):
         return LowPass((), math.inf)
@@ -122,13 +123,13 @@ def refuse_above_nyquist(name: str, cutoff: float, sample_time: float) -> None:
     """Raises ValueError unless `cutoff` [Hz] can be told apart at this sampling rate."""
     rate = 1 / sample_time
     if rate > FASTEST:
-        raise ValueError(
+        raise InputError(
             f"the log has {rate:.3g} samples in a second, as no robot's has: check the unit of its "
             "time, or `sample_time`."
         )
     if cutoff >= 0.5 * rate:
         slow = " Few robots log so slowly: check `time_unit`, or `sample_time`."
-        raise ValueError(
+        raise InputError(
             f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of "
             f"{rate:.6g} Hz: take a lower one, or log faster than {2 * cutoff:.6g} Hz."
             f"{slow if rate <= SLOWEST else ''}"
@@ -139,7 +140,7 @@ def refuse_unsettled(name: str, cutoff: float, sample_time: float) -> None:
     """Raises ValueError if a filter with this `cutoff` [Hz] would settle in no log."""
     lowest = LOWEST / sample_time
     if cutoff < lowest:
-        raise ValueError(
+        raise InputError(
             f"`{name}` of {cutoff:.6g} Hz is too low for a sampling rate of {1 / sample_time:.6g} "
             f"Hz, since no log is long enough for such a filter to settle: take one above "
             f"{lowest:.2g} Hz (about five times the highest frequency of the motion)."

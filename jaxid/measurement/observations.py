@@ -7,14 +7,15 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
 from jaxid.measurement.filters import AbstractFilter
 from jaxid.measurement.low_pass import said_hasty
 from jaxid.measurement.recording import Recording
 from jaxid.robot.limits import per_joint
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Bool, Float
 
 FEWEST_ROWS = 4
 """Rows below which a segment is not worth its edges."""
@@ -125,10 +126,10 @@ class Observations(eqx.Module):
         `slice(*chunk.rows)`, up to rounding.
 
         Raises:
-            ValueError: If `samples` is not positive.
+            InputError: If `samples` is not positive.
         """
         if samples < 1:
-            raise ValueError(f"`samples` must be positive, but is {samples}.")
+            raise InputError(f"`samples` must be positive, but is {samples}.")
         factor, edge = self.decimation.factor, self.filter.edge(self.sample_time)
         before, after = self.decimation.memory(), self.filter.memory(self.sample_time)
         found, step = [], max(1, samples // factor)
@@ -160,12 +161,12 @@ class Observations(eqx.Module):
         The log is filtered as a whole: no rows are lost where it is divided.
 
         Raises:
-            ValueError: If no row is left for some joint.
+            InputError: If no row is left for some joint.
         """
         time = self.reduced_time
         mask = np.asarray(self.mask) & ((time >= start) & (time < stop))[:, None]
         if not mask.any(axis=0).all():
-            raise ValueError(
+            raise InputError(
                 f"`{self.name}` has no rows from {start:g} s to {stop:g} s for every joint: its "
                 f"rows reach from {time[0]:g} s to {time[-1]:g} s."
             )
@@ -178,10 +179,10 @@ class Observations(eqx.Module):
             fraction: Of the recording's duration that belongs to the first part, of 1.
 
         Raises:
-            ValueError: If `fraction` is not between 0 and 1.
+            InputError: If `fraction` is not between 0 and 1.
         """
         if not 0 < fraction < 1:
-            raise ValueError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")
+            raise InputError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")
         time = np.asarray(self.time)
         middle = float(time[0] + fraction * (time[-1] - time[0]))
         return self.between(-np.inf, middle), self.between(middle, np.inf)
@@ -222,12 +223,12 @@ def observe(
         name: Of the observations; the recording's if None.
 
     Raises:
-        ValueError: If the numbers of joints differ, forces and columns would be aliased, nothing
+        InputError: If the numbers of joints differ, forces and columns would be aliased, nothing
             is left between the edges of the segments, or nothing of a joint is fast enough.
     """
     n = robot.joints
     if recording.joints != n:
-        raise ValueError(
+        raise InputError(
             f"`{recording.name}` has {recording.joints} joints, but the robot `{robot.name}` has "
             f"{n}: choose the columns of its joints, or the robot of this log."
         )
@@ -274,14 +275,14 @@ def usable(
     """The segments that are longer than what filters lose at their ends, and what to say.
 
     Raises:
-        ValueError: If there is none.
+        InputError: If there is none.
     """
     edge = filter.edge(sample_time)
     fewest = 2 * edge + (FEWEST_ROWS - 1) * decimation.factor + 1
     used = [(a, b) for a, b in segments if b - a >= max(fewest, 5)]
     if not used:
         longest = max(b - a for a, b in segments)
-        raise ValueError(
+        raise InputError(
             f"the longest segment of `{name}` has {longest} samples, but {edge} at each "
             f"end are lost to the filter and {FEWEST_ROWS} rows of {decimation.factor} are needed: "
             "record longer, close the gaps (`largest_gap`), or set a smaller `margin`."
@@ -302,12 +303,12 @@ def refuse_standstill(
     """Refuses a log in which a joint is never fast enough.
 
     Raises:
-        ValueError: If no row of some joint counts.
+        InputError: If no row of some joint counts.
     """
     slow = np.flatnonzero(~mask.any(axis=0))
     if slow.size:
         j = int(slow[0])
-        raise ValueError(
+        raise InputError(
             f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of `slow` in "
             f"`{name}`: take a smaller one, or a log in which it moves."
         )

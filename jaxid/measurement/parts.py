@@ -10,9 +10,10 @@ import equinox as eqx
 import numpy as np
 import polars as pl
 
+from jaxid.arrays import Int
+from jaxid.errors import InputError
 from jaxid.measurement.tables import Table, whole_parquet
 from jaxid.measurement.text import HEAD, SUFFIXES, Dialect
-from jaxid.types import Int
 
 FIRST = 4096
 """Rows by which a file is got to know."""
@@ -84,20 +85,20 @@ class ArrayParts(AbstractParts):
         """Maps the arrays.
 
         Raises:
-            ValueError: If an array is compressed.
+            InputError: If an array is compressed.
         """
         arrays = {}
         with zipfile.ZipFile(path) as archive, path.open("rb") as file:
             for entry in archive.infolist():
                 if entry.compress_type != zipfile.ZIP_STORED:
-                    raise ValueError(
+                    raise InputError(
                         f"`{entry.filename}` in `{path.name}` is compressed, so it cannot be "
                         "mapped: write it with `np.savez`, or as Parquet."
                     )
                 try:
                     mapped = _mapped(file, path, entry.header_offset)
                 except Exception as error:  # it depends on which bytes are damaged
-                    raise ValueError(
+                    raise InputError(
                         f"`{entry.filename}` in `{path.name}` is no array of numbers, or is "
                         f"damaged ({' '.join(str(error).split())}): write it again."
                     ) from error
@@ -151,7 +152,7 @@ class TextParts(AbstractParts):
         """Counts the lines.
 
         Raises:
-            ValueError: If the file is empty, or its header names a column twice.
+            InputError: If the file is empty, or its header names a column twice.
         """
         with path.open("rb") as file:
             dialect = Dialect.of(path.name, file.read(HEAD))
@@ -224,11 +225,11 @@ def open_parts(path: Path) -> AbstractParts:
     """Opens a file of numbers by its suffix, to be read part by part.
 
     Raises:
-        ValueError: If the file is missing, of another kind, or damaged.
+        InputError: If the file is missing, of another kind, or damaged.
     """
     suffix = path.suffix.lower()
     if not path.is_file():
-        raise ValueError(f"`{path}` is no file: check the path of the log.")
+        raise InputError(f"`{path}` is no file: check the path of the log.")
     if suffix in SUFFIXES:
         return TextParts.of(path)
     if suffix == ".parquet":
@@ -239,8 +240,8 @@ def open_parts(path: Path) -> AbstractParts:
         try:
             return ArrayParts.of(path)
         except zipfile.BadZipFile as error:
-            raise ValueError(f"`{path.name}` is no NPZ file ({error}).") from error
-    raise ValueError(
+            raise InputError(f"`{path.name}` is no NPZ file ({error}).") from error
+    raise InputError(
         f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet or .npz to be read part by "
         "part: convert it to one of them."
     )

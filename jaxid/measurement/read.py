@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.measurement.columns import Columns, Selection
 from jaxid.measurement.recording import Recording
 from jaxid.measurement.tables import Table, read_table
@@ -30,7 +31,7 @@ def read_recording(
             split the recording into segments.
 
     Raises:
-        ValueError: If a file, a column, a number or the time is not what it should be; the
+        InputError: If a file, a column, a number or the time is not what it should be; the
             message names file, column and line.
     """
     table = read_table(path)
@@ -49,13 +50,13 @@ def read_recording(
         velocities = _like(angles, table, velocities_table, "velocities", columns.velocities)
         velocities = velocities * columns.velocity_scale(joints)
     elif velocities_path is not None:
-        raise ValueError("`velocities_path` is given, but `Columns.velocities` names no columns.")
+        raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")
     stamps = None
     if columns.time is not None:
         stamps, dates = table.stamps(columns.time)
         stamps = stamps if dates else stamps * columns.time_unit.factor
         if len(stamps) != len(angles):
-            raise ValueError(
+            raise InputError(
                 f"`time` of `{table.source}` has {len(stamps)} stamps for {len(angles)} samples of "
                 "the angles: arrays must have one row for each sample (transpose them)."
             )
@@ -78,12 +79,12 @@ def _like(
 ) -> np.ndarray:
     array = table.array(what, selection)
     if len(array) != len(angles):
-        raise ValueError(
+        raise InputError(
             f"`{what}` in `{table.source}` have {len(array)} samples, but the angles in "
             f"`{angles_table.source}` have {len(angles)}: they must be of one run, row by row."
         )
     if array.shape[1] != angles.shape[1]:
-        raise ValueError(
+        raise InputError(
             f"`{what}` in `{table.source}` have {array.shape[1]} joints, but the angles in "
             f"`{angles_table.source}` have {angles.shape[1]}: name one column for each joint."
         )

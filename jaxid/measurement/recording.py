@@ -6,9 +6,10 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.measurement.clock import clock, uniform
 from jaxid.measurement.tables import LARGEST
-from jaxid.types import AnyArray, Float
 
 FEWEST = 10
 """Samples below which nothing can be filtered."""
@@ -76,49 +77,49 @@ class Recording(eqx.Module):
             first_row: Number of the first row in its file, for messages.
 
         Raises:
-            ValueError: If shapes differ, a value is not finite, time runs backwards or stands
+            InputError: If shapes differ, a value is not finite, time runs backwards or stands
                 still, or there are fewer than ten samples.
         """
         if any(np.iscomplexobj(x) for x in (angles, forces, velocities, time) if x is not None):
-            raise ValueError(f"`{name}` holds complex numbers: give real ones.")
+            raise InputError(f"`{name}` holds complex numbers: give real ones.")
         if not largest_gap > 1.0:
-            raise ValueError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
+            raise InputError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
         data = {"angles": np.array(angles, np.float64), "forces": np.array(forces, np.float64)}
         if velocities is not None:
             data["velocities"] = np.array(velocities, np.float64)
         shape = data["angles"].shape
         for key, array in data.items():
             if array.ndim != 2 or array.shape != shape:
-                raise ValueError(
+                raise InputError(
                     f"`{key}` of `{name}` must have one row for each sample and one column for "
                     f"each joint, like `angles` with shape {shape}, but has shape {array.shape}."
                 )
             if not np.isfinite(array).all():
                 row, joint = (int(i) for i in np.argwhere(~np.isfinite(array))[0])
-                raise ValueError(
+                raise InputError(
                     f"`{key}` of `{name}` must be finite, but are {array[row, joint]} for joint "
                     f"{joint + 1} at row {row + first_row}: repair or remove the row."
                 )
             if np.abs(array).max(initial=0.0) > LARGEST:
-                raise ValueError(
+                raise InputError(
                     f"`{key}` of `{name}` must be numbers that can be measured, but go up to "
                     f"{np.abs(array).max():.3g}: check their units, or remove the rows."
                 )
         samples = shape[0]
         if samples < FEWEST:
-            raise ValueError(
+            raise InputError(
                 f"`{name}` has {samples} samples, but at least {FEWEST} are needed: is the log cut?"
             )
         if (time is None) == (sample_time is None):
-            raise ValueError("a recording needs either `time` or `sample_time`, and not both.")
+            raise InputError("a recording needs either `time` or `sample_time`, and not both.")
         if sample_time is not None:
             if not 0 < sample_time < np.inf:
-                raise ValueError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
+                raise InputError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
             ticks = uniform(samples, float(sample_time))
         else:
             stamps = np.array(time, np.float64)
             if stamps.shape != (samples,) or not np.isfinite(stamps).all():
-                raise ValueError(
+                raise InputError(
                     f"`time` of `{name}` must hold one finite stamp for each of the {samples} "
                     f"samples, but has shape {stamps.shape}."
                 )
@@ -155,12 +156,12 @@ class Recording(eqx.Module):
         """The part from `start` [s] on and before `stop` [s], on the clock of `time`.
 
         Raises:
-            ValueError: If fewer than ten samples are left.
+            InputError: If fewer than ten samples are left.
         """
         slack = 1e-6 * self.sample_time
         a, b = (int(i) for i in np.searchsorted(self.time, [start - slack, stop - slack]))
         if b - a < FEWEST:
-            raise ValueError(
+            raise InputError(
                 f"`{self.name}` has {max(b - a, 0)} samples from {start:g} s to {stop:g} s, but at "
                 f"least {FEWEST} are needed: it lasts from {self.time[0]:g} s to "
                 f"{self.time[-1]:g} s."
@@ -171,11 +172,11 @@ class Recording(eqx.Module):
         """The first `fraction` of the recorded time, and the rest: to fit and to check.
 
         Raises:
-            ValueError: If a part has fewer than ten samples.
+            InputError: If a part has fewer than ten samples.
         """
         cut = round(fraction * self.samples)
         if not FEWEST <= cut <= self.samples - FEWEST:
-            raise ValueError(
+            raise InputError(
                 f"`fraction` must leave at least {FEWEST} samples on both sides, but {fraction:g} "
                 f"of the {self.samples} samples of `{self.name}` leaves {cut}."
             )

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.measurement.clock import (
     JITTER,
     TWINS,
@@ -51,7 +52,7 @@ class Survey:
         """The part from `start` [s] on and before `stop` [s].
 
         Raises:
-            ValueError: If fewer than ten rows are left.
+            InputError: If fewer than ten rows are left.
         """
         dt = self.sample_time
         ranges, times = [], []
@@ -65,7 +66,7 @@ class Survey:
         left = sum(b - a for a, b in ranges)
         if left < FEWEST:
             a, b = self.ranges[-1]
-            raise ValueError(
+            raise InputError(
                 f"`{name}` has {left} samples from {start:g} s to {stop:g} s, but at least "
                 f"{FEWEST} are needed: it lasts from {self.times[0]:g} s to "
                 f"{self.times[-1] + (b - a - 1) * dt:g} s."
@@ -81,7 +82,7 @@ class _Surveyor:
         steps = np.diff(first)
         moving = steps[steps > 0]
         if not moving.size:
-            raise ValueError(f"time of `{source}` stands still: check the column of time stamps.")
+            raise InputError(f"time of `{source}` stands still: check the column of time stamps.")
         self.typical = float(np.median(moving))
         spread = 1.4826 * float(np.median(np.abs(moving - self.typical)))
         self._gap = max(largest_gap * self.typical, self.typical + 8.0 * spread)
@@ -126,7 +127,7 @@ class _Surveyor:
         back = np.flatnonzero(steps < 0)
         if back.size:
             i = int(back[0])
-            raise ValueError(
+            raise InputError(
                 f"time of `{self._source}` runs backwards from {t[i] + self._origin:.9g} s to "
                 f"{t[i + 1] + self._origin:.9g} s at row {before + i + 1 + self._first_row}: sort "
                 "the log, or split it where the clock was set back."
@@ -146,7 +147,7 @@ class _Surveyor:
             if b - a >= FEWEST_IN_SEQUENCE
         ]
         if not ranges:
-            raise ValueError(
+            raise InputError(
                 f"`{self._source}` has no four rows in sequence: its time stamps are "
                 f"{self.typical:.6g} s apart at the median, with {self.gaps} gaps; check "
                 "`time_unit`, or give `sample_time`."
@@ -189,7 +190,7 @@ def survey(
 
     Raises:
         NeedsMemory: If rows would have to be moved or removed.
-        ValueError: If time runs backwards, or stands still.
+        InputError: If time runs backwards, or stands still.
     """
     surveyor = None
     for part in stamps:
@@ -197,5 +198,5 @@ def survey(
             surveyor = _Surveyor(part, source, largest_gap, first_row)
         surveyor.add(part)
     if surveyor is None:
-        raise ValueError(f"`{source}` has no rows: is the log cut?")
+        raise InputError(f"`{source}` has no rows: is the log cut?")
     return surveyor.found()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from jaxid.errors import InputError
 from jaxid.files import read_arrays
 from jaxid.measurement.columns import Selection
 from jaxid.measurement.text import SUFFIXES, Dialect
@@ -48,7 +49,7 @@ class Table:
         """Names of the columns of a selection, in the order of the joints.
 
         Raises:
-            ValueError: If there is no such column, or a number of a pattern is missing or there
+            InputError: If there is no such column, or a number of a pattern is missing or there
                 twice.
         """
         if isinstance(selection, tuple):
@@ -61,7 +62,7 @@ class Table:
             if not (match := re.fullmatch(pattern, column)):
                 continue
             if other := found.get(int(match[1])):
-                raise ValueError(
+                raise InputError(
                     f"`{self.source}` has `{other}` and `{column}`, which both are number "
                     f"{int(match[1])} of `{what}`: name the columns one by one."
                 )
@@ -72,7 +73,7 @@ class Table:
         numbers = range(min(first, 1), max(found) + 1)
         missing = next((number for number in numbers if number not in found), None)
         if missing is not None:
-            raise ValueError(
+            raise InputError(
                 f"`{self.source}` has no column `{selection.replace('{}', str(missing))}` for "
                 f"`{what}`, though it has `{found[max(found)]}`: name the columns one by one."
             )
@@ -82,7 +83,7 @@ class Table:
         names = list(self.columns)
         if isinstance(column, int):
             if not 0 <= column < len(names):
-                raise ValueError(
+                raise InputError(
                     f"`{what}` asks for column {column} of `{self.source}`, but its columns are "
                     f"numbered from 0 to {len(names) - 1}."
                 )
@@ -90,7 +91,7 @@ class Table:
         if column in self.columns:
             return column
         if not self.named:
-            raise ValueError(
+            raise InputError(
                 f"`{self.source}` has no header, so `{what}` cannot name the column `{column}`: "
                 f"give positions from 0 to {len(names) - 1}."
             )
@@ -98,7 +99,7 @@ class Table:
         hint = f" (did you mean `{near[0]}`?)" if near else ""
         shown = ", ".join(f"`{name}`" for name in names[:40])
         more = f" and {len(names) - 40} more" if len(names) > 40 else ""
-        raise ValueError(
+        raise InputError(
             f"`{self.source}` has no column `{column}` for `{what}`{hint}: it has {shown}{more}."
         )
 
@@ -109,14 +110,14 @@ class Table:
             channels: Selections by what they are for; those of None are left out.
 
         Raises:
-            ValueError: If a column comes twice.
+            InputError: If a column comes twice.
         """
         used: dict[str, str] = {}
         for what, selection in channels.items():
             for name in () if selection is None else self.expand(what, selection):
                 if name in used:
                     both = "twice" if used[name] == what else f"for `{used[name]}` and `{what}`"
-                    raise ValueError(
+                    raise InputError(
                         f"the column `{name}` of `{self.source}` is used {both}: one column holds "
                         "one channel; name the right one."
                     )
@@ -126,13 +127,13 @@ class Table:
         """The numbers of some columns (samples x columns).
 
         Raises:
-            ValueError: If a column is missing, has another length, or holds what is no number.
+            InputError: If a column is missing, has another length, or holds what is no number.
         """
         names = self.expand(what, selection)
         blocks = [self._numbers(name) for name in names]
         for name, block in zip(names, blocks, strict=True):
             if len(block) != len(blocks[0]):
-                raise ValueError(
+                raise InputError(
                     f"column `{name}` of `{self.source}` has {len(block)} samples, but "
                     f"`{names[0]}` has {len(blocks[0])}: they must be of one log."
                 )
@@ -142,7 +143,7 @@ class Table:
         """The time stamps, and whether they were dates (then in seconds).
 
         Raises:
-            ValueError: Like `array`.
+            InputError: Like `array`.
         """
         name = self._name("time", selection)
         column = self.columns[name]
@@ -159,7 +160,7 @@ class Table:
             return (column.astype(np.int64) - np.int64(column[0])).astype(np.float64), False
         block = self._numbers(name)
         if block.shape[1] != 1:
-            raise ValueError(
+            raise InputError(
                 f"`{name}` of `{self.source}` must be one column of time stamps, "
                 f"but is an array of {block.shape[1]} columns."
             )
@@ -168,14 +169,14 @@ class Table:
     def _numbers(self, name: str) -> np.ndarray:
         column = self.columns[name]
         if len(column) == 0:
-            raise ValueError(f"column `{name}` of `{self.source}` has no rows: is the log cut?")
+            raise InputError(f"column `{name}` of `{self.source}` has no rows: is the log cut?")
         if isinstance(column, pl.Series):
             try:
                 if isinstance(column.dtype, pl.List | pl.Array):
                     return self._nested(name, column)
                 numbers = _as_numbers(column)
             except pl.exceptions.PolarsError as error:
-                raise ValueError(
+                raise InputError(
                     f"column `{name}` of `{self.source}` holds {column.dtype} and no numbers: "
                     "write it as floating numbers, or name another column."
                 ) from error
@@ -184,7 +185,7 @@ class Table:
             array = numbers.to_numpy()
         else:
             if column.dtype.kind not in "iufb" or column.ndim > 2:
-                raise ValueError(
+                raise InputError(
                     f"`{name}` of `{self.source}` must be an array of real numbers of one or two "
                     f"axes, but holds {column.dtype} with {column.ndim} axes."
                 )
@@ -192,7 +193,7 @@ class Table:
             with np.errstate(invalid="ignore"):
                 array = np.asarray(column, np.float64)
         if array.size == 0:
-            raise ValueError(f"`{name}` of `{self.source}` has rows, but no columns.")
+            raise InputError(f"`{name}` of `{self.source}` has rows, but no columns.")
         array = np.array(array.reshape(len(array), -1), np.float64)
         bad = np.asarray(np.logical_not(np.isfinite(array)).any(axis=1))
         with np.errstate(invalid="ignore"):
@@ -217,7 +218,7 @@ class Table:
         if rows.size:
             first = int(rows[0])
             more = f" (and {rows.size - 1} more)" if rows.size > 1 else ""
-            raise ValueError(
+            raise InputError(
                 f"column `{name}` of `{self.source}`, {self.row(first)}, "
                 f"{complaint.format(column[first])}{more}: repair the log or remove those rows."
             )
@@ -235,11 +236,11 @@ def read_table(path: str | Path) -> Table:
     """Opens a file of numbers by its suffix.
 
     Raises:
-        ValueError: If the file is missing, of an unknown kind, or damaged.
+        InputError: If the file is missing, of an unknown kind, or damaged.
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"`{path}` is no file: check the path of the log.")
+        raise InputError(f"`{path}` is no file: check the path of the log.")
     suffix = path.suffix.lower()
     if suffix in SUFFIXES:
         return _read_text(path)
@@ -249,7 +250,7 @@ def read_table(path: str | Path) -> Table:
         return _read_npz(path)
     if suffix == ".mat":
         return _read_mat(path)
-    raise ValueError(
+    raise InputError(
         f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet, .npz or .mat, to be read as a "
         "log: convert it to one of them."
     )
@@ -270,13 +271,13 @@ def whole_parquet(path: Path) -> Iterator[None]:
         path: Of the file.
 
     Raises:
-        ValueError: If reading fails, also where Polars itself takes damage for a bug of its own.
+        InputError: If reading fails, also where Polars itself takes damage for a bug of its own.
     """
     try:
         yield
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
         said = " ".join(str(error).split())[:LONGEST]
-        raise ValueError(f"`{path.name}` is no Parquet file, or is damaged: {said}.") from error
+        raise InputError(f"`{path.name}` is no Parquet file, or is damaged: {said}.") from error
 
 
 def _read_parquet(path: Path) -> Table:
@@ -289,7 +290,7 @@ def _read_npz(path: Path) -> Table:
     try:
         arrays = read_arrays(path)
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"`{path.name}` is no NPZ file of plain arrays ({error}): save the log with "
             "`numpy.savez` and without objects."
         ) from error
@@ -302,13 +303,13 @@ def _read_mat(path: Path) -> Table:
     try:
         content = loadmat(path, simplify_cells=True)
     except NotImplementedError as error:
-        raise ValueError(
+        raise InputError(
             f"`{path.name}` is a MAT file of version 7.3, which cannot be read: save it with "
             "`save(name, ..., '-v7')`, or as CSV."
         ) from error
     except Exception as error:  # of many kinds: it depends on which bytes are damaged
         said = " ".join(str(error).split())[:LONGEST]
-        raise ValueError(f"`{path.name}` is no MAT file, or is damaged: {said}.") from error
+        raise InputError(f"`{path.name}` is no MAT file, or is damaged: {said}.") from error
     return Table(path.name, _arrays({k: v for k, v in content.items() if not k.startswith("__")}))
 
 

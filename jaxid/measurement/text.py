@@ -7,6 +7,8 @@ import re
 
 import polars as pl
 
+from jaxid.errors import InputError
+
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 SEPARATORS = (";", "\t", ",", " ")
 HEAD = 65536
@@ -38,19 +40,19 @@ class Dialect:
         """Looks at the beginning of a file.
 
         Raises:
-            ValueError: If it is empty, or names a column twice.
+            InputError: If it is empty, or names a column twice.
         """
         if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            raise ValueError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
+            raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
         first, _, _ = head.partition(b"\n")
         if b"\r" in first.rstrip(b"\r"):
-            raise ValueError(
+            raise InputError(
                 f"`{source}` ends its lines with carriage returns alone, as old Macintosh programs "
                 "do: save it again with line ends of Unix or Windows (LF or CRLF)."
             )
         line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
         if not line.strip():
-            raise ValueError(f"`{source}` must start with a header or with numbers, but is empty.")
+            raise InputError(f"`{source}` must start with a header or with numbers, but is empty.")
         separator = next((s for s in SEPARATORS if s in line.strip()), ",")
         line = " ".join(line.split()) if separator == " " else line
         cells = [cell.strip().strip('"') for cell in line.split(separator)]
@@ -58,7 +60,7 @@ class Dialect:
         names = cells if named else [str(i) for i in range(len(cells))]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(
+            raise InputError(
                 f"the header of `{source}` names the column `{twice[0]}` twice: rename one of them."
             )
         comma = separator == ";" and re.search(rb"\d,\d", head[:HEAD]) is not None
@@ -79,7 +81,7 @@ class Dialect:
             before: Rows of the file before these.
 
         Raises:
-            ValueError: If lines differ in their number of cells, or one reaches into the next.
+            InputError: If lines differ in their number of cells, or one reaches into the next.
         """
         tidied = self._tidied(rows)
         self._refuse_open_quotes(tidied, before)
@@ -92,15 +94,15 @@ class Dialect:
             )
         except pl.exceptions.PolarsError as error:
             if isinstance(error, pl.exceptions.NoDataError):
-                raise ValueError(
+                raise InputError(
                     f"`{self.source}` has a header, but no rows: is the log cut?"
                 ) from error
-            raise ValueError(
+            raise InputError(
                 f"`{self.source}` is no table with {len(self.names)} columns in every line: repair "
                 "or remove the lines that differ."
             ) from error
         if frame.width != len(self.names):
-            raise ValueError(
+            raise InputError(
                 f"`{self.source}` has {len(self.names)} names in its header, but {frame.width} "
                 "columns of numbers: make them agree."
             )
@@ -124,7 +126,7 @@ class Dialect:
             before: Rows of the file before these.
 
         Raises:
-            ValueError: Like `columns`.
+            InputError: Like `columns`.
         """
         tidied = self._tidied(rows)
         lines = tidied.count(b"\n") + (not tidied.endswith(b"\n"))
@@ -149,7 +151,7 @@ class Dialect:
             return
         for index, line in enumerate(rows.split(b"\n")):
             if line.count(b'"') % 2:
-                raise ValueError(
+                raise InputError(
                     f"line {index + before + self.first_line} of `{self.source}` opens a quotation "
                     "that does not end in that line: remove the quotation mark, or close it there."
                 )

@@ -6,6 +6,8 @@ import enum
 
 import numpy as np
 
+from jaxid.errors import InputError
+
 
 class Quantity(enum.Enum):
     """What a unit measures."""
@@ -38,7 +40,7 @@ class Unit:
     def __post_init__(self) -> None:
         """Refuses factors that cannot be undone."""
         if not np.isfinite(self.factor) or self.factor == 0:
-            raise ValueError(
+            raise InputError(
                 f"`factor` of the unit `{self.symbol}` must be finite and not zero, "
                 f"but is {self.factor}."
             )
@@ -76,7 +78,7 @@ def unit(symbol: str) -> Unit:
     """The unit that is written so: `unit("deg")` is `DEG`.
 
     Raises:
-        ValueError: If no unit is written so.
+        InputError: If no unit is written so.
     """
     found = [known for known in ALL if known.symbol == symbol]
     if not found:
@@ -86,5 +88,5 @@ def unit(symbol: str) -> Unit:
         near = difflib.get_close_matches(symbol, symbols, n=1, cutoff=0.9) or begun[-1:]
         near = near or difflib.get_close_matches(symbol, symbols, n=1)
         hint = f" (did you mean `{near[0]}`?)" if near else ""
-        raise ValueError(f"`{symbol}` is no known unit{hint}: write one of {', '.join(symbols)}.")
+        raise InputError(f"`{symbol}` is no known unit{hint}: write one of {', '.join(symbols)}.")
     return found[0]

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+from jaxid.errors import InputError
+
 
 def whole(name: str) -> Callable[[float | int], int]:
     """A converter that takes whole numbers only.
@@ -13,7 +15,7 @@ def whole(name: str) -> Callable[[float | int], int]:
     def convert(value: float | int) -> int:
         number = float(value)
         if not number.is_integer():
-            raise ValueError(f"`{name}` must be a whole number, but is {value:g}.")
+            raise InputError(f"`{name}` must be a whole number, but is {value:g}.")
         return int(value)
 
     return convert

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array
 from jaxid.program.operation import Operation
 from jaxid.program.program import Node, Program, Reference
 from jaxid.program.xla import CIRCULAR, ELEMENTWISE, Lowered, Values, primitives
-from jaxid.types import AnyArray, Array
 
 Groups = tuple[tuple[int, ...], ...]
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.program.c_library import KINDS, SINE_COSINE, Library
 from jaxid.program.operation import TRUTH_VALUED, Operation
 from jaxid.program.program import Program, Reference
@@ -100,7 +101,7 @@ def to_c(
         double: Whether the C code computes in `double`; in `float` otherwise.
 
     Raises:
-        ValueError: If a name is no identifier of C, is used twice, or there are not
+        InputError: If a name is no identifier of C, is used twice, or there are not
             as many names as inputs or outputs.
     """
     inputs = _names(inputs, "input", len(program.input_shapes))
@@ -129,7 +130,7 @@ def declaration(name: str, inputs: Sequence[str], outputs: Sequence[str], *, dou
         double: Whether its numbers are of `double`; of `float` otherwise.
 
     Raises:
-        ValueError: If a name is no identifier of C, or is used twice.
+        InputError: If a name is no identifier of C, or is used twice.
     """
     _check_names([name, *inputs, *outputs])
     kind = "double" if double else "float"
@@ -158,7 +159,7 @@ def definition(
             file, made for this program and others; the compiler's own functions if None.
 
     Raises:
-        ValueError: If a name is no identifier of C, or is used twice.
+        InputError: If a name is no identifier of C, or is used twice.
     """
     head = declaration(name, inputs, outputs, double=double)
     writer = _Writer(double)
@@ -242,15 +243,15 @@ def _description(program: Program, inputs: Sequence[str], outputs: Sequence[str]
 def _names(given: Sequence[str] | None, stem: str, count: int) -> list[str]:
     names = [f"{stem}{k}" for k in range(count)] if given is None else list(given)
     if len(names) != count:
-        raise ValueError(f"`{stem}s` must name the program's {count} {stem}s, but has {names}.")
+        raise InputError(f"`{stem}s` must name the program's {count} {stem}s, but has {names}.")
     return names
 
 
 def _check_names(names: list[str]) -> None:
     for name in names:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _KEYWORDS.fullmatch(name):
-            raise ValueError(f"A name in C code must be an identifier of C, but got {name!r}.")
+            raise InputError(f"A name in C code must be an identifier of C, but got {name!r}.")
         if re.fullmatch(r"t[a-z]?[0-9]+[ab]?", name):
-            raise ValueError(f"The name {name!r} is taken by the generated code: choose another.")
+            raise InputError(f"The name {name!r} is taken by the generated code: choose another.")
     if len(set(names)) < len(names):
-        raise ValueError(f"Names in C code must differ from each other, but are {names}.")
+        raise InputError(f"Names in C code must differ from each other, but are {names}.")

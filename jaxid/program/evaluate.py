@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxid.arrays import AnyArray
 from jaxid.program.operation import NUMPY, TRUTH_VALUED, Operation
 from jaxid.program.program import Program, Reference
-from jaxid.types import AnyArray
 
 _BLOCK = 1024
 """Samples at a time: the values that are alive at once then stay in the cache."""
@@ -78,7 +78,7 @@ def evaluate(program: Program, *arrays: AnyArray) -> Any:
         The outputs in the structure of the traced function, each with the batch axes last.
 
     Raises:
-        ValueError: If the arrays do not fit to the program's inputs.
+        InputError: If the arrays do not fit to the program's inputs.
     """
     plan = _plan(program)
     table, batch = _evaluate(program, plan, arrays)

@@ -11,9 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jaxid.arrays import Array
 from jaxid.program.operation import FUNCTIONS, Operation
 from jaxid.program.program import Program
-from jaxid.types import Array
 
 _FREE = (Operation.INPUT, Operation.NEGATE)
 _COST_OF_FUNCTION = 20

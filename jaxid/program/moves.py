@@ -10,6 +10,8 @@ import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
+from jaxid.errors import InputError
+
 
 def is_symbolic(x: np.ndarray) -> bool:
     """Whether the array holds scalars of a trace."""
@@ -83,7 +85,7 @@ def move_by_index(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
     """Moves entries to places that the numbers among the operands say.
 
     Raises:
-        ValueError: If an index is not a known number, or lies outside of the array.
+        InputError: If an index is not a known number, or lies outside of the array.
     """
     name = equation.primitive.name
     carriers = INDEXED_MOVES[name]
@@ -94,13 +96,13 @@ def move_by_index(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
         labels[k] = positions.reshape(operands[k].shape)
         start += operands[k].size
     if any(is_symbolic(x) for x in labels):
-        raise ValueError(
+        raise InputError(
             f"`trace` cannot translate `{name}` with an index that depends on the inputs: "
             "index with constant integers."
         )
     (moved,) = on_numbers(equation, *labels)
     if not ((moved >= 0) & (moved < start)).all():
-        raise ValueError(f"`trace` met an index outside of its array in `{name}`: correct it.")
+        raise InputError(f"`trace` met an index outside of its array in `{name}`: correct it.")
     return np.concatenate(entries)[moved.astype(int)]
 
 
@@ -108,7 +110,7 @@ def scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
     """Adds entries at known places, which is what the transpose of a gather does."""
     target, indices, updates = operands
     if is_symbolic(indices):
-        raise ValueError(
+        raise InputError(
             "`trace` cannot add at an index that depends on the inputs: "
             "index with constant integers."
         )

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.program.operation import COMPARISONS, FUNCTIONS, LOGIC, Operation
 from jaxid.program.rewrite import live, rewrite
 from jaxid.program.scalar import Graph, Operand, Scalar
@@ -128,18 +129,18 @@ class Program:
         """The trailing batch axes of arrays with these shapes, broadcast against each other.
 
         Raises:
-            ValueError: If the arrays are not as many as the inputs, or a shape does
+            InputError: If the arrays are not as many as the inputs, or a shape does
                 not begin with its input's.
         """
         if len(shapes) != len(self.input_shapes):
-            raise ValueError(
+            raise InputError(
                 f"The program takes {len(self.input_shapes)} arrays (of shapes "
                 f"{', '.join(map(str, self.input_shapes))} and batch axes behind), "
                 f"but got {len(shapes)}."
             )
         for k, (given, expected) in enumerate(zip(shapes, self.input_shapes, strict=True)):
             if given[: len(expected)] != expected:
-                raise ValueError(
+                raise InputError(
                     f"Input {k} of the program must have shape {expected} with batch axes behind, "
                     f"but has shape {given}: put the batch last."
                 )

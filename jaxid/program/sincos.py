@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.types import Array
+from jaxid.arrays import Array
 
 _HALF_PI = Fraction("1.57079632679489661923132169163975144209858469968755291")
 

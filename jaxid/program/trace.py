@@ -10,6 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
+from jaxid.arrays import double_precision
+from jaxid.errors import InputError
 from jaxid.program import scalar
 from jaxid.program.moves import (
     INDEXED_MOVES,
@@ -22,7 +24,6 @@ from jaxid.program.moves import (
 from jaxid.program.operation import COMPARISONS, FUNCTIONS, Operation
 from jaxid.program.program import Program, assemble
 from jaxid.program.scalar import Graph, Operand
-from jaxid.types import double_precision
 
 
 class Free:
@@ -157,7 +158,7 @@ def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     truth = all(scalar.is_truth(e) for e in x.flat)
     if truth or np.issubdtype(dtype, np.floating):
         return np.asarray(_each(scalar.as_number, 1)(x), object)
-    raise ValueError(
+    raise InputError(
         f"`trace` cannot translate a conversion to {dtype}: a program computes with real numbers."
     )
 
@@ -186,14 +187,14 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
         which, cases = operands[0], [_entries(x) for x in operands[1:]]
         return [(_select_truth if truth else _select_n)(which, *cases)]
     if name in ("div", "pow") and np.issubdtype(_dtype(equation), np.integer):
-        raise ValueError(f"`trace` cannot translate `{name}` of integers: use real numbers.")
+        raise InputError(f"`trace` cannot translate `{name}` of integers: use real numbers.")
     if name in _ARITHMETIC:
         parameters = equation.params if name in _WITH_PARAMETERS else {}
         result = _ARITHMETIC[name](*map(_entries, operands), **parameters)
         results = result if equation.primitive.multiple_results else [result]
         return [np.asarray(x, object) for x in results]
     reason = _INSTEAD.get(name, "it is not elementwise arithmetic, a sum, or a move of entries")
-    raise ValueError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
+    raise InputError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
 
 
 def _entries_of_floats(x: np.ndarray) -> np.ndarray:
@@ -202,7 +203,7 @@ def _entries_of_floats(x: np.ndarray) -> np.ndarray:
 
 def _known(constant: object) -> np.ndarray:
     if isinstance(constant, Tracer):
-        raise ValueError(
+        raise InputError(
             "The function given to `trace` closes over a value that JAX is tracing, which a "
             f"program cannot hold ({constant}): pass it as an input, or trace outside of `jit`."
         )
@@ -269,7 +270,7 @@ def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
             with numbers; the numbers become constants of the program.
 
     Raises:
-        ValueError: If the function does what a scalar program cannot, such as a loop
+        InputError: If the function does what a scalar program cannot, such as a loop
             of JAX or a sort; or if it closes over a value that JAX is tracing.
     """
     graph = Graph()
@@ -292,7 +293,7 @@ def applied(function: Callable, *arrays: np.ndarray) -> Any:
         What the function returns, with arrays of scalars and numbers in it.
 
     Raises:
-        ValueError: Like `trace`.
+        InputError: Like `trace`.
     """
     with double_precision():
         avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arrays]

@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array
+from jaxid.errors import InputError
 from jaxid.program.fence import AbstractFence, default_fence, fenced_nodes
 from jaxid.program.operation import Operation
 from jaxid.program.program import Program
 from jaxid.program.sincos import sine_cosine as polynomial_sine_cosine
-from jaxid.types import AnyArray, Array
 
 ELEMENTWISE: dict[Operation, Callable] = {
     Operation.ADD: lambda x, y: x + y,
@@ -96,7 +97,7 @@ class Lowered(eqx.Module):
         batch = self.program.batch_shape([np.shape(x) for x in arrays])
         dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
         if not jnp.issubdtype(dtype, jnp.floating):
-            raise ValueError(f"A program computes with real numbers, but got arrays of {dtype}.")
+            raise InputError(f"A program computes with real numbers, but got arrays of {dtype}.")
         return [
             _entries(jnp.asarray(x, dtype), shape, batch)
             for x, shape in zip(arrays, self.program.input_shapes, strict=True)

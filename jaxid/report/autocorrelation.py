@@ -8,6 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from jaxid.arrays import Float
+from jaxid.errors import InputError
 from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.report.numbers import shortened, significant
 from jaxid.report.style import (
@@ -23,7 +25,6 @@ from jaxid.report.style import (
 )
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 from jaxid.validation.errors import TorqueErrors
 
 COLUMNS = 2
@@ -70,12 +71,12 @@ def autocorrelation_figure(
         spectra: Whose filters shall be shown: the dashed line is what they make of white noise.
 
     Raises:
-        ValueError: If the numbers of joints differ, or there are fewer than three rows.
+        InputError: If the numbers of joints differ, or there are fewer than three rows.
     """
     require_joints(errors, robot)
     time, n = np.asarray(errors.time), robot.joints
     if len(time) < 3:
-        raise ValueError(f"`{errors.name}` must have three rows at least, but has {len(time)}.")
+        raise InputError(f"`{errors.name}` must have three rows at least, but has {len(time)}.")
     lags = min(LAGS, len(time) // 2) + 1
     step = float(np.median(np.diff(time)))
     values = autocorrelation(errors, lags)

@@ -6,6 +6,8 @@ import equinox as eqx
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxid.arrays import Float
+from jaxid.errors import InputError
 from jaxid.report.numbers import percent, shortened
 from jaxid.report.style import (
     BLUE,
@@ -20,7 +22,6 @@ from jaxid.report.style import (
 )
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
-from jaxid.types import Float
 from jaxid.validation.errors import TorqueErrors
 
 BAR = 0.36
@@ -64,10 +65,10 @@ def error_figure(
         robot: Whose joints they are.
 
     Raises:
-        ValueError: If there is no recording at all, or the numbers of joints differ.
+        InputError: If there is no recording at all, or the numbers of joints differ.
     """
     if not (*identification, *verification):
-        raise ValueError("`identification` or `verification` must hold errors, but both are empty.")
+        raise InputError("`identification` or `verification` must hold errors, but both are empty.")
     groups = (("identification", identification), ("verification", verification))
     return bar_figure(groups, robot)
 
@@ -84,12 +85,12 @@ def bar_figure(groups: Sequence[tuple[str, Sequence[TorqueErrors]]], robot: Robo
         robot: Whose joints they are.
 
     Raises:
-        ValueError: If there is no recording at all, there are too many groups, or the numbers of
+        InputError: If there is no recording at all, there are too many groups, or the numbers of
             joints differ.
     """
     filled = [(name, recordings) for name, recordings in groups if recordings]
     if not 0 < len(filled) <= len(COLOURS):
-        raise ValueError(
+        raise InputError(
             f"`groups` must hold 1 to {len(COLOURS)} groups with errors, but holds {len(filled)}."
         )
     everything = [errors for _, recordings in filled for errors in recordings]

@@ -7,6 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 from matplotlib.figure import Figure
 
+from jaxid.errors import InputError
 from jaxid.report.vector import Drawing, drawing
 
 NUMBER = "number"
@@ -136,7 +137,7 @@ class Sheet(AbstractBlock):
     def __check_init__(self) -> None:
         wrong = next((row for row in self.rows if len(row) != len(self.columns)), None)
         if wrong is not None:
-            raise ValueError(
+            raise InputError(
                 f"each of the `rows` must have {len(self.columns)} cells, but one has "
                 f"{len(wrong)}: {', '.join(map(str, wrong))}."
             )

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.files import read_json, written_whole
 from jaxid.identification.runs.comparison import Comparison
 from jaxid.identification.runs.estimates import Estimates
@@ -31,20 +32,20 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
         label: Of the run; the folder's name if None.
 
     Raises:
-        ValueError: If there is no result, or the file lacks something.
+        InputError: If there is no result, or the file lacks something.
     """
     path = folder if folder.is_file() else folder / "result.json"
     if not path.is_file():
-        raise ValueError(
+        raise InputError(
             f"`{folder}` must be a folder that `jaxid identify` has written, but holds no "
             "`result.json`."
         )
     try:
         content = read_json(path)
     except ValueError as error:
-        raise ValueError(f"`{path}` is no JSON file: {error}; identify again.") from None
+        raise InputError(f"`{path}` is no JSON file: {error}; identify again.") from None
     if not isinstance(content, dict) or not str(content.get("schema")).startswith(RESULT):
-        raise ValueError(
+        raise InputError(
             f"`{path}` must be the result of an identification (`schema` = `{RESULT}…`): identify "
             "again."
         )
@@ -58,7 +59,7 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
     covariance = _numbers(found, "fit.covariance", path)
     size = len(rows)
     if covariance.shape != (size, size):
-        raise ValueError(
+        raise InputError(
             f"`{path}`: `fit.covariance` must be {size} x {size}, one row for each base parameter, "
             f"but has shape {covariance.shape}: identify again."
         )
@@ -72,12 +73,12 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
     ):
         if not sound.all():
             k = int(np.flatnonzero(~sound)[0])
-            raise ValueError(
+            raise InputError(
                 f"`{path}` is damaged: `base_parameters[{k}].{key}` is {values[k]:g}; identify "
                 "again."
             )
     if not _is_covariance(covariance):
-        raise ValueError(
+        raise InputError(
             f"`{path}` is damaged: `fit.covariance` is none, for some combination of parameters "
             "has a negative variance; identify again."
         )
@@ -113,13 +114,13 @@ def _is_covariance(covariance: np.ndarray) -> bool:
 def _list(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
     found = content.get(key)
     if not isinstance(found, list) or not found:
-        raise ValueError(f"`{path}` has no `{key}`: identify again.")
+        raise InputError(f"`{path}` has no `{key}`: identify again.")
     return found
 
 
 def _entry(row: Any, key: str, path: Path, number: int) -> Any:
     if not isinstance(row, dict) or row.get(key) is None:
-        raise ValueError(f"`{path}`: `base_parameters[{number}]` has no `{key}`: identify again.")
+        raise InputError(f"`{path}`: `base_parameters[{number}]` has no `{key}`: identify again.")
     return row[key]
 
 
@@ -127,7 +128,7 @@ def _numbers(values: list[Any], key: str, path: Path) -> np.ndarray:
     try:
         return np.array(values, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"`{path}`: `{key}` must hold numbers: identify again.") from None
+        raise InputError(f"`{path}`: `{key}` must hold numbers: identify again.") from None
 
 
 def _freedom(row: Mapping[str, Any]) -> Any:
@@ -149,7 +150,7 @@ def write_comparison(
         The files.
 
     Raises:
-        ValueError: If `folder` is a file.
+        InputError: If `folder` is a file.
     """
     rows = _rows(comparison)
     content = plain(

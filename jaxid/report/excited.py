@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxid.arrays import double_precision
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.files import written_whole
 from jaxid.report.blocks import Headline, Picture, Prose, Remark, Remarks, Tone
@@ -20,7 +21,6 @@ from jaxid.report.sheets import sheet_of
 from jaxid.report.space import path_figure, pose_figure
 from jaxid.report.style import save
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import double_precision
 
 PAGE = "report.html"
 """File of the page."""

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.report.style import (
     BLUE,
     GREY,
@@ -17,7 +19,6 @@ from jaxid.report.style import (
     new_figure,
     plain_powers,
 )
-from jaxid.types import AnyArray, Float
 
 COLOURS = (GREY, VERMILION, BLUE)
 LEAST = 1e-2
@@ -35,10 +36,10 @@ def following_figure(
         title: Of the figure.
 
     Raises:
-        ValueError: If there is no run, or there are more than three.
+        InputError: If there is no run, or there are more than three.
     """
     if not 0 < len(runs) <= len(COLOURS):
-        raise ValueError(f"`runs` must hold 1 to {len(COLOURS)} runs, but holds {len(runs)}.")
+        raise InputError(f"`runs` must hold 1 to {len(COLOURS)} runs, but holds {len(runs)}.")
     with house_style():
         figure = new_figure(WIDTH, 3.4 + HEADING)
         heading(figure, title)

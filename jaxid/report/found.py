@@ -83,7 +83,7 @@ def write_found(
         The files.
 
     Raises:
-        ValueError: If `folder` is a file.
+        InputError: If `folder` is a file.
     """
     stem = schema.partition("/")[0].removeprefix("jaxid-")
     first, rows = estimates[0], [row for one in estimates for row in rows_of(one)]

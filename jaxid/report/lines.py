@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float
 
 GAP = 1.5
 """Steps longer than this, in usual steps, are gaps."""

@@ -5,7 +5,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.excitation.constraints.tip import tip_motion
 from jaxid.report.style import (
     BLUE,
@@ -22,7 +24,6 @@ from jaxid.report.style import (
 )
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float, double_precision
 
 ROW = 1.25
 """Height of a row of panels [inch]."""
@@ -106,10 +107,10 @@ def filtered_figure(
         joint: Its index; 0 is the first.
 
     Raises:
-        ValueError: If there is no such joint.
+        InputError: If there is no such joint.
     """
     if not 0 <= joint < robot.joints:
-        raise ValueError(f"`joint` must lie between 0 and {robot.joints - 1}, but is {joint}.")
+        raise InputError(f"`joint` must lie between 0 and {robot.joints - 1}, but is {joint}.")
     unit = robot.joint_unit(joint)
     with house_style():
         figure = new_figure(WIDTH, 2 * 1.9 + HEADING + 0.3)

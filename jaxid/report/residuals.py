@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxid.errors import InputError
 from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.report.numbers import percent, shortened
 from jaxid.report.style import (
@@ -39,11 +40,11 @@ def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
         robot: Whose joints they are.
 
     Raises:
-        ValueError: If the numbers of joints differ.
+        InputError: If the numbers of joints differ.
     """
     n = robot.joints
     if len(spectra.density) != n:
-        raise ValueError(
+        raise InputError(
             f"`spectra` must be those of the {n} joints of `{robot.name}`, but are of "
             f"{len(spectra.density)}."
         )

@@ -16,7 +16,9 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
+from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.excitation.constraints.tip import tip_motion
 from jaxid.report.style import (
     BLUE,
@@ -33,7 +35,6 @@ from jaxid.robot.capsules import GROUND
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.kinematics import placements, tip_placement
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float, double_precision
 
 SIZE = 7.0
 """Width of a figure [inch]."""
@@ -154,11 +155,11 @@ def animation(
         frames: Pictures in all.
 
     Raises:
-        ValueError: If there are fewer than two samples or pictures.
+        InputError: If there are fewer than two samples or pictures.
     """
     t, q = np.asarray(time, np.float64), np.asarray(q, np.float64)
     if len(t) < 2 or frames < 2:
-        raise ValueError(
+        raise InputError(
             f"`time` and `frames` must give at least two pictures, but are {len(t)} samples and "
             f"{frames} pictures."
         )

@@ -96,7 +96,7 @@ def error_table(errors: TorqueErrors, robot: Robot) -> Table:
         robot: Whose joints they are.
 
     Raises:
-        ValueError: If the numbers of joints differ.
+        InputError: If the numbers of joints differ.
     """
     require_joints(errors, robot)
     n = robot.joints

@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from jaxid.arrays import AnyArray
+from jaxid.errors import InputError
 from jaxid.report.lines import thinned
 from jaxid.report.numbers import percent, shortened, significant
 from jaxid.report.style import (
@@ -28,7 +30,6 @@ from jaxid.report.style import (
     new_figure,
 )
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray
 from jaxid.validation.errors import TorqueErrors
 
 OTHERS = (GREEN, ORANGE, PURPLE)
@@ -59,21 +60,21 @@ def torque_figure(
         beside: Other predictions of the same recording, with their names.
 
     Raises:
-        ValueError: If the numbers of joints differ, there is no such joint, or no row counts.
+        InputError: If the numbers of joints differ, there is no such joint, or no row counts.
     """
     for one in (errors, *(other for _, other in beside)):
         require_joints(one, robot)
     if len(beside) > len(OTHERS):
-        raise ValueError(f"`beside` must hold {len(OTHERS)} at most, but holds {len(beside)}.")
+        raise InputError(f"`beside` must hold {len(OTHERS)} at most, but holds {len(beside)}.")
     shown = range(robot.joints) if joints is None else tuple(joints)
     n = len(shown)
     if not n or not set(shown) <= set(range(robot.joints)):
-        raise ValueError(
+        raise InputError(
             f"`joints` must hold numbers from 0 to {robot.joints - 1}, but is {joints}."
         )
     counts = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
     if not len(counts):
-        raise ValueError(
+        raise InputError(
             f"no row of `{errors.name}` counts for any joint: there is nothing to draw."
         )
     window = slice(counts[0], counts[-1] + 1)
@@ -168,10 +169,10 @@ def require_joints(errors: TorqueErrors, robot: Robot) -> None:
     """Refuses errors of another robot.
 
     Raises:
-        ValueError: If the numbers of joints differ.
+        InputError: If the numbers of joints differ.
     """
     if errors.measured.shape[1] != robot.joints:
-        raise ValueError(
+        raise InputError(
             f"`errors` of `{errors.name}` belong to {errors.measured.shape[1]} joints, but the "
             f"robot `{robot.name}` has {robot.joints}."
         )

@@ -72,7 +72,7 @@ def write_report(
         The files.
 
     Raises:
-        ValueError: If there are no errors to show, or `folder` is a file.
+        InputError: If there are no errors to show, or `folder` is a file.
     """
     robot = fit.base.model.robot
     named = _file_names(identification, verification)

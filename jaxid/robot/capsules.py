@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.types import AnyArray, Array, Float, Numbers
+from jaxid.arrays import AnyArray, Array, Float, Numbers
+from jaxid.errors import InputError
 
 GROUND = -1
 """The body of what does not move."""
@@ -55,12 +56,12 @@ class Capsule(eqx.Module):
             radius: Of the capsule [m].
 
         Raises:
-            ValueError: If the ends are no points, or the radius is not positive.
+            InputError: If the ends are no points, or the radius is not positive.
         """
         first = _point(f"the start of capsule `{name}`", start)
         last = first if end is None else _point(f"the end of capsule `{name}`", end)
         if not 0 < radius < np.inf:
-            raise ValueError(
+            raise InputError(
                 f"the radius of capsule `{name}` must be positive [m], not {radius:g}."
             )
         return cls(name, body, first, last, np.array(radius, np.float64))
@@ -112,12 +113,12 @@ class HalfSpace(AbstractObstacle):
             height: Of the plane along the normal [m].
 
         Raises:
-            ValueError: If the normal is zero or the height not finite.
+            InputError: If the normal is zero or the height not finite.
         """
         n = _point(f"the normal of `{name}`", normal)
         length = np.linalg.norm(n)
         if length < 1e-9 or not np.isfinite(height):
-            raise ValueError(f"`{name}` needs a normal that is not zero, and a finite height [m].")
+            raise InputError(f"`{name}` needs a normal that is not zero, and a finite height [m].")
         return cls(name, n / length, np.array(height, np.float64))
 
     def distance(
@@ -156,14 +157,14 @@ class Box(AbstractObstacle):
             rotation: Columns are the box's axes; those of the ground if None.
 
         Raises:
-            ValueError: If an edge is not positive, or the rotation is none.
+            InputError: If an edge is not positive, or the rotation is none.
         """
         edges = _point(f"the size of box `{name}`", size)
         R = np.eye(3) if rotation is None else np.array(rotation, np.float64)
         if (edges <= 0).any():
-            raise ValueError(f"the edges of box `{name}` must be positive [m].")
+            raise InputError(f"the edges of box `{name}` must be positive [m].")
         if R.shape != (3, 3) or not np.abs(R.T @ R - np.eye(3)).max() < 1e-6:
-            raise ValueError(f"the rotation of box `{name}` is no rotation matrix.")
+            raise InputError(f"the rotation of box `{name}` is no rotation matrix.")
         return cls(name, _point(f"the centre of box `{name}`", centre), R, edges / 2)
 
     def distance(
@@ -255,5 +256,5 @@ def _share(part: Array, whole: Array, usable: Array) -> Array:
 def _point(what: str, value: Numbers) -> np.ndarray:
     point = np.array(value, np.float64)
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise ValueError(f"{what} must hold three finite numbers, but came as {value}.")
+        raise InputError(f"{what} must hold three finite numbers, but came as {value}.")
     return point

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable
+from jaxid.arrays import AnyArray, Array, Float, Hashable, double_precision
+from jaxid.errors import InputError
 from jaxid.robot.capsules import GROUND, AbstractObstacle, Capsule, segment_distance
 from jaxid.robot.kinematics import placements
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Array, Float, double_precision
 
 POSES = 200
 """Random poses on which pairs that always overlap are found."""
@@ -56,16 +56,16 @@ class CollisionModel(Hashable):
                 random poses, which the notes list.
 
         Raises:
-            ValueError: If a name is missing or comes twice, a body does not exist, two obstacles
+            InputError: If a name is missing or comes twice, a body does not exist, two obstacles
                 are paired, or there is no pair.
         """
         names = [shape.name for shape in (*capsules, *obstacles)]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"two shapes are named `{name}`: rename one.")
+                raise InputError(f"two shapes are named `{name}`: rename one.")
         for c in capsules:
             if not GROUND <= c.body < robot.joints:
-                raise ValueError(
+                raise InputError(
                     f"capsule `{c.name}` must be on a body from 0 to {robot.joints - 1} or on the "
                     f"ground (-1), but is on {c.body}."
                 )
@@ -90,7 +90,7 @@ class CollisionModel(Hashable):
             kept = [pair for pair, overlaps in zip(ordered, always, strict=True) if not overlaps]
             everything = cls._sorted(capsules, obstacles, kept, notes)
         if not everything.pairs and not everything.contacts:
-            raise ValueError("a collision model needs at least one pair of shapes that can meet.")
+            raise InputError("a collision model needs at least one pair of shapes that can meet.")
         return everything
 
     @classmethod
@@ -199,12 +199,12 @@ def _can_meet(robot: Robot, capsules: Sequence[Capsule], i: int, k: int) -> bool
 def _numbered(names: list[str], capsules: int, pair: tuple[str, str]) -> tuple[int, int]:
     for name in pair:
         if name not in names:
-            raise ValueError(
+            raise InputError(
                 f"`{name}` is none of the shapes {', '.join(f'`{n}`' for n in names)}."
             )
     i, k = sorted(names.index(name) for name in pair)
     if i >= capsules:
-        raise ValueError(f"`{pair[0]}` and `{pair[1]}` are both obstacles: neither can move.")
+        raise InputError(f"`{pair[0]}` and `{pair[1]}` are both obstacles: neither can move.")
     if i == k:
-        raise ValueError(f"`{pair[0]}` cannot be paired with itself.")
+        raise InputError(f"`{pair[0]}` cannot be paired with itself.")
     return i, k

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from jaxid.arrays import Numbers
+from jaxid.errors import InputError
 from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import GRAVITY, Robot, Tool
@@ -12,7 +14,6 @@ from jaxid.robot.snap import (
     check_tolerance,
     snap_angles,
 )
-from jaxid.types import Numbers
 
 _X, _, _Z = np.eye(3)
 CONVENTIONS = ("modified", "standard")
@@ -69,17 +70,17 @@ def from_dh(
         notes: What was changed or assumed on the way.
 
     Raises:
-        ValueError: If the convention has another name, or the table has the wrong shape.
+        InputError: If the convention has another name, or the table has the wrong shape.
     """
     if convention not in CONVENTIONS:
-        raise ValueError(
+        raise InputError(
             f'`convention` must be "modified" or "standard", but is "{convention}": the modified '
             "one lists alpha and a of the link before the joint, the standard one of the link "
             "after it."
         )
     table = np.array(rows, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] not in (3, 4) or not np.isfinite(table).all():
-        raise ValueError(
+        raise InputError(
             "`rows` must hold 3 or 4 finite numbers (alpha, a, d, theta) for each joint, "
             f"but has shape {table.shape}."
         )
@@ -87,7 +88,7 @@ def from_dh(
     table = np.column_stack([table, np.zeros(n)])[:, :4]
     revolute = (True,) * n if revolute is None else revolute
     if len(revolute) != n:
-        raise ValueError(f"`revolute` must have one entry for each of the {n} rows.")
+        raise InputError(f"`revolute` must have one entry for each of the {n} rows.")
 
     tolerance = check_tolerance(snap_tolerance)
     snapped = table.copy()

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from jaxid.arrays import Hashable, namespace
+from jaxid.arrays import AnyArray, Float, Hashable, Numbers, namespace
+from jaxid.errors import InputError
 from jaxid.robot.limits import per_joint
-from jaxid.types import AnyArray, Float, Numbers
 
 
 class Drives(Hashable):
@@ -39,19 +39,19 @@ class Drives(Hashable):
         """Builds drives from gear ratios (one for each joint) or a full matrix; direct if None.
 
         Raises:
-            ValueError: If a length is wrong, the matrix cannot be inverted, or a number cannot be.
+            InputError: If a length is wrong, the matrix cannot be inverted, or a number cannot be.
         """
         matrix = np.eye(joints) if reduction is None else np.array(reduction, dtype=np.float64)
         if matrix.shape == (joints,):
             matrix = np.diag(matrix)
         if matrix.shape != (joints, joints) or not np.isfinite(matrix).all():
-            raise ValueError(
+            raise InputError(
                 f"`reduction` must be {joints} gear ratios or a {joints} x {joints} matrix of "
                 f"finite numbers, but has shape {matrix.shape}."
             )
         largest = np.abs(matrix).max(axis=1)
         if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
-            raise ValueError(
+            raise InputError(
                 "`reduction` must be invertible, but some joint is moved by no motor of its own: "
                 "is a gear ratio zero?"
             )
@@ -67,7 +67,7 @@ class Drives(Hashable):
         ):
             if wrong.any():
                 j = int(np.flatnonzero(wrong)[0])
-                raise ValueError(
+                raise InputError(
                     f"`{key}` must be {rule}, but that of joint {j + 1} is {found[key][j]:g}."
                 )
         return cls(matrix, **found)

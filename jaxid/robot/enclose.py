@@ -6,7 +6,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 
 STARTS = 3
 """Principal directions from which the axis is sought."""
@@ -43,11 +44,11 @@ def enclose(points: Float[AnyArray, "points 3"]) -> Enclosing:
         points: At least one [m].
 
     Raises:
-        ValueError: If there is none, or one is not finite.
+        InputError: If there is none, or one is not finite.
     """
     cloud = np.asarray(points, np.float64)
     if cloud.ndim != 2 or cloud.shape[1] != 3 or not len(cloud) or not np.isfinite(cloud).all():
-        raise ValueError(f"`points` must be rows of three finite numbers, but are {cloud.shape}.")
+        raise InputError(f"`points` must be rows of three finite numbers, but are {cloud.shape}.")
     cloud = _hull(cloud)
     centre = 0.5 * (cloud.max(axis=0) + cloud.min(axis=0))
     _, _, directions = np.linalg.svd(cloud - cloud.mean(axis=0), full_matrices=True)

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import as_array
+from jaxid.arrays import Float, Numbers, as_array
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 from jaxid.robot.tip_jacobian import rotation_vectors, tip_jacobian
-from jaxid.types import Float, Numbers
 
 REACHED = 1e-9
 """Distance from a pose that counts as reached [m, and rad]."""
@@ -58,7 +58,7 @@ def inverse_kinematics(
         seed: Of the starts.
 
     Raises:
-        ValueError: If the pose cannot be reached: the message says how near the end-effector comes,
+        InputError: If the pose cannot be reached: the message says how near the end-effector comes,
             or which limits are in the way.
     """
     place = np.asarray(as_array("position", position))[None]
@@ -66,7 +66,7 @@ def inverse_kinematics(
     task, poses = _Task.of(robot, posture, starts, seed), _poses(place, attitude)
     found = _candidates(task, poses)
     if not len(found):
-        raise ValueError(_refusal(task, poses, "the pose"))
+        raise InputError(_refusal(task, poses, "the pose"))
     return found[0]
 
 
@@ -90,7 +90,7 @@ def inverse_kinematics_along(
         seed: Of the starts.
 
     Raises:
-        ValueError: If a pose cannot be reached, or only with a jump or beyond the limits.
+        InputError: If a pose cannot be reached, or only with a jump or beyond the limits.
     """
     places = np.asarray(as_array("positions", positions))
     attitudes = None if rotations is None else np.asarray(as_array("rotations", rotations))
@@ -100,7 +100,7 @@ def inverse_kinematics_along(
     count = len(poses.position)
     candidates = _candidates(task, poses[:1])
     if not len(candidates):
-        raise ValueError(_refusal(task, poses[:1], f"pose 1 of {count}"))
+        raise InputError(_refusal(task, poses[:1], f"pose 1 of {count}"))
     faults: list[tuple[int, str]] = []
     for q in _followed(task, poses, candidates[:TRIED]):
         fault = _fault(task, poses, q)
@@ -110,8 +110,8 @@ def inverse_kinematics_along(
     k, why = max(faults)
     name = f"pose {k + 1} of {count}"
     if not len(_candidates(task, poses[k : k + 1])):
-        raise ValueError(_refusal(task, poses[k : k + 1], name))
-    raise ValueError(
+        raise InputError(_refusal(task, poses[k : k + 1], name))
+    raise InputError(
         f"`{robot.name}` cannot follow the path in one piece: at {name}, {poses.where(k)}, {why}; "
         "choose another posture, or a path nearer to the middle of its reach."
     )
@@ -145,18 +145,18 @@ class _Poses:
 def _poses(position: np.ndarray, rotation: np.ndarray | None) -> _Poses:
     shape = position.shape
     if position.ndim != 2 or shape[1] != 3 or not len(position) or not np.isfinite(position).all():
-        raise ValueError(
+        raise InputError(
             f"a position must hold three finite numbers [m], but the shape is {shape[-1:]}."
         )
     if rotation is not None:
         if rotation.shape != (len(position), 3, 3):
-            raise ValueError(
+            raise InputError(
                 f"`rotations` must hold a 3 x 3 matrix for each of the {len(position)} poses, but "
                 f"have shape {rotation.shape}."
             )
         products = np.swapaxes(rotation, 1, 2) @ rotation
         if not np.abs(products - np.eye(3)).max() < 1e-9 or (np.linalg.det(rotation) < 0).any():
-            raise ValueError("attitudes must be rotation matrices: orthonormal and right-handed.")
+            raise InputError("attitudes must be rotation matrices: orthonormal and right-handed.")
     return _Poses(position, rotation)
 
 
@@ -175,7 +175,7 @@ class _Task(NamedTuple):
     def of(cls, robot: Robot, posture: Numbers | None, starts: int, seed: int) -> "_Task":
         """The task of a robot, checked."""
         if starts < 1:
-            raise ValueError(f"`starts` must be at least 1, but is {starts}.")
+            raise InputError(f"`starts` must be at least 1, but is {starts}.")
         low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
         known = np.isfinite(low) & np.isfinite(high)
         free = np.where(robot.revolute, FREE_TURN, FREE_STROKE)
@@ -185,7 +185,7 @@ class _Task(NamedTuple):
         if posture is not None:
             middle = as_array("posture", posture)
             if middle.shape != (robot.joints,):
-                raise ValueError(
+                raise InputError(
                     f"`posture` must hold one number for each joint ({robot.joints}), but has "
                     f"shape {middle.shape}."
                 )

@@ -6,8 +6,8 @@ Written on 3-vectors for one sample; batch with `jax.vmap`, differentiate with `
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 
 def skew(a: Float[AnyArray, "3"]) -> Float[AnyArray, "3 3"]:

@@ -6,6 +6,8 @@ nobody published. What is not listed is infinite (limits) or direct (drives).
 
 import numpy as np
 
+from jaxid.arrays import Numbers
+from jaxid.errors import InputError
 from jaxid.robot.capsules import GROUND, Capsule, HalfSpace
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.dh import from_dh
@@ -13,7 +15,6 @@ from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 from jaxid.robot.snap import axis_rotation
-from jaxid.types import Numbers
 
 _HALF = np.pi / 2
 _X, _Y, _Z = np.eye(3)
@@ -301,13 +302,13 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
         length: Length of the links [m], one for all or one for each.
 
     Raises:
-        ValueError: If there is no joint, or the lengths do not fit.
+        InputError: If there is no joint, or the lengths do not fit.
     """
     lengths = np.array(length, dtype=np.float64)
     if joints < 1:
-        raise ValueError(f"`joints` must be at least 1, but is {joints}.")
+        raise InputError(f"`joints` must be at least 1, but is {joints}.")
     if lengths.shape not in ((), (joints,)):
-        raise ValueError(
+        raise InputError(
             f"`length` must be one length or one for each joint ({joints}), but has shape "
             f"{lengths.shape}."
         )

@@ -3,24 +3,25 @@
 import equinox as eqx
 import numpy as np
 
-from jaxid.types import AnyArray, Float, Numbers
+from jaxid.arrays import AnyArray, Float, Numbers
+from jaxid.errors import InputError
 
 
 def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> np.ndarray:
     """Checks and copies one number for each joint; None stands for unknown everywhere.
 
     Raises:
-        ValueError: If there is not one number for each joint, or one is not a number.
+        InputError: If there is not one number for each joint, or one is not a number.
     """
     if value is None:
         return np.full(joints, unknown)
     array = np.array(value, dtype=np.float64)
     if array.shape != (joints,):
-        raise ValueError(
+        raise InputError(
             f"`{name}` must hold one number for each joint ({joints}), but has shape {array.shape}."
         )
     if np.isnan(array).any() and not np.isnan(unknown):
-        raise ValueError(f"`{name}` must hold numbers, but joint {_first(np.isnan(array))} is NaN.")
+        raise InputError(f"`{name}` must hold numbers, but joint {_first(np.isnan(array))} is NaN.")
     return array
 
 
@@ -66,14 +67,14 @@ class Limits(eqx.Module):
         """Builds limits from what is known; the rest is infinite.
 
         Raises:
-            ValueError: If a limit has the wrong length, is negative where it is a magnitude, or
+            InputError: If a limit has the wrong length, is negative where it is a magnitude, or
                 leaves a joint no range.
         """
         low = per_joint("position_min", position_min, joints, -np.inf)
         high = per_joint("position_max", position_max, joints, np.inf)
         if (low >= high).any():
             j = _first(low >= high)
-            raise ValueError(
+            raise InputError(
                 f"`position_min` must be below `position_max`, but joint {j} ranges "
                 f"from {low[j - 1]:g} to {high[j - 1]:g}."
             )
@@ -87,5 +88,5 @@ class Limits(eqx.Module):
         for name, array in checked.items():
             if (array <= 0).any():
                 j = _first(array <= 0)
-                raise ValueError(f"`{name}` must be positive, but joint {j} has {array[j - 1]:g}.")
+                raise InputError(f"`{name}` must be positive, but joint {j} has {array[j - 1]:g}.")
         return cls(low, high, **checked, assumed=assumed)

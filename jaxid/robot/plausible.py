@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxid.types import Float, Numbers
+from jaxid.arrays import Float, Numbers
 
 LARGEST_TURN = 8 * np.pi
 """Position of a revolute joint that is no angle in radians any more: four turns [rad]."""

@@ -6,12 +6,12 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import as_array, is_traced, namespace
+from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
+from jaxid.errors import InputError
 from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
 from jaxid.robot.names import cleaned, control_characters
 from jaxid.robot.plausible import FAR, FARTHEST, HEAVIEST, far_notes
-from jaxid.types import AnyArray, Float, Numbers
 
 GRAVITY = (0.0, 0.0, -9.81)
 AXES = "xyz"
@@ -44,25 +44,25 @@ class Tool(eqx.Module):
         """Builds a tool and checks it; a point mass if no inertia is given.
 
         Raises:
-            ValueError: If the mass is not positive, or the inertia belongs to no body.
+            InputError: If the mass is not positive, or the inertia belongs to no body.
         """
         m, r = as_array("mass", mass), as_array("centre_of_mass", centre_of_mass)
         J = np.zeros((3, 3)) if inertia is None else as_array("inertia", inertia)
         if m.shape != () or not (is_traced(m) or 0.0 < m <= HEAVIEST):
-            raise ValueError(
+            raise InputError(
                 f"`mass` of the tool must be a positive number of {HEAVIEST:g} kg at most, but is "
                 f"{mass}."
             )
         if r.shape != (3,) or not (is_traced(r) or np.isfinite(r).all()):
-            raise ValueError("`centre_of_mass` of the tool must hold three finite numbers [m].")
+            raise InputError("`centre_of_mass` of the tool must hold three finite numbers [m].")
         if not is_traced(r) and np.abs(r).max() > FARTHEST:
-            raise ValueError(
+            raise InputError(
                 f"`centre_of_mass` of the tool lies {np.abs(r).max():g} m away: give it in metres."
             )
         if J.shape != (3, 3) or not (is_traced(J) or _is_symmetric(np.asarray(J))):
-            raise ValueError("`inertia` of the tool must be a symmetric 3 x 3 matrix [kg m²].")
+            raise InputError("`inertia` of the tool must be a symmetric 3 x 3 matrix [kg m²].")
         if not is_traced(J) and np.abs(J).max() > FAR**2 * HEAVIEST:
-            raise ValueError(f"`inertia` of the tool holds {np.abs(J).max():g}: give it in kg m².")
+            raise InputError(f"`inertia` of the tool holds {np.abs(J).max():g}: give it in kg m².")
         if not is_traced(J):
             cls._refuse_impossible(np.linalg.eigvalsh(J))
         return cls(body, m, r, J)
@@ -71,7 +71,7 @@ class Tool(eqx.Module):
     def _refuse_impossible(principal: np.ndarray) -> None:
         slack = 1e-9 * np.abs(principal).max()
         if principal[0] < -slack or principal[2] > principal[0] + principal[1] + slack:
-            raise ValueError(
+            raise InputError(
                 "`inertia` of the tool belongs to no body: its principal moments are "
                 f"{principal[0]:.3g}, {principal[1]:.3g}, {principal[2]:.3g} kg m², but none may "
                 "be negative or larger than the sum of the others; is it about the centre of mass?"
@@ -134,26 +134,26 @@ class Robot(eqx.Module):
     def __check_init__(self):
         n = self.joints
         if len(self.revolute) != n or any(not -1 <= p < i for i, p in enumerate(self.parent)):
-            raise ValueError(
+            raise InputError(
                 f"`parent` must name for each of the {len(self.revolute)} bodies an earlier one "
                 f"(or -1 for the ground), but is {self.parent}."
             )
         if len(self.joint_names) != n or len(set(self.joint_names)) != n:
-            raise ValueError(
+            raise InputError(
                 f"`joint_names` must be {n} different names, but is {self.joint_names}."
             )
         for name in (self.name, *self.joint_names):
             if sign := control_characters(name):
-                raise ValueError(
+                raise InputError(
                     f"the name `{cleaned(name)}` holds the control character {sign}: remove it."
                 )
         carrier = self.tip_body if self.tool is None else self.tool.body
         for what, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
             if not 0 <= body < n:
-                raise ValueError(f"`{what}` must be a body from 0 to {n - 1}, but is {body}.")
+                raise InputError(f"`{what}` must be a body from 0 to {n - 1}, but is {body}.")
         for what, one in (("limits", self.limits.force), ("drives", self.drives.zero)):
             if one.shape[-1:] != (n,):
-                raise ValueError(
+                raise InputError(
                     f"`{what}` must be of {n} joints, like the robot, but are of {one.shape[-1]}."
                 )
 
@@ -199,12 +199,12 @@ class Robot(eqx.Module):
             notes: What was changed or assumed on the way.
 
         Raises:
-            ValueError: If shapes do not fit, a parent comes after its child, an axis is zero, or
+            InputError: If shapes do not fit, a parent comes after its child, an axis is zero, or
                 an attitude is no rotation.
         """
         n = len(revolute)
         if n == 0:
-            raise ValueError("a robot must have at least one joint, but has none.")
+            raise InputError("a robot must have at least one joint, but has none.")
         parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
         arrays = {}
         for key, value, shape in (
@@ -217,14 +217,14 @@ class Robot(eqx.Module):
         ):
             arrays[key] = np.array(value, dtype=np.float64)
             if arrays[key].shape != shape or not np.isfinite(arrays[key]).all():
-                raise ValueError(
+                raise InputError(
                     f"`{key}` must hold finite numbers of shape {shape}, "
                     f"but has shape {arrays[key].shape}."
                 )
         length = np.linalg.norm(arrays["axis"], axis=1)
         if (length < 1e-9).any():
             j = int(np.flatnonzero(length < 1e-9)[0]) + 1
-            raise ValueError(f"`axis` of joint {j} is the zero vector: give it a direction.")
+            raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
         arrays["axis"] = np.where(
             np.abs(length - 1.0)[:, None] > 1e-15, arrays["axis"] / length[:, None], arrays["axis"]
         )
@@ -237,7 +237,7 @@ class Robot(eqx.Module):
         places["`tip_offset`"] = arrays["tip_offset"]
         for what, r in places.items():
             if np.abs(r).max() > FARTHEST:
-                raise ValueError(f"{what} is {np.abs(r).max():g} m long: give it in metres.")
+                raise InputError(f"{what} is {np.abs(r).max():g} m long: give it in metres.")
         return cls(
             name=name,
             joint_names=tuple(names),
@@ -276,12 +276,12 @@ class Robot(eqx.Module):
         """Largest force of every joint [N m or N]: its own, else that of its motors (Eq. 30).
 
         Raises:
-            ValueError: If neither is known for some joint.
+            InputError: If neither is known for some joint.
         """
         forces = self.known_max_forces
         if not np.isfinite(forces).all():
             j = int(np.flatnonzero(~np.isfinite(forces))[0])
-            raise ValueError(
+            raise InputError(
                 f"the largest force of joint `{self.joint_names[j]}` of `{self.name}` is not known:"
                 " give `limits.force` (joint side) or `drives.max_torques` (motor side)."
             )
@@ -301,16 +301,16 @@ class Robot(eqx.Module):
             position: Origin of the former ground frame on the new ground [m].
 
         Raises:
-            ValueError: If the attitude is no rotation, or the position no point.
+            InputError: If the attitude is no rotation, or the position no point.
         """
         R = np.eye(3) if rotation is None else as_array("rotation", rotation)
         r = as_array("position", position)
         if R.shape != (3, 3):
-            raise ValueError(f"the base's rotation must be a 3 x 3 matrix, not of shape {R.shape}.")
+            raise InputError(f"the base's rotation must be a 3 x 3 matrix, not of shape {R.shape}.")
         if not is_traced(R):
             _require_rotation("the base's rotation", np.asarray(R))
         if r.shape != (3,) or not (is_traced(r) or np.isfinite(r).all()):
-            raise ValueError("the base's position must hold three finite numbers [m].")
+            raise InputError("the base's position must hold three finite numbers [m].")
         on_ground = np.array(self.parent) < 0
         moves = np.broadcast_to(on_ground[:, None], self.offset.shape)
         turns = np.broadcast_to(on_ground[:, None, None], self.rotation.shape)
@@ -339,7 +339,7 @@ class Robot(eqx.Module):
                 if None.
 
         Raises:
-            ValueError: If the mass is not positive, or the inertia belongs to no body.
+            InputError: If the mass is not positive, or the inertia belongs to no body.
         """
         R = self.tip_rotation
         tool = Tool.of(self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia)
@@ -367,4 +367,4 @@ def _is_symmetric(J: np.ndarray) -> bool:
 
 def _require_rotation(what: str, R: np.ndarray) -> None:
     if not np.abs(R.T @ R - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
-        raise ValueError(f"{what} is no rotation matrix.")
+        raise InputError(f"{what} is no rotation matrix.")

@@ -6,7 +6,8 @@ parameter too many, at a condition number of 1e7. What is snapped stands in the 
 
 import numpy as np
 
-from jaxid.types import Float, Numbers
+from jaxid.arrays import Float, Numbers
+from jaxid.errors import InputError
 
 SNAP_TOLERANCE = 1e-4
 _QUARTER = np.pi / 2
@@ -19,10 +20,10 @@ def check_tolerance(tolerance: float) -> float:
     """Returns the tolerance [rad] itself if it makes sense.
 
     Raises:
-        ValueError: If it is negative, or so large that it would change the robot.
+        InputError: If it is negative, or so large that it would change the robot.
     """
     if not 0.0 <= tolerance < 0.1:
-        raise ValueError(
+        raise InputError(
             f"`snap_tolerance` must be an angle from 0 (off) to 0.1 rad, but is {tolerance:g}."
         )
     return float(tolerance)

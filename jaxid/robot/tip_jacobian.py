@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 
 class TipJacobian(NamedTuple):

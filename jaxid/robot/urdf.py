@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float, Numbers
+from jaxid.errors import InputError
 from jaxid.robot.limits import Limits
 from jaxid.robot.plausible import (
     ENDLESS,
@@ -27,7 +29,6 @@ from jaxid.robot.snap import (
     snap_rotation,
 )
 from jaxid.robot.urdf_file import UrdfTree
-from jaxid.types import AnyArray, Float, Numbers
 
 _TURNING = ("revolute", "continuous")
 _ZERO = (0.0, 0.0, 0.0)
@@ -69,7 +70,7 @@ def load_urdf(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If it is no URDF, is no open tree, has a mimic, floating or planar joint on
+        InputError: If it is no URDF, is no open tree, has a mimic, floating or planar joint on
             the way, or angles or lengths in other units.
     """
     tree = UrdfTree(path)
@@ -129,7 +130,7 @@ def urdf_parameters(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file cannot be loaded, an inertia is not finite, or one belongs to no
+        InputError: If the file cannot be loaded, an inertia is not finite, or one belongs to no
             body.
     """
     tree = UrdfTree(path)
@@ -141,9 +142,9 @@ def urdf_parameters(
             continue
         mass, J, xyz, rpy = found
         if not all(np.isfinite(v).all() for v in found):
-            raise ValueError(f"`{tree.path}`: link `{name}` has an inertial that is not finite.")
+            raise InputError(f"`{tree.path}`: link `{name}` has an inertial that is not finite.")
         if possible and (why := _impossible(found)):
-            raise ValueError(
+            raise InputError(
                 f"`{tree.path}`: the inertial of link `{name}` belongs to no body: {why}; correct "
                 "the file, or do without its inertias."
             )
@@ -216,7 +217,7 @@ def merged_links(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If the file cannot be loaded.
+        InputError: If the file cannot be loaded.
     """
     return _merge(UrdfTree(path), base, tip, snap_tolerance).links
 
@@ -272,7 +273,7 @@ def _merge(tree: UrdfTree, base: str | None, tip: str | None, snap_tolerance: fl
     end = max(length, key=lambda link: length[link]) if tip is None else tip
     if out.links[end][0] < 0:
         below = f"below link `{base}`" if tip is None else f"between links `{base}` and `{tip}`"
-        raise ValueError(
+        raise InputError(
             f"`{tree.path}` has no moving joint {below}: choose another `base` or `tip`."
         )
     return out._replace(tip=end, notes=tuple(notes))

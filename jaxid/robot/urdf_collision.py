@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
+from jaxid.arrays import Numbers
+from jaxid.errors import InputError
 from jaxid.robot.capsules import GROUND, Capsule
 from jaxid.robot.enclose import enclose
 from jaxid.robot.snap import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import merged_links
-from jaxid.types import Numbers
 
 MESH_SCHEMES = ("package://", "file://", "model://")
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -49,7 +50,7 @@ def fit_capsules(
     Raises:
         FileNotFoundError: If the file or a mesh does not exist.
         ImportError: If there are meshes and trimesh is not installed.
-        ValueError: If the file cannot be loaded, or its geometry not be read.
+        InputError: If the file cannot be loaded, or its geometry not be read.
     """
     path = Path(path)
     links = merged_links(path, base=base, tip=tip, snap_tolerance=snap_tolerance)
@@ -77,7 +78,7 @@ def fit_capsules(
                 )
             )
     if not found:
-        raise ValueError(f"`{path}` has no collision geometry for the links that were asked for.")
+        raise InputError(f"`{path}` has no collision geometry for the links that were asked for.")
     return tuple(found)
 
 
@@ -108,7 +109,7 @@ def _fitted(
         vertices = _vertices(path, packages, shape)
         return enclose(vertices * _numbers(path, shape, "scale", 3, (1.0, 1.0, 1.0)))
     line = collision.sourceline if shape is None else shape.sourceline
-    raise ValueError(
+    raise InputError(
         f"`{path}`, line {line}: a collision geometry must be a box, cylinder, sphere, capsule or "
         f"mesh, but is {'empty' if kind is None else f'`{kind}`'}."
     )
@@ -127,9 +128,9 @@ def _vertices(path: Path, packages: str | Path | None, mesh: Any) -> np.ndarray:
         loaded = trimesh.load(str(file), force="mesh")
         vertices = np.asarray(loaded.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
     except Exception as error:  # readers of many formats raise many exceptions
-        raise ValueError(f"`{file}` is no mesh that can be read: {error}.") from error
+        raise InputError(f"`{file}` is no mesh that can be read: {error}.") from error
     if not len(vertices):
-        raise ValueError(f"`{file}` has no vertices.")
+        raise InputError(f"`{file}` has no vertices.")
     return vertices
 
 
@@ -170,7 +171,7 @@ def _numbers(
         numbers = np.zeros(0)
     if numbers.shape != (count,) or not np.isfinite(numbers).all():
         line = 0 if element is None else element.sourceline
-        raise ValueError(
+        raise InputError(
             f"`{path}`, line {line}: `{key}` must be {count} finite "
             f"{'number' if count == 1 else 'numbers'}, but is {text!r}."
         )

@@ -7,8 +7,9 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from urdf_parser_py.urdf import URDF
 
+from jaxid.arrays import Numbers
+from jaxid.errors import InputError
 from jaxid.robot.names import cleaned, control_characters
-from jaxid.types import Numbers
 
 _LARGEST_FILE = 64 * 2**20
 
@@ -51,7 +52,7 @@ class UrdfTree:
             self.urdf = URDF.from_xml_string(etree.tostring(element))
         except Exception as error:  # the library raises bare exceptions, among others
             reason = " ".join(str(error).split())
-            raise ValueError(f"`{self.path}` is not a URDF that can be read: {reason}.") from error
+            raise InputError(f"`{self.path}` is not a URDF that can be read: {reason}.") from error
         self.children: dict[str, list[Any]] = {link.name: [] for link in self.urdf.links}
         self.joint_above: dict[str, Any] = {}
         for joint in self.urdf.joints:
@@ -75,7 +76,7 @@ class UrdfTree:
     def _find_root(self) -> str:
         roots = [name for name in self.children if name not in self.joint_above]
         if len(roots) > 1:
-            raise ValueError(
+            raise InputError(
                 f"`{self.path}` has several root links ({_listed(roots)}), but must be one tree: "
                 "connect them by fixed joints."
             )
@@ -92,7 +93,7 @@ class UrdfTree:
                     "remove one joint of the loop",
                 )
         if not roots:
-            raise ValueError(f"`{self.path}` has no links.")
+            raise InputError(f"`{self.path}` has no links.")
         return roots[0]
 
     def error(self, joint: Any, complaint: str) -> ValueError:
@@ -103,10 +104,10 @@ class UrdfTree:
         """Returns the name of a link if the file has it.
 
         Raises:
-            ValueError: If it has not.
+            InputError: If it has not.
         """
         if link not in self.children:
-            raise ValueError(
+            raise InputError(
                 f"`{what}` must be a link of `{self.path}`, but is `{link}`; its links are "
                 f"{_listed(list(self.children))}."
             )
@@ -116,13 +117,13 @@ class UrdfTree:
         """The joints from one link to another, in this order.
 
         Raises:
-            ValueError: If the tip does not lie below the base.
+            InputError: If the tip does not lie below the base.
         """
         joints, link = [], tip
         while link != base:
             joint = self.joint_above.get(link)
             if joint is None:
-                raise ValueError(
+                raise InputError(
                     f"`{self.path}`: no chain leads from `base` `{base}` to `tip` `{tip}`."
                 )
             joints.append(joint)
@@ -135,7 +136,7 @@ class UrdfTree:
         """Numbers of a joint as an array.
 
         Raises:
-            ValueError: If one is not finite, or there are too few or too many.
+            InputError: If one is not finite, or there are too few or too many.
         """
         array = np.array(default if values is None else values, dtype=np.float64)
         if array.shape != (len(default),) or not np.isfinite(array).all():
@@ -149,7 +150,7 @@ def _read_xml(path: Path) -> etree._Element:
     if not path.is_file():
         raise FileNotFoundError(f"the URDF file `{path}` does not exist: check its path.")
     if path.stat().st_size > _LARGEST_FILE:
-        raise ValueError(
+        raise InputError(
             f"`{path}` is larger than {_LARGEST_FILE // 2**20} MiB: this is no URDF of a robot."
         )
     parser = etree.XMLParser(
@@ -159,20 +160,20 @@ def _read_xml(path: Path) -> etree._Element:
         document = etree.parse(str(path), parser)
     except etree.XMLSyntaxError as error:
         line = error.lineno or 1
-        raise ValueError(f"`{path}`, line {line}: this is not XML ({error.msg}).") from error
+        raise InputError(f"`{path}`, line {line}: this is not XML ({error.msg}).") from error
     if document.docinfo.doctype or document.docinfo.internalDTD is not None:
-        raise ValueError(
+        raise InputError(
             f"`{path}` has a DOCTYPE, which a URDF needs not and which could make a parser read "
             "other files: remove it."
         )
     robot = document.getroot()
     if any("ros.org/" in str(e.tag) and "xacro" in str(e.tag) for e in robot.iter()):
-        raise ValueError(
+        raise InputError(
             f"`{path}` is a xacro file: expand it first, for example with "
             "`xacro arm.urdf.xacro -o arm.urdf`."
         )
     if robot.tag != "robot":
-        raise ValueError(f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`.")
+        raise InputError(f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`.")
     robot.set("name", cleaned(robot.get("name") or path.stem))
     _keep_what_is_read(path, robot)
     for limit in robot.iter("limit"):
@@ -196,7 +197,7 @@ def _keep_what_is_read(path: Path, element: etree._Element) -> None:
             element.remove(child)
             continue
         if child.tag in _ONCE and child.tag in seen:
-            raise ValueError(
+            raise InputError(
                 f"`{path}`, line {child.sourceline}: `<{element.tag}>` has a second "
                 f"`<{child.tag}>`, and only one can hold."
             )
@@ -215,12 +216,12 @@ def _require_names(path: str, what: str, names: list[str | None]) -> None:
     seen: set[str | None] = set()
     for name in names:
         if name is not None and (sign := control_characters(name)):
-            raise ValueError(
+            raise InputError(
                 f"`{path}`: the name of {what} `{cleaned(name)}` holds the control character "
                 f"{sign}: rename it."
             )
         if name is not None and name in seen:
-            raise ValueError(f"`{path}` has two {what}s named `{name}`: rename one.")
+            raise InputError(f"`{path}` has two {what}s named `{name}`: rename one.")
         seen.add(name)
 
 

@@ -4,9 +4,8 @@ from abc import abstractmethod
 
 import jax.numpy as jnp
 
-from jaxid.arrays import Hashable
+from jaxid.arrays import AnyArray, Float, Hashable
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 Joints = Float[AnyArray, " joints"]
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
+from jaxid.errors import InputError
 from jaxid.files import written_whole
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
@@ -141,7 +142,7 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
         The files.
 
     Raises:
-        ValueError: If `folder` is a file, or holds one of the files with another content.
+        InputError: If `folder` is a file, or holds one of the files with another content.
         RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
@@ -161,7 +162,7 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
 
 def _refuse_other(present: Path, new: Path) -> None:
     if present.exists() and (not present.is_file() or present.read_bytes() != new.read_bytes()):
-        raise ValueError(
+        raise InputError(
             f"`{present}` is there already with another content: choose another folder for the "
             "example, or remove it."
         )

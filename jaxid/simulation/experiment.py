@@ -5,13 +5,14 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import require_float64
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 from jaxid.simulation.sensors import Sensors
 from jaxid.simulation.servo import FeedForward, Servo
 from jaxid.simulation.tracking import AbstractPlant, Tracking, run_servo
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import require_float64
 
 
 class AbstractExperiment(eqx.Module):
@@ -71,7 +72,7 @@ class AbstractExperiment(eqx.Module):
             name: Of the recording.
 
         Raises:
-            ValueError: If the times do not fit together, or the motion grows beyond all bounds.
+            InputError: If the times do not fit together, or the motion grows beyond all bounds.
             RuntimeError: If JAX runs in single precision.
         """
         require_float64("a virtual experiment")
@@ -81,12 +82,12 @@ class AbstractExperiment(eqx.Module):
         sample_time = tick if sample_time is None else sample_time
         every = max(round(sample_time / tick), 1)
         if not abs(every * tick - sample_time) < 1e-6 * tick:
-            raise ValueError(
+            raise InputError(
                 f"`sample_time` must be a multiple of the servo's ({tick:g} s), but is "
                 f"{sample_time:g} s."
             )
         if substeps < 1 or not duration >= tick:
-            raise ValueError(
+            raise InputError(
                 f"`duration` must be at least one tick of the servo ({tick:g} s) and `substeps` at "
                 f"least 1, but are {duration:g} s and {substeps}."
             )
@@ -97,7 +98,7 @@ class AbstractExperiment(eqx.Module):
         if feed_forward is not None:
             forward = np.asarray(feed_forward(desired), np.float64)
             if forward.shape != desired.q.shape or not np.isfinite(forward).all():
-                raise ValueError(
+                raise InputError(
                     "`feed_forward` must give one finite force for each sample and joint "
                     f"{desired.q.shape}, but gives shape {forward.shape}."
                 )

@@ -13,10 +13,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable
+from jaxid.arrays import AnyArray, Float, Hashable
 from jaxid.dynamics.terms import AbstractTerm, CoulombFriction, ViscousFriction
 from jaxid.dynamics.transitions import Tanh
-from jaxid.types import AnyArray, Float
 
 Joints = Float[AnyArray, " joints"]
 EPSILON = 0.01

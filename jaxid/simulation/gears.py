@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from jaxid.arrays import Hashable
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Hashable
 
 Joints = Float[AnyArray, " joints"]
 

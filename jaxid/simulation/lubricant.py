@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float
 
 
 class Lubricant(eqx.Module):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable
+from jaxid.arrays import AnyArray, Float, Hashable
 from jaxid.dynamics import projection
 from jaxid.dynamics.machine import program_of
 from jaxid.dynamics.model import Model
@@ -16,7 +16,6 @@ from jaxid.simulation.disturbances import AbstractDisturbance
 from jaxid.simulation.gear_friction import AbstractGearFriction
 from jaxid.simulation.gears import AbstractGear, Balance, Shafts
 from jaxid.simulation.tracking import AbstractPlant
-from jaxid.types import AnyArray, Float
 
 Joints = Float[AnyArray, " joints"]
 

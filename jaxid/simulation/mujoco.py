@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 from jaxid.simulation.experiment import AbstractExperiment
 from jaxid.simulation.sensors import Sensors
 from jaxid.simulation.servo import Servo
 from jaxid.simulation.tracking import AbstractPlant
 from jaxid.simulation.virtual import VirtualRobot
-from jaxid.types import AnyArray, Float
 
 
 class MujocoRobot(AbstractExperiment):
@@ -48,7 +49,7 @@ class MujocoRobot(AbstractExperiment):
             step: Of time [s].
 
         Raises:
-            ValueError: If the equations of motion hold more than bodies and rotors.
+            InputError: If the equations of motion hold more than bodies and rotors.
             ModuleNotFoundError: If MuJoCo is not installed.
         """
         library, robot = _mujoco(), self.robot
@@ -92,7 +93,7 @@ class MujocoRobot(AbstractExperiment):
         known = all(term.drive_matrices(robot)[0].any() or not p.any() for term, p in others)
         size = first.body_parameters
         if not (size and known):
-            raise ValueError(
+            raise InputError(
                 "MuJoCo needs `terms` that begin with `RigidBodies`; beside them it knows rotors "
                 "only."
             )

@@ -4,9 +4,9 @@ import equinox as eqx
 import numpy as np
 from scipy import signal
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 
 class Sensors(eqx.Module):

@@ -5,10 +5,11 @@ from collections.abc import Callable
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.machine import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.types import AnyArray, Float
+from jaxid.errors import InputError
 
 POSES = 200
 """Over which the inertia of a joint is averaged."""
@@ -37,11 +38,11 @@ class Servo(eqx.Module):
 
     def __check_init__(self):
         if not 0 < self.sample_time < np.inf:
-            raise ValueError(
+            raise InputError(
                 f"`sample_time` of the servo must be positive [s], but is {self.sample_time:g}."
             )
         if self.smoothing < 0:
-            raise ValueError(f"`smoothing` must not be negative [s], but is {self.smoothing:g}.")
+            raise InputError(f"`smoothing` must not be negative [s], but is {self.smoothing:g}.")
 
     @classmethod
     def tuned(
@@ -63,10 +64,10 @@ class Servo(eqx.Module):
             sample_time: Between two ticks [s].
 
         Raises:
-            ValueError: If frequency or damping are not positive.
+            InputError: If frequency or damping are not positive.
         """
         if not (frequency > 0 and damping > 0):
-            raise ValueError(
+            raise InputError(
                 "`frequency` and `damping` must be positive, but are "
                 f"{frequency:g} Hz and {damping:g}."
             )

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 from jaxid.simulation.servo import Servo
-from jaxid.types import AnyArray, Float
 
 Samples = Float[np.ndarray, "samples joints"]
 
@@ -93,7 +94,7 @@ def run_servo(
         substeps: Of the plant in one tick.
 
     Raises:
-        ValueError: If the motion grows beyond all bounds.
+        InputError: If the motion grows beyond all bounds.
     """
     ticks, n = fed_forward.shape
     asked, forward = np.asarray(desired.q).tolist(), fed_forward.tolist()
@@ -124,7 +125,7 @@ def run_servo(
             for _ in range(substeps):
                 plant.step(u)
     except (ArithmeticError, ValueError) as failure:
-        raise ValueError(
+        raise InputError(
             f"the simulated robot ran away after {len(given) * servo.sample_time:g} s: make the "
             "servo softer or the steps shorter, and see whether the bodies could exist."
         ) from failure

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.drives import Drives
@@ -18,7 +19,6 @@ from jaxid.simulation.gear_friction import LuGreFriction
 from jaxid.simulation.lubricant import Lubricant
 from jaxid.simulation.sensors import Sensors
 from jaxid.simulation.virtual import VirtualRobot
-from jaxid.types import Float
 
 
 class PublishedState(NamedTuple):

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float, require_float64
 from jaxid.dynamics.machine import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTerm
+from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
 from jaxid.simulation.disturbances import AbstractDisturbance
@@ -20,7 +22,6 @@ from jaxid.simulation.mechanics import DriveTrain, SimulatedPlant
 from jaxid.simulation.sensors import Sensors
 from jaxid.simulation.servo import Servo
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import AnyArray, Float, require_float64
 
 GRAINS = 12
 """Point masses of a random body: enough to fill all directions."""
@@ -89,16 +90,16 @@ class VirtualRobot(AbstractExperiment):
     def __check_init__(self):
         size, n = self.bodies.size, self.robot.joints
         if self.values.shape != (size,):
-            raise ValueError(
+            raise InputError(
                 f"`values` must hold one number for each parameter of `terms` ({size}), but has "
                 f"shape {self.values.shape}."
             )
         if (self.lubricant is None) != (self.temperature is None):
-            raise ValueError(
+            raise InputError(
                 "`lubricant` and `temperature` belong together: give both, or neither."
             )
         if self.temperature is not None and self.temperature.shape != (n,):
-            raise ValueError(
+            raise InputError(
                 f"`temperature` must be one for each gear ({n}), but has shape "
                 f"{self.temperature.shape}."
             )
@@ -145,14 +146,14 @@ class VirtualRobot(AbstractExperiment):
             temperature: Of all gears, or of each [°C].
 
         Raises:
-            ValueError: If the robot has no lubricant.
+            InputError: If the robot has no lubricant.
         """
         self._require_lubricant()
         return self.replace(temperature=np.full(self.robot.joints, temperature, np.float64))
 
     def _require_lubricant(self) -> Lubricant:
         if self.lubricant is None:
-            raise ValueError(
+            raise InputError(
                 "friction of this robot does not depend on temperature: give it a `lubricant` and "
                 "a `temperature`."
             )
@@ -172,13 +173,13 @@ class VirtualRobot(AbstractExperiment):
             Times [s] and temperatures [°C], from now on.
 
         Raises:
-            ValueError: If the robot has no lubricant, or a time is not positive.
+            InputError: If the robot has no lubricant, or a time is not positive.
             RuntimeError: If JAX runs in single precision.
         """
         require_float64("warming a virtual robot")
         lubricant = self._require_lubricant()
         if not (duration > 0 and interval > 0):
-            raise ValueError(
+            raise InputError(
                 f"`duration` and `interval` must be positive [s], but are {duration:g} and "
                 f"{interval:g}."
             )
@@ -202,7 +203,7 @@ class VirtualRobot(AbstractExperiment):
             duration: How long it is repeated [s]; the paper's robot is warm after 1800 s.
 
         Raises:
-            ValueError: If the robot has no lubricant, or the time is not positive.
+            InputError: If the robot has no lubricant, or the time is not positive.
             RuntimeError: If JAX runs in single precision.
         """
         _, temperatures = self.warming(trajectory, duration=duration)
@@ -272,12 +273,12 @@ class VirtualRobot(AbstractExperiment):
             step: Of time [s].
 
         Raises:
-            ValueError: If an elastic gear has a motor without inertia.
+            InputError: If an elastic gear has a motor without inertia.
         """
         drives = self.drives(step)
         elastic = np.asarray(self.gear.twist(np.ones(self.robot.joints))) != 0.0
         if (elastic & ~(np.asarray(drives.rotors) > 0)).any():
-            raise ValueError(
+            raise InputError(
                 "an elastic gear needs a motor with inertia: give `terms` a `RotorInertia` with "
                 "positive `values`."
             )

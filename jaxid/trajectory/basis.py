@@ -7,9 +7,10 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.trajectory.fourier import FourierSeries
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import AnyArray, Float
 
 ORDERS = 4
 """Position, velocity, acceleration and jerk."""
@@ -128,9 +129,9 @@ class FourierBasis(AbstractBasis):
 
     def __init__(self, harmonics: int, omega: float):
         if harmonics < 1:
-            raise ValueError(f"`harmonics` must be at least 1, but is {harmonics}.")
+            raise InputError(f"`harmonics` must be at least 1, but is {harmonics}.")
         if not 0 < omega < math.inf:
-            raise ValueError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
+            raise InputError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
         self.harmonics, self.omega = harmonics, float(omega)
         self.duration = 2 * math.pi / omega
 

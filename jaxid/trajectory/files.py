@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.files import read_json, written_whole
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierSeries
@@ -32,13 +33,13 @@ def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
         path: Of the JSON file.
 
     Raises:
-        ValueError: If a number is not finite, or the path is a folder.
+        InputError: If a number is not finite, or the path is a folder.
     """
     content = {"format": FORMAT, "version": VERSION, **_record(trajectory)}
     try:
         text = json.dumps(content, indent=1, allow_nan=False)
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             "a trajectory with numbers that are not finite cannot be saved."
         ) from error
     write_text(path, text + "\n")
@@ -55,7 +56,7 @@ def load_trajectory(
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        ValueError: If it holds no trajectory, or one of a later version or unknown kind.
+        InputError: If it holds no trajectory, or one of a later version or unknown kind.
     """
     path = Path(path)
     if not path.is_file():
@@ -63,18 +64,18 @@ def load_trajectory(
     try:
         content = read_json(path)
     except ValueError as error:
-        raise ValueError(f"`{path}` is no trajectory file: {error}.") from error
+        raise InputError(f"`{path}` is no trajectory file: {error}.") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f'`{path}` is no trajectory file: its `format` is not "{FORMAT}".')
+        raise InputError(f'`{path}` is no trajectory file: its `format` is not "{FORMAT}".')
     if content.get("version") != VERSION:
-        raise ValueError(
+        raise InputError(
             f"`{path}` has version {content.get('version')}, but this package reads version "
             f"{VERSION}: load it with the package that wrote it, or a newer one."
         )
     try:
         return _restore(content, {member.__name__: member for member in members})
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise ValueError(f"`{path}` is damaged: {' '.join(map(str, error.args))}.") from error
+        raise InputError(f"`{path}` is damaged: {' '.join(map(str, error.args))}.") from error
 
 
 def write_csv(
@@ -91,7 +92,7 @@ def write_csv(
         sample_time: Largest time between two samples [s].
 
     Raises:
-        ValueError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
+        InputError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
     """
     require_joints(trajectory, robot)
     times, motion = trajectory.sample(sample_time)
@@ -115,10 +116,10 @@ def require_joints(trajectory: AbstractTrajectory, robot: Robot) -> None:
     """Refuses a trajectory of another robot.
 
     Raises:
-        ValueError: If it moves more or fewer joints.
+        InputError: If it moves more or fewer joints.
     """
     if trajectory.joints != robot.joints:
-        raise ValueError(
+        raise InputError(
             f"the trajectory must move the {robot.joints} joints of `{robot.name}`, but moves "
             f"{trajectory.joints}."
         )
@@ -149,11 +150,11 @@ def _plain(value: Any) -> Any:
 def _restore(content: dict[str, Any], members: dict[str, type]) -> AbstractTrajectory:
     kind = content["kind"]
     if kind not in members:
-        raise ValueError(f"it holds a `{kind}`, which is none of {', '.join(members)}")
+        raise InputError(f"it holds a `{kind}`, which is none of {', '.join(members)}")
     values = {}
     for field in dataclasses.fields(members[kind]):
         if field.name not in content:
-            raise ValueError(f"`{kind}` has no `{field.name}`")
+            raise InputError(f"`{kind}` has no `{field.name}`")
         values[field.name] = _value(content[field.name], members)
     return members[kind](**values)
 
@@ -166,5 +167,5 @@ def _value(value: Any, members: dict[str, type]) -> Any:
             return tuple(_restore(one, members) for one in value)
         return np.array(value, np.float64)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{value!r} is no number")
+        raise InputError(f"{value!r} is no number")
     return value

@@ -5,10 +5,11 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import AnyArray, Float
 
 ASSUMED_RANGE = (1.0, math.pi)
 """Half of the range of a joint without limits: of a rail [m], of a joint that turns [rad]."""
@@ -97,14 +98,14 @@ def random_fourier_series(
         seed: Of the coefficients and offsets.
 
     Raises:
-        ValueError: If `omega` or `harmonics` is not positive, or `reach` not between 0 and 1.
+        InputError: If `omega` or `harmonics` is not positive, or `reach` not between 0 and 1.
     """
     if not 0 < omega < math.inf:
-        raise ValueError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
+        raise InputError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
     if not 1 <= harmonics <= GRID // 8:
-        raise ValueError(f"`harmonics` must be from 1 to {GRID // 8}, but is {harmonics}.")
+        raise InputError(f"`harmonics` must be from 1 to {GRID // 8}, but is {harmonics}.")
     if not 0 < reach <= 1:
-        raise ValueError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
+        raise InputError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
     low, high, velocity, acceleration = assumed_bounds(robot)
     centre, half = 0.5 * (low + high), reach * 0.5 * (high - low)
 

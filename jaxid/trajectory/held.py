@@ -5,9 +5,9 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.trajectory.trajectory import AbstractTrajectory
-from jaxid.types import AnyArray, Float
 
 ROUNDING = 1e-6
 """Share of a cycle by which a duration may miss a whole number of them."""

@@ -7,9 +7,9 @@ and, a tenth of the plane's diagonal inside of its corners, the points P2 to P5.
 
 import numpy as np
 
-from jaxid.arrays import as_array
+from jaxid.arrays import Numbers, as_array
+from jaxid.errors import InputError
 from jaxid.trajectory.tip_path import Circle, Line, TipPath
-from jaxid.types import Numbers
 
 INSIDE = 0.1
 """How far P2 to P5 lie inside of the plane's corners, as a share of its diagonal."""
@@ -45,15 +45,15 @@ def iso9283_path(
         acceleration: Largest acceleration along the way, and largest across it [m/s²].
 
     Raises:
-        ValueError: If the cube has no size, a limit is not positive, or there is no round.
+        InputError: If the cube has no size, a limit is not positive, or there is no round.
     """
     if not 0 < edge < np.inf:
-        raise ValueError(f"`edge` of the cube must be positive [m], but is {edge:g}.")
+        raise InputError(f"`edge` of the cube must be positive [m], but is {edge:g}.")
     if leans_along not in (0, 1):
-        raise ValueError(f"`leans_along` must be 0 (x) or 1 (y), but is {leans_along}.")
+        raise InputError(f"`leans_along` must be 0 (x) or 1 (y), but is {leans_along}.")
     c = as_array("centre", centre)
     if c.shape != (3,) or not np.isfinite(c).all():
-        raise ValueError("`centre` must hold three finite numbers [m].")
+        raise InputError("`centre` must hold three finite numbers [m].")
     rising = np.eye(3)[leans_along] + np.eye(3)[2]
     level = np.eye(3)[1 - leans_along]
     half, way = edge / 2, 1.0 - 2 * INSIDE

@@ -6,12 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
+from jaxid.arrays import AnyArray, Array, Float, Numbers
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.tip_path import TipPath
 from jaxid.trajectory.trajectory import AbstractTrajectory, each_time
-from jaxid.types import AnyArray, Array, Float, Numbers
 
 DEGREE = 5
 LEAST = 12
@@ -81,11 +82,11 @@ def joint_path(
         seed: Of the starts.
 
     Raises:
-        ValueError: If a part of the path is out of reach, a joint would have to move faster than it
+        InputError: If a part of the path is out of reach, a joint would have to move faster than it
             can, or `spacing` is not positive.
     """
     if not 0 < spacing < np.inf:
-        raise ValueError(f"`spacing` must be positive [s], but is {spacing:g}.")
+        raise InputError(f"`spacing` must be positive [s], but is {spacing:g}.")
     counts = [max(LEAST, int(np.ceil(time / spacing))) for time in path.durations]
     ends = np.concatenate([[0.0], np.cumsum(path.durations)])
     instants = [
@@ -121,7 +122,7 @@ def _refuse_haste(robot: Robot, path: TipPath, qd: np.ndarray, qdd: np.ndarray) 
     if slower[j] > 1.0 + TOLERANCE:
         what = "speed" if speed[j] == slower[j] else "acceleration"
         f = 1.01 * slower[j]
-        raise ValueError(
+        raise InputError(
             f"joint `{robot.joint_names[j]}` would need {max(speed[j], acceleration[j]):.2f} times "
             f"its largest {what}: give the path a `speed` of {path.speed / f:.3g} m/s and an "
             f"`acceleration` of {path.acceleration / f**2:.3g} m/s², or choose another posture."

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierSeries, assumed_bounds
 from jaxid.trajectory.trajectory import AbstractTrajectory, each_time
-from jaxid.types import AnyArray, Array, Float, double_precision
 
 PHASES = 360
 """Instants of a period at which the lead-in may hand over."""
@@ -93,13 +94,13 @@ def with_leads(
         reach: Share of every limit that may be used, of 1.
 
     Raises:
-        ValueError: If there is no period, the series is not one of this robot, or no instant of
+        InputError: If there is no period, the series is not one of this robot, or no instant of
             the period can be reached within the limits; the message names the joint.
     """
     if periods < 1:
-        raise ValueError(f"`periods` must be at least 1, but is {periods}.")
+        raise InputError(f"`periods` must be at least 1, but is {periods}.")
     if series.joints != robot.joints:
-        raise ValueError(
+        raise InputError(
             f"`series` must move the robot's {robot.joints} joints, but moves {series.joints}."
         )
     period = float(series.period)
@@ -116,7 +117,7 @@ def with_leads(
         excess = np.maximum(excess_in, excess_out)
         nearest = int(np.argmin(excess.max(axis=1)))
         joint = int(np.argmax(excess[nearest]))
-        raise ValueError(
+        raise InputError(
             "no instant of the period can be reached from standstill within the limits: at best "
             f"joint `{robot.joint_names[joint]}` exceeds one of them by "
             f"{100 * excess[nearest, joint]:.3g} %: take a motion that uses less of the limits, or "

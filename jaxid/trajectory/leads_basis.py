@@ -5,9 +5,10 @@ import math
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.trajectory.basis import AbstractBasis, Envelope, FourierBasis
 from jaxid.trajectory.leads import WithLeads
-from jaxid.types import AnyArray, Float
 
 DEGREE = 4
 """Of the polynomials in a lead."""
@@ -39,9 +40,9 @@ class LeadsBasis(AbstractBasis):
     def __init__(self, harmonics: int, omega: float, *, lead: float = 0.5, periods: int = 1):
         series = FourierBasis(harmonics, omega)
         if not 0 < lead < math.inf:
-            raise ValueError(f"`lead` must be a positive time [s], but is {lead:g}.")
+            raise InputError(f"`lead` must be a positive time [s], but is {lead:g}.")
         if periods < 1:
-            raise ValueError(f"`periods` must be at least 1, but is {periods}.")
+            raise InputError(f"`periods` must be at least 1, but is {periods}.")
         self.harmonics, self.omega = harmonics, series.omega
         self.lead, self.periods = float(lead), periods
         self.duration = periods * series.duration + 2 * self.lead

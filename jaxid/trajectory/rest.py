@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.trajectory.basis import AbstractBasis, Envelope, FourierBasis
 from jaxid.trajectory.fourier import FourierSeries
 from jaxid.trajectory.trajectory import AbstractTrajectory, each_time
-from jaxid.types import AnyArray, Array, Float
 
 
 class RestToRest(AbstractTrajectory):
@@ -37,11 +38,11 @@ class RestToRest(AbstractTrajectory):
             periods: Number of periods.
 
         Raises:
-            ValueError: If there is no period, or the series has a single harmonic, which cannot
+            InputError: If there is no period, or the series has a single harmonic, which cannot
                 stand at its ends.
         """
         if periods < 1:
-            raise ValueError(f"`periods` must be at least 1, but is {periods}.")
+            raise InputError(f"`periods` must be at least 1, but is {periods}.")
         _require_harmonics(series.harmonics)
         order = np.arange(1.0, series.harmonics + 1.0)
         a, b = jnp.asarray(series.a), jnp.asarray(series.b)
@@ -111,7 +112,7 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "coefficients free"]:
         harmonics: Number of harmonics.
 
     Raises:
-        ValueError: If there are fewer than two.
+        InputError: If there are fewer than two.
     """
     _require_harmonics(harmonics)
     order = np.arange(1.0, harmonics + 1.0)
@@ -121,7 +122,7 @@ def rest_basis(harmonics: int) -> Float[np.ndarray, "coefficients free"]:
 
 def _require_harmonics(harmonics: int) -> None:
     if harmonics < 2:
-        raise ValueError(
+        raise InputError(
             f"`harmonics` must be at least 2 for a motion between standstill and standstill, but "
             f"is {harmonics}."
         )

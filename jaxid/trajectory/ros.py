@@ -27,7 +27,7 @@ def joint_trajectory(
         sample_time: Largest time between two points [s].
 
     Raises:
-        ValueError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
+        InputError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
     """
     require_joints(trajectory, robot)
     times, motion = trajectory.sample(sample_time)
@@ -60,7 +60,7 @@ def write_ros_json(
         sample_time: Largest time between two points [s].
 
     Raises:
-        ValueError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
+        InputError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
     """
     message = joint_trajectory(trajectory, robot, sample_time=sample_time)
     write_text(path, json.dumps(message, allow_nan=False) + "\n")
@@ -80,7 +80,7 @@ def write_ros_yaml(
         sample_time: Largest time between two points [s].
 
     Raises:
-        ValueError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
+        InputError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
     """
     message = joint_trajectory(trajectory, robot, sample_time=sample_time)
     write_text(path, "\n".join(_yaml_lines(message)) + "\n")

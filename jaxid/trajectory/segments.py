@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.trajectory.trajectory import AbstractTrajectory, each_time
-from jaxid.types import AnyArray, Array, Float
 
 LARGEST_JUMP = 1e-6
 """Jump of a coordinate or its derivatives between two motions that counts as rounding."""
@@ -36,15 +37,15 @@ class Segments(AbstractTrajectory):
                 joint's unit and its rates [rad or m, per s, per s²].
 
         Raises:
-            ValueError: If there is none, or one does not start as the one before it ends.
+            InputError: If there is none, or one does not start as the one before it ends.
         """
         if not members:
-            raise ValueError("`members` must hold at least one trajectory, but is empty.")
+            raise InputError("`members` must hold at least one trajectory, but is empty.")
         whole = cls(tuple(members))
         for k, (before, after) in enumerate(itertools.pairwise(members)):
             end, start = before.motion(before.duration), after.motion(0.0)
             if end.joints != start.joints:
-                raise ValueError(
+                raise InputError(
                     f"trajectories {k + 1} and {k + 2} must move the same joints, but have "
                     f"{end.joints} and {start.joints}."
                 )
@@ -55,7 +56,7 @@ class Segments(AbstractTrajectory):
             ):
                 jump = np.abs(np.asarray(y) - np.asarray(x))
                 if jump.max() > largest_jump:
-                    raise ValueError(
+                    raise InputError(
                         f"the {what} of joint {int(jump.argmax()) + 1} jumps by {jump.max():.3g} "
                         f"between trajectories {k + 1} and {k + 2}: start the second as the first "
                         "ends, put a `Spline` between them, or raise `largest_jump`."

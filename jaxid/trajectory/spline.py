@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
+from jaxid.arrays import AnyArray, Array, Float, Numbers
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.trajectory.basis import ORDERS, AbstractBasis, Envelope
 from jaxid.trajectory.trajectory import AbstractTrajectory, each_time
-from jaxid.types import AnyArray, Array, Float, Numbers
 
 DEGREE = 5
 AT_REST = 3
@@ -47,7 +48,7 @@ class Spline(AbstractTrajectory):
             duration: Of the motion [s].
 
         Raises:
-            ValueError: If there are not at least two points, or the duration is not positive.
+            InputError: If there are not at least two points, or the duration is not positive.
         """
         handles = _checked(points, duration)
         return cls(_spread(len(handles)) @ handles, float(duration))
@@ -61,7 +62,7 @@ class Spline(AbstractTrajectory):
             duration: Of the motion [s].
 
         Raises:
-            ValueError: If there are not at least two points, or the duration is not positive.
+            InputError: If there are not at least two points, or the duration is not positive.
         """
         way = _checked(points, duration)
         still = [(1, np.zeros(way.shape[1])), (2, np.zeros(way.shape[1]))]
@@ -105,9 +106,9 @@ class RestToRestSplineBasis(AbstractBasis):
 
     def __init__(self, points: int, duration: float):
         if points < 2:
-            raise ValueError(f"`points` must be at least 2, but is {points}.")
+            raise InputError(f"`points` must be at least 2, but is {points}.")
         if not 0 < duration < np.inf:
-            raise ValueError(f"`duration` must be positive [s], but is {duration:g}.")
+            raise InputError(f"`duration` must be positive [s], but is {duration:g}.")
         self.points, self.duration = points, float(duration)
 
     def rows(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "4 samples variables"]:
@@ -180,10 +181,10 @@ def _polynomials(count: int) -> np.ndarray:
 def _checked(points: Numbers, duration: float) -> np.ndarray:
     rows = np.array(points, np.float64)
     if rows.ndim != 2 or len(rows) < 2 or not np.isfinite(rows).all():
-        raise ValueError(
+        raise InputError(
             "`points` must hold at least two rows of finite numbers, one for each joint, but has "
             f"shape {rows.shape}."
         )
     if not 0 < duration < np.inf:
-        raise ValueError(f"`duration` must be positive [s], but is {duration:g}.")
+        raise InputError(f"`duration` must be positive [s], but is {duration:g}.")
     return rows

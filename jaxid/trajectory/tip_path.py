@@ -5,8 +5,8 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import as_array
-from jaxid.types import AnyArray, Float, Numbers
+from jaxid.arrays import AnyArray, Float, Numbers, as_array
+from jaxid.errors import InputError
 
 PEAK_SPEED, PEAK_ACCELERATION = 15.0 / 8.0, 10.0 / np.sqrt(3.0)
 """Of the speed profile, over mean speed, and over way by time squared."""
@@ -78,7 +78,7 @@ class Circle(AbstractPiece):
 
     def __check_init__(self):
         if self.rounds < 1:
-            raise ValueError(f"`rounds` of a circle must be at least 1, but is {self.rounds}.")
+            raise InputError(f"`rounds` of a circle must be at least 1, but is {self.rounds}.")
 
     @property
     def length(self) -> float:
@@ -133,24 +133,24 @@ class TipPath(eqx.Module):
             acceleration: Largest acceleration along the way, and largest across it [m/s²].
 
         Raises:
-            ValueError: If there is no piece, one has no length or does not start where the one
+            InputError: If there is no piece, one has no length or does not start where the one
                 before it ends, or a limit is not positive.
         """
         for name, limit in (("speed", speed), ("acceleration", acceleration)):
             if not 0 < limit < np.inf:
-                raise ValueError(f"`{name}` must be positive, but is {limit:g}.")
+                raise InputError(f"`{name}` must be positive, but is {limit:g}.")
         if not pieces:
-            raise ValueError("`pieces` must hold at least one piece, but is empty.")
+            raise InputError("`pieces` must hold at least one piece, but is empty.")
         ends = [piece.at(np.array([0.0, 1.0])) for piece in pieces]
         for k, piece in enumerate(pieces):
             gap = float(np.linalg.norm(ends[k][0] - ends[k - 1][1])) if k else 0.0
             if gap > 1e-9:
-                raise ValueError(
+                raise InputError(
                     f"piece {k + 1} must start where the one before it ends, but lies {gap:.3g} m "
                     "from it."
                 )
             if not 0 < piece.length < np.inf:
-                raise ValueError(f"piece {k + 1} must have a length, but it is {piece.length:g} m.")
+                raise InputError(f"piece {k + 1} must have a length, but it is {piece.length:g} m.")
         return cls(tuple(pieces), as_array("rotation", rotation), float(speed), float(acceleration))
 
     @property

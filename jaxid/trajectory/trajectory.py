@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable
+from jaxid.arrays import AnyArray, Array, Float, Hashable, require_float64
 from jaxid.dynamics.motion import Motion
-from jaxid.types import AnyArray, Array, Float, require_float64
+from jaxid.errors import InputError
 
 
 class AbstractTrajectory(Hashable):
@@ -49,10 +49,10 @@ class AbstractTrajectory(Hashable):
             sample_time: Largest time between two samples [s].
 
         Raises:
-            ValueError: If `sample_time` is not positive.
+            InputError: If `sample_time` is not positive.
         """
         if not 0 < sample_time < np.inf:
-            raise ValueError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
+            raise InputError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
         duration = float(self.duration)
         # A duration that rounding has left a little longer needs no further sample.
         steps = max(int(np.ceil(duration / sample_time * (1 - 1e-9))), 1)
@@ -65,7 +65,7 @@ class AbstractTrajectory(Hashable):
             sample_time: Largest time between two samples [s].
 
         Raises:
-            ValueError: If `sample_time` is not positive.
+            InputError: If `sample_time` is not positive.
             RuntimeError: If JAX runs in single precision.
         """
         require_float64("sampling a trajectory")

@@ -3,10 +3,10 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.compiled import mass_matrices
 from jaxid.identification.fit import Fit
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 POSES = 2000
 

@@ -3,13 +3,13 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.compiled import tool_forces
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit import Fit
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Bool, Float
 
 ROWS = 2**18
 """Rows of a long log that are compared at most."""

@@ -4,12 +4,12 @@ import math
 
 import equinox as eqx
 
+from jaxid.arrays import Array, Float
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot
-from jaxid.types import Array, Float
 
 SIZE = 0.1
 """Length that a value of 1 stands for [m]."""

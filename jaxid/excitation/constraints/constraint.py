@@ -7,9 +7,9 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Array, Float
 
 
 class Entry(NamedTuple):

@@ -8,15 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float, Numbers
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.transitions import AbstractTransition, Reversal
+from jaxid.errors import InputError
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import assumed_bounds
-from jaxid.types import AnyArray, Array, Float, Numbers
 
 REVERSING = 0.02
 """Share of a joint's largest speed below which its dry friction may have either direction."""
@@ -59,28 +60,28 @@ class NominalForces(eqx.Module):
             deviations: Standard deviations that must fit below the limit, of 1.
 
         Raises:
-            ValueError: If there is not one number for each base parameter, the covariance is not
+            InputError: If there is not one number for each base parameter, the covariance is not
                 positive, or `deviations` negative.
         """
         p = np.array(parameters, np.float64)
         if p.shape != (base.size,) or not np.isfinite(p).all():
-            raise ValueError(
+            raise InputError(
                 f"`parameters` must hold one finite number for each base parameter ({base.size}), "
                 f"but has shape {p.shape}: `base.from_standard` makes them of standard ones."
             )
         if not 0 <= deviations < np.inf:
-            raise ValueError(f"`deviations` must not be negative, but is {deviations:g}.")
+            raise InputError(f"`deviations` must not be negative, but is {deviations:g}.")
         C = None
         if covariance is not None:
             C = np.array(covariance, np.float64)
             if C.shape != (base.size, base.size) or not np.isfinite(C).all():
-                raise ValueError(
+                raise InputError(
                     f"`covariance` must be a finite matrix of {base.size} rows and columns, but "
                     f"has shape {C.shape}."
                 )
             least = np.linalg.eigvalsh(0.5 * (C + C.T))[0]
             if least < -1e-9 * np.abs(C).max():
-                raise ValueError(f"`covariance` has a negative eigenvalue ({least:.3g}).")
+                raise InputError(f"`covariance` has a negative eigenvalue ({least:.3g}).")
         return cls(base, p, C, float(deviations))
 
     def __call__(

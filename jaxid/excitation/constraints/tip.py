@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float, Numbers
 from jaxid.dynamics.machine import on_samples
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
 from jaxid.robot.kinematics import tip_placement
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Array, Float, Numbers
 
 STILL = 1e-6
 """Share of a limit by which a length is rounded up, so that it is smooth at zero."""
@@ -130,15 +131,15 @@ class Workspace(AbstractConstraint):
             high: Largest coordinates [m]; infinity where it is open.
 
         Raises:
-            ValueError: If these are no corners of a box, or no side has an end.
+            InputError: If these are no corners of a box, or no side has an end.
         """
         corners = np.array(low, np.float64), np.array(high, np.float64)
         if any(x.shape != (3,) or np.isnan(x).any() for x in corners):
-            raise ValueError("`low` and `high` of a workspace must hold three numbers each [m].")
+            raise InputError("`low` and `high` of a workspace must hold three numbers each [m].")
         if (corners[0] >= corners[1]).any():
-            raise ValueError(f"`low` {low} of a workspace must be below `high` {high} [m].")
+            raise InputError(f"`low` {low} of a workspace must be below `high` {high} [m].")
         if not np.isfinite(corners).any():
-            raise ValueError("a workspace must have an end on some side, but is all of space.")
+            raise InputError("a workspace must have an end on some side, but is all of space.")
         return cls(*corners)
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
@@ -187,4 +188,4 @@ def _length(vector: Array) -> Array:
 
 def _require_positive(what: str, limit: float, unit: str) -> None:
     if not 0 < limit < np.inf:
-        raise ValueError(f"`limit` of `{what}` must be positive [{unit}], but is {limit:g}.")
+        raise InputError(f"`limit` of `{what}` must be positive [{unit}], but is {limit:g}.")

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Bool, Float, Int, require_float64
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.consistency.data import whitened
 from jaxid.identification.consistency.estimator import PhysicallyConsistent
 from jaxid.identification.consistency.interior_point import solve_compiled
-from jaxid.types import AnyArray, Array, Bool, Float, Int, require_float64
 
 ALONE = 8
 """Data sets for which another thread does not pay."""
@@ -57,7 +58,7 @@ class ConsistentSolver:
             estimator: Bounds, margin and priors; wide bounds if None.
 
         Raises:
-            ValueError: If the bounds do not fit the model.
+            InputError: If the bounds do not fit the model.
         """
         self.base = base
         self.estimator = PhysicallyConsistent() if estimator is None else estimator
@@ -115,7 +116,7 @@ class ConsistentSolver:
             rows: How many rows it stands for.
 
         Raises:
-            ValueError: If bounds and margin leave no body.
+            InputError: If bounds and margin leave no body.
         """
         data = self.estimator.with_prior(np, whitened(np, self.base, R, z, rows))
         self.estimator.program(np, self._possible, data).require_interior()
@@ -141,13 +142,13 @@ def consistent_batch(
         estimator: Bounds, margin and priors; wide bounds if None.
 
     Raises:
-        ValueError: If shapes do not fit, or bounds leave no body.
+        InputError: If shapes do not fit, or bounds leave no body.
         RuntimeError: If JAX's 64-bit mode is off.
     """
     require_float64("a batch of physically consistent estimates")
     count = len(R)
     if not count or R.shape[-1] != base.size or z.shape != R.shape[:-1] or rows.shape != (count,):
-        raise ValueError(
+        raise InputError(
             f"`R`, `z` and `rows` must have the shapes [datasets, height, {base.size}], [datasets, "
             f"height] and [datasets], but have {R.shape}, {z.shape} and {rows.shape}."
         )

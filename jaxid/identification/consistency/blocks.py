@@ -6,8 +6,8 @@ arrays: no calls of LAPACK for matrices of sixteen numbers.
 
 from types import ModuleType
 
+from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.identification.consistency.cone_program import Values
-from jaxid.types import AnyArray, Bool, Float
 
 
 def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:

@@ -3,9 +3,10 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.errors import InputError
 from jaxid.robot.limits import Numbers
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Bool, Float
 
 MASS_OF_A_METRE = 100.0
 """Largest mass of a body of a robot that reaches one metre [kg]; it grows with the square."""
@@ -64,7 +65,7 @@ class BodyBounds(eqx.Module):
             total_mass: Mass of all bodies together [kg], if it is known.
 
         Raises:
-            ValueError: If shapes do not fit, or no body could satisfy all bounds.
+            InputError: If shapes do not fit, or no body could satisfy all bounds.
         """
 
         def each(name: str, value: Numbers | None, unknown: float, *shape: int) -> np.ndarray:
@@ -72,7 +73,7 @@ class BodyBounds(eqx.Module):
             if np.isnan(array).any() or (
                 array.shape and array.shape not in (shape, (bodies, *shape))
             ):
-                raise ValueError(
+                raise InputError(
                     f"`{name}` must hold numbers for all bodies or for each of the {bodies}, but "
                     f"has shape {array.shape}."
                 )
@@ -110,7 +111,7 @@ class BodyBounds(eqx.Module):
         """A copy with some bounds replaced, as `of` takes them.
 
         Raises:
-            ValueError: If shapes do not fit, or no body could satisfy all bounds.
+            InputError: If shapes do not fit, or no body could satisfy all bounds.
         """
         return type(self).of(len(self.radius), **{**vars(self), **fields})
 
@@ -146,7 +147,7 @@ class BodyBounds(eqx.Module):
         """Centres of mass that satisfy all bounds, and not barely [m].
 
         Raises:
-            ValueError: If there are none for some body.
+            InputError: If there are none for some body.
         """
         radius = np.asarray(self.radius)[:, None]
         low = np.maximum(self.centre_min, -radius)
@@ -171,7 +172,7 @@ class BodyBounds(eqx.Module):
         )
         if not inside.all():
             k = int(np.flatnonzero(~inside)[0]) + 1
-            raise ValueError(
+            raise InputError(
                 f"no centre of mass of body {k} lies well within its box, its ellipsoid and its "
                 f"sphere of {float(self.radius[k - 1]):.3g} m: widen one of them."
             )
@@ -185,21 +186,21 @@ class BodyBounds(eqx.Module):
             if not good.all():
                 k, which = np.argwhere(~good)[0]
                 rule = "positive" if name == "ellipsoid_axes" else "positive and finite"
-                raise ValueError(
+                raise InputError(
                     f"`{name}` must be {rule}, but body {k + 1} has {values[k, which]:g}."
                 )
         low, high = np.asarray(self.mass_min), np.asarray(self.mass_max)
         if not ((low >= 0) & (low < high)).all():
             k = int(np.flatnonzero(~((low >= 0) & (low < high)))[0])
-            raise ValueError(
+            raise InputError(
                 f"`mass_min` must lie between 0 and `mass_max`, but body {k + 1} has {low[k]:g} "
                 f"and {high[k]:g} kg."
             )
         if not (np.asarray(self.centre_min) < np.asarray(self.centre_max)).all():
-            raise ValueError("`centre_min` must be below `centre_max` for every body and axis.")
+            raise InputError("`centre_min` must be below `centre_max` for every body and axis.")
         total = self.total_mass
         if total is not None and not low.sum() < total < high.sum():
-            raise ValueError(
+            raise InputError(
                 f"`total_mass` must lie between the sums of the bodies' bounds, {low.sum():g} and "
                 f"{high.sum():g} kg, but is {total:g} kg."
             )

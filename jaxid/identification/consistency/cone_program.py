@@ -12,8 +12,9 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float, Int
+from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import BASIS
-from jaxid.types import AnyArray, Float, Int
 
 Values = Any
 """What either machine computes with: arrays of NumPy or JAX, and NumPy's numbers."""
@@ -81,13 +82,13 @@ class ConeProgram(eqx.Module):
         """Refuses a start on or beyond a bound.
 
         Raises:
-            ValueError: If there is none within.
+            InputError: If there is none within.
         """
         y = np.asarray(self.start)
         S = self.matrices(np, y) + self.constant_matrices(np)
         s = self.slacks(np, y) + self.constant_slacks(np)
         if not (np.linalg.eigvalsh(S)[:, 0].min(initial=1.0) > 0 and s.min(initial=1.0) > 0):
-            raise ValueError(
+            raise InputError(
                 "no ball-shaped body lies within all bounds: make `margin` smaller, or widen the "
                 "bounds of masses, spheres and centres of mass."
             )

@@ -3,9 +3,9 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.interior_point import Outcome
-from jaxid.types import AnyArray, Bool, Float
 
 
 class Consistency(eqx.Module):

@@ -3,8 +3,9 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.model import Model
-from jaxid.types import Float
+from jaxid.errors import InputError
 
 LARGEST = 4
 """Axes whose drives can be coupled."""
@@ -38,13 +39,13 @@ def couplings_of(model: Model) -> tuple[Coupling, ...]:
             for place in range(len(group)):
                 own = [k for k in columns if inside[place, place, k] != 0]
                 if not own:
-                    raise ValueError(
+                    raise InputError(
                         f"coupled drives are consistent only together with the drives' own "
                         f"columns: add `{kind}()`."
                     )
                 diagonal.append(int(own[0]))
             if len(group) > LARGEST:
-                raise ValueError(
+                raise InputError(
                     f"drives that couple more than {LARGEST} axes have no consistent estimate yet: "
                     f"`{robot.name}` couples {len(group)}."
                 )

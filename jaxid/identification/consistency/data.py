@@ -5,9 +5,9 @@ from types import ModuleType
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.consistency.cone_program import Number, Values
-from jaxid.types import AnyArray, Float
 
 NOISE = 1e-3
 """Smallest noise that is believed, as a share of the forces."""

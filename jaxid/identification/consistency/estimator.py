@@ -6,7 +6,9 @@ from types import ModuleType
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters, Identifiability
+from jaxid.errors import InputError
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.cone_program import ConeProgram
 from jaxid.identification.consistency.consistency import Consistency
@@ -19,7 +21,6 @@ from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
 from jaxid.identification.estimators import AbstractEstimator, Estimate
 from jaxid.identification.solutions import Complete
 from jaxid.identification.weights import AbstractWeights, MaximumForces
-from jaxid.types import AnyArray, Float
 
 FLAT = 1e-4
 """Share of a body below which it counts as flat: on the boundary of what can exist."""
@@ -52,13 +53,13 @@ class PhysicallyConsistent(AbstractEstimator):
 
     def __check_init__(self):
         if not 0.0 <= self.margin < 1.0:
-            raise ValueError(f"`margin` must be between 0 and 1, but is {self.margin}.")
+            raise InputError(f"`margin` must be between 0 and 1, but is {self.margin}.")
 
     def __call__(self, rows):
         """Solves a small convex program on the rows' triangular factor.
 
         Raises:
-            ValueError: If weights are not known, or bounds and margin leave no body.
+            InputError: If weights are not known, or bounds and margin leave no body.
             RuntimeError: If the optimum was not proved and `throw` is set.
         """
         weights = self.weights(rows.robot, rows.factors)
@@ -106,7 +107,7 @@ class PhysicallyConsistent(AbstractEstimator):
             base: Of the model.
 
         Raises:
-            ValueError: If the bounds do not fit the model.
+            InputError: If the bounds do not fit the model.
         """
         robot = base.model.robot
         bounds = BodyBounds.from_geometry(robot) if self.bounds is None else self.bounds

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Bool, Float, Int, require_float64
 from jaxid.identification.consistency import blocks
 from jaxid.identification.consistency.cone_program import (
     ConeProgram,
@@ -34,7 +35,6 @@ from jaxid.identification.consistency.newton import (
     point_of,
     targets,
 )
-from jaxid.types import AnyArray, Bool, Float, Int, require_float64
 
 TOLERANCE = 2.5e-7
 """Error bound at which an optimum counts as found, as a share of objective and scale together."""

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
+from jaxid.arrays import Array
 from jaxid.identification.consistency import blocks
 from jaxid.identification.consistency.cone_program import ConeProgram, Values, indicators
 from jaxid.identification.consistency.pseudo_inertia import BASIS
-from jaxid.types import Array
 
 SHARES = np.array([1.0, *1.0 - np.geomspace(0.01, 0.64, 13), 0.28, 0.2, 0.13, 0.08, 0.04, 0.01])
 """Steps that are tried, as shares of what the linear functions allow."""

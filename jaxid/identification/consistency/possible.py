@@ -5,13 +5,14 @@ from types import ModuleType
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.model import Model
+from jaxid.errors import InputError
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.cone_program import Values
 from jaxid.identification.consistency.couplings import Coupling, couplings_of
 from jaxid.identification.consistency.pseudo_inertia import ball
 from jaxid.robot.robot import AXES
-from jaxid.types import Float
 
 WIDE = 10.0
 """Largest friction and rotor inertia, in units of what all measured forces together would give."""
@@ -52,7 +53,7 @@ class PossibleParameters(eqx.Module):
             margin: Share of a nominal ball that every body contains, of 1.
 
         Raises:
-            ValueError: If the model has no bodies, coupled drives lack the diagonal terms, or the
+            InputError: If the model has no bodies, coupled drives lack the diagonal terms, or the
                 margin leaves no body.
         """
         robot = model.robot
@@ -60,7 +61,7 @@ class PossibleParameters(eqx.Module):
         starts = np.cumsum([0, *sizes[:-1]])
         widths = [term.body_parameters for term in model.terms]
         if not any(widths):
-            raise ValueError(
+            raise InputError(
                 "physical consistency is about bodies, but the model has none: add `RigidBodies()`."
             )
         lower = np.concatenate([term.lower_bounds(robot) for term in model.terms])
@@ -68,7 +69,7 @@ class PossibleParameters(eqx.Module):
         columns = starts[first] + np.arange(sizes[first]).reshape(robot.joints, widths[first])
         others = np.setdiff1d(np.arange(model.size), columns)
         if len(bounds.radius) != robot.joints:
-            raise ValueError(
+            raise InputError(
                 f"`bounds` must be those of the {robot.joints} bodies of `{robot.name}`, but are "
                 f"of {len(bounds.radius)}."
             )

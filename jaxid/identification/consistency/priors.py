@@ -3,8 +3,9 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia, share_of_a_body
-from jaxid.types import AnyArray, Float
 
 
 class EntropicPull(eqx.Module):
@@ -25,10 +26,10 @@ class EntropicPull(eqx.Module):
 
     def __check_init__(self):
         if not 0.0 < self.strength < np.inf:
-            raise ValueError(f"`strength` must be positive, but is {self.strength}.")
+            raise InputError(f"`strength` must be positive, but is {self.strength}.")
         if self.bodies is not None and not (share_of_a_body(self.bodies) > 0.0).all():
             k = int(np.argmin(share_of_a_body(self.bodies))) + 1
-            raise ValueError(
+            raise InputError(
                 f"`bodies` of a prior must be bodies that could exist, with some extent in all "
                 f"directions, but body {k} is not: give it a mass and an inertia."
             )
@@ -42,12 +43,12 @@ class EntropicPull(eqx.Module):
             nominal: Of the bodies that are taken where none are given.
 
         Raises:
-            ValueError: If there is not one for each body.
+            InputError: If there is not one for each body.
         """
         if self.bodies is None:
             return nominal
         if len(self.bodies) != len(nominal):
-            raise ValueError(
+            raise InputError(
                 f"`bodies` of a prior must be one for each body of the robot ({len(nominal)}), but "
                 f"are {len(self.bodies)}."
             )
@@ -69,21 +70,21 @@ class ParameterPrior(eqx.Module):
 
     def __check_init__(self):
         if np.shape(self.parameters) != np.shape(self.deviations):
-            raise ValueError(
+            raise InputError(
                 "`parameters` and `deviations` of a prior must be as many, but are "
                 f"{np.shape(self.parameters)} and {np.shape(self.deviations)}."
             )
         if not (np.asarray(self.deviations) > 0.0).all():
-            raise ValueError("`deviations` of a prior must be positive.")
+            raise InputError("`deviations` of a prior must be positive.")
 
     def rows(self, size: int) -> tuple[Float[np.ndarray, "rows standard"], np.ndarray]:
         """Rows of least squares, in units of the standard deviations.
 
         Raises:
-            ValueError: If there is not one for each standard parameter.
+            InputError: If there is not one for each standard parameter.
         """
         if len(self.parameters) != size:
-            raise ValueError(
+            raise InputError(
                 f"`parameters` of a prior must be the {size} standard parameters of the model, but "
                 f"are {len(self.parameters)}."
             )

@@ -4,11 +4,11 @@ from types import ModuleType
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.consistency.cone_program import ConeProgram, Values
 from jaxid.identification.consistency.couplings import LARGEST
 from jaxid.identification.consistency.possible import PossibleParameters
 from jaxid.identification.consistency.pseudo_inertia import ball, inertial_parameters
-from jaxid.types import AnyArray, Float
 
 CLOSE = 0.98
 """Share of a prior's bodies in those of the start."""

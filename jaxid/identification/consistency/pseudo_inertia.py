@@ -8,7 +8,7 @@ principal moments of inertia.
 
 import numpy as np
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float
 
 TEN = 10
 

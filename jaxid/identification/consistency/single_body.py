@@ -3,11 +3,12 @@
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.interior_point import Outcome, solve_at_once
 from jaxid.identification.consistency.possible import PossibleParameters
 from jaxid.identification.consistency.program import program_of
-from jaxid.types import AnyArray, Float
 
 
 class ConsistentBody(eqx.Module):
@@ -42,18 +43,18 @@ def consistent_body(
         throw: Whether an optimum without proof is an error.
 
     Raises:
-        ValueError: If the covariance is not positive definite, or the bounds are not of one body.
+        InputError: If the covariance is not positive definite, or the bounds are not of one body.
         RuntimeError: If the optimum was not proved and `throw` is set.
     """
     if len(bounds.radius) != 1:
-        raise ValueError(f"`bounds` must be those of one body, but are of {len(bounds.radius)}.")
+        raise InputError(f"`bounds` must be those of one body, but are of {len(bounds.radius)}.")
     C = np.asarray(covariance, np.float64)
     size = np.sqrt(np.abs(np.diag(C)))
     size = np.where(size > 0, size, 1.0)
     try:
         L = np.linalg.cholesky(C / size[:, None] / size)
     except np.linalg.LinAlgError as error:
-        raise ValueError(
+        raise InputError(
             "`covariance` must be positive definite, but is not: is some parameter not determined?"
         ) from error
     A = np.linalg.inv(L) / size

@@ -6,13 +6,13 @@ import itertools
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.nonlinear.projection import Found, Search
 from jaxid.identification.nonlinear.separable import SeparableRows
 from jaxid.identification.nonlinear.shapes import Free, Shapes
 from jaxid.identification.rows import Rows
-from jaxid.types import Float
 
 STARTS = (0.2, 1.0, 5.0)
 """Multiples of the shapes among which the search chooses its beginning, joint by joint."""
@@ -39,7 +39,7 @@ class NonlinearFriction(AbstractEstimator):
         """Searches, and estimates with what was found.
 
         Raises:
-            ValueError: If the model has no shapes, or only factors are known.
+            InputError: If the model has no shapes, or only factors are known.
         """
         weights = np.asarray(self.linear(rows).weights)
         shapes, _, found = self.search(rows, weights)

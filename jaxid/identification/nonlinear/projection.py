@@ -16,11 +16,11 @@ import jax
 import numpy as np
 import optimistix as optx
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.factors import Factors
 from jaxid.identification.kernel import on_cpu
 from jaxid.identification.nonlinear.separable import SeparableRows, joined
 from jaxid.identification.solutions import Complete, Decomposition
-from jaxid.types import AnyArray, Float
 
 SPREAD = 10.0
 """Factor by which a shape may well differ from where its search began."""

@@ -9,14 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import program_of
+from jaxid.errors import InputError
 from jaxid.identification.factors import CHUNK, Blocks, Factors, JointFactor
 from jaxid.identification.nonlinear.shapes import Shapes
 from jaxid.identification.rows import RowChunk, Rows
 from jaxid.identification.streaming_log import source
 from jaxid.program import evaluate_packed
-from jaxid.types import Float
 
 MOST = 2**28
 """Numbers (two gigabytes) of columns that are held."""
@@ -94,7 +95,7 @@ class SeparableRows:
         shapes: To be found.
 
     Raises:
-        ValueError: If only factors are known, or the rows are too many to be held.
+        InputError: If only factors are known, or the rows are too many to be held.
     """
 
     def __init__(self, rows: Rows, shapes: Shapes):
@@ -135,7 +136,7 @@ class SeparableRows:
             pieces.append(self._factored(chunk))
             size += sum(Q.size for Q in pieces[-1].Q)
             if size > MOST:
-                raise ValueError(
+                raise InputError(
                     f"nonlinear friction holds the columns of all rows, but these are more than "
                     f"{MOST:.0e} numbers: decimate, or take a part of the log."
                 )

@@ -7,11 +7,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.dynamics.transitions import Shape
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
-from jaxid.types import AnyArray, Float
 
 Free = Callable[[tuple[AbstractTerm, ...]], Sequence[Any]]
 """Picks the leaves that shall be found out of a model's terms."""
@@ -37,14 +38,14 @@ class Shapes(eqx.Module):
             free: Picks leaves of the model's terms; what the terms want if None.
 
         Raises:
-            ValueError: If there are none, a leaf is no shape, or two shapes have one name.
+            InputError: If there are none, a leaf is no shape, or two shapes have one name.
         """
         terms = base.model.terms
         numbered = jax.tree.unflatten(jax.tree.structure(terms), range(len(jax.tree.leaves(terms))))
         picked = None if free is None else set(jax.tree.leaves(tuple(free(numbered))))
         known = [(i, s, s.leaf(numbered[i])) for i, t in enumerate(terms) for s in t.shapes]
         if picked is not None and not picked <= {leaf for _, _, leaf in known}:
-            raise ValueError(
+            raise InputError(
                 "`free` picks a leaf that is no shape of a friction law: pick such as "
                 "`terms[2].transition.epsilon` or `terms[2].speed`."
             )
@@ -55,13 +56,13 @@ class Shapes(eqx.Module):
         )
         names = [shape.name for _, shape in chosen]
         if not names:
-            raise ValueError(
+            raise InputError(
                 "the model has no friction law with a shape to be found: use a smooth transition "
                 "(`Tanh`) or `StribeckFriction`, or pick leaves by `free`."
             )
         if len(set(names)) < len(names):
             twice = next(n for n in names if names.count(n) > 1)
-            raise ValueError(
+            raise InputError(
                 f"two terms have a shape called `{twice}`: pick one of them by `free`, and give "
                 "the other the value that it shall keep."
             )
@@ -90,7 +91,7 @@ class Shapes(eqx.Module):
         """The shapes of a model as they are.
 
         Raises:
-            ValueError: If one of them is not positive.
+            InputError: If one of them is not positive.
         """
         terms, n = base.model.terms, self.robot.joints
         found = [
@@ -100,7 +101,7 @@ class Shapes(eqx.Module):
         x = np.concatenate(found)
         if not (x > 0).all():
             name, _ = self.parameters[int(np.argmin(x))]
-            raise ValueError(
+            raise InputError(
                 f"the search for `{name}` must begin at a positive number, but begins at "
                 f"{x.min():g}."
             )

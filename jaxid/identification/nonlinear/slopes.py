@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.identification.nonlinear.shapes import Shapes
-from jaxid.types import AnyArray, Float
 
 
 class ShapeSlopes(AbstractTerm):

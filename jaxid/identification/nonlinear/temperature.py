@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.friction import TemperatureScaled
 from jaxid.dynamics.terms import AbstractTerm
+from jaxid.errors import InputError
 from jaxid.identification.fit import Fit
-from jaxid.types import AnyArray, Float
 
 NEGLIGIBLE = 1e-12
 """Standard deviation below which an estimate counts as exact, of its size."""
@@ -52,18 +53,18 @@ def temperature_law(
         reference: Temperature to which the values belong [°C].
 
     Raises:
-        ValueError: If there are fewer than two temperatures, or a fit has no such parameters.
+        InputError: If there are fewer than two temperatures, or a fit has no such parameters.
     """
     warmer = np.asarray(temperatures, np.float64) - reference
     if warmer.shape != (len(fits),) or len(np.unique(warmer)) < 2:
-        raise ValueError(
+        raise InputError(
             "`temperatures` must hold one temperature for each fit, and at least two different "
             f"ones, but there are {len(fits)} fits and temperatures of shape {warmer.shape}."
         )
     robot = fits[0].base.model.robot
     names = tuple(name for name, _ in term.parameters(robot))
     if len(names) != robot.joints or any(set(names) - set(fit.base.names) for fit in fits):
-        raise ValueError(
+        raise InputError(
             f"`term` must have one parameter for each joint ({robot.joints}) that all fits have, "
             f"but has {', '.join(names)}."
         )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.factors import Blocks
 from jaxid.identification.fit import Fit
@@ -20,7 +21,6 @@ from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 FOLDS = 5
 WORTH = 0.01
@@ -143,7 +143,7 @@ def identify_nonlinear(
         progress: Is told now and then which share of the work is done, of 1.
 
     Raises:
-        ValueError: If the model has no shapes, or the observations do not fit to it.
+        InputError: If the model has no shapes, or the observations do not fit to it.
     """
     single = isinstance(observations, Observations | LongLog)
     recordings = (observations,) if single else tuple(observations)

@@ -6,9 +6,10 @@ import equinox as eqx
 import numpy as np
 from scipy import stats
 
+from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.errors import InputError
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import Estimates
-from jaxid.types import AnyArray, Bool, Float
 
 LEVEL = 0.95
 """Confidence of intervals and tests."""
@@ -90,10 +91,10 @@ class Comparison(eqx.Module):
                 different data.
 
         Raises:
-            ValueError: If the parameters are not the same, or `level` is no share.
+            InputError: If the parameters are not the same, or `level` is no share.
         """
         if not 0 < level < 1:
-            raise ValueError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
+            raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
         _require_same(first, second)
         a, b = np.asarray(first.covariance), np.asarray(second.covariance)
         with np.errstate(invalid="ignore"):
@@ -231,13 +232,13 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
         level: Confidence of intervals and tests, of 1.
 
     Raises:
-        ValueError: If the fits are not of the same base parameters, or `level` is no share.
+        InputError: If the fits are not of the same base parameters, or `level` is no share.
     """
     a, b = np.asarray(first.base.kappa), np.asarray(second.base.kappa)
     if first.base.indices == second.base.indices and not (
         a.shape == b.shape and np.allclose(a, b, rtol=1e-6, atol=1e-9)
     ):
-        raise ValueError(
+        raise InputError(
             "both fits must be of the same base parameters, but the lengths in them differ: use "
             "one geometry for both."
         )
@@ -246,7 +247,7 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
 
 def _require_same(first: Estimates, second: Estimates) -> None:
     if len(first.names) != len(second.names):
-        raise ValueError(
+        raise InputError(
             f"both runs must have the same base parameters, but `{first.label}` has "
             f"{len(first.names)} and `{second.label}` has {len(second.names)}: identify both with "
             "one robot and the same terms."
@@ -259,7 +260,7 @@ def _require_same(first: Estimates, second: Estimates) -> None:
     for one, other in columns:
         for a, b in zip(one, other, strict=True):
             if a != b:
-                raise ValueError(
+                raise InputError(
                     f"both runs must have the same base parameters, but `{first.label}` has `{a}` "
                     f"where `{second.label}` has `{b}`: identify both with one robot and the same "
                     "terms."

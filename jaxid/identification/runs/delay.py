@@ -7,8 +7,10 @@ import equinox as eqx
 import numpy as np
 from scipy import stats
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.factors import (
     Blocks,
     Factors,
@@ -23,7 +25,6 @@ from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.delay import without_delay
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 BLOCKS = 20
 """Blocks of time of all recordings together, from which the uncertainty is found."""
@@ -91,7 +92,7 @@ def estimate_delay(
         weights: Of the joints; the reciprocals of the largest forces if None.
 
     Raises:
-        ValueError: If weights are not known, or the search does not settle: the delay is longer
+        InputError: If weights are not known, or the search does not settle: the delay is longer
             than the motion's shortest swings.
     """
     single = isinstance(observations, Observations)
@@ -118,7 +119,7 @@ def estimate_delay(
         if abs(step) <= max(SETTLED * deviation, ROUNDING * recordings[0].sample_time):
             break
     else:
-        raise ValueError(
+        raise InputError(
             f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the log to where "
             "the robot moves, check angle columns and signs, or remove most of the delay first."
         )

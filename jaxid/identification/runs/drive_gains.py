@@ -11,6 +11,8 @@ import equinox as eqx
 import numpy as np
 from scipy import optimize
 
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 from jaxid.identification.factors import Factors
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.runs.left_out import Block, block_covariance
@@ -21,7 +23,6 @@ from jaxid.identification.runs.tied import tied
 from jaxid.identification.solutions import NUMERICAL, Complete, Decomposition
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Tool
-from jaxid.types import AnyArray, Float
 
 LARGEST = 100.0
 """Ratio of a true to an assumed force beyond which something else is wrong."""
@@ -66,10 +67,10 @@ class DriveGains(eqx.Module):
             recording: Of the same drives, with the same nominal gains.
 
         Raises:
-            ValueError: If it has another number of joints.
+            InputError: If it has another number of joints.
         """
         if recording.joints != len(self.joint_names):
-            raise ValueError(
+            raise InputError(
                 f"`{recording.name}` has {recording.joints} joints, but there are gains for "
                 f"{len(self.joint_names)}."
             )
@@ -95,7 +96,7 @@ def identify_drive_gains(
             friction and offsets.
 
     Raises:
-        ValueError: If the runs have different base parameters, motors turn more than one axis, the
+        InputError: If the runs have different base parameters, motors turn more than one axis, the
             robot has a known tool, or the load tells nothing about some gain.
     """
     runs = (unloaded, loaded)
@@ -104,12 +105,12 @@ def identify_drive_gains(
     robot = base.model.robot
     A = np.asarray(robot.drives.reduction)
     if np.count_nonzero(A - np.diag(np.diag(A))):
-        raise ValueError(
+        raise InputError(
             f"motors of `{robot.name}` turn more than one axis, so that joints have no gains of "
             "their own: gains can be identified for independent drives only."
         )
     if robot.tool is not None:
-        raise ValueError(
+        raise InputError(
             f"`{robot.name}` has a known tool, whose forces were subtracted from those of nominal "
             "gains: leave it out of the robot (`tool=None`), for its mass is found with the others."
         )
@@ -139,7 +140,7 @@ def identify_drive_gains(
     B = decomposition.inverse_information(Complete().inverse(decomposition.values))
     poor = np.flatnonzero(~((c > 1 / LARGEST) & (c < LARGEST)))
     if decomposition.values[-1] <= NUMERICAL * decomposition.values[0] or len(poor):
-        raise ValueError(
+        raise InputError(
             "the load does not tell all gains: mount a heavier one, farther from the flange, and "
             "let every joint move it in both runs."
         )

@@ -8,10 +8,10 @@ import equinox as eqx
 import numpy as np
 from scipy import stats
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.fit import Fit
 from jaxid.identification.uncertainty.uncertainty import Uncertainty
-from jaxid.types import AnyArray, Float
 
 
 class Estimates(eqx.Module):

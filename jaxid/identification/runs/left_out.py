@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxid.types import Float
+from jaxid.arrays import Float
 
 Block = tuple[Float[np.ndarray, "height unknowns"], Float[np.ndarray, " height"]]
 """Derivatives of a block's weighted residuals by the unknowns, and the residuals."""

@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.terms import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.errors import InputError
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
 from jaxid.identification.consistency.single_body import consistent_body
@@ -17,7 +19,6 @@ from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
 from jaxid.robot.robot import Robot, Tool
-from jaxid.types import AnyArray, Array, Float
 
 TEN = len(INERTIAL_NAMES)
 LOOSE = 1e-2
@@ -68,7 +69,7 @@ class Payload(eqx.Module):
         """The payload as a known load: `robot.replace(tool=payload.tool)`.
 
         Raises:
-            ValueError: If it is no body that could exist.
+            InputError: If it is no body that could exist.
         """
         return Tool.of(
             self.body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia
@@ -128,7 +129,7 @@ def identify_payload(
             wide ones from the robot's reach, which count only if the estimate could not exist.
 
     Raises:
-        ValueError: If the runs have different base parameters or have seen the same data, or the
+        InputError: If the runs have different base parameters or have seen the same data, or the
             model does not have ten parameters for the body.
         RuntimeError: If no body within the bounds was proved to be the nearest.
     """
@@ -177,15 +178,15 @@ def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"
         body: Index of the body (0 is the first).
 
     Raises:
-        ValueError: If there is no such body, or the model lacks some of its ten parameters.
+        InputError: If there is no such body, or the model lacks some of its ten parameters.
     """
     robot, names = base.model.robot, base.model.parameter_names
     if not 0 <= body < robot.joints:
-        raise ValueError(f"`body` must be from 0 to {robot.joints - 1}, but is {body}.")
+        raise InputError(f"`body` must be from 0 to {robot.joints - 1}, but is {body}.")
     ten = [f"{name}{body + 1}" for name in INERTIAL_NAMES]
     missing = [name for name in ten if name not in names]
     if missing:
-        raise ValueError(
+        raise InputError(
             f"a load on body {body} has ten parameters, but the model lacks `{missing[0]}`: use "
             "`RigidBodies()` with all ten."
         )

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.identification.estimators import WeightedLeastSquares
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.fit import Fit
@@ -18,7 +20,6 @@ from jaxid.identification.streaming import Progress
 from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import AbstractWeights, GivenWeights, MaximumForces
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 ROUNDING = 1e-7
 """Difference of predicted forces, relative to the forces, up to which estimates are the same."""
@@ -72,7 +73,7 @@ class Run(eqx.Module):
             progress: Is told now and then which share of a pass over a long log is done, of 1.
 
         Raises:
-            ValueError: If there are fewer rows than parameters, or weights are not known.
+            InputError: If there are fewer rows than parameters, or weights are not known.
         """
         single = isinstance(observations, Observations | LongLog)
         recordings = (observations,) if single else tuple(observations)
@@ -176,15 +177,15 @@ def require_same_base(runs: Sequence[Run]) -> None:
     """Refuses to combine runs of different base parameters.
 
     Raises:
-        ValueError: If there is no run, or base parameters differ.
+        InputError: If there is no run, or base parameters differ.
     """
     if not runs:
-        raise ValueError("`runs` must hold at least one run, but is empty.")
+        raise InputError("`runs` must hold at least one run, but is empty.")
     first = runs[0]
     for run in runs[1:]:
         same = run.base.indices == first.base.indices and run.base.names == first.base.names
         if not same or not np.allclose(run.base.kappa, first.base.kappa, rtol=1e-6, atol=1e-9):
-            raise ValueError(
+            raise InputError(
                 f"the runs `{first.name}` and `{run.name}` have different base parameters: use one "
                 "robot and the same terms for both."
             )

@@ -5,14 +5,15 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import Bool, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import in_numpy
+from jaxid.errors import InputError
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.comparison import LEVEL, Comparison, joint_test
 from jaxid.identification.runs.estimates import Estimates, groups, with_covariance
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.tied import Tied, tied
-from jaxid.types import Bool, Float
 
 POSES = 3
 """Random poses in which energies are looked at."""
@@ -70,17 +71,17 @@ class StatesFit(eqx.Module):
         """For each base parameter where it stands in a state's estimates.
 
         Raises:
-            ValueError: If there is no such state.
+            InputError: If there is no such state.
         """
         if state not in self.states:
-            raise ValueError(f"`state` must be one of {', '.join(self.states)}, but is `{state}`.")
+            raise InputError(f"`state` must be one of {', '.join(self.states)}, but is `{state}`.")
         return _places(self.base.size, self.shared, self.varying, self.states.index(state))
 
     def of(self, state: str) -> Estimates:
         """The base parameters of one state.
 
         Raises:
-            ValueError: If there is no such state.
+            InputError: If there is no such state.
         """
         k = np.array(self.places(state))
         base = self.base
@@ -99,7 +100,7 @@ class StatesFit(eqx.Module):
         """The model of one state: to validate, predict and report.
 
         Raises:
-            ValueError: If there is no such state.
+            InputError: If there is no such state.
         """
         own = self.of(state)
         run = self.runs[self.states.index(state)]
@@ -116,7 +117,7 @@ class StatesFit(eqx.Module):
             level: Confidence of intervals and tests, of 1.
 
         Raises:
-            ValueError: If there is no such state, or `level` is no share.
+            InputError: If there is no such state, or `level` is no share.
         """
         a, b = (np.array(self.places(state))[list(self.varying)] for state in (first, second))
         cross = np.asarray(self.found.covariance)[np.ix_(a, b)]
@@ -162,14 +163,14 @@ def identify_states(
             `varying`.
 
     Raises:
-        ValueError: If there are fewer than two runs, two have the same name, base parameters
+        InputError: If there are fewer than two runs, two have the same name, base parameters
             differ, or there is no such base parameter.
     """
     runs = tuple(runs)
     require_same_base(runs)
     states = [run.name for run in runs]
     if len(runs) < 2 or len(set(states)) < len(states):
-        raise ValueError(
+        raise InputError(
             "`runs` must be two or more with different names, but are "
             f"{', '.join(states)}: name them by their states."
         )
@@ -218,16 +219,16 @@ def own_parameters(
         shared: Names of the others; an alternative to `varying`.
 
     Raises:
-        ValueError: If both are given, or there is no such base parameter.
+        InputError: If both are given, or there is no such base parameter.
     """
     if varying is not None and shared is not None:
-        raise ValueError("give either `varying` or `shared`, and not both.")
+        raise InputError("give either `varying` or `shared`, and not both.")
     named = shared if varying is None else varying
     if named is None:
         return tuple(int(k) for k in np.flatnonzero(~stores_energy(base)))
     wrong = [name for name in named if name not in base.names]
     if wrong:
-        raise ValueError(
+        raise InputError(
             f"`{wrong[0]}` is no base parameter of `{base.model.robot.name}`: see `base.names`."
         )
     own = {base.names.index(name) for name in named}

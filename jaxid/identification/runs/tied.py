@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.runs.left_out import Block, block_covariance
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.twice import refuse_shared
 from jaxid.identification.solutions import NUMERICAL, Complete, Decomposition
-from jaxid.types import AnyArray, Float
 
 
 class Tied(eqx.Module):
@@ -51,7 +51,7 @@ def tied(
         known: For each run what is known of its base parameters; nothing if None.
 
     Raises:
-        ValueError: If two runs have seen the same data.
+        InputError: If two runs have seen the same data.
     """
     refuse_shared([(run.name, run.blocks) for run in runs])
     known = [np.zeros(run.base.size) for run in runs] if known is None else known

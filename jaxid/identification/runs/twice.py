@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks, Factors
 
 SAME = 1e-9
@@ -40,12 +41,12 @@ def refuse_shared(runs: Sequence[tuple[str, Blocks]]) -> None:
         runs: Their names and factors.
 
     Raises:
-        ValueError: If two have.
+        InputError: If two have.
     """
     for (one, ours), (other, theirs) in itertools.combinations(runs, 2):
         if share_data(ours, theirs):
             which = f"runs `{one}` and `{other}`" if one != other else f"two runs `{one}`"
-            raise ValueError(
+            raise InputError(
                 f"the {which} have seen the same data, which would count twice: give every log "
                 "once, as itself or by the report that was made of it."
             )

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
 from jaxid.files import read_arrays, written_whole
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.runs.run import Run, require_same_base
@@ -60,7 +61,7 @@ def update(earlier: Run, later: Run, name: str | None = None) -> Run:
         name: Of both together; their names in a row if None.
 
     Raises:
-        ValueError: If the runs have different base parameters, or have seen the same data.
+        InputError: If the runs have different base parameters, or have seen the same data.
     """
     runs = (earlier, later)
     require_same_base(runs)
@@ -87,7 +88,7 @@ def save_run(path: str | Path, run: Run) -> None:
         run: The run.
 
     Raises:
-        ValueError: If the file's place is no place for a file.
+        InputError: If the file's place is no place for a file.
     """
     arrays: dict[str, Any] = {
         key: np.asarray(getattr(run, key))
@@ -123,7 +124,7 @@ def load_run(path: str | Path, base: BaseParameters) -> Run:
         base: The base parameters that it was made with: of the same robot and terms.
 
     Raises:
-        ValueError: If the file holds no run, or one of other base parameters.
+        InputError: If the file holds no run, or one of other base parameters.
     """
     try:
         arrays = read_arrays(path)
@@ -138,13 +139,13 @@ def load_run(path: str | Path, base: BaseParameters) -> Run:
     if len(columns) != base.model.robot.joints or not all(
         0 <= k < base.size for own in columns for k in own
     ):
-        raise ValueError(
+        raise InputError(
             f"`{path}` is damaged: `columns` are not those of its joints; identify again."
         )
     parts = []
     for b, rows in enumerate(head.rows):
         if len(rows) != len(columns) or min(rows, default=0) < 0:
-            raise ValueError(
+            raise InputError(
                 f"`{path}` is damaged: `rows[{b}]` are not its joints'; identify again."
             )
         joints = (
@@ -153,7 +154,7 @@ def load_run(path: str | Path, base: BaseParameters) -> Run:
         )
         parts.append(Factors(tuple(joints), base.size))
     if not parts:
-        raise ValueError(f"`{path}` is damaged: it holds no rows; identify again.")
+        raise InputError(f"`{path}` is damaged: it holds no rows; identify again.")
     return Run(
         base=base, blocks=Blocks(tuple(parts)), name=head.name, recordings=head.recordings, **found
     )
@@ -176,7 +177,7 @@ def _sound(
     wrong = array.dtype != np.float64 or array.ndim != len(shape)
     wrong = wrong or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     if wrong or np.isnan(array).any():
-        raise ValueError(
+        raise InputError(
             f"`{path}` is damaged: its array `{key}` is missing, or holds what is no number; "
             "identify again."
         )
@@ -191,12 +192,12 @@ def _require_same(path: str | Path, head: _Head, kappa: np.ndarray, base: BasePa
         if there != own:
             pairs = zip(there, own, strict=False)
             first, here = next(((a, b) for a, b in pairs if a != b), ("more", "fewer"))
-            raise ValueError(
+            raise InputError(
                 f"`{path}` holds a run of other base parameters than `base`: {key} differ, "
                 f"`{first}` there and `{here}` here; use the robot and the terms of the file."
             )
     if kappa.shape != base.kappa.shape or not np.allclose(kappa, base.kappa, ALIKE, ALIKE):
-        raise ValueError(
+        raise InputError(
             f"`{path}` holds a run of `{head.robot}` with another geometry than that of `base`: "
             "lengths differ; use the robot of the file."
         )

@@ -4,13 +4,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import Array, Float
 from jaxid.identification.uncertainty.sandwich import (
     Windows,
     satterthwaite,
     scatter,
     variance_map,
 )
-from jaxid.types import Array, Float
 
 
 class LineSums(eqx.Module):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.factors import Blocks
-from jaxid.types import AnyArray, Float
 
 
 def jackknife(

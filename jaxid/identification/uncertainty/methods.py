@@ -6,6 +6,7 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.identification.estimators import Estimate
 from jaxid.identification.rows import Rows
 from jaxid.identification.uncertainty.jackknife import jackknife
@@ -13,7 +14,6 @@ from jaxid.identification.uncertainty.residuals import ResidualSpectra, residual
 from jaxid.identification.uncertainty.sandwich import sandwich
 from jaxid.identification.uncertainty.spectra import lines_of
 from jaxid.identification.uncertainty.uncertainty import Uncertainty
-from jaxid.types import Float
 
 
 class AbstractUncertainty(eqx.Module):

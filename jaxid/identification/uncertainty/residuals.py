@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.uncertainty.sandwich import Windows
 from jaxid.identification.uncertainty.spectra import Lines
-from jaxid.types import AnyArray, Float
 
 PASSED = 0.5
 """Gain of the filters above which a line counts for whiteness."""

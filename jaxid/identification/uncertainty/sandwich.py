@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.uncertainty.spectra import Lines, Seen
-from jaxid.types import AnyArray, Float
 
 NARROWEST, RELATIVE = 0.25, 0.3
 """Half of a window's width: at least the first [Hz], and this share of its frequency."""

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import AnyArray, Float
 from jaxid.identification.influence import AbstractInfluence, Channel
 from jaxid.identification.rows import Rows
 from jaxid.identification.streaming_log import source
@@ -16,7 +17,6 @@ from jaxid.identification.uncertainty.stretches import (
     stretches,
 )
 from jaxid.measurement.observations import Observations
-from jaxid.types import AnyArray, Float
 
 BINS = np.concatenate([np.arange(0.0, 1.0, 0.05), 1.15 ** np.arange(0, 80)])
 """Edges [Hz] between which spectra are taken as one for correlations between parameters."""

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.identification.rows import RowChunk, Rows
 from jaxid.identification.streaming_log import source
 from jaxid.measurement.observations import Observations
-from jaxid.types import Float
 
 LONGEST_ROWS = 2**15
 LONGEST_SAMPLES = 2**17

@@ -4,7 +4,8 @@ import equinox as eqx
 import numpy as np
 from scipy import special
 
-from jaxid.types import AnyArray, Float
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
 
 MANY = 1e6
 """Degrees of freedom that are as good as infinitely many."""
@@ -67,10 +68,10 @@ class Uncertainty(eqx.Module):
             level: Share of cases in which an interval holds the truth, of 1.
 
         Raises:
-            ValueError: If `level` is not between 0 and 1.
+            InputError: If `level` is not between 0 and 1.
         """
         if not 0 < level < 1:
-            raise ValueError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
+            raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
         freedom = np.clip(np.asarray(self.freedom), 1.0, MANY)
         quantile = special.stdtrit(freedom, 0.5 + 0.5 * level)
         return self.standard_deviations * quantile
