@@ -1,0 +1,331 @@
+"""Tables of results: facts, columns with units, remarks; as text, CSV and rows for HTML pages.
+
+Every result makes one by its method `summary()` and prints it by `__str__`:
+
+```python
+def summary(self) -> Table:
+    robot = self.robot
+    return Table(
+        f"Torque errors of {robot.name}",
+        Column("joint", robot.joint_names),
+        Column("RMS", self.rms, "N m"),
+        Column("RMS of max", self.rms / self.max_forces, "%", percent),
+        facts=[("recording", self.name), ("rows", len(self.time))],
+        status=[Status.GOOD if x < 5 else Status.DOUBTFUL for x in self.rms_percent],
+        remarks=[Remark("The mass matrix is positive definite.", Status.GOOD)],
+    )
+
+def __str__(self) -> str:
+    return str(self.summary())
+```
+
+prints
+
+```
+Torque errors of cart
+recording  first run
+rows       799
+
+   joint    RMS  RMS of max
+          [N m]         [%]
+✓  rail   5.21          2.6
+!  swing  0.482         6.1
+
+✓  The mass matrix is positive definite.
+```
+
+Columns hold numbers or texts. Numbers are formatted by the column's function (`significant`,
+`percent`, or your own) and aligned at their decimal points. Estimates and their deviations are
+rounded together: `values, deviations = with_deviations(p, s)` are texts for two columns of
+`kind="number"`. A table without columns holds facts and remarks only.
+"""
+
+import csv
+import dataclasses
+import enum
+import io
+import math
+import shutil
+import textwrap
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+MISSING = "–"  # noqa: RUF001
+"""Text in place of a number that is not known."""
+
+
+class Status(enum.Enum):
+    """Judgement of a row or a remark; the value is the mark beside it."""
+
+    GOOD = "✓"
+    DOUBTFUL = "!"
+    BAD = "✗"
+    NEUTRAL = "·"
+
+
+@dataclasses.dataclass(frozen=True)
+class Remark:
+    """Sentence below a table, or on a page.
+
+    Attributes:
+        text: The sentence; a missing full stop is added.
+        status: Judgement that the sentence expresses.
+        detail: Explanation that is shown smaller.
+    """
+
+    text: str
+    status: Status = Status.NEUTRAL
+    detail: str = ""
+
+    def __post_init__(self) -> None:
+        stop = "" if self.text.endswith((".", "?", "!")) else "."
+        object.__setattr__(self, "text", self.text + stop)
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, and a dash for NaN."""
+    if not math.isfinite(value):
+        return MISSING if math.isnan(value) else ("∞" if value > 0 else "-∞")
+    value = float(f"{value:.{digits - 1}e}")
+    if value == 0:
+        return "0"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    if not -3 <= decimals <= 8:
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.{max(decimals, 0)}f}"
+
+
+def percent(fraction: float, digits: int = 2) -> str:
+    """Return a fraction in percent, without the sign; whole numbers above 100."""
+    value = 100.0 * fraction
+    if math.isfinite(value) and abs(value) >= 100:
+        return f"{value:.0f}" if abs(value) < 1e4 else f"{value:.0e}"
+    return significant(value, digits)
+
+
+def with_deviation(value: float, deviation: float) -> tuple[str, str]:
+    """Return an estimate and its standard deviation, both to the deviation's second digit."""
+    if not (math.isfinite(deviation) and deviation > 0 and math.isfinite(value)):
+        return significant(value, 4), significant(deviation, 2)
+    decimals = 1 - math.floor(math.log10(float(f"{deviation:.1e}")))
+    if not -3 <= decimals <= 8:
+        return significant(value, 5), significant(deviation, 2)
+    decimals = max(decimals, 0)
+    return f"{value:.{decimals}f}", f"{deviation:.{decimals}f}"
+
+
+def with_deviations(values: Any, deviations: Any) -> tuple[list[str], list[str]]:
+    """Return estimates and their deviations as texts for two columns, rounded together."""
+    pairs = [with_deviation(float(v), float(d)) for v, d in zip(values, deviations, strict=True)]
+    return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+
+
+def shortened(text: str, longest: int) -> str:
+    """Return a text whose middle is left out if it is longer than its place."""
+    if len(text) <= longest:
+        return text
+    head = (longest - 1) * 2 // 3
+    return f"{text[:head]}…{text[head + 1 - longest :]}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """Column of a table.
+
+    Attributes:
+        name: Header; may have several lines.
+        values: Numbers or texts, one for each row.
+        unit: Unit of all values, shown in brackets below the name.
+        format: Function that makes a text of a number.
+        kind: Numbers are aligned at their decimal points; `code` is set in a fixed-width font on
+            pages. By default `number` if all values are numbers, else `text`.
+    """
+
+    name: str
+    values: Sequence[Any] | np.ndarray
+    unit: str = ""
+    format: Callable[[float], str] = significant
+    kind: Literal["number", "text", "code", ""] = ""
+
+    def __post_init__(self) -> None:
+        values = tuple(x.item() if isinstance(x, np.generic) else x for x in _listed(self.values))
+        object.__setattr__(self, "values", values)
+        if not self.kind:
+            numeric = bool(values) and all(isinstance(x, int | float) for x in values)
+            object.__setattr__(self, "kind", "number" if numeric else "text")
+
+    @property
+    def header(self) -> list[str]:
+        """Lines of the header: the name, and the unit in brackets."""
+        return [*self.name.split("\n"), *([f"[{self.unit}]"] if self.unit else [])]
+
+    @property
+    def texts(self) -> list[str]:
+        """Formatted values; numbers have blanks behind them so that their points are aligned."""
+        texts = [self.format(x) if isinstance(x, float) else str(x) for x in self.values]
+        if self.kind != "number":
+            return texts
+        tails = [len(s) - s.index(".") if "." in s else 0 for s in texts]
+        longest = max(tails, default=0)
+        return [s + " " * (longest - tail) for s, tail in zip(texts, tails, strict=True)]
+
+
+class Table:
+    """Table of results with facts above it and remarks below it.
+
+    Args:
+        title: Line above everything; may be empty.
+        columns: Columns of the same length.
+        facts: Pairs of a word and what is said about it, shown above the columns.
+        remarks: Sentences, or `Remark`s with a status, shown below the columns.
+        status: Judgement of each row; no marks are shown if empty.
+        rules: Indices of rows above which a line is drawn.
+
+    Raises:
+        ValueError: If columns and `status` are not of the same length.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        *columns: Column,
+        facts: Iterable[tuple[str, Any]] = (),
+        remarks: Iterable[Remark | str] = (),
+        status: Sequence[Status] = (),
+        rules: Iterable[int] = (),
+    ):
+        self.title = title
+        self.columns = columns
+        self.facts = tuple((word, str(text)) for word, text in facts)
+        self.remarks = tuple(Remark(x) if isinstance(x, str) else x for x in remarks)
+        self.status = tuple(status)
+        self.rules = frozenset(rules)
+        lengths = {len(c.values) for c in columns} | ({len(self.status)} if self.status else set())
+        if len(lengths) > 1:
+            raise ValueError(f"`columns` and `status` must have one length, not {sorted(lengths)}.")
+
+    @property
+    def rows(self) -> list[tuple[str, ...]]:
+        """Rows of formatted texts."""
+        return list(zip(*(column.texts for column in self.columns), strict=True))
+
+    def csv(self) -> str:
+        """Return the columns as comma-separated values: all digits, units in the header."""
+        file = io.StringIO()
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(
+            " ".join(c.name.split()) + (f" [{c.unit}]" if c.unit else "") for c in self.columns
+        )
+        writer.writerows(zip(*(column.values for column in self.columns), strict=True))
+        return file.getvalue()
+
+    def text(self, width: int | None = None) -> str:
+        """Return the table as plain text.
+
+        Args:
+            width: Characters of a line; those of the terminal by default. The widest columns of
+                texts are shortened to fit, remarks are wrapped.
+        """
+        return "\n".join("".join(part for part, _ in line).rstrip() for line in self.lines(width))
+
+    def __str__(self) -> str:
+        return self.text()
+
+    def lines(self, width: int | None = None) -> Iterator[list[tuple[str, Status | str]]]:
+        """Yield the lines of the text as parts with a style each, for renderers with colours.
+
+        A style is a `Status`, `title`, `header`, `dim`, or empty.
+
+        Args:
+            width: Characters of a line; those of the terminal by default.
+        """
+        width = shutil.get_terminal_size((100, 24)).columns if width is None else width
+        groups = (self._facts(width), self._grid(width), self._remarks(width))
+        filled = [lines for lines in map(list, groups) if lines]
+        if self.title:
+            yield [(self.title, "title")]
+        for k, lines in enumerate(filled):
+            if k:
+                yield []
+            yield from lines
+
+    def _facts(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
+        indent = max((_width(word) for word, _ in self.facts), default=0) + 2
+        for word, text in self.facts:
+            for k, line in enumerate(_wrapped(text, width - indent)):
+                yield [(_padded("" if k else word, indent), "dim"), (line, "")]
+
+    def _grid(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
+        if not self.columns:
+            return
+        texts = [column.texts for column in self.columns]
+        headers = [column.header for column in self.columns]
+        widths = [
+            max(map(_width, (*head, *cells))) for head, cells in zip(headers, texts, strict=True)
+        ]
+        margin = 3 if self.status else 0
+        _shrink(widths, [column.kind == "number" for column in self.columns], width - margin)
+        for head in zip(*_bottom_aligned(headers), strict=True):
+            if any(head):
+                yield [(" " * margin + self._line(head, widths), "header")]
+        for k, row in enumerate(zip(*texts, strict=True)):
+            if k in self.rules:
+                yield [("─" * min(width, margin + sum(widths) + 2 * len(widths) - 2), "dim")]
+            mark = self.status[k] if self.status else Status.NEUTRAL
+            yield [(f"{mark.value}  "[:margin], mark), (self._line(row, widths), "")]
+
+    def _line(self, cells: Sequence[str], widths: Sequence[int]) -> str:
+        padded = (
+            _padded(_cut(cell, width), width, column.kind == "number")
+            for cell, width, column in zip(cells, widths, self.columns, strict=True)
+        )
+        return "  ".join(padded)
+
+    def _remarks(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
+        for remark in self.remarks:
+            text = f"{remark.text} ({remark.detail})" if remark.detail else remark.text
+            for k, line in enumerate(_wrapped(text, width - 3)):
+                yield [("   " if k else f"{remark.status.value}  ", remark.status), (line, "")]
+
+
+def _listed(values: Sequence[Any] | np.ndarray) -> Sequence[Any]:
+    return values if isinstance(values, list | tuple) else np.asarray(values).tolist()
+
+
+def _width(text: str) -> int:
+    """Return the number of places that a text takes in a terminal."""
+    wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
+    return len(text) + wide - sum(bool(unicodedata.combining(c)) for c in text)
+
+
+def _padded(text: str, width: int, right: bool = False) -> str:
+    blanks = " " * (width - _width(text))
+    return blanks + text if right else text + blanks
+
+
+def _cut(text: str, width: int) -> str:
+    while _width(text) > width:
+        text = text.removesuffix("…")[:-1] + "…"
+    return text
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, max(width, 20), break_on_hyphens=False) or [""]
+
+
+def _shrink(widths: list[int], numbers: Sequence[bool], available: int) -> None:
+    """Shorten the widest columns of texts until a line fits, to 12 characters at least."""
+    texts = [k for k, number in enumerate(numbers) if not number]
+    while sum(widths) + 2 * (len(widths) - 1) > available and texts:
+        widest = max(texts, key=lambda k: widths[k])
+        if widths[widest] <= 12:
+            return
+        widths[widest] -= 1
+
+
+def _bottom_aligned(headers: Sequence[list[str]]) -> list[list[str]]:
+    tallest = max(map(len, headers))
+    return [[""] * (tallest - len(head)) + head for head in headers]
