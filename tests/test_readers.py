@@ -32,7 +32,7 @@ def test_damaged_files_end_in_a_sentence(target, tmp_path):
 def test_objects_in_archives_are_refused_and_never_run(tmp_path):
     import numpy as np
 
-    from jaxid.files import read_arrays
+    from jaxid.io import read_arrays
 
     ran = tmp_path / "ran"
 

@@ -14,8 +14,8 @@ from jaxid.export.jax_function import export_jax
 from jaxid.export.mjcf import export_mjcf
 from jaxid.export.pinocchio import export_pinocchio
 from jaxid.export.urdf import export_urdf
-from jaxid.files import require_place
 from jaxid.identification.fit import Fit, load
+from jaxid.io import require_writable
 from jaxid.report.write import MODEL
 
 
@@ -84,7 +84,7 @@ def export(
             raise InputError(f"`{one}` is a folder: choose another `--output`.")
         if one.exists() and not force:
             raise InputError(f"`{one}` is there already: choose another `--output`, or `--force`.")
-    require_place(path.parent)
+    require_writable(path.parent)
     fit = load(_model_file(report))
     match to:
         case Target.C:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.files import read_arrays, written_whole
+from jaxid.io import read_arrays, write_bytes
 
 
 def fingerprint(*parts: Any) -> str:
@@ -62,8 +62,7 @@ def save_state(path: Path, digest: str, state: Any) -> None:
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
     buffer = io.BytesIO()
     np.savez(buffer, np.array(digest), *leaves)
-    with written_whole(path.parent) as folder:
-        (folder / path.name).write_bytes(buffer.getvalue())
+    write_bytes(path, buffer.getvalue())
 
 
 def load_state(path: Path, digest: str, like: Any) -> Any:

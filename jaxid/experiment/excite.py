@@ -21,7 +21,7 @@ from jaxid.experiment.excited_forces import force_remarks
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.nominal import Nominal, build_nominal
 from jaxid.experiment.robot_tables import within
-from jaxid.files import written_whole
+from jaxid.io import atomic_folder
 from jaxid.report.blocks import Remark, Tone
 from jaxid.report.excited import Aside, write_pictures
 from jaxid.trajectory.basis import FourierBasis
@@ -144,7 +144,7 @@ def write(excited: Excited, output: Path, command: str = "") -> list[Path]:
     robot, step = plan.base.model.robot, excited.sample_time
     names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{excited.ros}"]
     write_ros = write_ros_json if excited.ros == "json" else write_ros_yaml
-    with double_precision(), written_whole(output.parent) as folder:
+    with double_precision(), atomic_folder(output.parent) as folder:
         write_csv(excited.sampled, robot, folder / names[0], sample_time=step)
         save_trajectory(jax.tree.map(np.asarray, played), folder / names[1])
         write_ros(excited.sampled, robot, folder / names[2], sample_time=step)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxid.errors import InputError
 from jaxid.experiment.demo import DEMO
-from jaxid.files import read_json, require_place, unfinished
+from jaxid.io import read_json, require_writable
 from jaxid.report import compared_files, content, found
 from jaxid.trajectory.files import load_trajectory
 
@@ -36,7 +36,7 @@ def refuse_foreign_folder(target: Path, force: bool) -> None:
     if target.exists() and not target.is_dir():
         raise InputError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
     if force or not target.is_dir() or not any(target.iterdir()) or _is_report(target):
-        require_place(target)
+        require_writable(target)
         return
     raise InputError(
         f"`{target}` holds files but no report: choose another folder with -o, or add --force to "
@@ -67,7 +67,7 @@ def refuse_foreign_table(target: Path) -> None:
         raise InputError(
             f"`{found}` is there already, and no motion of `jaxid excite`: choose another -o."
         )
-    require_place(target.parent)
+    require_writable(target.parent)
 
 
 def _is_trajectory(path: Path) -> bool:
@@ -79,9 +79,7 @@ def _is_trajectory(path: Path) -> bool:
 
 
 def _is_report(folder: Path) -> bool:
-    # While a report takes the place of another, and where that was killed, both are hidden.
-    places = (folder, *unfinished(folder))
-    return any(_has(place / file, schema) for place in places for file, schema in WRITTEN)
+    return any(_has(folder / file, schema) for file, schema in WRITTEN)
 
 
 def _has(path: Path, schema: str) -> bool:

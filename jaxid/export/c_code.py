@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.export.feed_forward import Form, forms
-from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
+from jaxid.io import atomic_folder
 from jaxid.program import Library, declaration, definition, evaluate
 
 STATES = 4
@@ -37,7 +37,7 @@ def export_c(fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = 
     """
     source, header = c_code(fit, name, double)
     folder = Path(folder)
-    with written_whole(folder) as staging:
+    with atomic_folder(folder) as staging:
         (staging / f"{name}.c").write_text(source, encoding="ascii")
         (staging / f"{name}.h").write_text(header, encoding="ascii")
     return folder / f"{name}.c"

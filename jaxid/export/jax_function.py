@@ -10,8 +10,8 @@ from jax import export
 
 from jaxid.arrays import Array, Float, double_precision
 from jaxid.export.feed_forward import torque_program
-from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
+from jaxid.io import write_bytes
 from jaxid.program import lower
 
 PLATFORMS = ("cpu", "cuda")
@@ -61,6 +61,5 @@ def export_jax(fit: Fit, path: str | Path) -> Path:
             "`pip install flatbuffers`."
         )
     path, content = Path(path), exported_function(fit).serialize()
-    with written_whole(path.parent) as staging:
-        (staging / path.name).write_bytes(content)
+    write_bytes(path, content)
     return path

@@ -7,8 +7,8 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.export.physical import Inertial, Joints, known_efforts, possible_bodies
-from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
+from jaxid.io import write_text
 from jaxid.robot.robot import Robot
 
 
@@ -40,8 +40,7 @@ def export_mjcf(fit: Fit, path: str | Path) -> Path:
         friction=joints.friction,
         comment=" ".join(said),
     )
-    with written_whole(path.parent) as staging:
-        (staging / path.name).write_text(text, encoding="utf-8")
+    write_text(path, text)
     return path
 
 

@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.documents import text_of
 from jaxid.export.feed_forward import bodies_of
 from jaxid.export.physical import Joints
-from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
+from jaxid.io import json_text, write_text
 
 NAMES = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 PLACES = (0, 1, 2, 3, 4, 9, 5, 8, 7, 6)
@@ -58,6 +57,5 @@ def export_pinocchio(fit: Fit, path: str | Path) -> Path:
         ],
         "left_out": list(joints.left),
     }
-    with written_whole(path.parent) as staging:
-        (staging / path.name).write_text(text_of(content), encoding="utf-8")
+    write_text(path, json_text(content))
     return path

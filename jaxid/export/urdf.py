@@ -8,8 +8,8 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.export.physical import Inertial, Joints, known_efforts, possible_bodies
-from jaxid.files import written_whole
 from jaxid.identification.fit import Fit
+from jaxid.io import write_bytes
 from jaxid.robot.robot import Robot
 from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import load_urdf, merged_links
@@ -82,8 +82,7 @@ def export_urdf(
         if np.isfinite(efforts[i]):
             _child(elements[name], "limit").set("effort", repr(float(efforts[i])))
     text = etree.tostring(document, xml_declaration=True, encoding="utf-8")
-    with written_whole(path.parent) as staging:
-        (staging / path.name).write_bytes(text + b"\n")
+    write_bytes(path, text + b"\n")
     return path
 
 

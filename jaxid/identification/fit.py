@@ -8,7 +8,6 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.documents import NotAValueError, encoded
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
@@ -21,6 +20,7 @@ from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.identification.uncertainty.uncertainty import Uncertainty
+from jaxid.io import to_json
 from jaxid.measurement.observations import Observations
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
@@ -176,7 +176,7 @@ class Fit(eqx.Module):
     @property
     def checksum(self) -> str:
         """Of everything that a model file of this fit holds: tells models apart."""
-        return checksum_of(encoded(self._kept()))
+        return checksum_of(to_json(self._kept()))
 
     def save(self, path: str | Path) -> Path:
         """Writes the fit to a model file (JSON) from which `load` makes the same fit again.
@@ -194,8 +194,8 @@ class Fit(eqx.Module):
 
     def _kept(self) -> "Fit":
         try:
-            encoded(self.estimator, refused=(Observations, LongLog))
-        except NotAValueError:
+            to_json(self.estimator, refused=(Observations, LongLog))
+        except InputError:
             return dataclasses.replace(self, estimator=EstimatorInWords(str(self.estimator)))
         return self
 

@@ -8,9 +8,8 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 
-from jaxid.documents import decoded, encoded, text_of
 from jaxid.errors import InputError
-from jaxid.files import read_json, written_whole
+from jaxid.io import from_json, json_text, read_json, to_json, write_text
 
 FORMAT = "jaxid model"
 VERSION = 1
@@ -29,15 +28,14 @@ def write_model(path: str | Path, model: eqx.Module) -> Path:
         InputError: If the model holds something that no file can hold.
     """
     path = Path(path)
-    content = encoded(model)
+    content = to_json(model)
     document = {
         "format": FORMAT,
         "version": VERSION,
         "checksum": checksum_of(content),
         "model": content,
     }
-    with written_whole(path.parent) as staging:
-        (staging / path.name).write_text(text_of(document), encoding="utf-8")
+    write_text(path, json_text(document))
     return path
 
 
@@ -82,7 +80,7 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
             "save the model again."
         )
     try:
-        model = decoded(content, kind)
+        model = from_json(content, kind)
         check(model)
     except (ValueError, TypeError, RecursionError) as error:
         said = " ".join(str(error).split()).rstrip(".")

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from jaxid.errors import InputError
-from jaxid.files import read_arrays
+from jaxid.io import read_arrays
 from jaxid.measurement.columns import Selection
 from jaxid.measurement.text import SUFFIXES, Dialect
 

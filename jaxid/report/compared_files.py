@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.files import read_json, written_whole
 from jaxid.identification.runs.comparison import Comparison
 from jaxid.identification.runs.estimates import Estimates
+from jaxid.io import atomic_folder, read_json
 from jaxid.report.compared import comparison_figure
 from jaxid.report.content import plain, versions
 from jaxid.report.style import save
@@ -179,7 +179,7 @@ def write_comparison(
         }
     )
     names = ["comparison.json", "comparison.csv", "comparison.png"]
-    with written_whole(folder) as staging:
+    with atomic_folder(folder) as staging:
         write_json(staging / names[0], content)
         write_csv(staging / names[1], rows)
         save(comparison_figure(comparison), staging / names[2])

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jaxid.arrays import double_precision
 from jaxid.excitation.plan import ExcitationPlan
-from jaxid.files import written_whole
+from jaxid.io import atomic_folder
 from jaxid.report.blocks import Headline, Picture, Prose, Remark, Remarks, Tone
 from jaxid.report.excitation import criteria_table, deviation_table, findings_table, use_table
 from jaxid.report.excitation_words import expectation, ordered, remarks
@@ -69,7 +69,7 @@ def write_pictures(
         "joints": joint_figure(robot, plan.limits.limits, time, motion),
         "end_effector": tip_figure(robot, time, motion),
     }
-    with written_whole(folder) as staging:
+    with atomic_folder(folder) as staging:
         write_page(staging / PAGE, excitation_page(plan, figures, aside))
         for name, figure in figures.items():
             save(figure, staging / f"{name}.png")

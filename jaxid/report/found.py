@@ -9,9 +9,9 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from jaxid.files import written_whole
 from jaxid.identification.runs.comparison import LEVEL
 from jaxid.identification.runs.estimates import Estimates
+from jaxid.io import atomic_folder
 from jaxid.report.content import plain, versions
 from jaxid.report.numbers import aligned, with_deviation
 from jaxid.report.tables import plain_table
@@ -100,7 +100,7 @@ def write_found(
         **content,
     }
     names = [f"{stem}.json", f"{stem}.csv"]
-    with written_whole(folder) as staging:
+    with atomic_folder(folder) as staging:
         write_json(staging / names[0], plain(everything))
         write_csv(staging / names[1], rows)
     return [folder / name for name in names]

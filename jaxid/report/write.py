@@ -7,12 +7,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxid.documents import text_of
-from jaxid.files import read_json, written_whole
 from jaxid.identification.filter_choice import FilterChoice
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.update import save_run
+from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.report.autocorrelation import autocorrelation_figure
 from jaxid.report.bars import error_figure
 from jaxid.report.content import Beside, parameters, result
@@ -93,7 +92,7 @@ def write_report(
     names = [PAGE, "result.json", "parameters.csv", MODEL, *drawn]
     names += [RUN] if run is not None else []
     content["files"] = names
-    with written_whole(folder, _earlier) as staging:
+    with atomic_folder(folder, _earlier) as staging:
         write_json(staging / "result.json", content)
         write_csv(staging / "parameters.csv", parameters(fit))
         fit.save(staging / MODEL)
@@ -111,7 +110,7 @@ def write_report(
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a file that programs read exactly and people can read."""
-    path.write_text(text_of(content), encoding="utf-8")
+    path.write_text(json_text(content), encoding="utf-8")
 
 
 def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
 from jaxid.errors import InputError
-from jaxid.files import written_whole
+from jaxid.io import atomic_folder
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
 from jaxid.simulation.gear_friction import SmoothFriction
@@ -146,7 +146,7 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
         RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
-    with written_whole(folder) as staging:
+    with atomic_folder(folder) as staging:
         (staging / FILES[0]).write_text(_EXPERIMENT, encoding="utf-8")
         for k, (file, periods) in enumerate(
             zip(FILES[1:3], (IDENTIFICATION_PERIODS, VERIFICATION_PERIODS), strict=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.files import read_json, written_whole
+from jaxid.io import atomic_folder, read_json
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierSeries
 from jaxid.trajectory.held import Held
@@ -128,7 +128,7 @@ def require_joints(trajectory: AbstractTrajectory, robot: Robot) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Writes one file whole or not at all."""
     path = Path(path)
-    with written_whole(path.parent) as folder:
+    with atomic_folder(path.parent) as folder:
         (folder / path.name).write_text(text, encoding="utf-8")
 
 

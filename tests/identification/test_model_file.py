@@ -11,8 +11,8 @@ import pytest
 from virtual import motion, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.documents import decoded, encoded
 from jaxid.identification.model_file import checksum_of
+from jaxid.io import from_json, to_json
 
 
 @pytest.fixture(scope="module")
@@ -102,16 +102,16 @@ def test_a_consistent_fit_keeps_bodies_and_verdict(tmp_path):
 @pytest.mark.parametrize("name", ["tx90l_on_rail", "tx40", "panda", "kr300"])
 def test_robots_come_back(name):
     robot = getattr(jid.robots, name)()
-    through = json.loads(json.dumps(encoded(robot), allow_nan=False))
-    same(plain(decoded(through, jid.Robot)), plain(robot))
+    through = json.loads(json.dumps(to_json(robot), allow_nan=False))
+    same(plain(from_json(through, jid.Robot)), plain(robot))
 
 
 @pytest.mark.parametrize("number", [0.1, -0.0, 5e-324, 1.7976931348623157e308, np.inf, np.nan])
 def test_every_number_survives(number):
     array = np.array([[number, 1.0]])
-    values = json.loads(json.dumps(encoded(array), allow_nan=False))
-    assert decoded(values, np.ndarray).tobytes() == array.tobytes()
-    again = decoded(json.loads(json.dumps(encoded(float(number)))), float)
+    values = json.loads(json.dumps(to_json(array), allow_nan=False))
+    assert from_json(values, np.ndarray).tobytes() == array.tobytes()
+    again = from_json(json.loads(json.dumps(to_json(float(number)))), float)
     assert np.array(again).tobytes() == np.array(number).tobytes()
 
 
@@ -126,15 +126,15 @@ class TermOfOnesOwn(jid.AbstractTerm):
 
 
 def test_a_term_of_ones_own_is_found_where_it_is_known():
-    values = encoded(TermOfOnesOwn(2.0))
-    assert decoded(values, jid.AbstractTerm) == TermOfOnesOwn(2.0)
+    values = to_json(TermOfOnesOwn(2.0))
+    assert from_json(values, jid.AbstractTerm) == TermOfOnesOwn(2.0)
     with pytest.raises(ValueError, match=r"`Cubic` , which|is a `Cubic`, which is not known"):
-        decoded({**values, "kind": "Cubic"}, jid.AbstractTerm)
+        from_json({**values, "kind": "Cubic"}, jid.AbstractTerm)
 
 
 def test_a_class_outside_of_the_family_is_not_looked_up():
     with pytest.raises(ValueError, match="not known"):
-        decoded({"kind": "WeightedLeastSquares"}, jid.AbstractTerm)
+        from_json({"kind": "WeightedLeastSquares"}, jid.AbstractTerm)
 
 
 def test_an_estimator_with_recordings_is_kept_in_words(fit, tmp_path):

@@ -5,7 +5,7 @@ from pathlib import Path
 from jaxid.experiment.demo.page import page
 from jaxid.experiment.demo.record import record
 from jaxid.experiment.demo.study import Study
-from jaxid.files import written_whole
+from jaxid.io import atomic_folder
 from jaxid.report.page import write_page
 from jaxid.report.write import write_json
 
@@ -19,7 +19,7 @@ def write_study(folder: Path, study: Study) -> list[Path]:
         folder: Of the files.
         study: What was found.
     """
-    with written_whole(folder) as staging:
+    with atomic_folder(folder) as staging:
         write_page(staging / FILES[0], page(study))
         write_json(staging / FILES[1], record(study))
     return [folder / name for name in FILES]

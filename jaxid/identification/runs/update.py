@@ -10,10 +10,10 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.files import read_arrays, written_whole
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.tied import tied
+from jaxid.io import read_arrays, write_bytes
 
 SCHEMA = "jaxid-run/1"
 ALIKE = 1e-6
@@ -112,8 +112,7 @@ def save_run(path: str | Path, run: Run) -> None:
     file = io.BytesIO()
     np.savez_compressed(file, **arrays)
     path = Path(path)
-    with written_whole(path.absolute().parent) as staging:
-        (staging / path.name).write_bytes(file.getvalue())
+    write_bytes(path, file.getvalue())
 
 
 def load_run(path: str | Path, base: BaseParameters) -> Run:

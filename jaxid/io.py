@@ -1,0 +1,391 @@
+"""Atomic writes, safe reading of JSON and NPZ files, and modules as JSON values.
+
+A module becomes an object with the name of its class under `kind` and one entry for each field; an
+array becomes an object with its dtype as the only key. Numbers are exact to the last bit. Only
+classes that fit the annotation of a field are looked up, so that no file can run code. A user's
+own subclass is found once its module is imported.
+"""
+
+import contextlib
+import dataclasses
+import enum
+import json
+import math
+import os
+import re
+import shutil
+import types
+import typing
+import uuid
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxid.arrays import AnyArray
+from jaxid.errors import InputError
+
+_DTYPES = ("float64", "float32", "int64", "int32", "bool")
+_NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8, whole or not at all.
+
+    Args:
+        path: Path of the file; missing folders above it are made.
+        text: Content of the file.
+    """
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a file, whole or not at all.
+
+    Args:
+        path: Path of the file; missing folders above it are made.
+        data: Content of the file.
+
+    Raises:
+        OSError: If nothing can be written there.
+        InputError: If a folder is in its place.
+    """
+    path = Path(path)
+    with atomic_folder(path.parent) as folder:
+        (folder / path.name).write_bytes(data)
+
+
+@contextlib.contextmanager
+def atomic_folder(
+    folder: str | Path, outdated: Callable[[Path], Iterable[str]] = lambda folder: ()
+) -> Iterator[Path]:
+    """Yield an empty temporary folder whose files appear in `folder` when the block ends.
+
+    After an error in the block nothing has changed. A new folder appears in one step. In an
+    existing folder, each file replaces the one of its name in one step, files in JSON last: a
+    result whose JSON file is there is complete. Other files stay.
+
+    Args:
+        folder: Folder of the files.
+        outdated: Function of the folder that names files of an earlier result, to be removed.
+
+    Raises:
+        OSError: If nothing can be written there.
+        InputError: If a file is in the place of a folder, or a folder in that of a file.
+    """
+    folder = Path(folder).absolute()
+    with _temporary_folder(folder) as staging:
+        yield staging
+        if folder.exists():
+            _move_files(staging, folder, outdated(folder))
+        else:
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(staging, folder)
+
+
+def require_writable(folder: str | Path) -> None:
+    """Check that files can be written to a folder, before long work begins.
+
+    Args:
+        folder: Folder of the files; it need not exist yet.
+
+    Raises:
+        OSError: If nothing can be written there.
+        InputError: If a file is in the place of the folder, or of one above it.
+    """
+    with _temporary_folder(Path(folder).absolute()):
+        pass
+
+
+@contextlib.contextmanager
+def _temporary_folder(folder: Path) -> Iterator[Path]:
+    """Make a hidden folder on the same file system, and remove it in the end."""
+    place = folder
+    while not place.exists() and not place.is_symlink():
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"`{place}` must be a folder, but is none: choose another place.")
+    path = place / f".jaxid-{uuid.uuid4().hex[:12]}"
+    try:
+        path.mkdir()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from error
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
+    paths = sorted(staging.iterdir(), key=lambda path: (path.suffix == ".json", path.name))
+    for path in paths:
+        if (folder / path.name).is_dir():
+            raise InputError(f"`{folder / path.name}` must be a file, but is a folder: remove it.")
+    old = {name for name in outdated if (folder / name).is_file()} - {p.name for p in paths}
+    if len(paths) > 1:
+        # Without its JSON files, no mixture of old and new files is taken for a result.
+        old |= {p.name for p in paths if p.suffix == ".json"}
+    for name in old:
+        (folder / name).unlink(missing_ok=True)
+    for path in paths:
+        os.replace(path, folder / path.name)
+
+
+def read_json(path: str | Path, hook: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
+    """Read a JSON file.
+
+    Args:
+        path: Path of the file.
+        hook: Function that makes an object of its key-value pairs; a dict if None.
+
+    Raises:
+        OSError: If the file cannot be read.
+        InputError: If it is no JSON in UTF-8.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=hook)
+    except RecursionError as error:
+        raise InputError("its brackets are nested too deeply") from error
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(str(error)) from error
+
+
+def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an NPZ file; objects, which could run code, are rejected.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        OSError: If the file cannot be opened.
+        InputError: If it is no archive of plain arrays, or is damaged.
+    """
+    with Path(path).open("rb") as file:
+        try:
+            with np.load(file, allow_pickle=False) as archive:
+                members = {name: archive[name] for name in archive.files}
+        except AttributeError as error:
+            raise InputError("it is one array, not an archive of them") from error
+        except Exception as error:  # some ten kinds: it depends on which bytes are damaged
+            raise InputError(" ".join(str(error).split()) or type(error).__name__) from error
+    # A member that NumPy did not write comes as bytes.
+    return {name: x for name, x in members.items() if isinstance(x, np.ndarray)}
+
+
+def json_text(content: dict[str, Any]) -> str:
+    """Return the text of a JSON file that programs read exactly and people can read.
+
+    Args:
+        content: Strings, finite numbers, lists and objects.
+    """
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+    # A list of numbers or texts stands on one line. Texts hold no line breaks, so none is touched.
+    return re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text) + "\n"
+
+
+def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
+    """Return a module, or the value of a field, as plain JSON values.
+
+    Args:
+        value: Module, enumeration, tuple, array, number or text.
+        refused: Classes that must not occur, such as recordings.
+
+    Raises:
+        InputError: If anything else occurs.
+    """
+    if isinstance(value, refused):
+        raise InputError(f"a document cannot hold `{type(value).__name__}`.")
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, enum.Enum):
+        return {"member": f"{type(value).__name__}.{value.name}"}
+    if isinstance(value, np.generic):
+        return to_json(value.item())
+    if isinstance(value, AnyArray):
+        return _array_to_json(value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {"float": repr(value)}
+    if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
+        return [to_json(x, refused) for x in value]
+    if isinstance(value, eqx.Module) and dataclasses.is_dataclass(value):
+        fields = (f for f in dataclasses.fields(value) if f.init)
+        entries = {f.name: to_json(getattr(value, f.name), refused) for f in fields}
+        return {"kind": type(value).__name__, **entries}
+    raise InputError(f"a document cannot hold {value!r:.60}.")
+
+
+def _array_to_json(value: AnyArray) -> Any:
+    if isinstance(value, jax.Array) and not value.is_fully_addressable:
+        raise InputError("a document cannot hold an array that is spread over processes.")
+    array = np.asarray(value)
+    name = array.dtype.name
+    if name not in _DTYPES:
+        raise InputError(f"a document cannot hold an array of {name}.")
+    entries = array.tolist()
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        entries = _name_infinities(entries)
+    return {name: entries} if array.size else {name: [], "shape": list(array.shape)}
+
+
+def _name_infinities(entries: Any) -> Any:
+    if isinstance(entries, list):
+        return [_name_infinities(x) for x in entries]
+    return entries if math.isfinite(entries) else repr(entries)
+
+
+def from_json(value: Any, hint: Any, place: str = "") -> Any:
+    """Return the module or value that `to_json` has made these values of.
+
+    Args:
+        value: Plain JSON values.
+        hint: Class, or annotation of a field, that the result must fit.
+        place: Path within the document, for messages.
+
+    Raises:
+        InputError: If the values do not fit; the message names the place.
+    """
+    if isinstance(value, dict):
+        result = _object_from_json(value, hint, place)
+    elif isinstance(value, list):
+        hints = _element_hints(hint, len(value))
+        pairs = enumerate(zip(value, hints, strict=True))
+        result = tuple(from_json(x, h, f"{place}[{k}]") for k, (x, h) in pairs)
+    else:
+        result = value
+    options = union_members(hint)
+    if not any(_fits(result, o) for o in options) and isinstance(result, float | np.ndarray):
+        # A number and an array without axes are the same.
+        result = np.array(result) if isinstance(result, float) else result[()]
+    if not any(_fits(result, option) for option in options):
+        raise InputError(f"`{place}` holds {value!r:.60}, which does not belong there")
+    return result
+
+
+def _object_from_json(value: dict[str, Any], hint: Any, place: str) -> Any:
+    if "kind" in value:
+        return _module_from_json(value, hint, place)
+    if set(value) == {"float"}:
+        return _infinity(value["float"], place)
+    if set(value) == {"member"}:
+        return _enum_member(str(value["member"]), hint, place)
+    names = set(value) - {"shape"}
+    if len(names) != 1 or not names <= set(_DTYPES):
+        raise InputError(f"`{place}` has the keys {', '.join(sorted(map(str, value)))}")
+    (name,) = names
+    try:
+        return _array_from_json(value[name], name, value.get("shape"), place)
+    except (TypeError, OverflowError) as error:
+        raise InputError(f"`{place}` is no array of {name}") from error
+
+
+def _enum_member(value: str, hint: Any, place: str) -> enum.Enum:
+    family, _, member = value.partition(".")
+    for option in union_members(hint):
+        if not isinstance(option, type) or not issubclass(option, enum.Enum):
+            continue
+        if family == option.__name__ and member in option.__members__:
+            return option[member]
+    raise InputError(f"`{place}` names `{value}`, which is not known")
+
+
+def _array_from_json(entries: Any, name: str, shape: Any, place: str) -> np.ndarray:
+    if shape is not None:
+        return np.zeros(tuple(shape), name)
+    exact = {"f": float, "i": int, "b": bool}[np.dtype(name).kind]
+
+    def leaf(x: Any) -> Any:
+        if isinstance(x, list):
+            return [leaf(y) for y in x]
+        x = _infinity(x, place) if isinstance(x, str) and exact is float else x
+        if type(x) is not exact:
+            raise InputError(f"`{place}` holds {x!r:.30} in an array of {name}")
+        return x
+
+    checked = leaf(entries)
+    try:
+        return np.array(checked, name)
+    except ValueError as error:
+        raise InputError(f"`{place}` has rows of different lengths") from error
+
+
+def _infinity(word: Any, place: str) -> float:
+    if word not in _NOT_FINITE:
+        raise InputError(f"`{place}` holds {word!r:.30} in the place of a number")
+    return _NOT_FINITE[word]
+
+
+def _module_from_json(value: dict[str, Any], hint: Any, place: str) -> Any:
+    kind = value["kind"]
+    families = [o for o in union_members(hint) if isinstance(o, type) and issubclass(o, eqx.Module)]
+    named = [c for family in families for c in _subclasses(family) if c.__name__ == kind]
+    # Of classes of one name the last one counts; not a twin that Equinox derives for its own ends.
+    named = [c for c in named if not any(b in named for b in c.__mro__[1:])]
+    if not named:
+        raise InputError(
+            f"`{place or 'the model'}` is a `{kind}`, which is not known: import the module that "
+            "defines it, or use a newer version of jaxid"
+        )
+    fields = {f.name: f for f in dataclasses.fields(named[-1]) if f.init}
+    unknown = [key for key in value if key != "kind" and key not in fields]
+    missing = [f for f in fields.values() if f.name not in value and _is_required(f)]
+    if unknown or missing:
+        complaint = (
+            f"has an unknown key `{unknown[0]}`" if unknown else f"lacks `{missing[0].name}`"
+        )
+        raise InputError(f"`{place or kind}` ({kind}) {complaint}")
+    entries = {
+        name: from_json(value[name], field.type, f"{place}.{name}".strip("."))
+        for name, field in fields.items()
+        if name in value
+    }
+    return named[-1](**entries)
+
+
+def _is_required(field: dataclasses.Field) -> bool:
+    absent = dataclasses.MISSING
+    return field.default is absent and field.default_factory is absent
+
+
+def _subclasses(family: type) -> list[type]:
+    """Return a class and all that are derived from it, older ones first."""
+    return [family, *(c for child in family.__subclasses__() for c in _subclasses(child))]
+
+
+def union_members(hint: Any) -> tuple[Any, ...]:
+    """Return the members of a union, or the annotation itself if it is none.
+
+    Args:
+        hint: Annotation of a field or argument.
+    """
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return tuple(o for x in typing.get_args(hint) for o in union_members(x))
+    return (hint,)
+
+
+def _element_hints(hint: Any, length: int) -> tuple[Any, ...]:
+    """Return the annotations of the elements of a tuple."""
+    for option in union_members(hint):
+        if typing.get_origin(option) is tuple:
+            arguments = typing.get_args(option)
+            if len(arguments) == 2 and arguments[1] is Ellipsis:
+                return (arguments[0],) * length
+            if len(arguments) == length:
+                return arguments
+    return (None,) * length
+
+
+def _fits(value: Any, option: Any) -> bool:
+    if option is Any:
+        return value is None or isinstance(value, str | bool | int | float)
+    if option is None or option is type(None):
+        return value is None
+    if typing.get_origin(option) is tuple:
+        return isinstance(value, tuple)
+    if option is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(option, type) and isinstance(value, option)
