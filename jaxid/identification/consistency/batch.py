@@ -1,4 +1,4 @@
-"""Physically consistent estimates as a function of arrays, and of many data sets at once."""
+"""Physically consistent estimates as a function of arrays, for `jit`, `vmap` and many data sets."""
 
 import functools
 import os
@@ -12,31 +12,25 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float, Int, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.consistency.data import whitened
 from jaxid.identification.consistency.estimator import PhysicallyConsistent
-from jaxid.identification.consistency.interior_point import solve_compiled
-
-ALONE = 8
-"""Data sets for which another thread does not pay."""
-TOGETHER = 256
-"""Data sets that an accelerator solves in step."""
+from jaxid.identification.consistency.solver import solve_compiled
 
 
 class ConsistentBatch(eqx.Module):
-    """Physically consistent parameters of many data sets, or of one.
+    """Physically consistent parameters of one or many data sets.
 
     Attributes:
         standard: Standard parameters: complete bodies, friction, rotors.
         parameters: Base parameters.
-        prices: By how much residuals exceed those without bounds, of 1.
-        error_bounds: Bounds of the objectives' distances to their optima, as shares of them.
-        certified: Where the bound is within the tolerance.
-        iterations: How many it took.
+        residual_increases: Relative increases of the norms of the residuals by the bounds.
+        error_bounds: Bounds of the objectives' relative distances to their optima.
+        certified: Whether the bounds are within the tolerance.
+        iterations: Numbers of iterations.
     """
 
     standard: Float[AnyArray, "*datasets standard"]
     parameters: Float[AnyArray, "*datasets base"]
-    prices: Float[AnyArray, "*datasets"]
+    residual_increases: Float[AnyArray, "*datasets"]
     error_bounds: Float[AnyArray, "*datasets"]
     certified: Bool[AnyArray, "*datasets"]
     iterations: Int[AnyArray, "*datasets"]
@@ -46,23 +40,21 @@ class ConsistentSolver:
     """Physically consistent estimates of one model: a function of arrays for `jit` and `vmap`.
 
     The factors are those of `Factors.weighted`: their rows are weighted already, so the weights of
-    the estimator do not count. Equal solvers share what was compiled for them. It goes through a
-    loop whose length depends on the data: there are no reverse-mode gradients.
+    the estimator do not count. Equal solvers share their compiled functions. The solver is a loop
+    whose length depends on the data: there are no reverse-mode gradients.
+
+    Args:
+        base: Base parameters of the factors' columns.
+        estimator: Bounds, margin and priors; wide bounds if None.
+
+    Raises:
+        InputError: If the bounds do not fit the model.
     """
 
     def __init__(self, base: BaseParameters, estimator: PhysicallyConsistent | None = None):
-        """Prepares the bounds.
-
-        Args:
-            base: Whose columns the factors have.
-            estimator: Bounds, margin and priors; wide bounds if None.
-
-        Raises:
-            InputError: If the bounds do not fit the model.
-        """
         self.base = base
         self.estimator = PhysicallyConsistent() if estimator is None else estimator
-        self._possible = self.estimator.possible(base)
+        self._feasible = self.estimator.feasible_set(base)
         leaves, structure = jax.tree.flatten((base, self.estimator))
         arrays = [np.asarray(x) for x in leaves]
         self._key = structure, tuple((x.shape, x.dtype.str, x.tobytes()) for x in arrays)
@@ -79,27 +71,25 @@ class ConsistentSolver:
         z: Float[AnyArray, " height"],
         rows: Int[AnyArray, ""] | int,
     ) -> ConsistentBatch:
-        """The estimate of one data set.
+        """Return the estimate of one data set.
 
         Args:
             R: Upper triangle of the weighted rows.
             z: Weighted forces, of the same decomposition.
-            rows: How many rows it stands for.
+            rows: Number of rows behind the factor.
         """
         require_float64("a physically consistent estimate")
         R, z = jnp.asarray(R), jnp.asarray(z)
-        plain = whitened(jnp, self.base, R, z, rows)
-        data = self.estimator.with_prior(jnp, plain)
-        program = self.estimator.program(jnp, self._possible, data)
+        data, program = self.estimator.program(jnp, self.base, self._feasible, R, z, rows)
         optimum = solve_compiled(program)
-        p = self._possible.standard(jnp, data.A, data.b, optimum.y)
-        left = z[self.base.size :] / plain.noise
-        away = plain.A @ p - plain.b
-        free = jnp.maximum(left @ left, 1e-300)
+        p = self._feasible.standard_parameters(jnp, data.A, data.b, optimum.y)
+        parameters = self.base.from_standard(p)
+        free, bounded = z[self.base.size :], R @ parameters - z
+        squares = jnp.maximum(free @ free, 1e-300 * data.noise**2)
         return ConsistentBatch(
             p,
-            self.base.from_standard(p),
-            jnp.sqrt(away @ away / free) - 1.0,
+            parameters,
+            jnp.sqrt(bounded @ bounded / squares) - 1.0,
             optimum.error / jnp.maximum(optimum.value, program.scale),
             jnp.asarray(optimum.certified),
             jnp.asarray(optimum.iterations),
@@ -108,18 +98,18 @@ class ConsistentSolver:
     def check(
         self, R: Float[np.ndarray, "height base"], z: Float[np.ndarray, " height"], rows: int
     ) -> None:
-        """Refuses bounds that leave no body.
+        """Check that the bounds leave room for bodies.
 
         Args:
             R: Upper triangle of some data set.
-            z: Its weighted forces.
-            rows: How many rows it stands for.
+            z: Weighted forces of that data set.
+            rows: Number of rows behind the factor.
 
         Raises:
             InputError: If bounds and margin leave no body.
         """
-        data = self.estimator.with_prior(np, whitened(np, self.base, R, z, rows))
-        self.estimator.program(np, self._possible, data).require_interior()
+        _, program = self.estimator.program(np, self.base, self._feasible, R, z, rows)
+        program.require_interior()
 
 
 def consistent_batch(
@@ -129,16 +119,16 @@ def consistent_batch(
     rows: Int[AnyArray, " datasets"],
     estimator: PhysicallyConsistent | None = None,
 ) -> ConsistentBatch:
-    """Physically consistent estimates from the triangular factors of many data sets.
+    """Estimate physically consistent parameters from the triangular factors of many data sets.
 
-    It is `ConsistentSolver`, compiled once for each model, estimator and shape, and shared among
-    the processor's cores.
+    It is `ConsistentSolver`, compiled once for each model, estimator and shape, and spread over the
+    cores of the processor.
 
     Args:
-        base: Whose columns they are.
+        base: Base parameters of the factors' columns.
         R: Upper triangles of the weighted rows.
         z: Weighted forces, of the same decompositions.
-        rows: How many rows each stands for.
+        rows: Numbers of rows behind the factors.
         estimator: Bounds, margin and priors; wide bounds if None.
 
     Raises:
@@ -154,7 +144,8 @@ def consistent_batch(
         )
     solver = ConsistentSolver(base, estimator)
     solver.check(np.asarray(R[0]), np.asarray(z[0]), int(rows[0]))
-    parts = min(_threads(), -(-count // ALONE))
+    # Below eight data sets another thread does not pay.
+    parts = min(_threads(), -(-count // 8))
     size = -(-count // parts)
     solve = _compiled(solver, (size, *R.shape[1:]))
     arrays = np.asarray(R, np.float64), np.asarray(z, np.float64), np.asarray(rows, np.int64)
@@ -164,12 +155,12 @@ def consistent_batch(
         return jax.block_until_ready(solve(*(x[chosen] for x in arrays)))
 
     with ThreadPoolExecutor(parts) as pool:
-        found = list(pool.map(part, range(parts)))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *found)
+        results = list(pool.map(part, range(parts)))
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *results)
 
 
 def _threads() -> int:
-    """Cores that this process may use; an accelerator takes everything at once."""
+    """Return the number of usable cores; an accelerator takes all data sets at once."""
     if jax.default_backend() != "cpu":
         return 1
     allowed = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
@@ -178,9 +169,9 @@ def _threads() -> int:
 
 @functools.lru_cache(maxsize=16)
 def _compiled(solver: ConsistentSolver, shape: tuple[int, int, int]):
-    """The program for so many data sets; compiled ahead, so that threads do not wait in turn."""
-    # A core gains nothing from solving in step, and waits for the slowest; an accelerator does.
-    together = None if jax.default_backend() == "cpu" else TOGETHER
+    """Compile the solver for a number of data sets, ahead of time so that threads do not wait."""
+    # A core gains nothing from solving data sets in step: it waits for the slowest.
+    together = None if jax.default_backend() == "cpu" else 256
 
     def many(R: Array, z: Array, rows: Array) -> ConsistentBatch:
         return jax.lax.map(lambda x: solver(*x), (R, z, rows), batch_size=together)

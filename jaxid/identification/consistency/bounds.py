@@ -1,26 +1,22 @@
-"""What every body of a robot stays within: masses, and how far matter reaches."""
+"""Prior knowledge about bodies: bounds of masses and sizes, a CAD model, a data sheet."""
 
 import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.errors import InputError
+from jaxid.identification.consistency.pseudo_inertia import consistency_margin, pseudo_inertia
 from jaxid.robot.limits import Numbers
 from jaxid.robot.robot import Robot
 
-MASS_OF_A_METRE = 100.0
-"""Largest mass of a body of a robot that reaches one metre [kg]; it grows with the square."""
-MARGIN = 0.25
-"""How far matter reaches beyond the neighbouring joints, as a share of the robot's reach."""
-
 
 class BodyBounds(eqx.Module):
-    """Bounds of the bodies, without which the best bodies would be infinitely heavy.
+    """Bounds of masses, sizes and centres of mass; without them the best masses are infinite.
 
     Attributes:
-        mass_min: Smallest mass of each body [kg].
         mass_max: Largest mass of each body [kg].
         radius: Radius of the sphere about the origin of each body's frame that holds it [m].
+        mass_min: Smallest mass of each body [kg].
         centre_min: Lower corners of boxes for the centres of mass [m]; -inf for none.
         centre_max: Upper corners [m]; inf for none.
         ellipsoid_centre: Centres of ellipsoids that hold the centres of mass [m].
@@ -28,123 +24,100 @@ class BodyBounds(eqx.Module):
         total_mass: Mass of all bodies together [kg], or None.
     """
 
-    mass_min: Float[AnyArray, " bodies"]
     mass_max: Float[AnyArray, " bodies"]
     radius: Float[AnyArray, " bodies"]
+    mass_min: Float[AnyArray, " bodies"]
     centre_min: Float[AnyArray, "bodies 3"]
     centre_max: Float[AnyArray, "bodies 3"]
     ellipsoid_centre: Float[AnyArray, "bodies 3"]
     ellipsoid_axes: Float[AnyArray, "bodies 3"]
-    total_mass: float | None = None
+    total_mass: float | None
 
-    @classmethod
-    def of(
-        cls,
-        bodies: int,
-        *,
+    def __init__(
+        self,
         mass_max: Numbers,
         radius: Numbers,
-        mass_min: Numbers | None = None,
-        centre_min: Numbers | None = None,
-        centre_max: Numbers | None = None,
-        ellipsoid_centre: Numbers | None = None,
-        ellipsoid_axes: Numbers | None = None,
+        mass_min: Numbers = 0.0,
+        centre_min: Numbers = -np.inf,
+        centre_max: Numbers = np.inf,
+        ellipsoid_centre: Numbers = 0.0,
+        ellipsoid_axes: Numbers = np.inf,
         total_mass: float | int | None = None,
-    ) -> "BodyBounds":
-        """Builds bounds and checks them: one number for all bodies, or one for each.
-
-        Args:
-            bodies: Number of bodies.
-            mass_max: Largest masses [kg].
-            radius: Radii of the spheres about the origins of the bodies' frames [m].
-            mass_min: Smallest masses [kg]; 0 if None.
-            centre_min: Lower corners of boxes for the centres of mass [m]; None for no box.
-            centre_max: Upper corners [m].
-            ellipsoid_centre: Centres of ellipsoids for the centres of mass [m]; origins if None.
-            ellipsoid_axes: Half axes of the ellipsoids [m]; None for no ellipsoids.
-            total_mass: Mass of all bodies together [kg], if it is known.
+    ):
+        """Build bounds; `mass_max` or `radius` has one number per body, others may be scalars.
 
         Raises:
-            InputError: If shapes do not fit, or no body could satisfy all bounds.
+            InputError: If shapes do not fit, or no body satisfies all bounds.
         """
+        bodies = max(np.size(mass_max), np.size(radius))
 
-        def each(name: str, value: Numbers | None, unknown: float, *shape: int) -> np.ndarray:
-            array = np.array(unknown if value is None else value, np.float64)
-            if np.isnan(array).any() or (
-                array.shape and array.shape not in (shape, (bodies, *shape))
-            ):
+        def each(name: str, value: Numbers, *shape: int) -> np.ndarray:
+            array = np.array(value, np.float64)
+            if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
                 raise InputError(
                     f"`{name}` must hold numbers for all bodies or for each of the {bodies}, but "
                     f"has shape {array.shape}."
                 )
             return np.broadcast_to(array, (bodies, *shape)).copy()
 
-        bounds = cls(
-            mass_min=each("mass_min", mass_min, 0.0),
-            mass_max=each("mass_max", mass_max, np.inf),
-            radius=each("radius", radius, np.inf),
-            centre_min=each("centre_min", centre_min, -np.inf, 3),
-            centre_max=each("centre_max", centre_max, np.inf, 3),
-            ellipsoid_centre=each("ellipsoid_centre", ellipsoid_centre, 0.0, 3),
-            ellipsoid_axes=each("ellipsoid_axes", ellipsoid_axes, np.inf, 3),
-            total_mass=None if total_mass is None else float(total_mass),
-        )
-        bounds._check()
-        return bounds
+        self.mass_max = each("mass_max", mass_max)
+        self.radius = each("radius", radius)
+        self.mass_min = each("mass_min", mass_min)
+        self.centre_min = each("centre_min", centre_min, 3)
+        self.centre_max = each("centre_max", centre_max, 3)
+        self.ellipsoid_centre = each("ellipsoid_centre", ellipsoid_centre, 3)
+        self.ellipsoid_axes = each("ellipsoid_axes", ellipsoid_axes, 3)
+        self.total_mass = None if total_mass is None else float(total_mass)
+        self._check()
 
     @classmethod
     def from_geometry(cls, robot: Robot) -> "BodyBounds":
-        """Wide bounds from a robot's geometry, for a robot of which nothing else is known.
+        """Return wide bounds for a robot of which only the geometry is known.
 
-        A body reaches a quarter of the robot's reach beyond its neighbouring joints, and weighs at
-        most 100 kg times the square of the reach in metres.
+        A body extends beyond its neighbouring joints by at most a quarter of the robot's reach, and
+        weighs at most 100 kg times the square of the reach in metres.
 
         Args:
-            robot: Whose bodies they are.
+            robot: Robot whose bodies are bounded.
         """
         reach, neighbours = _reach(robot)
-        return cls.of(
-            robot.joints, mass_max=MASS_OF_A_METRE * reach**2, radius=neighbours + MARGIN * reach
-        )
+        return cls(100.0 * reach**2, neighbours + 0.25 * reach)
 
     def replace(self, **fields: Numbers | float | None) -> "BodyBounds":
-        """A copy with some bounds replaced, as `of` takes them.
+        """Return a copy with some bounds replaced; scalars count for all bodies.
 
         Raises:
-            InputError: If shapes do not fit, or no body could satisfy all bounds.
+            InputError: If shapes do not fit, or no body satisfies all bounds.
         """
-        return type(self).of(len(self.radius), **{**vars(self), **fields})
+        return type(self)(**{**vars(self), **fields})  # pyright: ignore[reportArgumentType]
 
-    @property
-    def sentence(self) -> str:
-        """What was assumed, in one sentence."""
-
+    def __str__(self):
         def span(values: AnyArray) -> str:
             low, high = float(np.min(values)), float(np.max(values))
             return f"{high:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
-        said = (
+        text = (
             f"masses up to {span(self.mass_max)} kg, bodies within {span(self.radius)} m of the "
             "origins of their frames"
         )
         if np.any(self.mass_min):
-            said += f", masses from {span(self.mass_min)} kg"
+            text += f", masses from {span(self.mass_min)} kg"
         if np.isfinite(self.centre_min).any() or np.isfinite(self.centre_max).any():
-            said += ", centres of mass in boxes"
-        if np.isfinite(self.ellipsoid_axes).any():
-            said += ", centres of mass in ellipsoids"
+            text += ", centres of mass in boxes"
+        if self.has_ellipsoid.any():
+            text += ", centres of mass in ellipsoids"
         if self.total_mass is not None:
-            said += f", {self.total_mass:.4g} kg together"
-        return said
+            text += f", {self.total_mass:.4g} kg together"
+        return text
 
     @property
     def has_ellipsoid(self) -> Bool[np.ndarray, " bodies"]:
-        """Which bodies have an ellipsoid for their centre of mass."""
+        """Whether bodies have an ellipsoid for their centre of mass."""
         return np.asarray(np.isfinite(np.asarray(self.ellipsoid_axes)).all(axis=1))
 
     @property
-    def interior(self) -> Float[np.ndarray, "bodies 3"]:
-        """Centres of mass that satisfy all bounds, and not barely [m].
+    def inner_centres(self) -> Float[np.ndarray, "bodies 3"]:
+        """Centres of mass well inside all bounds [m].
 
         Raises:
             InputError: If there are none for some body.
@@ -154,15 +127,18 @@ class BodyBounds(eqx.Module):
         high = np.minimum(self.centre_max, radius)
         axes = np.where(self.has_ellipsoid[:, None], self.ellipsoid_axes, radius)
         centre = np.where(self.has_ellipsoid[:, None], self.ellipsoid_centre, 0.0)
+
+        def toward(point: np.ndarray, middle: np.ndarray | float, axes: np.ndarray) -> np.ndarray:
+            """Pull points that lie outside 90 % of an ellipsoid onto its surface."""
+            away = point - middle
+            size = np.linalg.norm(away / axes, axis=1) / 0.9
+            return middle + away / np.maximum(size, 1.0)[:, None]
+
         point = 0.5 * (low + high)
-        # Alternating between the box and the two ellipsoids, both drawn together a little.
+        # Alternating projections onto the box, the ellipsoid and the sphere, each a little smaller.
         inner_low, inner_high = low + 0.1 * (high - low), high - 0.1 * (high - low)
         for _ in range(200):
-            away = point - centre
-            point = (
-                centre + away / np.maximum(np.linalg.norm(away / axes, axis=1) / 0.9, 1.0)[:, None]
-            )
-            point = point / np.maximum(np.linalg.norm(point / radius, axis=1) / 0.9, 1.0)[:, None]
+            point = toward(toward(point, centre, axes), 0.0, radius)
             point = np.clip(point, inner_low, inner_high)
         inside = (
             (np.linalg.norm((point - centre) / axes, axis=1) < 0.99)
@@ -171,44 +147,39 @@ class BodyBounds(eqx.Module):
             & (point < high).all(axis=1)
         )
         if not inside.all():
-            k = int(np.flatnonzero(~inside)[0]) + 1
+            k = int(np.argmin(inside))
             raise InputError(
-                f"no centre of mass of body {k} lies well within its box, its ellipsoid and its "
-                f"sphere of {float(self.radius[k - 1]):.3g} m: widen one of them."
+                f"no centre of mass of body {k + 1} lies well within its box, its ellipsoid and "
+                f"its sphere of {float(self.radius[k]):.3g} m: widen one of them."
             )
         return point
 
     def _check(self) -> None:
-        n = len(self.radius)
-        for name in ("mass_max", "radius", "ellipsoid_axes"):
-            values = np.asarray(getattr(self, name)).reshape(n, -1)
-            good = (values > 0) & ((name == "ellipsoid_axes") | np.isfinite(values))
-            if not good.all():
-                k, which = np.argwhere(~good)[0]
-                rule = "positive" if name == "ellipsoid_axes" else "positive and finite"
-                raise InputError(
-                    f"`{name}` must be {rule}, but body {k + 1} has {values[k, which]:g}."
-                )
         low, high = np.asarray(self.mass_min), np.asarray(self.mass_max)
-        if not ((low >= 0) & (low < high)).all():
-            k = int(np.flatnonzero(~((low >= 0) & (low < high)))[0])
-            raise InputError(
-                f"`mass_min` must lie between 0 and `mass_max`, but body {k + 1} has {low[k]:g} "
-                f"and {high[k]:g} kg."
-            )
-        if not (np.asarray(self.centre_min) < np.asarray(self.centre_max)).all():
-            raise InputError("`centre_min` must be below `centre_max` for every body and axis.")
+        radius, axes = np.asarray(self.radius), np.asarray(self.ellipsoid_axes)
+        rules = (
+            ("mass_max", "positive and finite", (high > 0) & np.isfinite(high)),
+            ("radius", "positive and finite", (radius > 0) & np.isfinite(radius)),
+            ("ellipsoid_axes", "positive", axes > 0),
+            ("mass_min", "at least 0 and below `mass_max`", (low >= 0) & (low < high)),
+            ("centre_min", "below `centre_max`", self.centre_min < self.centre_max),
+        )
+        for name, rule, good in rules:
+            if not good.all():
+                k = int(np.argwhere(~good)[0, 0])
+                value = np.asarray(getattr(self, name))[k]
+                raise InputError(f"`{name}` must be {rule}, but body {k + 1} has {value}.")
         total = self.total_mass
         if total is not None and not low.sum() < total < high.sum():
             raise InputError(
                 f"`total_mass` must lie between the sums of the bodies' bounds, {low.sum():g} and "
                 f"{high.sum():g} kg, but is {total:g} kg."
             )
-        _ = self.interior
+        _ = self.inner_centres
 
 
 def _reach(robot: Robot) -> tuple[float, np.ndarray]:
-    """Length of the longest chain [m], and the distance of each body to its farthest neighbour."""
+    """Return the longest chain's length [m] and each body's distance to its farthest neighbour."""
     offset = np.linalg.norm(np.asarray(robot.offset), axis=1)
     tip = float(np.linalg.norm(np.asarray(robot.tip_offset)))
     chains = [offset[list(chain)].sum() for chain in robot.ancestors]
@@ -220,3 +191,92 @@ def _reach(robot: Robot) -> tuple[float, np.ndarray]:
     neighbours[robot.tip_body] = max(neighbours[robot.tip_body], tip)
     reach = float(max(chains))
     return (reach if reach > 0 else 1.0), neighbours
+
+
+class EntropicPull(eqx.Module):
+    r"""Pull of the bodies towards those of a prior, along directions that the data do not see.
+
+    It adds $\gamma \sum_k \left( \mathrm{tr}(\Pi_{0k}^{-1} \Pi_k) - \ln \det \Pi_k \right)$ to half
+    the squared residuals in units of the noise: the Bregman divergence of pseudo-inertias, which
+    does not depend on frames or units, and which keeps bodies away from the boundary of physical
+    consistency.
+
+    Attributes:
+        bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ of the prior's bodies; None for balls of
+            medium size.
+        strength: Factor $\gamma$: 1 is weak, and already gives the mass matrix a margin.
+    """
+
+    bodies: Float[AnyArray, "bodies 10"] | None = None
+    strength: float = 1.0
+
+    def __check_init__(self):
+        if not 0.0 < self.strength < np.inf:
+            raise InputError(f"`strength` must be positive, but is {self.strength}.")
+        if self.bodies is not None and not (consistency_margin(self.bodies) > 0.0).all():
+            k = int(np.argmin(consistency_margin(self.bodies))) + 1
+            raise InputError(
+                "`bodies` of a prior must be physically consistent, with some extent in all "
+                f"directions, but body {k} is not: give it a mass and an inertia."
+            )
+
+    def pseudo_inertias(
+        self, nominal: Float[np.ndarray, "bodies 4 4"]
+    ) -> Float[np.ndarray, "bodies 4 4"]:
+        """Return the pseudo-inertias of the prior's bodies.
+
+        Args:
+            nominal: Pseudo-inertias for a prior without bodies.
+
+        Raises:
+            InputError: If the number of bodies is not that of the robot.
+        """
+        if self.bodies is None:
+            return nominal
+        if len(self.bodies) != len(nominal):
+            raise InputError(
+                f"`bodies` of a prior must be one for each body of the robot ({len(nominal)}), but "
+                f"are {len(self.bodies)}."
+            )
+        return pseudo_inertia(self.bodies)
+
+
+class ParameterPrior(eqx.Module):
+    r"""Standard parameters that are known roughly, each with its own standard deviation (a ridge).
+
+    It adds $\frac12 \sum_i (p_i - p_{0i})^2 / \sigma_i^2$ to half the squares in units of noise.
+
+    Attributes:
+        parameters: Standard parameters.
+        deviations: Their standard deviations; infinite where nothing is known.
+    """
+
+    parameters: Float[AnyArray, " standard"]
+    deviations: Float[AnyArray, " standard"]
+
+    def __check_init__(self):
+        if np.shape(self.parameters) != np.shape(self.deviations):
+            raise InputError(
+                "`parameters` and `deviations` of a prior must be as many, but are "
+                f"{np.shape(self.parameters)} and {np.shape(self.deviations)}."
+            )
+        if not (np.asarray(self.deviations) > 0.0).all():
+            raise InputError("`deviations` of a prior must be positive.")
+
+    def rows(self, size: int) -> tuple[Float[np.ndarray, "rows standard"], np.ndarray]:
+        """Return the prior as rows of least squares, in units of the standard deviations.
+
+        Args:
+            size: Number of standard parameters of the model.
+
+        Raises:
+            InputError: If the number of parameters is not that of the model.
+        """
+        if len(self.parameters) != size:
+            raise InputError(
+                f"`parameters` of a prior must be the {size} standard parameters of the model, but "
+                f"are {len(self.parameters)}."
+            )
+        inverse = 1.0 / np.asarray(self.deviations, np.float64)
+        known = inverse > 0.0
+        return np.diag(inverse)[known], (inverse * np.asarray(self.parameters))[known]

@@ -1,20 +1,27 @@
-r"""Pseudo-inertias: ten inertial parameters of a body as one symmetric 4x4 matrix.
+r"""Pseudo-inertias: the ten inertial parameters of a body as one symmetric 4x4 matrix.
 
 A body with density $\rho$ has $\Pi = \int (r; 1)(r; 1)^T \rho\, dV$: second moments $\Sigma$, first
 moment and mass. Ten numbers belong to some distribution of positive masses if and only if $\Pi$ is
 positive semidefinite (Wensing, Kim, Slotine, 2018), which includes the triangle inequality of the
 principal moments of inertia.
+
+The second half of the file is arithmetic on stacks of such matrices, for NumPy and JAX alike. The
+loops over four rows are unrolled: a stack takes a few dozen array operations and no call of LAPACK.
 """
+
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Bool, Float
 
-TEN = 10
+Values = Any
+"""Arrays of NumPy or JAX, and NumPy scalars."""
 
 
 def _basis() -> np.ndarray:
-    basis = np.zeros((TEN, 4, 4))
+    basis = np.zeros((10, 4, 4))
     basis[0, 3, 3] = 1.0
     for k in range(3):
         basis[1 + k, k, 3] = basis[1 + k, 3, k] = 1.0
@@ -26,13 +33,11 @@ def _basis() -> np.ndarray:
 
 
 BASIS = _basis()
-r"""What unit parameters $(m, m r_c, A, B, C, D, E, F)$ add to the pseudo-inertia."""
+r"""Pseudo-inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
 
 
-def pseudo_inertia(
-    bodies: Float[AnyArray, "*batch 10"],
-) -> Float[np.ndarray, "*batch 4 4"]:
-    r"""The pseudo-inertia $\begin{pmatrix} \Sigma & m r_c \\ m r_c^T & m \end{pmatrix}$ of bodies.
+def pseudo_inertia(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*batch 4 4"]:
+    r"""Return the pseudo-inertia $\begin{pmatrix} \Sigma & m r_c \\ m r_c^T & m \end{pmatrix}$.
 
     The second moments are $\Sigma = \frac12 \mathrm{tr}(J^o) I - J^o$ [kg m²].
 
@@ -42,29 +47,13 @@ def pseudo_inertia(
     return np.einsum("...i,iab->...ab", np.asarray(bodies), BASIS)
 
 
-def inertial_parameters(
-    pseudo: Float[AnyArray, "*batch 4 4"],
-) -> Float[np.ndarray, "*batch 10"]:
-    """The parameters $(m, m r_c, A, B, C, D, E, F)$ of pseudo-inertias.
-
-    Args:
-        pseudo: Pseudo-inertias about the origin of the body's frame.
-    """
+def inertial_parameters(pseudo: Float[AnyArray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 10"]:
+    """Return the parameters $(m, m r_c, A, B, C, D, E, F)$ of pseudo-inertias."""
     P = np.asarray(pseudo)
     xx, yy, zz = P[..., 0, 0], P[..., 1, 1], P[..., 2, 2]
-    return np.stack(
-        [
-            P[..., 3, 3],
-            *(P[..., k, 3] for k in range(3)),
-            yy + zz,
-            xx + zz,
-            xx + yy,
-            P[..., 1, 2],
-            P[..., 0, 2],
-            P[..., 0, 1],
-        ],
-        axis=-1,
-    )
+    first_moments = (P[..., k, 3] for k in range(3))
+    products = P[..., 1, 2], P[..., 0, 2], P[..., 0, 1]
+    return np.stack([P[..., 3, 3], *first_moments, yy + zz, xx + zz, xx + yy, *products], axis=-1)
 
 
 def ball(
@@ -72,12 +61,12 @@ def ball(
     centre: Float[AnyArray, "*batch 3"],
     radius: Float[AnyArray, "*batch"],
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """Pseudo-inertias of solid balls.
+    """Return the pseudo-inertias of solid balls.
 
     Args:
         mass: Masses [kg].
-        centre: Their centres in the body's frame [m].
-        radius: Their radii [m].
+        centre: Centres in the body's frame [m].
+        radius: Radii [m].
     """
     m, c = np.asarray(mass, np.float64), np.asarray(centre, np.float64)
     spread = np.asarray(radius, np.float64)[..., None, None] ** 2 / 5.0 * np.eye(3)
@@ -88,13 +77,73 @@ def ball(
     return P * m[..., None, None]
 
 
-def share_of_a_body(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*batch"]:
-    r"""How far bodies are from the boundary of what can exist; negative beyond it, of 1.
+def consistency_margin(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*batch"]:
+    r"""Return the distances of bodies from the boundary of physical consistency.
 
-    It is the smallest eigenvalue of the pseudo-inertia in units of which its diagonal is one: free
-    of units, 1 for a body whose axes do not mix, 0 for one that is flat.
+    It is the smallest eigenvalue of the pseudo-inertia after its diagonal is scaled to one: at most
+    1, independent of units, 0 for a flat body, negative for a body that cannot exist.
     """
     P = pseudo_inertia(bodies)
     size = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1)))
     scale = 1.0 / np.where(size > 0, size, 1.0)
     return np.linalg.eigvalsh(P * scale[..., :, None] * scale[..., None, :])[..., 0]
+
+
+def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
+    """Return the entries of the lower triangles; NaN where a matrix is not positive definite."""
+    n = P.shape[-1]
+    L: list[list[Values]] = [[P[..., 0, 0]] * n for _ in range(n)]
+    for j in range(n):
+        pivot = P[..., j, j]
+        for k in range(j):
+            pivot = pivot - L[j][k] ** 2
+        L[j][j] = xp.sqrt(pivot)
+        for i in range(j + 1, n):
+            entry = P[..., i, j]
+            for k in range(j):
+                entry = entry - L[i][k] * L[j][k]
+            L[i][j] = entry / L[j][j]
+    return L
+
+
+def are_definite(P: Float[AnyArray, "stack n n many"]) -> Bool[AnyArray, "stack many"]:
+    """Return whether matrices, which lie side by side along the last axis, are positive definite."""
+    good = P[:, 0, 0] > 0
+    for _ in range(P.shape[1] - 1):
+        column = P[:, 1:, 0]
+        P = P[:, 1:, 1:] - column[:, :, None] * (column / P[:, :1, 0])[:, None]
+        good = good & (P[:, 0, 0] > 0)
+    return good
+
+
+def log_determinant(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[AnyArray, "*stack"]:
+    """Return the logarithms of the determinants of positive definite matrices."""
+    L = _cholesky(xp, P)
+    total = xp.log(L[0][0])
+    for j in range(1, P.shape[-1]):
+        total = total + xp.log(L[j][j])
+    return 2.0 * total
+
+
+def inverse(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[AnyArray, "*stack n n"]:
+    """Return the inverses of positive definite matrices."""
+    L = _cholesky(xp, P)
+    n = P.shape[-1]
+    zero = xp.zeros_like(P[..., 0, 0])
+    rows = [[zero] * n for _ in range(n)]
+    for j in range(n):
+        rows[j][j] = 1.0 / L[j][j]
+        for i in range(j + 1, n):
+            total = zero
+            for k in range(j, i):
+                total = total + L[i][k] * rows[k][j]
+            rows[i][j] = -total / L[i][i]
+    M = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    return xp.swapaxes(M, -1, -2) @ M
+
+
+def symmetric_part(
+    xp: ModuleType, P: Float[AnyArray, "*stack n n"]
+) -> Float[AnyArray, "*stack n n"]:
+    """Return the symmetric parts of matrices."""
+    return 0.5 * (P + xp.swapaxes(P, -1, -2))
