@@ -3,23 +3,22 @@
 import cvxpy as cp
 import numpy as np
 
-from jaxid.identification.consistency.data import Data
-from jaxid.identification.consistency.possible import PossibleParameters
+from jaxid.identification.consistency.feasible_set import FeasibleSet, ScaledRows
 
 
-def problem(possible: PossibleParameters, data: Data) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
+def problem(feasible: FeasibleSet, data: ScaledRows) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
     """The fit as a conic program, written down in SI units anew; its variables and their units."""
-    bounds = possible.bounds
+    bounds = feasible.bounds
     size = data.A.shape[1]
     norms = np.linalg.norm(data.A, axis=0)
     unit = np.where(norms > 0, 10.0 * np.linalg.norm(data.b) / np.where(norms > 0, norms, 1), 0)
-    for k, columns in enumerate(possible.bodies):
+    for k, columns in enumerate(feasible.bodies):
         L, m = bounds.radius[k], bounds.mass_max[k]
         unit[list(columns)] = (m * L ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2]))[: len(columns)]
     y = cp.Variable(size)
     p = cp.multiply(unit, y)
     constraints = []
-    for k, columns in enumerate(possible.bodies):
+    for k, columns in enumerate(feasible.bodies):
         m, h = p[columns[0]], p[list(columns[1:4])]
         A, B, C = (p[j] for j in columns[4:7])
         D, E, F = (p[j] for j in columns[7:]) if len(columns) == 10 else (0.0, 0.0, 0.0)
@@ -34,7 +33,7 @@ def problem(possible: PossibleParameters, data: Data) -> tuple[cp.Problem, cp.Va
         )
         shrink = np.diag([1 / L, 1 / L, 1 / L, 1.0]) / np.sqrt(bounds.mass_max[k])
         constraints += [
-            shrink @ (pseudo - possible.floors[k]) @ shrink >> 0,
+            shrink @ (pseudo - feasible.floors[k]) @ shrink >> 0,
             m / bounds.mass_max[k] <= 1,
             m >= bounds.mass_min[k],
             L**2 * m >= (A + B + C) / 2,
@@ -48,19 +47,19 @@ def problem(possible: PossibleParameters, data: Data) -> tuple[cp.Problem, cp.Va
         if np.isfinite(axes).all():
             away = h - bounds.ellipsoid_centre[k] * m
             constraints.append(cp.norm(cp.multiply(1 / axes, away)) <= m)
-    drives = list(possible.drives)
+    drives = list(feasible.drives)
     constraints += [y[drives] >= 0, y[drives] <= 1]
-    for coupling in possible.couplings:
+    for coupling in feasible.couplings:
         parts = [p[j] * basis for j, basis in zip(coupling.columns, coupling.basis, strict=True)]
         constraints.append(sum(parts[1:], parts[0]) >> 0)
     if bounds.total_mass is not None:
-        constraints.append(cp.sum(p[[c[0] for c in possible.bodies]]) == bounds.total_mass)
+        constraints.append(cp.sum(p[[c[0] for c in feasible.bodies]]) == bounds.total_mass)
     objective = 0.5 * cp.sum_squares((data.A * unit) @ y - data.b)
     return cp.Problem(cp.Minimize(objective), constraints), y, unit
 
 
-def optimum(possible: PossibleParameters, data: Data) -> tuple[float, np.ndarray]:
+def optimum(feasible: FeasibleSet, data: ScaledRows) -> tuple[float, np.ndarray]:
     """Smallest half squares, and the parameters, by CLARABEL."""
-    fit, y, unit = problem(possible, data)
+    fit, y, unit = problem(feasible, data)
     fit.solve(cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
     return float(fit.value), unit * np.asarray(y.value)

@@ -5,9 +5,7 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.experiment.tables import EstimatorTable
-from jaxid.identification.consistency.bounds import BodyBounds
-from jaxid.identification.consistency.estimator import PhysicallyConsistent
-from jaxid.identification.consistency.priors import EntropicPull
+from jaxid.identification.consistency import BodyBounds, EntropicPull, PhysicallyConsistent
 from jaxid.identification.weights import AbstractWeights
 from jaxid.robot.robot import Robot
 

@@ -269,7 +269,7 @@ def show_fit(console: Console, fit: Fit) -> None:
 
 def show_notes(console: Console, notes: Sequence[str], fit: Fit) -> None:
     """What was assumed and found, but for what the table of bodies is going to say."""
-    shown = () if fit.consistency is None else fit.consistency.tabulated
+    shown = () if fit.consistency is None else fit.consistency.findings
     sentences(console, [*notes, *(said for said in fit.notes if said not in shown)])
 
 

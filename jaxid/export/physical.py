@@ -8,7 +8,7 @@ from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.projection import inertia_tensor
 from jaxid.errors import InputError
 from jaxid.export.feed_forward import bodies_of
-from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
+from jaxid.identification.consistency import consistency_margin
 from jaxid.identification.fit import Fit
 from jaxid.robot.robot import Robot
 
@@ -94,7 +94,7 @@ def possible_bodies(fit: Fit, what: str) -> Float[np.ndarray, "joints 10"]:
             f"{way_out}."
         )
     bodies = bodies_of(fit.base.model, fit.standard_parameters)
-    shares = np.asarray(share_of_a_body(bodies))
+    shares = np.asarray(consistency_margin(bodies))
     wrong = np.flatnonzero(~(shares >= IMPOSSIBLE) | ~(bodies[:, 0] > 0))
     if len(wrong):
         raise InputError(

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia
+from jaxid.identification.consistency import pseudo_inertia
 from jaxid.program import program_of_scalars
 from jaxid.program.operation import Operation
 from jaxid.program.scalar import apply

@@ -1,6 +1,7 @@
 """Estimators: how parameters follow from rows."""
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -8,7 +9,6 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.consistency.consistency import Consistency
 from jaxid.identification.factors import Blocks
 from jaxid.identification.influence import AbstractInfluence, ByJoint
 from jaxid.identification.rows import Rows
@@ -40,7 +40,7 @@ class Estimate(eqx.Module):
         solution: How the weighted system was solved.
         standard: Standard parameters, of an estimator that finds a complete set of them.
         notes: What the user should know, in sentences.
-        consistency: How a physically consistent estimate came about.
+        consistency: `Consistency` of a physically consistent estimate, or None.
         taken: Number of parameters that the rows decide, of which regularised ones are a part;
             found from `inverse` if None.
     """
@@ -54,7 +54,7 @@ class Estimate(eqx.Module):
     solution: AbstractSpectralSolution = Complete()
     standard: Float[AnyArray, " standard"] | None = None
     notes: tuple[str, ...] = eqx.field(static=True, default=())
-    consistency: Consistency | None = None
+    consistency: Any = None
     taken: float | None = None
 
     @classmethod

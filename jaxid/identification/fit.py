@@ -12,7 +12,7 @@ from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.identification.consistency.consistency import Consistency
+from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators import AbstractEstimator, EstimatorInWords
 from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.model_file import checksum_of, read_model, write_model

@@ -6,7 +6,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from jaxid.identification.consistency.consistency import Consistency
+from jaxid.identification.consistency import Consistency
 from jaxid.identification.fit import Fit
 from jaxid.report.numbers import aligned, percent, significant
 from jaxid.report.tables import plain_table
@@ -30,7 +30,7 @@ def body_table(found: Consistency, names: tuple[str, ...]) -> Table:
             (f"{axis} of centre\n[m]", [significant(x, 2) for x in centre[:, k]])
             for k, axis in enumerate("xyz")
         ),
-        ("from flat\n[%]", [percent(x) for x in found.shares]),
+        ("from flat\n[%]", [percent(x) for x in found.margins]),
     ]
     for title, _ in columns:
         table.add_column(Text(title), justify="right", no_wrap=True)
@@ -50,7 +50,10 @@ def consistency_facts(found: Consistency) -> list[tuple[str, str]]:
     """
     proof = f"within {found.error_bound:.1e} of it, {found.iterations} iterations"
     return [
-        ("price", f"weighted residuals {100 * found.price:.2g} % above those without bounds"),
+        (
+            "price",
+            f"weighted residuals {100 * found.residual_increase:.2g} % above those without bounds",
+        ),
         ("optimum", proof),
         ("bounds that decide", "; ".join(found.active) or "none"),
     ]
@@ -70,19 +73,19 @@ def consistency_content(fit: Fit) -> dict[str, Any] | None:
         model.parameter_names,
         model.parameter_units,
         np.asarray(fit.full_parameters).tolist(),
-        found.decided.tolist(),
+        found.determined.tolist(),
         strict=True,
     )
     keys = ("name", "unit", "estimate", "follows_from_forces_alone")
     return {
-        "price": found.price,
+        "price": found.residual_increase,
         "error_bound": found.error_bound,
         "proved": found.outcome.name == "CERTIFIED",
         "outcome": found.outcome.value,
         "iterations": found.iterations,
-        "assumed": found.bounds.sentence,
+        "assumed": str(found.bounds),
         "active_bounds": found.active,
         "masses_from_bounds": [f"m{k + 1}" for k in found.masses_from_bounds],
-        "shares_of_a_body": found.shares,
+        "shares_of_a_body": found.margins,
         "standard_parameters": [dict(zip(keys, row, strict=True)) for row in columns],
     }

@@ -16,7 +16,7 @@ from jaxid.excitation.plan import ExcitationPlan
 from jaxid.experiment.demo.feed_forward import Timing, timing
 from jaxid.experiment.demo.following import Followed, followed
 from jaxid.experiment.progress import Stages
-from jaxid.identification.consistency.estimator import PhysicallyConsistent
+from jaxid.identification.consistency import PhysicallyConsistent
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows

@@ -189,8 +189,8 @@ def _coupled(
         largest: Units of the drives' variables.
     """
     w, bounds = feasible.width, feasible.bounds
-    ellipsoids = np.flatnonzero(bounds.has_ellipsoid)
-    if not len(ellipsoids) and not feasible.couplings:
+    ellipsoids = np.flatnonzero(bounds.has_ellipsoid).tolist()
+    if not ellipsoids and not feasible.couplings:
         return np.zeros((0, 0, 4, 4)), np.zeros((0, 0), int), np.zeros((0, 4, 4))
     matrices, members, fillings = [], [], []
     for k in ellipsoids:

@@ -107,7 +107,7 @@ def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
 
 
 def are_definite(P: Float[AnyArray, "stack n n many"]) -> Bool[AnyArray, "stack many"]:
-    """Return whether matrices, which lie side by side along the last axis, are positive definite."""
+    """Return whether matrices, side by side along the last axis, are positive definite."""
     good = P[:, 0, 0] > 0
     for _ in range(P.shape[1] - 1):
         column = P[:, 1:, 0]

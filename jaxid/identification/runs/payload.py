@@ -11,9 +11,7 @@ from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.terms import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.errors import InputError
-from jaxid.identification.consistency.bounds import BodyBounds
-from jaxid.identification.consistency.pseudo_inertia import share_of_a_body
-from jaxid.identification.consistency.single_body import consistent_body
+from jaxid.identification.consistency import BodyBounds, consistency_margin, consistent_body
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.states import own_parameters, state_maps
@@ -125,7 +123,7 @@ def identify_payload(
         body: Index of the body that carries it; that of the end-effector if None.
         varying: Names of base parameters that may differ between the runs beside the payload. If
             None, friction and offsets: they change with load and temperature.
-        bounds: What is known of the payload: `BodyBounds.of(1, mass_max=..., radius=...)`. If None,
+        bounds: What is known of the payload: `BodyBounds(mass_max=..., radius=...)`. If None,
             wide ones from the robot's reach, which count only if the estimate could not exist.
 
     Raises:
@@ -156,10 +154,10 @@ def _possible(
     if not np.isfinite(covariance).all():
         return estimate, np.nan
     if bounds is None:
-        if share_of_a_body(estimate) >= 0:
+        if consistency_margin(estimate) >= 0:
             return estimate, 0.0
         wide = BodyBounds.from_geometry(robot)
-        bounds = BodyBounds.of(1, mass_max=np.max(wide.mass_max), radius=np.max(wide.radius))
+        bounds = BodyBounds(mass_max=np.max(wide.mass_max), radius=np.max(wide.radius))
     # Estimates that are known too well, as those of noiseless data, leave no digits for a proof.
     found = consistent_body(estimate, covariance, bounds, throw=False)
     if not found.error_bound <= LOOSE * (1.0 + found.distance**2):

@@ -4,7 +4,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
-from jaxid.identification.consistency.data import Data, whitened
+from jaxid.identification.consistency.feasible_set import ScaledRows, scaled_rows
 from jaxid.simulation.virtual import random_bodies
 
 
@@ -38,6 +38,8 @@ def factor(
     return R[:, :-1], R[:, -1], len(rows), p
 
 
-def data(base: jid.BaseParameters, seed: int, noise: float = 0.05, samples: int = 200) -> Data:
+def data(
+    base: jid.BaseParameters, seed: int, noise: float = 0.05, samples: int = 200
+) -> ScaledRows:
     R, z, rows, _ = factor(base, seed, noise, samples)
-    return whitened(np, base, R, z, rows)
+    return scaled_rows(np, base, R, z, rows)

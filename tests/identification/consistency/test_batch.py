@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.identification.consistency.estimator import PhysicallyConsistent
-from jaxid.identification.consistency.interior_point import Outcome, solve_at_once
+from jaxid.identification.consistency.estimator import Outcome, PhysicallyConsistent
 from jaxid.identification.consistency.pseudo_inertia import (
     ball,
+    consistency_margin,
     inertial_parameters,
-    share_of_a_body,
 )
+from jaxid.identification.consistency.solver import solve_in_numpy
 
 TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.RotorInertia(), jid.ConstantOffset())
 
@@ -23,18 +23,18 @@ def test_a_batch_is_its_data_sets_one_by_one():
     R, z, rows = (np.array([f[k] for f in factors]) for k in range(3))
     many = jid.consistent_batch(base, R, z, rows)
     estimator = PhysicallyConsistent()
-    possible = estimator.possible(base)
+    feasible = estimator.feasible_set(base)
     for k in range(3):
-        data = arms.data(base, k, 0.2, 100)
-        optimum = solve_at_once(estimator.program(np, possible, data))
-        p = possible.standard(np, data.A, data.b, optimum.y)
+        data, program = estimator.program(np, base, feasible, R[k], z[k], rows[k])
+        optimum = solve_in_numpy(program)
+        p = feasible.standard_parameters(np, data.A, data.b, optimum.y)
         np.testing.assert_allclose(many.parameters[k], base.from_standard(p), rtol=1e-3, atol=1e-4)
         free = np.linalg.norm(data.b[base.size :])
         price = np.sqrt(2.0 * optimum.value) / free - 1.0
-        np.testing.assert_allclose(many.prices[k], price, atol=1e-6)
+        np.testing.assert_allclose(many.residual_increases[k], price, atol=1e-6)
     assert many.certified.all()
     bodies = np.asarray(many.standard)[:, :20].reshape(3, 2, 10)
-    assert (share_of_a_body(bodies) > 0).all()
+    assert (consistency_margin(bodies) > 0).all()
     with pytest.raises(ValueError, match="`R`, `z` and `rows` must have the shapes"):
         jid.consistent_batch(base, R[:, :, :-1], z, rows)
 
@@ -56,8 +56,8 @@ BODY = inertial_parameters(ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.arr
 
 
 def test_a_possible_body_stays():
-    bounds = jid.BodyBounds.of(1, mass_max=10.0, radius=0.5)
-    assert share_of_a_body(BODY) > 0
+    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
+    assert consistency_margin(BODY) > 0
     found = jid.consistent_body(BODY, 1e-4 * np.eye(10), bounds)
     np.testing.assert_allclose(found.parameters, BODY, atol=1e-4)
     assert found.distance < 0.05
@@ -65,12 +65,12 @@ def test_a_possible_body_stays():
 
 
 def test_an_impossible_body_moves_as_little_as_its_errors_allow():
-    bounds = jid.BodyBounds.of(1, mass_max=10.0, radius=0.5)
+    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
     wrong = BODY.copy()
     wrong[6] = -0.02
     covariance = np.diag([1e-4, *[1e-4] * 3, *[1e-6] * 2, 1e-2, *[1e-6] * 3])
     found = jid.consistent_body(wrong, covariance, bounds)
-    assert share_of_a_body(found.parameters) > 0
+    assert consistency_margin(found.parameters) > 0
     assert abs(found.parameters[4] - wrong[4]) < 5e-3
     assert found.parameters[6] > 0
     shift = (found.parameters - wrong) / np.sqrt(np.diag(covariance))
@@ -78,6 +78,6 @@ def test_an_impossible_body_moves_as_little_as_its_errors_allow():
 
 
 def test_an_undetermined_body_is_refused():
-    bounds = jid.BodyBounds.of(1, mass_max=10.0, radius=0.5)
+    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
     with pytest.raises(ValueError, match="`covariance` must be positive definite"):
         jid.consistent_body(BODY, np.diag([1.0] * 9 + [-1.0]), bounds)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.identification.consistency import interior_point
-from jaxid.identification.consistency.possible import PossibleParameters, nominal_bodies
-from jaxid.identification.consistency.program import program_of
+from jaxid.identification.consistency import solver
+from jaxid.identification.consistency.cone_program import cone_program
+from jaxid.identification.consistency.feasible_set import feasible_set, nominal_bodies
 
 TERMS = (
     jid.RigidBodies(),
@@ -32,11 +32,11 @@ def _robot(name):
 def _case(name, terms=TERMS, margin=0.0, **bounds):
     base = jid.base_parameters(jid.Model(_robot(name), terms))
     wide = jid.BodyBounds.from_geometry(base.model.robot)
-    return base, PossibleParameters.of(base.model, wide.replace(**bounds), margin)
+    return base, feasible_set(base.model, wide.replace(**bounds), margin)
 
 
-def _program(possible, data):
-    return program_of(np, possible, data.A, data.b, data.scale)
+def _program(feasible, data):
+    return cone_program(np, feasible, data)
 
 
 CASES = {
@@ -63,48 +63,48 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_the_optimum_is_a_conic_solvers(name):
-    (base, possible), noise = CASES[name]
+    (base, feasible), noise = CASES[name]
     data = arms.data(base, 3, noise)
-    optimum = interior_point.solve_at_once(_program(possible, data))
-    value, p = conic.optimum(possible, data)
+    optimum = solver.solve_in_numpy(_program(feasible, data))
+    value, p = conic.optimum(feasible, data)
     assert optimum.certified
     assert optimum.iterations <= 30
     assert abs(optimum.value - value) <= 1e-6 * value
-    ours = possible.standard(np, data.A, data.b, optimum.y)
+    ours = feasible.standard_parameters(np, data.A, data.b, optimum.y)
     np.testing.assert_allclose(
         data.A @ ours, data.A @ p, atol=5e-3 * np.sqrt(value), err_msg="forces of the optimum"
     )
 
 
 def test_noise_free_forces_are_met_exactly():
-    (base, possible), _ = CASES["a seven-axis arm"]
+    (base, feasible), _ = CASES["a seven-axis arm"]
     data = arms.data(base, 5, 0.0)
-    optimum = interior_point.solve_at_once(_program(possible, data))
+    optimum = solver.solve_in_numpy(_program(feasible, data))
     assert optimum.certified
     assert optimum.value < 1e-6 * data.scale
 
 
 def test_the_bound_holds_on_the_way(monkeypatch):
-    (base, possible), _ = CASES["coupled drives"]
-    program = _program(possible, arms.data(base, 7, 0.3))
-    best = interior_point.solve_at_once(program).value
+    (base, feasible), _ = CASES["coupled drives"]
+    program = _program(feasible, arms.data(base, 7, 0.3))
+    best = solver.solve_in_numpy(program).value
     for most in (1, 3, 6, 9):
-        monkeypatch.setattr(interior_point, "MOST", most)
-        early = interior_point.solve_at_once(program)
+        monkeypatch.setattr(solver, "MAX_ITERATIONS", most)
+        early = solver.solve_in_numpy(program)
         assert early.value - best <= early.error * (1 + 1e-9)
         assert not early.certified
 
 
 def test_the_bound_holds_with_a_pull(monkeypatch):
-    (base, possible), _ = CASES["all bounds"]
+    (base, feasible), _ = CASES["all bounds"]
     data = arms.data(base, 7, 0.3)
-    prior = nominal_bodies(possible.bounds)
-    program = program_of(np, possible, data.A, data.b, data.scale, 3.0, prior)
-    optimum = interior_point.solve_at_once(program)
+    prior = nominal_bodies(feasible.bounds)
+    program = cone_program(np, feasible, data, 3.0, prior)
+    optimum = solver.solve_in_numpy(program)
     assert optimum.certified
 
     def objective(y):
-        S = program.matrices(np, y)[: program.bodies] - program.floors
+        S = program.slacks(np, y)[0][: program.bodies]
         away = program.A @ y - program.b
         return 0.5 * away @ away + 3.0 * np.sum(
             np.einsum("kab,kab->k", program.prior, S) - np.linalg.slogdet(S)[1]
@@ -112,18 +112,18 @@ def test_the_bound_holds_with_a_pull(monkeypatch):
 
     best = objective(optimum.y)
     for most in (2, 5):
-        monkeypatch.setattr(interior_point, "MOST", most)
-        early = interior_point.solve_at_once(program)
+        monkeypatch.setattr(solver, "MAX_ITERATIONS", most)
+        early = solver.solve_in_numpy(program)
         assert -1e-6 <= objective(early.y) - best <= early.error * (1 + 1e-9)
 
 
 def test_both_machines_find_the_same():
-    (base, possible), _ = CASES["coupled drives"]
-    programs = [_program(possible, arms.data(base, seed, 0.2)) for seed in range(3)]
+    (base, feasible), _ = CASES["coupled drives"]
+    programs = [_program(feasible, arms.data(base, seed, 0.2)) for seed in range(3)]
     stacked = jax.tree.map(lambda *x: np.stack(x), *programs)
-    many = jax.vmap(interior_point.solve_compiled)(stacked)
+    many = jax.vmap(solver.solve_compiled)(stacked)
     for k, program in enumerate(programs):
-        one = interior_point.solve_at_once(program)
+        one = solver.solve_in_numpy(program)
         np.testing.assert_allclose(many.value[k], one.value, rtol=1e-6)
         assert many.certified[k]
         assert abs(int(many.iterations[k]) - int(one.iterations)) <= 2

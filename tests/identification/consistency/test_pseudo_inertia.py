@@ -6,8 +6,8 @@ import pytest
 import jaxid as jid
 from jaxid.identification.consistency.pseudo_inertia import (
     ball,
+    consistency_margin,
     inertial_parameters,
-    share_of_a_body,
 )
 
 
@@ -36,9 +36,9 @@ def test_the_order_is_that_of_tools():
 )
 def test_the_triangle_inequality_decides(moments, possible):
     body = np.array([5.0, 0.0, 0.0, 0.0, *moments, 0.0, 0.0, 0.0])
-    assert (share_of_a_body(body) > 0) == possible
+    assert (consistency_margin(body) > 0) == possible
 
 
 def test_a_centre_of_mass_too_far_out_is_impossible():
     body = np.array([1.0, 0.5, 0.0, 0.0, 0.1, 0.2, 0.2, 0.0, 0.0, 0.0])
-    assert share_of_a_body(body) < 0
+    assert consistency_margin(body) < 0
