@@ -94,7 +94,6 @@ from jaxid.identification.nonlinear.temperature import TemperatureLaw as Tempera
 from jaxid.identification.nonlinear.temperature import temperature_law as temperature_law
 from jaxid.identification.nonlinear.verdict import NonlinearFit as NonlinearFit
 from jaxid.identification.nonlinear.verdict import identify_nonlinear as identify_nonlinear
-from jaxid.identification.opening import open_log as open_log
 from jaxid.identification.prior import RelativeTo as RelativeTo
 from jaxid.identification.robust import AbstractLoss as AbstractLoss
 from jaxid.identification.robust import Huber as Huber
@@ -143,6 +142,7 @@ from jaxid.measurement.filters import AbstractFilter as AbstractFilter
 from jaxid.measurement.filters import PaperFilter as PaperFilter
 from jaxid.measurement.filters import PeriodicFourier as PeriodicFourier
 from jaxid.measurement.filters import ZeroPhaseButterworth as ZeroPhaseButterworth
+from jaxid.measurement.log_on_disk import scan_log as scan_log
 from jaxid.measurement.observations import Observations as Observations
 from jaxid.measurement.observations import observe as observe
 from jaxid.measurement.read import read_recording as read_recording

@@ -1,6 +1,5 @@
 """The commands `jaxid init`, `example`, `inspect`, `identify`; what all run through."""
 
-import dataclasses
 import functools
 import importlib.metadata
 import io
@@ -45,8 +44,6 @@ from jaxid.identification.rows import Rows
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.twice import share_data
 from jaxid.identification.runs.update import update
-from jaxid.identification.streaming_log import LongLog, source
-from jaxid.measurement.observations import Observations
 from jaxid.program.cache import keep_compiled
 from jaxid.report.content import Beside
 from jaxid.report.write import write_report
@@ -266,13 +263,13 @@ def identify(
         if split is not None:
             parts = [o.split(split) for o in fitted]
             percent = f"{100 * split:g}"
-            fitted = [_named(a, f"{a.name}, first {percent} %") for a, _ in parts]
-            checked = [*(_named(b, f"{b.name}, rest") for _, b in parts), *checked]
+            fitted = [a.replace(name=f"{a.name}, first {percent} %") for a, _ in parts]
+            checked = [*(b.replace(name=f"{b.name}, rest") for _, b in parts), *checked]
         stage("finding base parameters")
         base = loaded.base
         stage("factorising the rows")
-        rows = Rows.of(base, fitted, stage.through(sum(map(_samples, fitted))))
-        fit = loaded.fit(rows, stage.through(sum(map(_samples, fitted))))
+        rows = Rows.of(base, fitted, stage.through(sum(o.samples for o in fitted)))
+        fit = loaded.fit(rows, stage.through(sum(o.samples for o in fitted)))
         run = Run.of_rows(rows, fit)
         if not run.tells(fit):
             said.append(KEPT)
@@ -285,7 +282,7 @@ def identify(
                         "has seen a log is not verified by it; verify with another."
                     )
         stage("predicting torques")
-        through = stage.through(max(map(_samples, [*fitted, *checked])))
+        through = stage.through(max(o.samples for o in [*fitted, *checked]))
         found = validate(fit, [*fitted, *checked], progress=through)
         beside = None
         doubtful = loaded.regularised or loaded.single_axes is not None or fit.undetermined
@@ -351,16 +348,6 @@ def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -
         )
     whole = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), run])
     return whole.fit, whole
-
-
-def _named(observations: Observations | LongLog, name: str) -> Observations | LongLog:
-    if isinstance(observations, LongLog):
-        return observations.named(name)
-    return dataclasses.replace(observations, name=name)
-
-
-def _samples(observations: Observations | LongLog) -> int:
-    return len(source(observations)[0].time)
 
 
 app.command()(demo)

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from jaxid.identification.streaming_log import LongLog
+from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 
 EXAMINED = 2**17
@@ -15,7 +15,7 @@ EDGES = 20
 """Length of a stretch over what filters lose at one end, at least."""
 
 
-def excerpt(log: LongLog) -> Recording:
+def excerpt(log: Observations) -> Recording:
     """Some stretches of a log, as they were recorded: at its beginning, at its end and between.
 
     Args:
@@ -26,32 +26,32 @@ def excerpt(log: LongLog) -> Recording:
     """
     stretches = _stretches(log)
     angles, velocities, forces = zip(
-        *(log.recorded(slice(a, b)) for a, b in stretches), strict=True
+        *(log.source.read_recorded(slice(a, b)) for a, b in stretches), strict=True
     )
     ends = np.cumsum([0, *(b - a for a, b in stretches)])
     times = []
     for a, b in stretches:
         k = next(k for k, (_, end) in enumerate(log.segments) if end > a)
-        times.append(log.times[k] + log.sample_time * (np.arange(a, b) - log.segments[k][0]))
+        times.append(log.start_times[k] + log.sample_time * (np.arange(a, b) - log.segments[k][0]))
     return Recording(
         time=np.concatenate(times),
         angles=np.concatenate(angles),
         forces=np.concatenate(forces),
         velocities=None if velocities[0] is None else np.concatenate(velocities),
-        angles_on_motor_side=log.columns.angles_on_motor_side,
-        forces_on_motor_side=log.columns.forces_on_motor_side,
+        angles_on_motor_side=log.source.columns.angles_on_motor_side,
+        forces_on_motor_side=log.source.columns.forces_on_motor_side,
         segments=tuple((int(a), int(b)) for a, b in itertools.pairwise(ends)),
         sample_time=log.sample_time,
         name=log.name,
     )
 
 
-def _stretches(log: LongLog) -> list[tuple[int, int]]:
+def _stretches(log: Observations) -> list[tuple[int, int]]:
     """Half-open ranges of samples, none of which goes over a gap."""
     if log.samples <= EXAMINED:
         return list(log.segments)
     length = EXAMINED // STRETCHES
-    least = EDGES * log.outline.filter.edge(log.sample_time)
+    least = EDGES * log.filter.edge(log.sample_time)
     found = []
     for start in np.linspace(0, log.samples - length, STRETCHES).astype(int):
         a = max(int(start), found[-1][1] if found else 0)

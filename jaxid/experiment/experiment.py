@@ -36,18 +36,17 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
 from jaxid.identification.nonlinear.estimator import NonlinearFriction
 from jaxid.identification.nonlinear.verdict import identify_nonlinear
-from jaxid.identification.opening import open_log
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import Complete, CrossValidated
 from jaxid.identification.stepwise import Stepwise
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.methods import AbstractUncertainty
 from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
 from jaxid.measurement.delay import remove_delay
 from jaxid.measurement.filters import AbstractFilter
+from jaxid.measurement.log_on_disk import scan_log
 from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.parts import estimated_rows
 from jaxid.measurement.read import read_recording
@@ -213,7 +212,7 @@ class Experiment:
         """Whether a log is better read part by part than as a whole."""
         return estimated_rows(Path(log)) >= LONG
 
-    def open(self, log: str | Path, progress: Progress | None = None) -> LongLog:
+    def open(self, log: str | Path, progress: Progress | None = None) -> Observations:
         """Opens a log that need not fit into memory: like `read` and `observe`, part by part.
 
         Args:
@@ -228,7 +227,7 @@ class Experiment:
         table, columns = self._columns_of(log)
         if table.force_delay:
             raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
-        return open_log(
+        return scan_log(
             log,
             columns,
             self.robot,

@@ -11,7 +11,6 @@ from jaxid.experiment.progress import Stages
 from jaxid.experiment.robot_tables import within
 from jaxid.experiment.sanity import LogCheck, check_log, check_long_log
 from jaxid.identification.filter_choice import FilterChoice, choose_filter
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.measurement.survey import NeedsMemory
@@ -30,8 +29,8 @@ class Loaded:
         notes: How it was read, in sentences.
     """
 
-    recording: Recording | LongLog
-    observations: Observations | LongLog
+    recording: Recording | Observations
+    observations: Observations
     check: LogCheck
     examined: Observations | None
     notes: tuple[str, ...] = ()
@@ -39,7 +38,8 @@ class Loaded:
     @property
     def sides(self) -> tuple[bool, bool]:
         """Whether its angles and forces are taken for the motors'."""
-        held = self.recording.columns if isinstance(self.recording, LongLog) else self.recording
+        recording = self.recording
+        held = recording if isinstance(recording, Recording) else recording.source.columns
         return held.angles_on_motor_side, held.forces_on_motor_side
 
 
@@ -74,7 +74,7 @@ def load_log(experiment: Experiment, path: Path, stage: Stages, name: str | None
 def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None) -> Loaded:
     stage(f"opening {path.name}")
     log = experiment.open(path)
-    log = log if name is None else log.named(name)
+    log = log if name is None else log.replace(name=name)
     stage(f"looking through {path.name}")
     part = excerpt(log)
     check = check_long_log(experiment.robot, log, part, stage.through(log.samples))
@@ -84,8 +84,7 @@ def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None)
         examined, why = None, f" of single channels only: {error}"
     if part.samples < log.samples or examined is None:
         note = f"{part.samples} of the {log.samples} samples were examined for slips{why}"
-        outline = dataclasses.replace(log.outline, notes=(*log.notes, note))
-        log = dataclasses.replace(log, outline=outline)
+        log = log.replace(notes=(*log.notes, note))
     every = compared_rows(log)
     if every == 1:
         return Loaded(log, log, check, examined)

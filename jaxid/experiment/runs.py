@@ -13,7 +13,6 @@ from jaxid.identification.identify import fit_rows
 from jaxid.identification.rows import Rows
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.update import load_run, update
-from jaxid.identification.streaming_log import source
 from jaxid.report.write import RUN
 
 
@@ -87,7 +86,7 @@ def read_run(
     if logs:
         observed = [log.observations for log in logs]
         stage(f"factorising the rows, {name}")
-        through = stage.through(sum(len(source(o)[0].time) for o in observed))
+        through = stage.through(sum(o.samples for o in observed))
         rows = Rows.of(experiment.base, observed, through)
         fit = fit_rows(rows, experiment.plain)
         doubts += slips_of(logs, fit)

@@ -18,7 +18,6 @@ from jaxid.experiment.faults import channel_faults
 from jaxid.experiment.mistakes import FRICTION
 from jaxid.identification.fit import Fit
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
@@ -82,7 +81,7 @@ def check_log(robot: Robot, recording: Recording, observations: Observations) ->
 
 
 def check_long_log(
-    robot: Robot, log: LongLog, part: Recording, progress: Progress | None = None
+    robot: Robot, log: Observations, part: Recording, progress: Progress | None = None
 ) -> LogCheck:
     """The same for a log that is gone through part by part.
 
@@ -99,7 +98,7 @@ def check_long_log(
         last = np.zeros((0, robot.joints))
         for start in range(a, b, AT_ONCE):
             stop = min(start + AT_ONCE, b)
-            motion, forces, angles = log.seen(slice(start, stop))
+            motion, forces, angles = log.source.read_with_angles(slice(start, stop))
             look.steps(np.concatenate([last, angles]))
             look.motion(motion, forces, log.sample_time)
             last = angles[-1:]

@@ -18,7 +18,6 @@ from jaxid.identification.fit import DOUBTFUL as DOUBTFUL_SHARE
 from jaxid.identification.fit import TRUSTED, Fit, Trust
 from jaxid.identification.runs.comparison import Comparison, Verdict
 from jaxid.identification.solutions import AbstractSpectralSolution
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.report.bodies import body_table, consistency_facts
@@ -126,7 +125,7 @@ def show_base(console: Console, base: BaseParameters) -> None:
     sentences(console, base.notes, DOUBTFUL, "!")
 
 
-def show_recording(console: Console, recording: Recording | LongLog) -> None:
+def show_recording(console: Console, recording: Recording | Observations) -> None:
     """Samples, rate, duration and gaps of a log."""
     gaps = len(recording.segments) - 1
     heading(console, f"log {recording.name}")
@@ -177,7 +176,7 @@ def _beside(value: float, limit: float) -> Text:
     return Text.assemble(significant(float(value)), (f" ({shown})", "dim"))
 
 
-def show_rows(console: Console, observations: Iterable[Observations | LongLog], fit: Fit) -> None:
+def show_rows(console: Console, observations: Iterable[Observations], fit: Fit) -> None:
     """How many rows there are, and how well they tell the parameters apart."""
     numbers = fit.condition_numbers
     rows = fit.rows

@@ -1,6 +1,5 @@
 """Many data sets for any estimator: one after the other, on all cores."""
 
-import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,8 +14,6 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import identify
 from jaxid.identification.normal_equations import BatchFit
 from jaxid.identification.uncertainty.methods import IndependentRows, SpectralSandwich
-from jaxid.measurement.decimation import Subsample
-from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations
 
 AS_IT_IS = 0.4
@@ -54,15 +51,10 @@ def estimate_each(
 
     def one(case: tuple[int, int]) -> Fit:
         k, draw = case
-        o = Observations(
-            time=dt * np.arange(Q.shape[-2]),
-            motion=Motion(q[k], qd[k], qdd[k]),
-            forces=Q[k, draw],
-            filter=ZeroPhaseButterworth(AS_IT_IS / dt, force_cutoff=math.inf, margin=0.0),
-            decimation=Subsample(1),
-            segments=((0, Q.shape[-2]),),
-            mask=counted[k],
+        o = Observations.of(
+            *(q[k], qd[k], qdd[k], Q[k, draw]),
             sample_time=dt,
+            mask=counted[k],
             name=f"data set {k + 1}",
         )
         return identify(base, o, estimator, uncertainty=uncertainty)

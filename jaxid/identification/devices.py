@@ -27,7 +27,6 @@ from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks, Factors, JointFactor, condensed, factorise
 from jaxid.identification.sharded import sharded
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 
 AT_ONCE = 8192
@@ -132,7 +131,7 @@ def shards(folder: str | Path, pattern: str = "*.parquet") -> tuple[Path, ...]:
     """The files of a data set that this process reads; all of them in a single process.
 
     Large files are dealt first, each to the process with the fewest bytes so far: alike in all
-    processes, without asking. Open each with `open_log`.
+    processes, without asking. Open each with `scan_log`.
 
     Args:
         folder: Of the data set, which all processes see.
@@ -156,7 +155,7 @@ def shards(folder: str | Path, pattern: str = "*.parquet") -> tuple[Path, ...]:
 
 def factorise_across_processes(
     base: BaseParameters,
-    recordings: Sequence[Observations | LongLog],
+    recordings: Sequence[Observations],
     blocks: int = 10,
     patience: float | int = PATIENCE,
     progress: Progress | None = None,

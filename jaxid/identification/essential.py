@@ -15,7 +15,6 @@ from jaxid.identification.held_out import folds
 from jaxid.identification.identify import fit_rows
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import NUMERICAL
-from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.methods import AbstractUncertainty
 from jaxid.measurement.observations import Observations
 
@@ -82,7 +81,7 @@ class EssentialParameters(eqx.Module):
 
 def essential_parameters(
     fit: Fit,
-    observations: Observations | LongLog | Sequence[Observations | LongLog],
+    observations: Observations | Sequence[Observations],
     *,
     cost: float = COST,
     uncertainty: AbstractUncertainty | None = None,
@@ -104,7 +103,7 @@ def essential_parameters(
     """
     if not cost >= 0:
         raise InputError(f"`cost` must be a share of zero or more, but is {cost:g}.")
-    single = isinstance(observations, Observations | LongLog)
+    single = isinstance(observations, Observations)
     recordings = (observations,) if single else tuple(observations)
     rows = Rows.of(fit.base, recordings)
     if [int(n) for n in rows.factors.rows] != list(fit.rows):

@@ -18,8 +18,7 @@ from jaxid.dynamics.compiled import acting_columns
 from jaxid.identification.kernel import CHUNK as SAMPLES
 from jaxid.identification.reduction import reduced
 from jaxid.identification.sharded import StreamOnDevices, devices
-from jaxid.identification.streaming import Progress, Read, Stream, held, suits
-from jaxid.identification.streaming_log import LongLog, source
+from jaxid.identification.streaming import Progress, Stream, suits
 from jaxid.measurement.observations import Observations
 
 CHUNK = 65536
@@ -150,7 +149,7 @@ def empty(base: BaseParameters) -> Factors:
 
 def factorise(
     base: BaseParameters,
-    recordings: Sequence[Observations | LongLog],
+    recordings: Sequence[Observations],
     blocks: int = BLOCKS,
     progress: Progress | None = None,
 ) -> Blocks:
@@ -166,15 +165,14 @@ def factorise(
         progress: Is told now and then which share of a long log is done, of 1.
     """
     parts, done = [], 0
-    sources = [source(recording) for recording in recordings]
-    whole = sum(len(observations.time) for observations, _ in sources)
-    for observations, read in sources:
-        edges, samples = block_edges(observations, blocks), len(observations.time)
+    whole = sum(observations.samples for observations in recordings)
+    for observations in recordings:
+        edges, samples = block_edges(observations, blocks), observations.samples
         told = None if progress is None else _share_of(progress, done / whole, samples / whole)
         if suits(observations):
-            parts += streamed(base, observations, edges, read=read, progress=told)
+            parts += streamed(base, observations, edges, progress=told)
         else:
-            parts += _in_numpy(base, observations, edges, read)
+            parts += _in_numpy(base, observations, edges)
         done += samples
     return Blocks(tuple(parts))
 
@@ -192,12 +190,12 @@ def block_edges(observations: Observations, blocks: int = BLOCKS) -> list[int]:
 
 
 def _in_numpy(
-    base: BaseParameters, observations: Observations, edges: Sequence[int], read: Read
+    base: BaseParameters, observations: Observations, edges: Sequence[int]
 ) -> list[Factors]:
     """The factors of blocks of time, without compiling."""
     mask = np.asarray(observations.mask)
     factors = [empty(base) for _ in edges[1:]]
-    for rows, columns, forces in reduced_rows(base, observations, read=read):
+    for rows, columns, forces in reduced_rows(base, observations):
         for k, (first, last) in enumerate(itertools.pairwise(edges)):
             low, high = max(first, rows.start), min(last, rows.stop)
             if low < high:
@@ -211,7 +209,6 @@ def streamed(
     observations: Observations,
     edges: Sequence[int],
     chunk: int = SAMPLES,
-    read: Read | None = None,
     progress: Progress | None = None,
 ) -> list[Factors]:
     """The factors of blocks of time by the compiled loop, for logs of any length.
@@ -223,13 +220,12 @@ def streamed(
         observations: What was measured.
         edges: Rows at which the blocks begin, and the last one ends.
         chunk: Samples of an iteration of the loop.
-        read: Gives motion and forces of some samples; those of the observations if None.
         progress: Is told now and then which share of the log is done, of 1.
     """
     mask = np.asarray(observations.mask)
     acting = acting_columns(base)
     kind = StreamOnDevices if len(devices()) > 1 else Stream
-    triangles = kind(base, observations, edges, chunk, read, progress).triangles()
+    triangles = kind(base, observations, edges, chunk, progress).triangles()
     found = []
     for R, (first, last) in zip(triangles, itertools.pairwise(edges), strict=True):
         rows = mask[first:last].sum(axis=0)
@@ -252,7 +248,6 @@ def reduced_rows(
     base: BaseParameters,
     observations: Observations,
     samples: int = CHUNK,
-    read: Read | None = None,
     wanted: Sequence[tuple[int, int]] | None = None,
 ):
     """Goes through observations by chunks: row range, columns of each joint, and forces.
@@ -263,16 +258,14 @@ def reduced_rows(
         base: The base parameters.
         observations: What was measured.
         samples: Size of a chunk.
-        read: Gives motion and forces of some samples; those of the observations if None.
         wanted: Ranges of rows; chunks without any of them are left out. All if None.
 
     Yields:
         Slice of the rows; for each joint its columns [rows, columns of the joint]; forces
         [rows, joints] in [N m] or [N].
     """
-    read = held(observations) if read is None else read
     for chunk in observations.chunks(samples):
         first, last = chunk.rows
         if wanted is not None and not any(a < last and first < b for a, b in wanted):
             continue
-        yield slice(*chunk.rows), *reduced(base, *read(slice(*chunk.samples)), chunk)
+        yield slice(*chunk.rows), *reduced(base, *observations.read(slice(*chunk.samples)), chunk)

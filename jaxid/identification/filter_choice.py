@@ -208,7 +208,7 @@ def _inner(observations: Observations, edge: int) -> Observations:
     for a, b in observations.segments:
         far |= (at >= a + edge) & (at < b - edge)
     mask = np.asarray(observations.mask) & far[:, None]
-    return eqx.tree_at(lambda o: o.mask, observations, mask)
+    return observations.replace(mask=mask)
 
 
 def _with_motion(judge: Observations, observations: Observations) -> Observations:
@@ -218,7 +218,7 @@ def _with_motion(judge: Observations, observations: Observations) -> Observation
             f"the filters of `candidates` leave different parts of `{judge.name}`, whose gaps are "
             "close together: choose on a log without, or take filters whose edges are alike."
         )
-    return eqx.tree_at(lambda o: o.motion, judge, observations.motion)
+    return judge.replace(motion=observations.motion)
 
 
 def _errors(

@@ -17,7 +17,6 @@ from jaxid.identification.estimators import AbstractEstimator, EstimatorInWords
 from jaxid.identification.excited import UndeterminedDirection
 from jaxid.identification.model_file import checksum_of, read_model, write_model
 from jaxid.identification.solutions import AbstractSpectralSolution
-from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.identification.uncertainty.uncertainty import Uncertainty
 from jaxid.io import to_json
@@ -194,7 +193,7 @@ class Fit(eqx.Module):
 
     def _kept(self) -> "Fit":
         try:
-            to_json(self.estimator, refused=(Observations, LongLog))
+            to_json(self.estimator, refused=(Observations,))
         except InputError:
             return dataclasses.replace(self, estimator=EstimatorInWords(str(self.estimator)))
         return self

@@ -15,14 +15,13 @@ from jaxid.identification.fit import ConditionNumbers, Fit
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import NUMERICAL, AbstractSpectralSolution, Decomposition
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.uncertainty.methods import AbstractUncertainty, SpectralSandwich
 from jaxid.measurement.observations import Observations
 
 
 def identify(
     base: BaseParameters,
-    observations: Observations | LongLog | Sequence[Observations | LongLog],
+    observations: Observations | Sequence[Observations],
     estimator: AbstractEstimator | None = None,
     progress: Progress | None = None,
     uncertainty: AbstractUncertainty | None = None,
@@ -32,7 +31,7 @@ def identify(
     Args:
         base: What can be identified on this robot.
         observations: Of one recording, or of several that are fitted together; logs larger than
-            memory come from `open_log`.
+            memory come from `scan_log`.
         estimator: Weighted least squares with the largest forces if None.
         progress: Is told now and then which share of a pass over a long log is done, of 1.
         uncertainty: How standard deviations are found: the spectral sandwich if None.
@@ -145,7 +144,7 @@ def _check(base: Any, recordings: Sequence[Any]) -> None:
         )
     n = base.model.robot.joints
     for observations in recordings:
-        if not isinstance(observations, Observations | LongLog):
+        if not isinstance(observations, Observations):
             raise TypeError(
                 "`observations` must be what `observe` makes of a recording, or a sequence of "
                 f"such, but hold a `{type(observations).__name__}`."

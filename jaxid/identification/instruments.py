@@ -12,7 +12,6 @@ from jaxid.identification.factors import reduced_rows
 from jaxid.identification.influence import AbstractInfluence, Channel
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import NUMERICAL, Complete
-from jaxid.identification.streaming_log import source
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations
 from jaxid.trajectory.trajectory import AbstractTrajectory
@@ -77,7 +76,7 @@ class InstrumentalVariables(AbstractEstimator):
             _for(count, "starts", self.starts),
         )
         instruments = tuple(
-            _columns(rows.base, source(recording)[0], reference, start)
+            _columns(rows.base, recording, reference, start)
             for recording, reference, start in zip(rows.recordings, references, starts, strict=True)
         )
         influence = InstrumentRows(weights, instruments)

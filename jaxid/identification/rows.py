@@ -19,7 +19,6 @@ from jaxid.identification.factors import (
     reduced_rows,
 )
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog, source
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 
@@ -80,7 +79,7 @@ class Rows:
         self,
         base: BaseParameters,
         blocks: Blocks,
-        recordings: Sequence[Observations | LongLog] = (),
+        recordings: Sequence[Observations] = (),
         progress: Progress | None = None,
     ):
         self.base, self.blocks = base, blocks
@@ -91,7 +90,7 @@ class Rows:
     def of(
         cls,
         base: BaseParameters,
-        recordings: Sequence[Observations | LongLog],
+        recordings: Sequence[Observations],
         progress: Progress | None = None,
     ) -> "Rows":
         """Goes through recordings for the first time, and keeps their factors (Eq. 26)."""
@@ -157,10 +156,9 @@ class Rows:
         whole = sum(o.rows for o in self.recordings)
         acting = acting_columns(self.base)
         for number, recording in enumerate(self.recordings):
-            observations, read = source(recording)
-            mask, edges = np.asarray(observations.mask), block_edges(observations)
+            mask, edges = np.asarray(recording.mask), block_edges(recording)
             wanted = None if spans is None else [(a, b) for k, a, b in spans if k == number]
-            passing = reduced_rows(self.base, observations, read=read, wanted=wanted)
+            passing = reduced_rows(self.base, recording, wanted=wanted)
             for rows, columns, forces in passing:
                 for block, (low, high) in enumerate(itertools.pairwise(edges), blocks):
                     a, b = max(low, rows.start), min(high, rows.stop)

@@ -26,7 +26,6 @@ from jaxid.identification.held_out import held_out_squares, weighted_error
 from jaxid.identification.identify import fit_rows
 from jaxid.identification.influence import AbstractInfluence, Channel
 from jaxid.identification.rows import Rows
-from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations
 
@@ -243,7 +242,7 @@ class StepwiseComparison(eqx.Module):
 
 def identify_stepwise(
     base: BaseParameters,
-    observations: Observations | LongLog | Sequence[Observations | LongLog],
+    observations: Observations | Sequence[Observations],
     stepwise: Stepwise | None = None,
     at_once: AbstractEstimator | None = None,
 ) -> StepwiseComparison:
@@ -259,7 +258,7 @@ def identify_stepwise(
         InputError: If the observations do not fit to the model, or a motion of single axes moves
             several.
     """
-    single = isinstance(observations, Observations | LongLog)
+    single = isinstance(observations, Observations)
     recordings = (observations,) if single else tuple(observations)
     stepwise = Stepwise() if stepwise is None else stepwise
     at_once = WeightedLeastSquares(stepwise.weights) if at_once is None else at_once

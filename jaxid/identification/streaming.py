@@ -7,7 +7,7 @@ triangle of all rows follows from both.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -16,11 +16,11 @@ import numpy as np
 from jaxid.arrays import AnyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.compiled import acting_columns
-from jaxid.dynamics.motion import Motion
 from jaxid.identification.kernel import CHUNK, Grams, Kernel
 from jaxid.identification.reduction import reduced
 from jaxid.identification.response import Stage, centre, stages
 from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Progress as Progress
 
 LONG = 100_000
 """Samples from which compiling pays."""
@@ -34,12 +34,6 @@ REGULAR = 1e-13
 """Share of a column's square by which a triangle is kept from being singular."""
 ALIKE = 1e4
 """Ratio of squares that the first triangle may be wrong by."""
-
-
-Read = Callable[[slice], tuple[Motion, np.ndarray]]
-"""Gives motion and forces of some samples."""
-Progress = Callable[[float], None]
-"""Is told which share is done, of 1."""
 
 
 class Ends(NamedTuple):
@@ -60,7 +54,7 @@ class Piece(NamedTuple):
 
 def suits(observations: Observations) -> bool:
     """Whether a log is long enough to compile for, and its filters are short enough."""
-    if len(observations.time) < LONG:
+    if observations.samples < LONG:
         return False
     chain = _chain(observations)
     cost = sum(len(stage.response) / stage.factor for stage in chain)
@@ -71,12 +65,6 @@ def _chain(observations: Observations) -> tuple[Stage, ...]:
     return stages(observations.filter, observations.decimation, observations.sample_time)
 
 
-def held(observations: Observations) -> Read:
-    """Motion and forces from memory."""
-    forces = np.asarray(observations.forces)
-    return lambda samples: (observations.motion[samples], forces[samples])
-
-
 class Stream:
     """A log on its way through the compiled loop.
 
@@ -85,7 +73,6 @@ class Stream:
         observations: A long log.
         edges: Rows at which blocks of time begin, and the last one ends.
         chunk: Samples of an iteration.
-        read: Gives motion and forces of some samples; those of the observations if None.
         progress: Is told now and then which share of the log is done, of 1.
     """
 
@@ -95,10 +82,9 @@ class Stream:
         observations: Observations,
         edges: Sequence[int],
         chunk: int = CHUNK,
-        read: Read | None = None,
         progress: Progress | None = None,
     ):
-        self._read = held(observations) if read is None else read
+        self._read = observations.read
         self._progress = progress
         chain = _chain(observations)
         self._stride = 1

@@ -54,26 +54,26 @@ class Subsample(AbstractDecimation):
     """Takes every n-th sample: for filters whose cut-off lies below half of the new rate.
 
     Attributes:
-        every: The n.
+        step: Number of samples for each row.
     """
 
-    every: int = eqx.field(static=True, converter=whole("every"), default=1)
+    step: int = eqx.field(static=True, converter=whole("step"), default=1)
 
     def __check_init__(self) -> None:
-        _refuse_factors("every", (self.every,))
+        _refuse_factors("step", (self.step,))
 
     @property
     def stages(self) -> tuple[int, ...]:  # noqa: D102
-        return (self.every,)
+        return (self.step,)
 
     def low_pass(self, stage: int) -> LowPass:  # noqa: D102
         return LowPass((), math.inf)
 
     def check(self, cutoff: float, sample_time: float) -> None:  # noqa: D102
-        rate = 1.0 / (sample_time * self.every)
-        if self.every > 1 and cutoff > 0.5 * rate:
+        rate = 1.0 / (sample_time * self.step)
+        if self.step > 1 and cutoff > 0.5 * rate:
             raise InputError(
-                f"`Subsample({self.every})` leaves {rate:.6g} Hz, but the filter lets forces and "
+                f"`Subsample({self.step})` leaves {rate:.6g} Hz, but the filter lets forces and "
                 f"columns pass up to {cutoff:.6g} Hz, which must be below half of that: take "
                 f"one of {max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, a "
                 "lower cut-off, or `Decimation`."

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 
-import equinox as eqx
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -95,7 +94,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
             f"{time[-1] - time[0]:g} s: no rows of some joint are left."
         )
     motion = Motion(*(np.concatenate(values) for values in parts))
-    return eqx.tree_at(lambda o: (o.motion, o.mask), observations, (motion, mask))
+    return observations.replace(motion=motion, mask=mask)
 
 
 def _refuse_endless(seconds: float) -> None:

@@ -1,7 +1,11 @@
-"""What an estimator sees: a motion and forces with the filter and the rows that belong to them."""
+"""Observations: motion and forces of a log, and the filters that turn them into rows (Eq. 26)."""
 
+import abc
+import dataclasses
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -11,26 +15,59 @@ from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
-from jaxid.measurement.filters import AbstractFilter
+from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth
 from jaxid.measurement.low_pass import said_hasty
 from jaxid.measurement.recording import Recording
 from jaxid.robot.limits import per_joint
 from jaxid.robot.robot import Robot
 
 FEWEST_ROWS = 4
-"""Rows below which a segment is not worth its edges."""
+"""Smallest number of rows for which a segment is used."""
+
+Progress = Callable[[float], None]
+"""Callback, called with the completed fraction (0 to 1)."""
+
+
+class AbstractSamples(eqx.Module):
+    """Motion and forces at the full rate, joint side, in memory or on disk."""
+
+    @abc.abstractmethod
+    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+        """Return motion and forces of some samples of one segment."""
+
+    @abc.abstractmethod
+    def read_all(self) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+        """Return motion and forces of all segments."""
+
+
+class SamplesInMemory(AbstractSamples):
+    """Motion and forces as arrays.
+
+    Attributes:
+        motion: Filtered joint angles, velocities and accelerations.
+        forces: Generalised forces, not filtered [N m or N].
+    """
+
+    motion: Motion
+    forces: Float[AnyArray, "samples joints"]
+
+    def read(self, samples):  # noqa: D102
+        return self.motion[samples], np.asarray(self.forces)[samples]
+
+    def read_all(self):  # noqa: D102
+        return self.motion, self.forces
 
 
 class Chunk(eqx.Module):
-    """A part of the observations whose columns fit into memory.
+    """Part of the observations whose columns fit into memory.
 
     Attributes:
         samples: Half-open range of samples whose columns are needed (rows and overlap).
-        rows: Half-open range of rows that come out.
-        smoothed: Of what was smoothed, the part that decimation needs, from the chunk's first.
-        wanted: Of what was decimated, the rows.
-        filter: Of forces and columns.
-        decimation: Of forces and columns.
+        rows: Half-open range of the resulting rows.
+        smoothed: Range of smoothed samples that decimation needs, from the chunk's first.
+        wanted: Range of decimated samples that are the rows.
+        filter: Filter of forces and columns.
+        decimation: Decimation of forces and columns.
         sample_time: Time between two samples [s].
     """
 
@@ -43,37 +80,141 @@ class Chunk(eqx.Module):
     sample_time: float = eqx.field(static=True)
 
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Float[np.ndarray, "rows *columns"]:
-        """Reduces columns at the chunk's samples to its rows."""
+        """Reduce columns at the chunk's samples to its rows."""
         x = self.filter.smooth(x, self.sample_time)[slice(*self.smoothed)]
         return self.decimation(x)[slice(*self.wanted)]
 
 
 class Observations(eqx.Module):
-    """Motion and forces at the full rate, joint side, and how both become rows.
+    """Motion and forces at the full rate, joint side, and the filters that turn them into rows.
+
+    The samples are in memory (`observe`, `Observations.of`) or stay on disk (`scan_log`).
 
     Attributes:
-        time: Of the samples [s].
-        motion: Filtered joint angles, velocities and accelerations.
-        forces: Generalized forces, not filtered [N m or N].
-        filter: Of forces and columns.
-        decimation: Of forces and columns.
+        source: Motion and forces of the samples.
+        filter: Filter of forces and columns.
+        decimation: Decimation of forces and columns.
         segments: Half-open ranges of samples without gaps.
-        mask: Which rows count for which joint.
+        start_times: Time of the first sample of each segment [s].
+        mask: Rows that count, for each joint.
         sample_time: Time between two samples [s].
-        name: Of the recording.
-        notes: Of the recording, and what was left out, in sentences.
+        name: Name of the recording.
+        notes: Remarks on what was changed or left out, as sentences.
     """
 
-    time: Float[AnyArray, " samples"]
-    motion: Motion
-    forces: Float[AnyArray, "samples joints"]
+    source: AbstractSamples
     filter: AbstractFilter
     decimation: AbstractDecimation
     segments: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    start_times: tuple[float, ...] = eqx.field(static=True)
     mask: Bool[AnyArray, "rows joints"]
     sample_time: float = eqx.field(static=True)
     name: str = eqx.field(static=True, default="observations")
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @classmethod
+    def of(
+        cls,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
+        forces: ArrayLike,
+        *,
+        sample_time: float | int,
+        filter: AbstractFilter | None = None,
+        decimation: AbstractDecimation | None = None,
+        segments: Sequence[tuple[int, int]] | None = None,
+        mask: ArrayLike | None = None,
+        name: str = "observations",
+    ) -> "Observations":
+        """Make observations of arrays (samples x joints), joint side, whose motion is filtered.
+
+        Args:
+            q: Joint angles [rad or m].
+            qd: Velocities [rad/s or m/s].
+            qdd: Accelerations [rad/s² or m/s²].
+            forces: Generalised forces [N m or N].
+            sample_time: Time between two samples [s].
+            filter: Filter of forces and columns; neither is filtered if None.
+            decimation: Decimation of forces and columns; every sample is a row if None.
+            segments: Half-open ranges of samples without gaps; one segment if None.
+            mask: Rows that count (rows x joints); all if None.
+            name: Name of the observations.
+
+        Raises:
+            InputError: If shapes differ, values are not finite, or `sample_time` is not positive.
+        """
+        arrays = {"q": q, "qd": qd, "qdd": qdd, "forces": forces}
+        data = {key: np.asarray(x, np.float64) for key, x in arrays.items()}
+        shape = data["q"].shape
+        for key, x in data.items():
+            if x.ndim != 2 or x.shape != shape or not np.isfinite(x).all():
+                raise InputError(
+                    f"`{key}` must hold a finite number for each sample and joint, like `q` with "
+                    f"shape {shape}, but has shape {x.shape}."
+                )
+        dt = float(sample_time)
+        if not 0 < dt < np.inf:
+            raise InputError(f"`sample_time` must be positive [s], but is {dt:g}.")
+        filter = ZeroPhaseButterworth(math.inf) if filter is None else filter
+        decimation = Subsample(1) if decimation is None else decimation
+        segments = ((0, len(data["q"])),) if segments is None else tuple(segments)
+        rows = sum(map(len, _row_samples(segments, filter.edge(dt), decimation.factor)))
+        counted = np.ones((rows, shape[1]), bool) if mask is None else np.asarray(mask, bool)
+        if counted.shape != (rows, shape[1]):
+            raise InputError(
+                f"`mask` must have one entry for each row and joint, {(rows, shape[1])}, but has "
+                f"shape {counted.shape}."
+            )
+        motion = Motion(data["q"], data["qd"], data["qdd"])
+        return cls(
+            source=SamplesInMemory(motion, data["forces"]),
+            filter=filter,
+            decimation=decimation,
+            segments=segments,
+            start_times=tuple(a * dt for a, _ in segments),
+            mask=counted,
+            sample_time=dt,
+            name=name,
+        )
+
+    def replace(self, **changes: Any) -> "Observations":
+        """Return the same observations with other fields; `motion` and `forces` are fields too."""
+        arrays = {key: changes.pop(key) for key in ("motion", "forces") if key in changes}
+        if arrays:
+            motion, forces = self.source.read_all()
+            changes["source"] = SamplesInMemory(**({"motion": motion, "forces": forces} | arrays))
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def motion(self) -> Motion:
+        """Filtered joint angles, velocities and accelerations of all samples."""
+        return self.source.read_all()[0]
+
+    @property
+    def forces(self) -> Float[AnyArray, "samples joints"]:
+        """Generalised forces of all samples, not filtered [N m or N]."""
+        return self.source.read_all()[1]
+
+    @property
+    def time(self) -> Float[np.ndarray, " samples"]:
+        """Times of the samples [s]."""
+        return np.concatenate(
+            [
+                start + self.sample_time * np.arange(b - a)
+                for (a, b), start in zip(self.segments, self.start_times, strict=True)
+            ]
+        )
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.segments[-1][1]
+
+    @property
+    def duration(self) -> float:
+        """Recorded time without gaps [s]."""
+        return self.samples * self.sample_time
 
     @property
     def rows(self) -> int:
@@ -93,20 +234,28 @@ class Observations(eqx.Module):
     @property
     def row_segments(self) -> tuple[tuple[int, int], ...]:
         """Half-open ranges of rows without gaps."""
-        ends = np.cumsum([0, *(len(r) for r in self._kept())])
+        ends = np.cumsum([0, *(len(r) for r in self._row_samples())])
         return tuple((int(a), int(b)) for a, b in itertools.pairwise(ends))
 
     @property
     def instants(self) -> np.ndarray:
         """Indices of the samples at which the rows lie."""
-        return np.concatenate([np.arange(r.start, r.stop, r.step) for r in self._kept()])
+        return np.concatenate([np.arange(r.start, r.stop, r.step) for r in self._row_samples()])
 
-    def _kept(self) -> list[range]:
+    def _row_samples(self) -> list[range]:
         edge = self.filter.edge(self.sample_time)
-        return [range(a + edge, b - edge, self.decimation.factor) for a, b in self.segments]
+        return _row_samples(self.segments, edge, self.decimation.factor)
+
+    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+        """Return motion and forces of some samples of one segment.
+
+        Raises:
+            InputError: If a file of a log on disk holds something else than numbers there.
+        """
+        return self.source.read(samples)
 
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Float[np.ndarray, "rows *columns"]:
-        """Turns forces or columns at all samples into rows: smooths, trims and decimates.
+        """Turn forces or columns at all samples into rows: smooth, trim and decimate (Eq. 26).
 
         Linear, and the same for every column: what holds between columns and forces at the samples
         holds between the rows.
@@ -119,11 +268,11 @@ class Observations(eqx.Module):
         return np.concatenate(parts)
 
     def chunks(self, samples: int = 16384) -> tuple[Chunk, ...]:
-        """Parts of about so many samples, each with the overlap that its filters need.
+        """Divide into parts of about so many samples, each with the overlap that its filters need.
 
-        For columns that do not fit into memory at the full rate: evaluate them at
-        `motion[slice(*chunk.samples)]`, and `chunk.reduce` gives `reduce`'s rows
-        `slice(*chunk.rows)`, up to rounding.
+        For columns that do not fit into memory at the full rate: evaluate them at the motion of
+        `read(slice(*chunk.samples))`, and `chunk.reduce` gives the rows `slice(*chunk.rows)` of
+        `reduce`, up to rounding.
 
         Raises:
             InputError: If `samples` is not positive.
@@ -132,17 +281,17 @@ class Observations(eqx.Module):
             raise InputError(f"`samples` must be positive, but is {samples}.")
         factor, edge = self.decimation.factor, self.filter.edge(self.sample_time)
         before, after = self.decimation.memory(), self.filter.memory(self.sample_time)
-        found, step = [], max(1, samples // factor)
+        chunks, step = [], max(1, samples // factor)
         for (a, b), (r0, r1) in zip(self.segments, self.row_segments, strict=True):
             first, last = a + edge, b - edge
             for start in range(r0, r1, step):
                 stop = min(start + step, r1)
-                # Decimation keeps its phase: what it is given starts at a row.
+                # Decimation keeps its phase: its first input sample is a row.
                 skipped = max(0, start - r0 - -(-before // factor))
                 low = first + skipped * factor
                 high = min(last, first + (stop - 1 - r0) * factor + before + 1)
                 begin, end = max(a, low - after), min(b, high + after)
-                found.append(
+                chunks.append(
                     Chunk(
                         samples=(begin, end),
                         rows=(start, stop),
@@ -153,10 +302,10 @@ class Observations(eqx.Module):
                         sample_time=self.sample_time,
                     )
                 )
-        return tuple(found)
+        return tuple(chunks)
 
     def between(self, start: float, stop: float) -> "Observations":
-        """The same observations, of which only rows from `start` to before `stop` [s] count.
+        """Return the same observations, of which only rows from `start` to before `stop` [s] count.
 
         The log is filtered as a whole: no rows are lost where it is divided.
 
@@ -170,27 +319,35 @@ class Observations(eqx.Module):
                 f"`{self.name}` has no rows from {start:g} s to {stop:g} s for every joint: its "
                 f"rows reach from {time[0]:g} s to {time[-1]:g} s."
             )
-        return eqx.tree_at(lambda o: o.mask, self, mask)
+        return self.replace(mask=mask)
 
     def split(self, fraction: float) -> tuple["Observations", "Observations"]:
-        """Divides the rows in time: a part to identify with, and the rest to verify with.
+        """Divide the rows in time: a part for identification and the rest for validation.
 
         Args:
-            fraction: Of the recording's duration that belongs to the first part, of 1.
+            fraction: Fraction (0 to 1) of the recording's duration in the first part.
 
         Raises:
-            InputError: If `fraction` is not between 0 and 1.
+            InputError: If `fraction` is not between 0 and 1, or a part has no rows.
         """
         if not 0 < fraction < 1:
             raise InputError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")
-        time = np.asarray(self.time)
-        middle = float(time[0] + fraction * (time[-1] - time[0]))
+        (a, b), first = self.segments[-1], self.start_times[0]
+        last = self.start_times[-1] + (b - a - 1) * self.sample_time
+        middle = float(first + fraction * (last - first))
         return self.between(-np.inf, middle), self.between(middle, np.inf)
 
     @property
     def reduced_time(self) -> Float[np.ndarray, " rows"]:
         """Times of the rows [s]."""
-        return np.asarray(self.time)[self.instants]
+        return np.concatenate(
+            [
+                start + self.sample_time * (np.arange(r.start, r.stop, r.step) - a)
+                for r, (a, _), start in zip(
+                    self._row_samples(), self.segments, self.start_times, strict=True
+                )
+            ]
+        )
 
     @property
     def reduced_forces(self) -> Float[np.ndarray, "rows joints"]:
@@ -199,8 +356,13 @@ class Observations(eqx.Module):
 
     @property
     def reduced_motion(self) -> Motion:
-        """The motion at the rows' instants, for figures: columns are reduced, not the motion."""
+        """Motion at the rows' instants, for figures: columns are reduced, not the motion."""
         return self.motion[self.instants]
+
+
+def _row_samples(segments: Sequence[tuple[int, int]], edge: int, factor: int) -> list[range]:
+    """Return the samples of each segment at which rows lie."""
+    return [range(a + edge, b - edge, factor) for a, b in segments]
 
 
 def observe(
@@ -208,23 +370,23 @@ def observe(
     robot: Robot,
     filter: AbstractFilter,
     decimation: AbstractDecimation | None = None,
-    slow: ArrayLike | tuple[float | int, ...] | None = None,
+    min_speed: ArrayLike | tuple[float | int, ...] | None = None,
     name: str | None = None,
 ) -> Observations:
-    """Prepares a recording for estimation: joint side, derivatives, rows and their mask.
+    """Prepare a recording for estimation: joint side, derivatives, rows and their mask.
 
     Args:
-        recording: What was logged.
-        robot: Its drives lead from the motors to the joints where the recording is on their side.
-        filter: For the motion, and for forces and columns.
-        decimation: For forces and columns; every sample is a row if None.
-        slow: Speed of each joint below which its rows do not count [rad/s or m/s]: stiction is not
-            in the model.
-        name: Of the observations; the recording's if None.
+        recording: Recording of the robot.
+        robot: Robot, whose drives convert from motors to joints where the recording needs it.
+        filter: Filter of the motion, and of forces and columns.
+        decimation: Decimation of forces and columns; every sample is a row if None.
+        min_speed: Speed of each joint below which its rows do not count [rad/s or m/s], since
+            stiction is not in the model.
+        name: Name of the observations; the recording's if None.
 
     Raises:
         InputError: If the numbers of joints differ, forces and columns would be aliased, nothing
-            is left between the edges of the segments, or nothing of a joint is fast enough.
+            is left between the edges of the segments, or some joint is never fast enough.
     """
     n = robot.joints
     if recording.joints != n:
@@ -235,44 +397,48 @@ def observe(
     decimation = Subsample(1) if decimation is None else decimation
     dt = recording.sample_time
     decimation.check(filter.low_pass(dt).cutoff, dt)
-    speeds = per_joint("slow", None if slow is None else np.asarray(slow, np.float64), n, 0.0)
-    used, said = usable(recording.segments, filter, decimation, dt, recording.name)
-    notes = [*recording.notes, *said, *filter.said(recording.velocities is not None)]
-    angles, forces, velocities = _joint_side(recording, robot)
+    used, omitted = usable_segments(recording.segments, filter, decimation, dt, recording.name)
+    notes = [*recording.notes, *omitted, *filter.said(recording.velocities is not None)]
+    angles, velocities, forces = joint_side(
+        robot,
+        np.asarray(recording.angles),
+        None if recording.velocities is None else np.asarray(recording.velocities),
+        np.asarray(recording.forces),
+        recording.angles_on_motor_side,
+        recording.forces_on_motor_side,
+    )
     motions = [
         filter.motion(angles[a:b], None if velocities is None else velocities[a:b], dt)
         for a, b in used
     ]
-    ends = np.cumsum([0, *(b - a for a, b in used)])
-    observations = Observations(
-        time=_join([np.asarray(recording.time)[a:b] for a, b in used]),
-        motion=Motion(
-            _join([m.q for m in motions]),
-            _join([m.qd for m in motions]),
-            _join([m.qdd for m in motions]),
-        ),
-        forces=_join([forces[a:b] for a, b in used]),
+    motion = Motion(*(_join([getattr(m, x) for m in motions]) for x in ("q", "qd", "qdd")))
+    ends = [0, *itertools.accumulate(b - a for a, b in used)]
+    segments = tuple(itertools.pairwise(ends))
+    speeds = per_joint("min_speed", _optional_array(min_speed), n, 0.0)
+    rows = _row_samples(segments, filter.edge(dt), decimation.factor)
+    mask = np.abs(motion.qd[np.concatenate([np.asarray(r) for r in rows])]) >= speeds
+    require_fast_rows(mask, speeds, robot, recording.name)
+    return Observations(
+        source=SamplesInMemory(motion, _join([forces[a:b] for a, b in used])),
         filter=filter,
         decimation=decimation,
-        segments=tuple((int(a), int(b)) for a, b in itertools.pairwise(ends)),
-        mask=np.ones((0, n), bool),
+        segments=segments,
+        start_times=tuple(float(recording.time[a]) for a, _ in used),
+        mask=mask,
         sample_time=dt,
         name=recording.name if name is None else name,
         notes=tuple(notes),
     )
-    mask = np.abs(np.asarray(observations.reduced_motion.qd)) >= speeds
-    refuse_standstill(mask, speeds, robot, recording.name)
-    return eqx.tree_at(lambda o: o.mask, observations, mask)
 
 
-def usable(
+def usable_segments(
     segments: Sequence[tuple[int, int]],
     filter: AbstractFilter,
     decimation: AbstractDecimation,
     sample_time: float,
     name: str,
 ) -> tuple[list[tuple[int, int]], list[str]]:
-    """The segments that are longer than what filters lose at their ends, and what to say.
+    """Return the segments that are longer than the filter's edges, and remarks on the others.
 
     Raises:
         InputError: If there is none.
@@ -294,13 +460,13 @@ def usable(
     return used, [f"{short} segment(s), shorter than the filter's edges, were left out"]
 
 
-def refuse_standstill(
+def require_fast_rows(
     mask: Bool[np.ndarray, "rows joints"],
     speeds: Float[np.ndarray, " joints"],
     robot: Robot,
     name: str,
 ) -> None:
-    """Refuses a log in which a joint is never fast enough.
+    """Refuse a log in which some joint never reaches its minimum speed.
 
     Raises:
         InputError: If no row of some joint counts.
@@ -309,23 +475,32 @@ def refuse_standstill(
     if slow.size:
         j = int(slow[0])
         raise InputError(
-            f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of `slow` in "
-            f"`{name}`: take a smaller one, or a log in which it moves."
+            f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of `min_speed` "
+            f"in `{name}`: take a smaller one, or a log in which it moves."
         )
+
+
+def joint_side(
+    robot: Robot,
+    angles: Float[np.ndarray, "samples joints"],
+    velocities: Float[np.ndarray, "samples joints"] | None,
+    forces: Float[np.ndarray, "samples joints"],
+    angles_on_motor_side: bool,
+    forces_on_motor_side: bool,
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Convert angles, velocities and forces from the motors to the joints where needed."""
+    drives = robot.drives
+    if angles_on_motor_side:
+        angles = np.asarray(drives.joint_angles(angles))
+        velocities = None if velocities is None else np.asarray(drives.joint_velocities(velocities))
+    if forces_on_motor_side:
+        forces = np.asarray(drives.joint_forces(forces))
+    return angles, velocities, forces
 
 
 def _join(parts: list) -> np.ndarray:
     return np.concatenate([np.asarray(p, np.float64) for p in parts])
 
 
-def _joint_side(recording: Recording, robot: Robot):
-    angles = np.asarray(recording.angles)
-    forces = np.asarray(recording.forces)
-    velocities = None if recording.velocities is None else np.asarray(recording.velocities)
-    if recording.angles_on_motor_side:
-        angles = np.asarray(robot.drives.joint_angles(angles))
-        if velocities is not None:
-            velocities = np.asarray(robot.drives.joint_velocities(velocities))
-    if recording.forces_on_motor_side:
-        forces = np.asarray(robot.drives.joint_forces(forces))
-    return angles, forces, velocities
+def _optional_array(value: ArrayLike | tuple | None) -> np.ndarray | None:
+    return None if value is None else np.asarray(value, np.float64)

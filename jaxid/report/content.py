@@ -15,7 +15,6 @@ from jaxid.identification.excited import LARGEST_UNCERTAINTY, UndeterminedDirect
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import groups
 from jaxid.identification.solutions import AbstractSpectralSolution
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.report.bodies import consistency_content
 from jaxid.robot.robot import Robot
@@ -46,7 +45,7 @@ class Beside:
     def of(
         cls,
         fit: Fit,
-        observations: Sequence[Observations | LongLog],
+        observations: Sequence[Observations],
         ways: tuple[str, str] | None = None,
     ) -> "Beside":
         """Judges another fit on some recordings."""

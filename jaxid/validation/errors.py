@@ -8,7 +8,6 @@ from jaxid.dynamics.compiled import tool_forces
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit import Fit
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 
 ROWS = 2**18
@@ -92,7 +91,7 @@ def _share(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray:
 
 
 def torque_errors(
-    fit: Fit, observations: Observations | LongLog, progress: Progress | None = None
+    fit: Fit, observations: Observations, progress: Progress | None = None
 ) -> TorqueErrors:
     """Compares the forces that a model predicts with measured ones (Eqs. 27, 37).
 
@@ -107,28 +106,19 @@ def torque_errors(
     robot = fit.base.model.robot
     known = robot.known_max_forces
     known = np.where(np.isfinite(known), known, np.nan)
-    if isinstance(observations, LongLog):
-        every = compared_rows(observations)
-        measured, predicted = _by_parts(fit, observations, every, progress)
-        return TorqueErrors(
-            name=observations.name,
-            time=observations.reduced_time[::every],
-            measured=measured,
-            predicted=predicted,
-            counted=np.asarray(observations.outline.mask)[::every],
-            max_forces=known,
-        )
+    every = compared_rows(observations)
+    measured, predicted = _by_parts(fit, observations, every, progress)
     return TorqueErrors(
         name=observations.name,
-        time=observations.reduced_time,
-        measured=observations.reduced_forces,
-        predicted=observations.reduce(_predicted(fit, observations.motion)),
-        counted=np.asarray(observations.mask),
+        time=observations.reduced_time[::every],
+        measured=measured,
+        predicted=predicted,
+        counted=np.asarray(observations.mask)[::every],
         max_forces=known,
     )
 
 
-def compared_rows(log: LongLog) -> int:
+def compared_rows(log: Observations) -> int:
     """The n of a long log of which every n-th row is compared."""
     return -(-log.rows // ROWS)
 
@@ -138,14 +128,13 @@ def _predicted(fit: Fit, motion: Motion) -> np.ndarray:
 
 
 def _by_parts(
-    fit: Fit, log: LongLog, every: int, progress: Progress | None
+    fit: Fit, log: Observations, every: int, progress: Progress | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Measured and predicted forces of every n-th row; nothing is computed for masked parts."""
-    outline = log.outline
-    mask = np.asarray(outline.mask)
+    mask = np.asarray(log.mask)
     kept = len(range(0, log.rows, every))
     measured, predicted = np.zeros((2, kept, log.joints))
-    for chunk in outline.chunks():
+    for chunk in log.chunks(65536):
         first, stop = chunk.rows
         own = slice(-(-first // every), -(-stop // every))
         if mask[first:stop].any():

@@ -6,7 +6,6 @@ import equinox as eqx
 
 from jaxid.identification.fit import Fit
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 from jaxid.validation.definiteness import Definiteness, definiteness
 from jaxid.validation.errors import TorqueErrors, torque_errors
@@ -26,7 +25,7 @@ class Validation(eqx.Module):
 
 def validate(
     fit: Fit,
-    observations: Observations | LongLog | Sequence[Observations | LongLog],
+    observations: Observations | Sequence[Observations],
     *,
     seed: int = 0,
     progress: Progress | None = None,
@@ -39,7 +38,7 @@ def validate(
         seed: Of the poses in which the mass matrix is looked at.
         progress: Is told now and then which share of each long log is done, of 1.
     """
-    single = isinstance(observations, Observations | LongLog)
+    single = isinstance(observations, Observations)
     recordings = (observations,) if single else tuple(observations)
     return Validation(
         tuple(torque_errors(fit, o, progress) for o in recordings), definiteness(fit, seed=seed)

@@ -69,7 +69,7 @@ def test_masked_rows_and_weights_of_each_data_set(base):
     forces = np.where(mask, forces, np.nan)
     fit = identify_batch(base, m, forces, weights, mask=mask)
     for k, o in enumerate(sets):
-        masked = jid.Observations(**{**vars(o), "mask": mask[k]})
+        masked = o.replace(mask=mask[k])
         estimator = jid.WeightedLeastSquares(jid.GivenWeights(weights[k]))
         assert_same(base, fit, k, jid.identify(base, masked, estimator))
 
@@ -90,7 +90,7 @@ def test_honest_deviations_of_many_draws(base):
     estimator = jid.WeightedLeastSquares(jid.GivenWeights(WEIGHTS))
     for k, draw in ((0, 0), (0, 2), (1, 1)):
         fields = {"mask": mask[k], "forces": draws[k, draw]}
-        one = jid.identify(base, jid.Observations(**{**vars(sets[k]), **fields}), estimator)
+        one = jid.identify(base, sets[k].replace(**fields), estimator)
         np.testing.assert_allclose(
             fit.standard_deviations[k, draw], one.standard_deviations, rtol=1e-8
         )
@@ -116,7 +116,7 @@ def test_honest_deviations_under_jit_and_by_chunks(base, monkeypatch):
     half = SAMPLES // 2
     halves = {"segments": ((0, half), (half, SAMPLES))}
     estimator = jid.WeightedLeastSquares(jid.GivenWeights(WEIGHTS))
-    one = jid.identify(base, jid.Observations(**{**vars(sets[1]), **halves}), estimator)
+    one = jid.identify(base, sets[1].replace(**halves), estimator)
     np.testing.assert_allclose(parts.standard_deviations[1], one.standard_deviations, rtol=1e-8)
 
 
@@ -132,7 +132,7 @@ def test_any_estimator_takes_batches(base, loss):
     fit = identify_batch(base, m, draws, mask=mask, estimator=estimator, row_time=dt)
     assert fit.parameters.shape == (2, 2, base.size)
     assert np.asarray(fit.determined).all()
-    one = jid.identify(base, jid.Observations(**{**vars(sets[1]), "mask": mask[1]}), estimator)
+    one = jid.identify(base, sets[1].replace(mask=mask[1]), estimator)
     np.testing.assert_allclose(fit.parameters[1, 0], one.parameters, rtol=1e-8)
     np.testing.assert_allclose(fit.standard_deviations[1, 0], one.standard_deviations, rtol=1e-8)
     np.testing.assert_allclose(fit.parameters[1, 1], 2 * one.parameters, rtol=1e-2)
@@ -257,7 +257,7 @@ def test_refusals(base):
 def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
     o = observations(base.model, standard_parameters(base.model), samples=12000, noise=2.0)
     order = np.random.default_rng(0).permutation(12000)
-    o = jid.Observations(**{**vars(o), "motion": o.motion[order], "forces": o.forces[order]})
+    o = o.replace(motion=o.motion[order], forces=o.forces[order])
     blocks = factorise(base, [o], blocks=60)
     fit = fit_blocks(base, blocks, jid.LeastSquares())
     draws = bootstrap(blocks, fit.weights, 4000, jax.random.key(0))

@@ -1,7 +1,5 @@
 """Essential parameters, filters chosen by data, and identification axis by axis."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import virtual
@@ -120,9 +118,7 @@ def test_errors_are_handed_on_as_the_estimate_says():
     rows = jid.Rows.of(BASE, [o])
     estimate = STEPWISE(rows)
     disturbance = 1e-3 * np.random.default_rng(7).normal(size=np.shape(o.forces))
-    moved = STEPWISE(
-        jid.Rows.of(BASE, [dataclasses.replace(o, forces=np.asarray(o.forces) + disturbance)])
-    )
+    moved = STEPWISE(jid.Rows.of(BASE, [o.replace(forces=np.asarray(o.forces) + disturbance)]))
     g = np.zeros(BASE.size)
     for chunk in rows.chunks():
         for channel in estimate.influence.channels(chunk, o.reduce(disturbance)[chunk.rows]):

@@ -72,7 +72,7 @@ from pathlib import Path
 columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
 paths = jid.shards(sys.argv[4])
 assert 1 <= len(paths) <= 3, paths
-logs = [jid.open_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0)) for p in paths]
+logs = [jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0)) for p in paths]
 write(factorise_across_processes(base, logs, patience=60.0))
 """
 KILLED = """
@@ -231,7 +231,7 @@ def test_three_processes_read_their_own_shards(base, tmp_path):
     assert [p.returncode for p in processes] == [0] * count, "\n\n".join(outputs)
     assert len(jid.shards(folder)) == 5
     logs = [
-        jid.open_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0))
+        jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0))
         for p in jid.shards(folder)
     ]
     fit = jid.identify(base, logs, jid.LeastSquares())

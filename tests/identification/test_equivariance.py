@@ -1,7 +1,5 @@
 """What estimates do when their data are scaled, moved, reordered, divided or padded."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -47,7 +45,7 @@ def observed(seed, samples=150, **options):
 
 
 def with_forces(o, forces):
-    return dataclasses.replace(o, forces=forces)
+    return o.replace(forces=forces)
 
 
 def close(found, expected, rtol=1e-9):
@@ -98,7 +96,7 @@ def test_the_order_of_rows_is_rounding(seed, order):
     chosen = np.random.default_rng(order).permutation(len(o.time))
     motion = jid.Motion(*(np.asarray(x)[chosen] for x in (o.motion.q, o.motion.qd, o.motion.qdd)))
     # Not filtered, so that rows are samples.
-    mixed = dataclasses.replace(o, motion=motion, forces=np.asarray(o.forces)[chosen])
+    mixed = o.replace(motion=motion, forces=np.asarray(o.forces)[chosen])
     a, b = (jid.identify(BASE, x, jid.WeightedLeastSquares()) for x in (o, mixed))
     close(b.parameters, a.parameters, 1e-10)
     assert b.rows == a.rows

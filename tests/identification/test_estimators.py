@@ -63,7 +63,7 @@ def rough(joints):
 def with_forces(o, change):
     forces = np.array(o.forces)
     change(forces)
-    return dataclasses.replace(o, forces=forces)
+    return o.replace(forces=forces)
 
 
 @pytest.mark.parametrize("k", range(9))

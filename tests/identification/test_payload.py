@@ -96,7 +96,7 @@ def test_deviations_are_those_of_many_draws_and_carry_both_runs(base):
 
 def test_a_loads_gains_come_back(base):
     true = np.array([1.2, 0.85, 1.05])
-    exact = [dataclasses.replace(o, forces=o.forces / true) for o in runs(base)]
+    exact = [o.replace(forces=o.forces / true) for o in runs(base)]
     found = jid.identify_drive_gains(*of(base, exact), LOAD)
     np.testing.assert_allclose(found.gains, true, rtol=1e-7)
     p = np.asarray(base.from_standard(standard_parameters(base.model)))
@@ -104,7 +104,7 @@ def test_a_loads_gains_come_back(base):
     errors, sizes = [], []
     for seed in range(16):
         noisy = runs(base, np.array([0.5, 0.5, 0.2]), seed, samples=300)
-        noisy = [dataclasses.replace(o, forces=o.forces / true) for o in noisy]
+        noisy = [o.replace(forces=o.forces / true) for o in noisy]
         found = jid.identify_drive_gains(*of(base, noisy), LOAD)
         errors.append(found.gains - true)
         sizes.append(found.estimates.standard_deviations)
@@ -116,7 +116,7 @@ def test_a_loads_gains_come_back(base):
 def test_gains_turn_a_recording_into_true_forces(base):
     true = np.array([2.0, 0.5, 1.0])
     recording = jid.Recording.of(np.zeros((20, 3)), np.ones((20, 3)), sample_time=0.01)
-    exact = [dataclasses.replace(o, forces=o.forces / true) for o in runs(base)]
+    exact = [o.replace(forces=o.forces / true) for o in runs(base)]
     found = jid.identify_drive_gains(*of(base, exact), LOAD)
     np.testing.assert_allclose(found.corrected(recording).forces[0], true, rtol=1e-6)
 

@@ -41,7 +41,7 @@ def observed(base, samples=6000, noise=0.3, **options) -> jid.Observations:
 
 def changed(o: jid.Observations, **fields) -> jid.Observations:
     """Other observations of the same samples, of which four fifths of the rows count."""
-    o = jid.Observations(**{**vars(o), **fields})
+    o = o.replace(**fields)
     mask = np.random.default_rng(1).random((len(o.instants), o.joints)) < 0.8
     return eqx.tree_at(lambda x: x.mask, o, mask)
 

@@ -11,9 +11,8 @@ import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
 from jaxid.identification import streaming
 from jaxid.identification.factors import factorise
-from jaxid.identification.opening import open_log
-from jaxid.identification.streaming_log import forgetting
 from jaxid.measurement import parts, units
+from jaxid.measurement.log_on_disk import filter_memory, scan_log
 from jaxid.measurement.survey import NeedsMemory
 
 COLUMNS = jid.Columns(angles="q{}", forces="tau{}", time="t")
@@ -64,14 +63,14 @@ def agree(base, log, o):
 @pytest.mark.parametrize("decimation", [jid.Subsample(1), jid.Subsample(15)])
 def test_parquet_in_numpy(base, parquet, decimation, monkeypatch):
     monkeypatch.setattr("jaxid.identification.factors.CHUNK", 3000)
-    log = open_log(parquet, COLUMNS, base.model.robot, SMOOTH, decimation)
+    log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, decimation)
     agree(base, log, in_memory(base, parquet, decimation))
 
 
 def test_parquet_compiled(base, parquet, monkeypatch):
     monkeypatch.setattr(streaming, "LONG", 1000)
     monkeypatch.setattr("jaxid.identification.kernel.PIECE", 4096)
-    log = open_log(parquet, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
+    log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
     assert log.name == "log"
     agree(base, log, in_memory(base, parquet, jid.Subsample(15)))
     shares = []
@@ -86,16 +85,16 @@ def test_mapped_arrays(base, numbers, parquet, tmp_path):
     path = tmp_path / "log.npz"
     np.savez(path, t=time, q=np.asfortranarray(angles), tau=forces)
     columns = jid.Columns(angles="q", forces="tau", sample_time=DT)
-    log = open_log(path, columns, base.model.robot, SMOOTH, jid.Subsample(15))
+    log = scan_log(path, columns, base.model.robot, SMOOTH, jid.Subsample(15))
     mapped = log.read(slice(1000, 2000))
-    other = open_log(parquet, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
+    other = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
     expected = other.read(slice(1000, 2000))
     np.testing.assert_array_equal(mapped[0].qd, expected[0].qd)
     np.testing.assert_array_equal(mapped[1], forces[1000:2000])
 
 
 def test_a_part_is_filtered_like_the_whole(base, parquet):
-    log = open_log(parquet, COLUMNS, base.model.robot, SMOOTH)
+    log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH)
     whole = in_memory(base, parquet, None).motion
     for a, b in ((0, 500), (7000, 9000), (SAMPLES - 300, SAMPLES)):
         part, _ = log.read(slice(a, b))
@@ -108,15 +107,15 @@ def test_refusals(base, numbers, parquet, tmp_path):
     robot, (time, angles, forces) = base.model.robot, numbers
     np.savez_compressed(tmp_path / "small.npz", t=time, q=angles, tau=forces)
     with pytest.raises(ValueError, match="compressed"):
-        open_log(tmp_path / "small.npz", COLUMNS, robot, SMOOTH)
+        scan_log(tmp_path / "small.npz", COLUMNS, robot, SMOOTH)
     with pytest.raises(ValueError, match="is no file"):
-        open_log(tmp_path / "none.parquet", COLUMNS, robot, SMOOTH)
+        scan_log(tmp_path / "none.parquet", COLUMNS, robot, SMOOTH)
     (tmp_path / "log.bag").write_text("t,q1\n0,1\n")
     with pytest.raises(ValueError, match=r"must end in .csv"):
-        open_log(tmp_path / "log.bag", COLUMNS, robot, SMOOTH)
+        scan_log(tmp_path / "log.bag", COLUMNS, robot, SMOOTH)
     three = jid.robots.planar_arm(3, 0.4)
     with pytest.raises(ValueError, match="have 2 columns, but"):
-        open_log(parquet, COLUMNS, three, SMOOTH)
+        scan_log(parquet, COLUMNS, three, SMOOTH)
     for stamps, sentence in (
         (np.where(np.arange(SAMPLES) == 9000, time + 4e-4, time), "leave a uniform grid"),
         (np.where(np.arange(SAMPLES) == 9000, time[8999], time), "repeat .* first at row 9001"),
@@ -124,19 +123,19 @@ def test_refusals(base, numbers, parquet, tmp_path):
         path = tmp_path / "stamps.parquet"
         pl.read_parquet(parquet).with_columns(pl.Series("t", stamps)).write_parquet(path)
         with pytest.raises(NeedsMemory, match=sentence):
-            open_log(path, COLUMNS, robot, SMOOTH)
+            scan_log(path, COLUMNS, robot, SMOOTH)
     back = pl.Series("t", np.r_[0.0, 1, 2, 3, np.full(SAMPLES - 4, 2.0)])
     pl.read_parquet(parquet).with_columns(back).write_parquet(tmp_path / "back.parquet")
     with pytest.raises(ValueError, match=r"backwards .* at row 5"):
-        open_log(tmp_path / "back.parquet", COLUMNS, robot, SMOOTH)
+        scan_log(tmp_path / "back.parquet", COLUMNS, robot, SMOOTH)
 
 
 def test_how_long_filters_remember():
-    slow, fast = (forgetting(jid.ZeroPhaseButterworth(f), DT, False) for f in (5.0, 50.0))
+    slow, fast = (filter_memory(jid.ZeroPhaseButterworth(f), DT, False) for f in (5.0, 50.0))
     assert slow > 5 * fast
-    assert forgetting(jid.ZeroPhaseButterworth(math.inf), DT, True) < 10
+    assert filter_memory(jid.ZeroPhaseButterworth(math.inf), DT, True) < 10
     with pytest.raises(ValueError, match="PeriodicFourier"):
-        forgetting(jid.PeriodicFourier(2.0, 3), DT, False)
+        filter_memory(jid.PeriodicFourier(2.0, 3), DT, False)
 
 
 @pytest.fixture(scope="module")
@@ -149,17 +148,21 @@ def text(parquet):
 @pytest.fixture
 def short_strides(monkeypatch):
     monkeypatch.setattr(parts, "STRIDE", 5000)
-    monkeypatch.setattr("jaxid.identification.opening.AT_ONCE", 3000)
+    monkeypatch.setattr("jaxid.measurement.log_on_disk.AT_ONCE", 3000)
 
 
 @pytest.mark.usefixtures("short_strides")
 def test_text_is_read_part_by_part(base, parquet, text):
-    log = open_log(text, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
-    other = open_log(parquet, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
-    assert log.outline.sample_time == other.outline.sample_time == DT
+    log = scan_log(text, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
+    other = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, jid.Subsample(15))
+    assert log.sample_time == other.sample_time == DT
     assert (log.samples, log.rows) == (other.samples, other.rows)
     for a, b in ((0, 1), (4321, 4321 + 999), (0, SAMPLES), (SAMPLES - 1, SAMPLES)):
-        for x, y in zip(log.measured(slice(a, b)), other.measured(slice(a, b)), strict=True):
+        for x, y in zip(
+            log.source.read_unfiltered(slice(a, b)),
+            other.source.read_unfiltered(slice(a, b)),
+            strict=True,
+        ):
             np.testing.assert_array_equal(x, y)
     agree(base, log, in_memory(base, text, jid.Subsample(15)))
 
@@ -185,10 +188,10 @@ def test_text_of_any_kind(base, numbers, tmp_path, separator, header, end, comma
     path = tmp_path / "log.txt"
     path.write_bytes(((end.strip("\n") or "") + "\n").join(lines).encode() + end.encode())
     columns = COLUMNS if header else jid.Columns(angles=(1, 2), forces=(3, 4), time=0)
-    log = open_log(path, columns, base.model.robot, SMOOTH)
+    log = scan_log(path, columns, base.model.robot, SMOOTH)
     assert log.samples == 3000
     whole = jid.read_recording(path, columns)
-    angles, _, forces = log.measured(slice(0, 3000))
+    angles, _, forces = log.source.read_unfiltered(slice(0, 3000))
     np.testing.assert_array_equal(angles, whole.angles)
     np.testing.assert_array_equal(forces, whole.forces)
 
@@ -206,13 +209,13 @@ def test_bad_cells_of_long_texts_are_named_with_line_and_column(
     lines[15000] = ",".join(row)
     path = tmp_path / "log.csv"
     path.write_text("\n".join(lines))
-    log = open_log(path, COLUMNS, base.model.robot, SMOOTH)
+    log = scan_log(path, COLUMNS, base.model.robot, SMOOTH)
     with pytest.raises(ValueError, match=rf"column `q2` of `log.csv`, line 15001, {complaint}"):
         factorise(base, [log])
     lines[15000] = "1,2,3,4,5,6,7"
     path.write_text("\n".join(lines))
     with pytest.raises(ValueError, match="is no table with 6 columns in every line"):
-        factorise(base, [open_log(path, COLUMNS, base.model.robot, SMOOTH)])
+        factorise(base, [scan_log(path, COLUMNS, base.model.robot, SMOOTH)])
 
 
 @pytest.mark.usefixtures("short_strides")
@@ -222,18 +225,18 @@ def test_gaps_slow_rows_and_limits_as_in_memory(base, numbers, tmp_path):
     np.savez(tmp_path / "log.npz", t=time, q=angles, tau=forces)
     columns = jid.Columns(angles="q", forces="tau", time="t")
     robot, every, slow = base.model.robot, jid.Subsample(15), (0.3, 0.2)
-    log = open_log(tmp_path / "log.npz", columns, robot, SMOOTH, every, slow, start=1.0, stop=18.0)
+    log = scan_log(tmp_path / "log.npz", columns, robot, SMOOTH, every, slow, start=1.0, stop=18.0)
     recording = jid.read_recording(tmp_path / "log.npz", columns).crop(1.0, 18.0)
     o = jid.observe(recording, robot, SMOOTH, every, slow)
     assert log.notes == o.notes
     assert len(o.segments) == 2
-    np.testing.assert_array_equal(log.outline.mask, o.mask)
+    np.testing.assert_array_equal(log.mask, o.mask)
     np.testing.assert_allclose(log.reduced_time, o.reduced_time, atol=1e-9)
     agree(base, log, o)
     for a, b in zip(log.split(0.6), o.split(0.6), strict=True):
         agree(base, a, b)
     with pytest.raises(ValueError, match="from 90 s to inf s"):
-        open_log(tmp_path / "log.npz", columns, robot, SMOOTH, start=90.0)
+        scan_log(tmp_path / "log.npz", columns, robot, SMOOTH, start=90.0)
 
 
 def test_nanoseconds_since_1970(base, numbers, tmp_path):
@@ -245,9 +248,9 @@ def test_nanoseconds_since_1970(base, numbers, tmp_path):
     )
     frame.write_csv(tmp_path / "log.csv")
     columns = jid.Columns(angles="q{}", forces="tau{}", time="t", time_unit=units.NS)
-    log = open_log(tmp_path / "log.csv", columns, base.model.robot, SMOOTH)
-    assert log.outline.sample_time == DT
-    assert log.outline.segments == ((0, 5000),)
+    log = scan_log(tmp_path / "log.csv", columns, base.model.robot, SMOOTH)
+    assert log.sample_time == DT
+    assert log.segments == ((0, 5000),)
 
 
 def test_forces_in_another_file(base, numbers, tmp_path):
@@ -256,8 +259,8 @@ def test_forces_in_another_file(base, numbers, tmp_path):
     pl.DataFrame({"tau1": forces[:, 0], "tau2": forces[:, 1]}).write_parquet(tmp_path / "f.parquet")
     columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=DT)
     robot = base.model.robot
-    log = open_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=tmp_path / "f.parquet")
-    np.testing.assert_array_equal(log.measured(slice(100, 200))[2], forces[100:200])
+    log = scan_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=tmp_path / "f.parquet")
+    np.testing.assert_array_equal(log.source.read_unfiltered(slice(100, 200))[2], forces[100:200])
     pl.DataFrame({"tau1": forces[1:, 0], "tau2": forces[1:, 1]}).write_csv(tmp_path / "less.csv")
     with pytest.raises(ValueError, match=r"has 4999 rows, but `q.csv` has 5000"):
-        open_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=tmp_path / "less.csv")
+        scan_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=tmp_path / "less.csv")

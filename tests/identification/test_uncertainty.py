@@ -1,6 +1,5 @@
 """The spectral sandwich against its definition, and against the scatter of many draws."""
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -159,7 +158,7 @@ def long_one(base, *, segments=None, mask=None, seed=0, samples=1000):
         changed["segments"] = segments
     if mask is not None:
         changed["mask"] = mask
-    return jid.Observations(**{**vars(o), **changed})
+    return o.replace(**changed)
 
 
 SLOW = np.abs(moved(1000).qd) > 0.3
@@ -189,7 +188,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(base, options, memory):
 def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
     o = long_one(base, samples=24000)
     noise = coloured(np.random.default_rng(3), (1, 24000, 2), 0.3, 0.02)[0]
-    o = jid.Observations(**{**vars(o), "forces": o.forces + noise})
+    o = o.replace(forces=o.forces + noise)
     whole = jid.identify(base, o, ESTIMATOR)
     monkeypatch.setattr(stretches, "LONGEST_ROWS", 1500)
     divided = jid.identify(base, o, ESTIMATOR)
@@ -203,7 +202,7 @@ def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
 def test_intervals_by_the_fit(base):
     o = long_one(base)
     noise = np.random.default_rng(0).standard_normal((1000, 2))
-    fit = jid.identify(base, jid.Observations(**{**vars(o), "forces": o.forces + noise}), ESTIMATOR)
+    fit = jid.identify(base, o.replace(forces=o.forces + noise), ESTIMATOR)
     low, high = fit.intervals(0.9).T
     quantile = special.stdtrit(fit.uncertainty.freedom, 0.95)
     np.testing.assert_allclose(high - low, 2 * quantile * fit.standard_deviations)
@@ -258,9 +257,7 @@ def test_residuals_are_told_white_or_not(base):
     white = np.random.default_rng(0).standard_normal((1000, 2))
     slow = coloured(np.random.default_rng(1), (1, 1000, 2), 0.3, 0.02)[0]
     noise = np.stack([white[:, 0], slow[:, 1]], axis=1)
-    spectra = jid.identify(
-        base, jid.Observations(**{**vars(o), "forces": o.forces + noise}), ESTIMATOR
-    ).residual_spectra
+    spectra = jid.identify(base, o.replace(forces=o.forces + noise), ESTIMATOR).residual_spectra
     assert spectra.white == (True, False)
     assert spectra.slow[1] > 0.5 > 0.2 > spectra.slow[0]
     # One-sided densities: their area is the variance.
@@ -274,7 +271,7 @@ def test_many_gaps_cost_no_memory_and_change_little(base, monkeypatch):
     segments = tuple((int(a), int(b)) for a, b in itertools.pairwise(ends))
     o = long_one(base, segments=segments, samples=int(ends[-1]))
     noise = coloured(np.random.default_rng(8), (1, o.rows, 2), 0.1, o.row_time)[0]
-    o = dataclasses.replace(o, forces=o.forces + noise)
+    o = o.replace(forces=o.forces + noise)
     shared, _ = seen(base, [o])
     assert [x.stretches for x in shared.lines] == [8]
     monkeypatch.setattr(stretches, "KINDS", 8)

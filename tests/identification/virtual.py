@@ -50,19 +50,13 @@ def observations(
     dt = 10.0 / (samples - 1)
     if filter is None:
         filter = jid.ZeroPhaseButterworth(0.4 / dt, force_cutoff=math.inf, margin=0.0)
-    o = jid.Observations(
-        time=dt * np.arange(samples),
-        motion=m,
-        forces=forces,
+    return jid.Observations.of(
+        *(m.q, m.qd, m.qdd, forces),
         filter=filter,
         decimation=jid.Subsample(every),
-        segments=((0, samples),),
-        mask=np.ones((0, n), bool),
+        mask=mask,
         sample_time=dt,
     )
-    rows = len(o.instants)
-    full = np.ones((rows, n), bool) if mask is None else mask
-    return jid.Observations(**{**vars(o), "mask": full})
 
 
 def dense(

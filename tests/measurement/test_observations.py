@@ -114,14 +114,14 @@ def test_rows_lie_where_they_say():
 
 def test_slow_rows_are_masked_for_their_joint_alone():
     speeds = np.array([0.5, 1.2])
-    o = observe(a_recording(), a_robot(), CASES[1][0], CASES[1][1], slow=(0.5, 1.2))
+    o = observe(a_recording(), a_robot(), CASES[1][0], CASES[1][1], min_speed=(0.5, 1.2))
     np.testing.assert_array_equal(o.mask, np.abs(o.reduced_motion.qd) >= speeds)
     assert not o.mask.all(axis=0).any()
     assert (o.mask[:, 0] != o.mask[:, 1]).any()
     with pytest.raises(ValueError, match="joint `joint2` never reaches the speed 99"):
-        observe(a_recording(), a_robot(), CASES[1][0], slow=[0.0, 99.0])
-    with pytest.raises(ValueError, match="`slow`"):
-        observe(a_recording(), a_robot(), CASES[1][0], slow=[0.0])
+        observe(a_recording(), a_robot(), CASES[1][0], min_speed=[0.0, 99.0])
+    with pytest.raises(ValueError, match="`min_speed`"):
+        observe(a_recording(), a_robot(), CASES[1][0], min_speed=[0.0])
 
 
 @pytest.mark.parametrize("angles", [True, False])

@@ -16,7 +16,6 @@ from jaxid.errors import InputError
 from jaxid.identification.factors import CHUNK, Blocks, Factors, JointFactor
 from jaxid.identification.nonlinear.shapes import Shapes
 from jaxid.identification.rows import RowChunk, Rows
-from jaxid.identification.streaming_log import source
 from jaxid.program import evaluate_packed
 
 MOST = 2**28
@@ -179,10 +178,10 @@ class SeparableRows:
 
     def _shaped(self, number: int, x: Float[np.ndarray, " shapes"]) -> np.ndarray:
         """The rows of everything that depends on shapes, for one recording."""
-        observations, read = source(self._rows.recordings[number])
+        observations = self._rows.recordings[number]
         found = np.empty((observations.rows, len(self._needed)))
         for chunk in observations.chunks(CHUNK):
-            motion, _ = read(slice(*chunk.samples))
+            motion, _ = observations.read(slice(*chunk.samples))
             arrays = (np.asarray(a, np.float64).T for a in (motion.q, motion.qd, motion.qdd))
             packed = evaluate_packed(self._program, np.asarray(x), *arrays)
             wide = np.empty((len(motion.q), len(self._needed)), order="F")

@@ -19,7 +19,6 @@ from jaxid.identification.nonlinear.slopes import with_slopes
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.measurement.observations import Observations
 
 FOLDS = 5
@@ -124,7 +123,7 @@ class NonlinearFit(eqx.Module):
 
 def identify_nonlinear(
     base: BaseParameters,
-    observations: Observations | LongLog | Sequence[Observations | LongLog],
+    observations: Observations | Sequence[Observations],
     estimator: NonlinearFriction | None = None,
     *,
     linear: BaseParameters | None = None,
@@ -145,7 +144,7 @@ def identify_nonlinear(
     Raises:
         InputError: If the model has no shapes, or the observations do not fit to it.
     """
-    single = isinstance(observations, Observations | LongLog)
+    single = isinstance(observations, Observations)
     recordings = (observations,) if single else tuple(observations)
     estimator = NonlinearFriction() if estimator is None else estimator
     beside = Rows.of(base if linear is None else linear, recordings)

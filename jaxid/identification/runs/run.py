@@ -17,7 +17,6 @@ from jaxid.identification.rows import Rows
 from jaxid.identification.runs.estimates import freedom_of, with_covariance
 from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.identification.streaming import Progress
-from jaxid.identification.streaming_log import LongLog
 from jaxid.identification.weights import AbstractWeights, GivenWeights, MaximumForces
 from jaxid.measurement.observations import Observations
 
@@ -56,7 +55,7 @@ class Run(eqx.Module):
     def of(
         cls,
         base: BaseParameters,
-        observations: Observations | LongLog | Sequence[Observations | LongLog],
+        observations: Observations | Sequence[Observations],
         *,
         weights: AbstractWeights | None = None,
         name: str | None = None,
@@ -75,7 +74,7 @@ class Run(eqx.Module):
         Raises:
             InputError: If there are fewer rows than parameters, or weights are not known.
         """
-        single = isinstance(observations, Observations | LongLog)
+        single = isinstance(observations, Observations)
         recordings = (observations,) if single else tuple(observations)
         rows = Rows.of(base, recordings, progress)
         chosen = MaximumForces() if weights is None else weights

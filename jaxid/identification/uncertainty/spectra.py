@@ -8,7 +8,6 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.identification.influence import AbstractInfluence, Channel
 from jaxid.identification.rows import Rows
-from jaxid.identification.streaming_log import source
 from jaxid.identification.uncertainty.stretches import (
     FAINT,
     filled,
@@ -95,7 +94,7 @@ def lines_of(
     B = np.asarray(inverse)
     correlated = np.zeros((0, 0, *B.shape))
     for stretch, parts in gathered(rows, wanted, np.asarray(p)):
-        o, _ = source(rows.recordings[stretch.recording])
+        o = rows.recordings[stretch.recording]
         pieces = [influence.channels(chunk, residuals) for chunk, residuals in parts]
         if not len(correlated):
             correlated = np.zeros((len(BINS) + 1, len(pieces[0]), *B.shape))

@@ -8,7 +8,6 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.identification.rows import RowChunk, Rows
-from jaxid.identification.streaming_log import source
 from jaxid.measurement.observations import Observations
 
 LONGEST_ROWS = 2**15
@@ -53,14 +52,14 @@ def stretches(rows: Rows) -> tuple[list[Stretch], bool]:
     """
     found, samples = [], 0
     for number, recording in enumerate(rows.recordings):
-        o, _ = source(recording)
+        o = recording
         most = max(4, min(LONGEST_ROWS, LONGEST_SAMPLES // o.decimation.factor))
         for a, b in o.row_segments:
             parts = np.array_split(np.arange(a, b), math.ceil((b - a) / most))
             found += [
                 Stretch(number, (int(part[0]), int(part[-1]) + 1), o.row_time) for part in parts
             ]
-        samples += len(o.time)
+        samples += o.samples
     if samples <= SEEN:
         return found, True
     chosen = np.linspace(0, len(found) - 1, max(1, len(found) * SEEN // samples))
