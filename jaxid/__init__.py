@@ -150,11 +150,12 @@ from jaxid.measurement.recording import Recording as Recording
 from jaxid.program.cache import keep_compiled as keep_compiled
 from jaxid.report import plot as plot
 from jaxid.robot import library as robots  # noqa: F401
-from jaxid.robot.capsules import AbstractObstacle as AbstractObstacle
-from jaxid.robot.capsules import Box as Box
-from jaxid.robot.capsules import Capsule as Capsule
-from jaxid.robot.capsules import HalfSpace as HalfSpace
+from jaxid.robot.collision import AbstractObstacle as AbstractObstacle
+from jaxid.robot.collision import Box as Box
+from jaxid.robot.collision import Capsule as Capsule
 from jaxid.robot.collision import CollisionModel as CollisionModel
+from jaxid.robot.collision import HalfSpace as HalfSpace
+from jaxid.robot.collision import fit_capsules as fit_capsules
 from jaxid.robot.dh import from_dh as from_dh
 from jaxid.robot.drives import Drives as Drives
 from jaxid.robot.inverse_kinematics import inverse_kinematics as inverse_kinematics
@@ -164,7 +165,6 @@ from jaxid.robot.robot import Robot as Robot
 from jaxid.robot.robot import Tool as Tool
 from jaxid.robot.urdf import load_urdf as load_urdf
 from jaxid.robot.urdf import urdf_parameters as urdf_parameters
-from jaxid.robot.urdf_collision import fit_capsules as fit_capsules
 from jaxid.simulation.disturbances import AbstractDisturbance as AbstractDisturbance
 from jaxid.simulation.disturbances import CableForce as CableForce
 from jaxid.simulation.disturbances import TorqueRipple as TorqueRipple

@@ -11,7 +11,7 @@ from jaxid.robot.drives import Drives
 from jaxid.robot.library import panda, planar_arm
 from jaxid.trajectory.fourier import random_fourier_series
 
-ROBOT = panda().replace(drives=Drives.of(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))
+ROBOT = panda().replace(drives=Drives(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))
 T = np.arange(0.0, 10.0, 0.005)
 Q = np.asarray(random_fourier_series(ROBOT, omega=0.6, seed=3).motion(T).q)
 

@@ -118,14 +118,14 @@ def _log(model: jid.Model, p, seed: int, alone: int | None = None) -> jid.Record
 def given(tmp_path_factory):
     """What readers of a page have by then: a robot, its model, logs of it in a folder, a fit."""
     folder = tmp_path_factory.mktemp("documents")
-    robot = jid.Robot.of(
+    robot = jid.Robot(
         "two joints",
         revolute=(True,) * 2,
         axis=[(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)],
         rotation=np.tile(np.eye(3), (2, 1, 1)),
         offset=[(0.0, 0.0, 0.3), (0.1, 0.0, 0.2)],
         tip_offset=(0.0, 0.0, 0.4),
-        limits=jid.Limits.of(
+        limits=jid.Limits(
             2,
             position_min=[-2.9, -1.5],
             position_max=[2.9, 1.5],

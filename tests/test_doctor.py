@@ -18,7 +18,7 @@ from jaxid.trajectory.fourier import random_fourier_series
 
 COUPLED = np.diag([50.0, -60.0, 50.0, 60.0, 40.0, 30.0, 30.0])
 COUPLED[6, 5] = 30.0
-ROBOT = panda().replace(drives=Drives.of(7, reduction=COUPLED))
+ROBOT = panda().replace(drives=Drives(7, reduction=COUPLED))
 BASE = base_parameters(Model(ROBOT, (RigidBodies(), ViscousFriction(), CoulombFriction())))
 DT = 0.005
 

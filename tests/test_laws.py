@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import jaxid as jid
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.failures import is_for_the_user
-from jaxid.robot.snap import snap_angles, snap_axis, snap_rotation
+from jaxid.robot.plausibility import snap_angles, snap_axis, snap_rotation
 
 ARM = jid.robots.planar_arm(2, 0.4)
 ODD = (

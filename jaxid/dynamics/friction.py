@@ -9,13 +9,10 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, matching, one_or_each
 from jaxid.dynamics import projection
-from jaxid.dynamics.terms import (
-    INERTIAL_NAMES,
-    AbstractTerm,
-    each_joint,
-)
+from jaxid.dynamics.terms import AbstractTerm, each_joint
 from jaxid.dynamics.transitions import AbstractTransition, Shape, Tanh
 from jaxid.errors import InputError
+from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
 
 TINY = 1e-30

@@ -23,7 +23,8 @@ from jaxid.dynamics.observation import (
 )
 from jaxid.dynamics.rank import solve_from_earlier
 from jaxid.program import FREE, Program, evaluate, trace
-from jaxid.robot.robot import AXES, Robot
+from jaxid.robot.inertia import AXES
+from jaxid.robot.robot import Robot
 
 EXPLAINED = 1e-9
 _NOTHING = 1e-12

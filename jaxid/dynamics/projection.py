@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
+from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.kinematics import placement_in_parent, placements, skew
 from jaxid.robot.robot import Robot
 
@@ -162,12 +163,6 @@ def rigid_body_mass_matrix(
             mp, hp, Jp = composite[parent]
             composite[parent] = (mp + m, hp + h + m * r, Jp + J)
     return jnp.stack([jnp.stack([jnp.asarray(x) for x in row]) for row in M])
-
-
-def inertia_tensor(j: Float[AnyArray, "6"]) -> Float[AnyArray, "3 3"]:
-    """The tensor $J^o$ of the moments $(A, B, C, D, E, F)$ [kg m²] (Eq. 9)."""
-    A, B, C, D, E, F = (j[k] for k in range(6))
-    return jnp.array([[A, -F, -E], [-F, B, -D], [-E, -D, C]])
 
 
 def potential_energy_columns(

@@ -11,10 +11,9 @@ from jaxid.arrays import AnyArray, Float, matching, one_or_each
 from jaxid.dynamics import projection
 from jaxid.dynamics.transitions import AbstractTransition, Shape, Tanh, has_dead_zone
 from jaxid.errors import InputError
-from jaxid.robot.robot import AXES, Robot
+from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.robot.robot import Robot
 
-INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")
-INERTIAL_UNITS = ("kg", *("kg m",) * 3, *("kg m²",) * 6)
 PRINCIPAL = 7
 
 

@@ -8,11 +8,18 @@ from jaxid.errors import InputError
 from jaxid.experiment.robot_tables import within
 from jaxid.experiment.tables import BoxTable, CapsuleTable, CollisionTable, Tables
 from jaxid.robot import library
-from jaxid.robot.capsules import GROUND, AbstractObstacle, Box, Capsule, HalfSpace
-from jaxid.robot.collision import CollisionModel
+from jaxid.robot.collision import (
+    GROUND,
+    AbstractObstacle,
+    Box,
+    Capsule,
+    CollisionModel,
+    HalfSpace,
+    fit_capsules,
+)
+from jaxid.robot.kinematics import rpy_rotation
+from jaxid.robot.plausibility import SNAP_TOLERANCE
 from jaxid.robot.robot import Robot
-from jaxid.robot.snap import SNAP_TOLERANCE, rpy_rotation
-from jaxid.robot.urdf_collision import fit_capsules
 
 BUILTIN_SHAPES = {"tx90l_on_rail": library.tx90l_on_rail_collision}
 """Robots of the library whose shapes are in the library too."""
@@ -37,10 +44,10 @@ def build_collision(tables: Tables, robot: Robot, path: Path) -> CollisionModel 
         capsules += [_capsule(robot, one) for one in table.capsules]
         obstacles += [_box(one) for one in table.boxes]
         if table.ground is not None:
-            obstacles.append(HalfSpace.of("ground", height=table.ground))
+            obstacles.append(HalfSpace("ground", height=table.ground))
         if table.pairs is not None:
             pairs = table.pairs
-        return CollisionModel.of(robot, capsules, obstacles, pairs)
+        return CollisionModel(robot, capsules, obstacles, pairs)
 
 
 def _given(
@@ -92,11 +99,11 @@ def _capsule(robot: Robot, table: CapsuleTable) -> Capsule:
             f"`body` of capsule `{table.name}` must be `ground` or the name of the joint that "
             f'moves it ({", ".join(robot.joint_names)}), but is "{table.body}".'
         )
-    return Capsule.of(
+    return Capsule(
         table.name, bodies[table.body], start=table.start, end=table.end, radius=table.radius
     )
 
 
 def _box(table: BoxTable) -> Box:
     rotation = None if table.rotation is None else rpy_rotation(np.deg2rad(table.rotation))
-    return Box.of(table.name, centre=table.centre, size=table.size, rotation=rotation)
+    return Box(table.name, centre=table.centre, size=table.size, rotation=rotation)

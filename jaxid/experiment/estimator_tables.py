@@ -33,8 +33,8 @@ from jaxid.identification.uncertainty.methods import (
     SpectralSandwich,
 )
 from jaxid.identification.weights import AbstractWeights, MaximumForces, ResidualVariances
+from jaxid.robot.plausibility import SNAP_TOLERANCE
 from jaxid.robot.robot import Robot
-from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import urdf_parameters
 from jaxid.trajectory.files import load_trajectory
 

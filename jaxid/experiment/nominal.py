@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.dynamics.terms import INERTIAL_NAMES
 from jaxid.errors import InputError
 from jaxid.experiment.experiment import Experiment
 from jaxid.report.compared_files import read_estimates
-from jaxid.robot.snap import SNAP_TOLERANCE
+from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.robot.plausibility import SNAP_TOLERANCE
 from jaxid.robot.urdf import urdf_parameters
 
 

@@ -13,7 +13,6 @@ import msgspec
 
 from jaxid.errors import InputError
 from jaxid.experiment.tables import FILTERS, Tables
-from jaxid.robot.names import control_characters
 
 _WORDS = {
     "float": "a number",
@@ -76,8 +75,8 @@ def read_tables(path: Path) -> tuple[Tables, str]:
         stop = "" if sentence.endswith("?") else "."
         raise InputError(f"{path.name}: {sentence}{stop}") from error
     for key, value in _texts(raw):
-        if sign := control_characters(value):
-            raise InputError(f"{path.name}: `{key}` holds the control character {sign}: remove it.")
+        if not value.replace("\t", " ").replace("\n", " ").isprintable():
+            raise InputError(f"{path.name}: `{key}` holds control characters: remove them.")
     return found, text
 
 

@@ -20,10 +20,10 @@ from jaxid.experiment.tables import (
 from jaxid.robot import library
 from jaxid.robot.dh import from_dh
 from jaxid.robot.drives import Drives
+from jaxid.robot.kinematics import rpy_rotation
 from jaxid.robot.limits import Limits
-from jaxid.robot.plausible import beyond_range, far_notes, fast_notes
+from jaxid.robot.plausibility import SNAP_TOLERANCE, far_notes, fast_notes, range_fault
 from jaxid.robot.robot import GRAVITY, Robot, Tool
-from jaxid.robot.snap import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import load_urdf
 
 BUILTIN = {
@@ -184,7 +184,7 @@ def build_load(robot: Robot, table: ToolTable) -> Tool:
             f'but is "{table.body}".'
         )
     body = robot.joint_names.index(table.body)
-    return Tool.of(body, mass=table.mass, centre_of_mass=table.centre_of_mass, inertia=J)
+    return Tool(body, mass=table.mass, centre_of_mass=table.centre_of_mass, inertia=J)
 
 
 def _limits(robot: Robot, table: LimitsTable) -> Limits:
@@ -209,13 +209,13 @@ def _limits(robot: Robot, table: LimitsTable) -> Limits:
         fields[name] = known
     for j, name in enumerate(robot.joint_names):
         low, high = fields["position_min"][j], fields["position_max"][j]
-        if why := beyond_range(low, high, robot.revolute[j]):
+        if why := range_fault(low, high, robot.revolute[j]):
             cure = "give the limits in metres, inf for none"
             if robot.revolute[j]:
                 cure = 'for degrees add `angle_unit = "deg"`, and inf means no limit'
             raise InputError(f"joint `{name}` {why}: {cure}.")
     assumed = tuple(what for what in robot.limits.assumed if what not in said)
-    return Limits.of(robot.joints, **fields, assumed=assumed)
+    return Limits(robot.joints, **fields, assumed=assumed)
 
 
 def _limit_notes(robot: Robot, table: LimitsTable, limits: Limits) -> Iterator[str]:
@@ -251,7 +251,7 @@ def _drives(robot: Robot, table: DrivesTable) -> Drives:
         zero = np.array(table.zero) * np.where(turns, np.pi / 180, 1.0)
     torques = each(robot, "max_torques", table.max_torques)
     inertia = each(robot, "rotor_inertia", table.rotor_inertia)
-    fresh = Drives.of(n, reduction=reduction, zero=zero, max_torques=torques, rotor_inertia=inertia)
+    fresh = Drives(n, reduction=reduction, zero=zero, max_torques=torques, rotor_inertia=inertia)
     if torques is None:
         fresh = eqx.tree_at(lambda d: d.max_torques, fresh, drives.max_torques)
     if inertia is None:

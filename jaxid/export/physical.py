@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, double_precision
-from jaxid.dynamics.projection import inertia_tensor
 from jaxid.errors import InputError
 from jaxid.export.feed_forward import bodies_of
 from jaxid.identification.consistency import consistency_margin
 from jaxid.identification.fit import Fit
+from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
 
 IMPOSSIBLE = -1e-9

@@ -10,8 +10,8 @@ from jaxid.errors import InputError
 from jaxid.export.physical import Inertial, Joints, known_efforts, possible_bodies
 from jaxid.identification.fit import Fit
 from jaxid.io import write_bytes
+from jaxid.robot.plausibility import SNAP_TOLERANCE
 from jaxid.robot.robot import Robot
-from jaxid.robot.snap import SNAP_TOLERANCE
 from jaxid.robot.urdf import load_urdf, merged_links
 
 SAME = 1e-3

@@ -31,8 +31,7 @@ from jaxid.report.style import (
     house_style,
     new_figure,
 )
-from jaxid.robot.capsules import GROUND
-from jaxid.robot.collision import CollisionModel
+from jaxid.robot.collision import GROUND, CollisionModel
 from jaxid.robot.kinematics import placements, tip_placement
 from jaxid.robot.robot import Robot
 

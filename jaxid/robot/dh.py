@@ -5,15 +5,10 @@ import numpy as np
 from jaxid.arrays import Numbers
 from jaxid.errors import InputError
 from jaxid.robot.drives import Drives
+from jaxid.robot.kinematics import axis_rotation
 from jaxid.robot.limits import Limits
+from jaxid.robot.plausibility import SNAP_TOLERANCE, angle_notes, check_tolerance, snap_angles
 from jaxid.robot.robot import GRAVITY, Robot, Tool
-from jaxid.robot.snap import (
-    SNAP_TOLERANCE,
-    angle_notes,
-    axis_rotation,
-    check_tolerance,
-    snap_angles,
-)
 
 _X, _, _Z = np.eye(3)
 CONVENTIONS = ("modified", "standard")
@@ -107,7 +102,7 @@ def from_dh(
             rotation[i], offset[i] = R @ turn, r
             R, r = twist, d * _Z + a * _X
     end = np.eye(3) if tip_rotation is None else np.asarray(tip_rotation, dtype=np.float64)
-    robot = Robot.of(
+    robot = Robot(
         name,
         revolute=revolute,
         axis=np.tile(_Z, (n, 1)),

@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxid.arrays import Float, Numbers, as_array
 from jaxid.errors import InputError
+from jaxid.robot.kinematics import rotation_vectors, tip_jacobian
 from jaxid.robot.robot import Robot
-from jaxid.robot.tip_jacobian import rotation_vectors, tip_jacobian
 
 REACHED = 1e-9
 """Distance from a pose that counts as reached [m, and rad]."""

@@ -8,13 +8,12 @@ import numpy as np
 
 from jaxid.arrays import Numbers
 from jaxid.errors import InputError
-from jaxid.robot.capsules import GROUND, Capsule, HalfSpace
-from jaxid.robot.collision import CollisionModel
+from jaxid.robot.collision import GROUND, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.dh import from_dh
 from jaxid.robot.drives import Drives
+from jaxid.robot.kinematics import axis_rotation
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
-from jaxid.robot.snap import axis_rotation
 
 _HALF = np.pi / 2
 _X, _Y, _Z = np.eye(3)
@@ -41,14 +40,14 @@ def tx90l_on_rail() -> Robot:
         ]
     )
     parents = np.concatenate([[upright], attitudes[:-1]])
-    return Robot.of(
+    return Robot(
         "TX90L on rail",
         revolute=(False, *(True,) * 6),
         axis=[_X, *[_Z] * 6],
         rotation=np.einsum("iba,ibc->iac", parents, attitudes),
         offset=np.einsum("iba,ib->ia", parents, urdf_offset),
         joint_names=("rail", *(f"joint{i}" for i in range(1, 7))),
-        limits=Limits.of(
+        limits=Limits(
             7,
             position_min=[-1.5, *np.deg2rad([-180.0, -130.0, -145.0, -270.0, -115.0, -270.0])],
             position_max=[1.5, *np.deg2rad([180.0, 147.5, 145.0, 270.0, 140.0, 270.0])],
@@ -81,11 +80,11 @@ def tx90l_on_rail_collision() -> CollisionModel:
     flange's joint.
     """
     capsules = (
-        Capsule.of("column", 0, start=(0.0, 0.0, 0.05), end=(0.0, 0.0, 0.45), radius=0.19),
-        Capsule.of("upper arm", 2, start=(0.0, 0.0, 0.05), end=(0.0, -0.5, 0.05), radius=0.13),
-        Capsule.of("forearm", 4, start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 0.55), radius=0.12),
-        Capsule.of("wrist", 6, start=(0.0, 0.0, -0.1), end=(0.0, 0.0, 0.2), radius=0.07),
-        Capsule.of("rail", GROUND, start=(-2.5, 0.0, -0.15), end=(2.5, 0.0, -0.15), radius=0.25),
+        Capsule("column", 0, start=(0.0, 0.0, 0.05), end=(0.0, 0.0, 0.45), radius=0.19),
+        Capsule("upper arm", 2, start=(0.0, 0.0, 0.05), end=(0.0, -0.5, 0.05), radius=0.13),
+        Capsule("forearm", 4, start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 0.55), radius=0.12),
+        Capsule("wrist", 6, start=(0.0, 0.0, -0.1), end=(0.0, 0.0, 0.2), radius=0.07),
+        Capsule("rail", GROUND, start=(-2.5, 0.0, -0.15), end=(2.5, 0.0, -0.15), radius=0.25),
     )
     pairs = (
         ("forearm", "column"),
@@ -96,7 +95,7 @@ def tx90l_on_rail_collision() -> CollisionModel:
         ("forearm", "ground"),
         ("wrist", "ground"),
     )
-    return CollisionModel.of(tx90l_on_rail(), capsules, (HalfSpace.of("ground"),), pairs)
+    return CollisionModel(tx90l_on_rail(), capsules, (HalfSpace("ground"),), pairs)
 
 
 def tx40() -> Robot:
@@ -121,14 +120,14 @@ def tx40() -> Robot:
         convention="modified",
         name="TX40",
         base_position=(0.0, 0.0, 0.32),
-        limits=Limits.of(
+        limits=Limits(
             6,
             position_min=np.deg2rad([-180.0, -125.0, -138.0, -270.0, -120.0, -270.0]) + zero,
             position_max=np.deg2rad([180.0, 125.0, 138.0, 270.0, 133.5, 270.0]) + zero,
             velocity=np.deg2rad([287.0, 287.0, 430.0, 410.0, 320.0, 700.0]),
             force=[131.84, 131.84, 103.49, 46.08, 43.19, 30.72],
         ),
-        drives=Drives.of(6, reduction=reduction, zero=zero),
+        drives=Drives(6, reduction=reduction, zero=zero),
         source="figaroh-examples and BIRDy (geometry, gears, limits)",
         notes=(
             "the ranges of the joints 2 and 3 are the manufacturer's, moved by -90 and +90 degrees "
@@ -151,7 +150,7 @@ def ur10() -> Robot:
         ],
         convention="standard",
         name="UR10",
-        limits=Limits.of(
+        limits=Limits(
             6,
             position_min=-np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
             position_max=np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
@@ -176,7 +175,7 @@ def ur10e() -> Robot:
         ],
         convention="standard",
         name="UR10e",
-        limits=Limits.of(
+        limits=Limits(
             6,
             position_min=-np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
             position_max=np.pi * np.array([2.0, 2.0, 1.0, 2.0, 2.0, 2.0]),
@@ -203,7 +202,7 @@ def panda() -> Robot:
         convention="modified",
         name="Panda",
         tip_offset=(0.0, 0.0, 0.107),
-        limits=Limits.of(
+        limits=Limits(
             7,
             position_min=[-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973],
             position_max=[2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973],
@@ -219,7 +218,7 @@ def panda() -> Robot:
 def iiwa14() -> Robot:
     """The KUKA LBR iiwa 14 R820, seven axes; frames as in its URDF, all upright at q = 0."""
     reach = np.array([2.9668, 2.0942, 2.9668, 2.0942, 2.9668, 2.0942, 3.0541])
-    return Robot.of(
+    return Robot(
         "LBR iiwa 14",
         revolute=(True,) * 7,
         axis=[_Z, _Y, _Z, -_Y, _Z, _Y, _Z],
@@ -234,7 +233,7 @@ def iiwa14() -> Robot:
             (0.0, 0.0, 0.0),
         ],
         tip_offset=(0.0, 0.0, 0.126),
-        limits=Limits.of(
+        limits=Limits(
             7,
             position_min=-reach,
             position_max=reach,
@@ -273,7 +272,7 @@ def kr300() -> Robot:
         convention="standard",
         name="KR300 R2500 ultra",
         base_rotation=axis_rotation(_X, np.pi),
-        drives=Drives.of(
+        drives=Drives(
             6,
             reduction=[
                 256.85714285714283,
@@ -314,7 +313,7 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
         )
     lengths = np.broadcast_to(lengths, (joints,))
     ends = np.outer(lengths, _X)
-    return Robot.of(
+    return Robot(
         f"planar arm, {joints} joints",
         revolute=(True,) * joints,
         axis=np.tile(_Z, (joints, 1)),

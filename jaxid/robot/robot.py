@@ -1,30 +1,35 @@
-"""What is known of a robot: its kinematic tree, its limits and its drives. Never a parameter."""
+"""Robot: kinematic tree, limits, drives and known load; never an unknown parameter."""
 
 import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.drives import Drives
+from jaxid.robot.inertia import Inertia
 from jaxid.robot.limits import Limits
-from jaxid.robot.names import cleaned, control_characters
-from jaxid.robot.plausible import FAR, FARTHEST, HEAVIEST, far_notes
+from jaxid.robot.plausibility import FARTHEST, check_name, far_notes
+from jaxid.table import Column, Table
 
 GRAVITY = (0.0, 0.0, -9.81)
-AXES = "xyz"
 
 
 class Tool(eqx.Module):
-    """A load of known mass that is mounted on a body: it is subtracted, not identified.
+    """Load of known mass on a body: its forces are subtracted, not identified.
 
-    Attributes:
+    Args:
         body: Index of the body that carries it (0 is the first).
         mass: Mass [kg].
-        centre_of_mass: In the frame of the body [m].
-        inertia: Inertia tensor about its centre of mass, along the body's axes [kg m²].
+        centre_of_mass: Centre of mass in the frame of the body [m].
+        inertia: Inertia tensor about the centre of mass, along the body's axes [kg m²]; a point
+            mass if None.
+
+    Raises:
+        InputError: If the mass is not positive, or no body has such an inertia.
     """
 
     body: int = eqx.field(static=True)
@@ -32,86 +37,64 @@ class Tool(eqx.Module):
     centre_of_mass: Float[AnyArray, "3"]
     inertia: Float[AnyArray, "3 3"]
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         body: int,
         *,
         mass: Float[AnyArray, ""] | float | int,
         centre_of_mass: Numbers,
         inertia: Numbers | None = None,
-    ) -> "Tool":
-        """Builds a tool and checks it; a point mass if no inertia is given.
+    ):
+        self.body = body
+        self.mass = _checked("`mass` of the tool", mass, ())
+        self.centre_of_mass = _checked("`centre_of_mass` of the tool", centre_of_mass, (3,))
+        tensor = np.zeros((3, 3)) if inertia is None else inertia
+        self.inertia = _checked("`inertia` of the tool", tensor, (3, 3))
+        if not is_traced(self.mass) and self.mass <= 0:
+            raise InputError(f"`mass` of the tool must be positive, but is {self.mass:g} kg.")
+        self.body_inertia.check("the tool")
 
-        Raises:
-            InputError: If the mass is not positive, or the inertia belongs to no body.
-        """
-        m, r = as_array("mass", mass), as_array("centre_of_mass", centre_of_mass)
-        J = np.zeros((3, 3)) if inertia is None else as_array("inertia", inertia)
-        if m.shape != () or not (is_traced(m) or 0.0 < m <= HEAVIEST):
-            raise InputError(
-                f"`mass` of the tool must be a positive number of {HEAVIEST:g} kg at most, but is "
-                f"{mass}."
-            )
-        if r.shape != (3,) or not (is_traced(r) or np.isfinite(r).all()):
-            raise InputError("`centre_of_mass` of the tool must hold three finite numbers [m].")
-        if not is_traced(r) and np.abs(r).max() > FARTHEST:
-            raise InputError(
-                f"`centre_of_mass` of the tool lies {np.abs(r).max():g} m away: give it in metres."
-            )
-        if J.shape != (3, 3) or not (is_traced(J) or _is_symmetric(np.asarray(J))):
-            raise InputError("`inertia` of the tool must be a symmetric 3 x 3 matrix [kg m²].")
-        if not is_traced(J) and np.abs(J).max() > FAR**2 * HEAVIEST:
-            raise InputError(f"`inertia` of the tool holds {np.abs(J).max():g}: give it in kg m².")
-        if not is_traced(J):
-            cls._refuse_impossible(np.linalg.eigvalsh(J))
-        return cls(body, m, r, J)
-
-    @staticmethod
-    def _refuse_impossible(principal: np.ndarray) -> None:
-        slack = 1e-9 * np.abs(principal).max()
-        if principal[0] < -slack or principal[2] > principal[0] + principal[1] + slack:
-            raise InputError(
-                "`inertia` of the tool belongs to no body: its principal moments are "
-                f"{principal[0]:.3g}, {principal[1]:.3g}, {principal[2]:.3g} kg m², but none may "
-                "be negative or larger than the sum of the others; is it about the centre of mass?"
-            )
+    @property
+    def body_inertia(self) -> Inertia:
+        """Mass, centre of mass and tensor in the frame of the body."""
+        return Inertia(self.mass, self.centre_of_mass, self.inertia)
 
     @property
     def parameters(self) -> Float[AnyArray, "10"]:
         """The ten parameters $(m, m r_c, A, B, C, D, E, F)$ about the body's origin (Eqs. 8, 9)."""
-        m, r = self.mass, self.centre_of_mass
-        J = self.inertia + m * (r @ r * np.eye(3) - r[:, None] * r[None, :])
-        return namespace(m, r, J).stack(
-            [m, *(m * r), J[0, 0], J[1, 1], J[2, 2], -J[1, 2], -J[0, 2], -J[0, 1]]
-        )
+        return self.body_inertia.parameters
 
 
 class Robot(eqx.Module):
     r"""An open kinematic chain or tree: joint $i$ moves body $i$ against its parent.
 
-    The frame of a body has its origin on the joint's axis. At $q_i = 0$ it stands at `offset` with
-    the attitude `rotation` in its parent; a revolute joint turns it about `axis`, a prismatic joint
-    moves it along `axis`. Geometry may carry NumPy arrays (constants of what is compiled) or JAX
-    arrays (inputs: batches of geometries, derivatives with respect to lengths).
+    The frame of a body has its origin on the joint's axis. At $q_i = 0$ it is placed in its parent
+    at `offset` with the attitude `rotation`; a revolute joint turns it about `axis`, a prismatic
+    joint moves it along `axis`. Geometry may consist of NumPy arrays (constants of compiled code),
+    which are checked, or of JAX arrays (inputs: batches of geometries, derivatives with respect to
+    lengths), which are taken as they are.
 
-    Attributes:
-        name: Of the robot.
-        joint_names: One for each joint.
-        parent: Index of the parent body; -1 is the ground.
-        revolute: Whether the joint turns; a prismatic joint slides.
-        axis: Unit vectors of the joints' axes, in the frame of their body.
-        rotation: Attitude of the body in its parent at $q = 0$: columns are the body's axes.
-        offset: Origin of the body in its parent at $q = 0$ [m].
-        gravity: In the frame of the ground [m/s²].
-        limits: What the joints can do.
-        drives: Motors and gears.
-        tool: A known load, or None.
-        tip_body: Index of the body that carries the end-effector.
-        tip_rotation: Attitude of the end-effector in that body.
+    Args:
+        name: Name of the robot.
+        revolute: For each joint whether it turns; a prismatic joint slides.
+        axis: Axes of the joints, in the frames of their bodies; of any length.
+        rotation: Attitudes of the bodies in their parents at $q = 0$: columns are the body's axes.
+        offset: Origins of the bodies in their parents at $q = 0$ [m].
+        parent: Indices of the parent bodies, -1 for the ground; a serial chain if None.
+        joint_names: Names of the joints; `joint1`, `joint2`, … if None.
+        gravity: Acceleration of gravity in the frame of the ground [m/s²].
+        limits: Joint limits; infinite if None.
+        drives: Motors and gears; direct drives if None.
+        tool: Known load, or None.
+        tip_body: Index of the body that carries the end-effector; the last if None.
+        tip_rotation: Attitude of the end-effector in that body; the body's own if None.
         tip_offset: Origin of the end-effector in that body [m].
-        source: Where the numbers come from.
-        notes: What was changed or assumed on the way, in sentences.
+        source: Origin of the numbers.
+        notes: Changes and assumptions that were made, one sentence each.
+
+    Raises:
+        InputError: If shapes do not fit, a parent comes after its child, an axis is zero, or an
+            attitude is no rotation.
     """
 
     name: str = eqx.field(static=True)
@@ -128,45 +111,18 @@ class Robot(eqx.Module):
     tip_body: int = eqx.field(static=True)
     tip_rotation: Float[AnyArray, "3 3"]
     tip_offset: Float[AnyArray, "3"]
-    source: str = eqx.field(static=True, default="")
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    source: str = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
 
-    def __check_init__(self):
-        n = self.joints
-        if len(self.revolute) != n or any(not -1 <= p < i for i, p in enumerate(self.parent)):
-            raise InputError(
-                f"`parent` must name for each of the {len(self.revolute)} bodies an earlier one "
-                f"(or -1 for the ground), but is {self.parent}."
-            )
-        if len(self.joint_names) != n or len(set(self.joint_names)) != n:
-            raise InputError(
-                f"`joint_names` must be {n} different names, but is {self.joint_names}."
-            )
-        for name in (self.name, *self.joint_names):
-            if sign := control_characters(name):
-                raise InputError(
-                    f"the name `{cleaned(name)}` holds the control character {sign}: remove it."
-                )
-        carrier = self.tip_body if self.tool is None else self.tool.body
-        for what, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
-            if not 0 <= body < n:
-                raise InputError(f"`{what}` must be a body from 0 to {n - 1}, but is {body}.")
-        for what, one in (("limits", self.limits.force), ("drives", self.drives.zero)):
-            if one.shape[-1:] != (n,):
-                raise InputError(
-                    f"`{what}` must be of {n} joints, like the robot, but are of {one.shape[-1]}."
-                )
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         name: str,
         *,
-        parent: tuple[int, ...] | None = None,
         revolute: tuple[bool, ...],
         axis: Numbers,
         rotation: Numbers,
         offset: Numbers,
+        parent: tuple[int, ...] | None = None,
         joint_names: tuple[str, ...] | None = None,
         gravity: Numbers = GRAVITY,
         limits: Limits | None = None,
@@ -177,80 +133,66 @@ class Robot(eqx.Module):
         tip_offset: Numbers = (0.0, 0.0, 0.0),
         source: str = "",
         notes: tuple[str, ...] = (),
-    ) -> "Robot":
-        """Builds a robot and checks it; axes are normalised, unknown limits are infinite.
-
-        Args:
-            name: Of the robot.
-            parent: Index of each body's parent, -1 for the ground; a serial chain if None.
-            revolute: Whether each joint turns (otherwise it slides).
-            axis: Axes of the joints, in their body's frame.
-            rotation: Attitudes of the bodies in their parents at q = 0.
-            offset: Origins of the bodies in their parents at q = 0 [m].
-            joint_names: `joint1`, `joint2`, … if None.
-            gravity: In the frame of the ground [m/s²].
-            limits: Infinite if None.
-            drives: Direct drives if None.
-            tool: A known load.
-            tip_body: Body of the end-effector; the last if None.
-            tip_rotation: Attitude of the end-effector in that body; the same if None.
-            tip_offset: Origin of the end-effector in that body [m].
-            source: Where the numbers come from.
-            notes: What was changed or assumed on the way.
-
-        Raises:
-            InputError: If shapes do not fit, a parent comes after its child, an axis is zero, or
-                an attitude is no rotation.
-        """
+    ):
         n = len(revolute)
         if n == 0:
-            raise InputError("a robot must have at least one joint, but has none.")
-        parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
-        arrays = {}
-        for key, value, shape in (
-            ("axis", axis, (n, 3)),
-            ("rotation", rotation, (n, 3, 3)),
-            ("offset", offset, (n, 3)),
-            ("gravity", gravity, (3,)),
-            ("tip_rotation", np.eye(3) if tip_rotation is None else tip_rotation, (3, 3)),
-            ("tip_offset", tip_offset, (3,)),
-        ):
-            arrays[key] = np.array(value, dtype=np.float64)
-            if arrays[key].shape != shape or not np.isfinite(arrays[key]).all():
-                raise InputError(
-                    f"`{key}` must hold finite numbers of shape {shape}, "
-                    f"but has shape {arrays[key].shape}."
-                )
-        length = np.linalg.norm(arrays["axis"], axis=1)
-        if (length < 1e-9).any():
-            j = int(np.flatnonzero(length < 1e-9)[0]) + 1
-            raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
-        arrays["axis"] = np.where(
-            np.abs(length - 1.0)[:, None] > 1e-15, arrays["axis"] / length[:, None], arrays["axis"]
-        )
-        for j, R in enumerate(arrays["rotation"]):
-            _require_rotation(f"`rotation` of joint {j + 1}", R)
-        _require_rotation("`tip_rotation`", arrays["tip_rotation"])
+            raise InputError("`revolute` must have one entry for each joint, but is empty.")
         names = tuple(f"joint{i + 1}" for i in range(n)) if joint_names is None else joint_names
-        places = [f"`offset` of joint `{one}`" for one in names]
-        places = dict(zip(places, arrays["offset"], strict=False))
-        places["`tip_offset`"] = arrays["tip_offset"]
-        for what, r in places.items():
-            if np.abs(r).max() > FARTHEST:
-                raise InputError(f"{what} is {np.abs(r).max():g} m long: give it in metres.")
-        return cls(
-            name=name,
-            joint_names=tuple(names),
-            parent=parent,
-            revolute=tuple(bool(r) for r in revolute),
-            limits=Limits.of(n) if limits is None else limits,
-            drives=Drives.of(n) if drives is None else drives,
-            tool=tool,
-            tip_body=n - 1 if tip_body is None else tip_body,
-            source=source,
-            notes=(*notes, *(said for what, r in places.items() for said in far_notes(what, r))),
-            **arrays,
-        )
+        self.name, self.joint_names = name, tuple(names)
+        self.parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
+        self.revolute = tuple(bool(r) for r in revolute)
+        self.axis = _unit_vectors(_checked("`axis`", axis, (n, 3)))
+        self.rotation = _rotations("`rotation`", rotation, (n, 3, 3))
+        self.offset = _checked("`offset`", offset, (n, 3))
+        self.gravity = _checked("`gravity`", gravity, (3,))
+        self.limits = Limits(n) if limits is None else limits
+        self.drives = Drives(n) if drives is None else drives
+        self.tool = tool
+        self.tip_body = n - 1 if tip_body is None else tip_body
+        tip_rotation = np.eye(3) if tip_rotation is None else tip_rotation
+        self.tip_rotation = _rotations("`tip_rotation`", tip_rotation, (3, 3))
+        self.tip_offset = _checked("`tip_offset`", tip_offset, (3,))
+        self.source = source
+        self._check_joints()
+        self.notes = tuple(dict.fromkeys((*notes, *self._far_notes())))
+
+    def _check_joints(self) -> None:
+        """Reject names, parents and bodies that do not fit the number of joints."""
+        n = len(self.revolute)
+        if len(self.parent) != n or any(not -1 <= p < i for i, p in enumerate(self.parent)):
+            raise InputError(
+                f"`parent` must hold for each of the {n} bodies the index of an earlier one (or -1 "
+                f"for the ground), but is {self.parent}."
+            )
+        if len(self.joint_names) != n or len(set(self.joint_names)) != n:
+            raise InputError(
+                f"`joint_names` must be {n} different names, but is {self.joint_names}."
+            )
+        for name in (self.name, *self.joint_names):
+            check_name("a robot or joint", name)
+        carrier = self.tip_body if self.tool is None else self.tool.body
+        for field, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
+            if not 0 <= body < n:
+                raise InputError(f"`{field}` must be a body from 0 to {n - 1}, but is {body}.")
+        for field, one in (("limits", self.limits.force), ("drives", self.drives.zero)):
+            if one.shape[-1:] != (n,):
+                raise InputError(
+                    f"`{field}` must be of {n} joints, like the robot, but are of {one.shape[-1]}."
+                )
+
+    def _far_notes(self) -> tuple[str, ...]:
+        """Reject offsets that no robot has, and return notes on those that may be in mm."""
+        lengths = {"`tip_offset`": self.tip_offset}
+        if self.offset.ndim == 2 and isinstance(self.offset, np.ndarray):
+            places = [f"`offset` of joint `{name}`" for name in self.joint_names]
+            lengths |= dict(zip(places, self.offset, strict=True))
+        notes = []
+        for place, r in lengths.items():
+            if isinstance(r, np.ndarray) and np.abs(r).max() > FARTHEST:
+                raise InputError(f"{place} is {np.abs(r).max():g} m long: give it in metres.")
+            if isinstance(r, np.ndarray):
+                notes += far_notes(place, r)
+        return tuple(notes)
 
     @property
     def joints(self) -> int:
@@ -259,7 +201,7 @@ class Robot(eqx.Module):
 
     @property
     def ancestors(self) -> tuple[tuple[int, ...], ...]:
-        """For every body, the joints that move it: itself and those between it and the ground."""
+        """For every body the joints that move it, from the ground to its own."""
         chains: list[tuple[int, ...]] = []
         for i, p in enumerate(self.parent):
             chains.append((i,) if p < 0 else (*chains[p], i))
@@ -267,13 +209,13 @@ class Robot(eqx.Module):
 
     @property
     def known_max_forces(self) -> Float[AnyArray, " joints"]:
-        """Largest force of every joint as far as it is known; else infinite [N m or N]."""
-        own = np.asarray(self.limits.force)
-        return np.where(np.isfinite(own), own, self.drives.max_forces)
+        """Largest force of every joint, infinite where it is not known [N m or N]."""
+        forces = np.asarray(self.limits.force)
+        return np.where(np.isfinite(forces), forces, self.drives.max_forces)
 
     @property
     def max_forces(self) -> Float[AnyArray, " joints"]:
-        """Largest force of every joint [N m or N]: its own, else that of its motors (Eq. 30).
+        """Largest force of every joint: its limit, or else that of its motors [N m or N] (Eq. 30).
 
         Raises:
             InputError: If neither is known for some joint.
@@ -288,13 +230,13 @@ class Robot(eqx.Module):
         return forces
 
     def replace(self, **fields: Any) -> "Robot":
-        """A copy with some fields replaced."""
+        """Return a copy with some fields replaced and checked."""
         return dataclasses.replace(self, **fields)
 
     def mounted(
         self, rotation: Numbers | None = None, position: Numbers = (0.0, 0.0, 0.0)
     ) -> "Robot":
-        """The same robot on a base that is tilted and shifted; gravity stays as it is.
+        """Return the robot on a base that is tilted and shifted; gravity stays as it is.
 
         Args:
             rotation: Attitude of the former ground frame on the new ground; upright if None.
@@ -303,22 +245,16 @@ class Robot(eqx.Module):
         Raises:
             InputError: If the attitude is no rotation, or the position no point.
         """
-        R = np.eye(3) if rotation is None else as_array("rotation", rotation)
-        r = as_array("position", position)
-        if R.shape != (3, 3):
-            raise InputError(f"the base's rotation must be a 3 x 3 matrix, not of shape {R.shape}.")
-        if not is_traced(R):
-            _require_rotation("the base's rotation", np.asarray(R))
-        if r.shape != (3,) or not (is_traced(r) or np.isfinite(r).all()):
-            raise InputError("the base's position must hold three finite numbers [m].")
+        R = _rotations("`rotation`", np.eye(3) if rotation is None else rotation, (3, 3))
+        r = _checked("`position`", position, (3,))
         on_ground = np.array(self.parent) < 0
+        xp = namespace(R, r, self.rotation, self.offset)
         moves = np.broadcast_to(on_ground[:, None], self.offset.shape)
         turns = np.broadcast_to(on_ground[:, None, None], self.rotation.shape)
-        xp = namespace(R, r, self.rotation, self.offset)
-        r = xp.broadcast_to(r, self.offset.shape)
+        shift = xp.broadcast_to(r, self.offset.shape)
         return self.replace(
             rotation=xp.where(turns, R @ self.rotation, self.rotation),
-            offset=xp.where(moves, r + self.offset @ R.T, self.offset),
+            offset=xp.where(moves, shift + self.offset @ R.T, self.offset),
         )
 
     def with_tool(
@@ -328,43 +264,86 @@ class Robot(eqx.Module):
         centre_of_mass: Numbers,
         inertia: Numbers | None = None,
     ) -> "Robot":
-        """The robot with a known load at its end-effector, in place of the load it had.
+        """Return the robot with a known load at its end-effector, in place of the load it had.
 
-        For a load elsewhere: `robot.replace(tool=Tool.of(body, ...))`.
+        For a load elsewhere: `robot.replace(tool=Tool(body, ...))`.
 
         Args:
             mass: Mass [kg].
-            centre_of_mass: In the end-effector's frame [m].
-            inertia: About the centre of mass, along the end-effector's axes [kg m²]; a point mass
-                if None.
+            centre_of_mass: Centre of mass in the end-effector's frame [m].
+            inertia: Inertia tensor about the centre of mass, along the end-effector's axes [kg m²];
+                a point mass if None.
 
         Raises:
-            InputError: If the mass is not positive, or the inertia belongs to no body.
+            InputError: If the mass is not positive, or no body has such an inertia.
         """
-        R = self.tip_rotation
-        tool = Tool.of(self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia)
-        return self.replace(
-            tool=Tool(
-                tool.body,
-                tool.mass,
-                self.tip_offset + R @ tool.centre_of_mass,
-                R @ tool.inertia @ R.T,
-            )
-        )
+        own = Tool(self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia)
+        there = own.body_inertia.moved(self.tip_rotation, self.tip_offset)
+        tool = Tool(self.tip_body, mass=own.mass, centre_of_mass=there.centre, inertia=there.tensor)
+        return self.replace(tool=tool)
 
     def joint_unit(self, joint: int) -> str:
-        """Unit of a joint's coordinate: rad or m."""
+        """Return the unit of a joint's coordinate: rad or m."""
         return "rad" if self.revolute[joint] else "m"
 
     def force_unit(self, joint: int) -> str:
-        """Unit of a joint's generalized force: N m or N."""
+        """Return the unit of a joint's generalised force: N m or N."""
         return "N m" if self.revolute[joint] else "N"
 
+    def summary(self) -> Table:
+        """Return a table of the joints: parents, ranges, speeds and largest forces."""
+        names = ("ground", *self.joint_names)
+        units = [self.joint_unit(j) for j in range(self.joints)]
+        limits = self.limits
+        facts = [("end-effector", f"on the body of `{self.joint_names[self.tip_body]}`")]
+        if self.tool is not None:
+            carrier = self.joint_names[self.tool.body]
+            facts.append(("tool", f"{float(self.tool.mass):.3g} kg on the body of `{carrier}`"))
+        if self.source:
+            facts.append(("source", self.source))
+        return Table(
+            f"{self.name}: {self.joints} joints",
+            Column("joint", self.joint_names),
+            Column("moves on", [names[p + 1] for p in self.parent]),
+            Column("unit", units),
+            Column("from", np.asarray(limits.position_min)),
+            Column("to", np.asarray(limits.position_max)),
+            Column("speed\nper s", np.asarray(limits.velocity)),
+            Column("acceleration\nper s²", np.asarray(limits.acceleration)),
+            Column("force", self.known_max_forces),
+            Column("unit", [self.force_unit(j) for j in range(self.joints)]),
+            facts=facts,
+            remarks=self.notes,
+        )
 
-def _is_symmetric(J: np.ndarray) -> bool:
-    return bool(np.abs(J - J.T).max() <= 1e-9 * np.abs(J).max() < np.inf)
+    def __str__(self) -> str:
+        return str(self.summary())
 
 
-def _require_rotation(what: str, R: np.ndarray) -> None:
-    if not np.abs(R.T @ R - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
-        raise InputError(f"{what} is no rotation matrix.")
+def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+    """Return a copy as an array of finite numbers; a JAX array may have leading axes."""
+    array = value if isinstance(value, jax.Array) else np.array(as_array(name, value), np.float64)
+    if array.shape[array.ndim - len(shape) :] != shape or array.ndim < len(shape):
+        raise InputError(f"{name} must have the shape {shape}, but has {array.shape}.")
+    if isinstance(array, np.ndarray) and not np.isfinite(array).all():
+        raise InputError(f"{name} must hold finite numbers.")
+    return array
+
+
+def _unit_vectors(axes: AnyArray) -> AnyArray:
+    if isinstance(axes, jax.Array):
+        return axes
+    length = np.linalg.norm(axes, axis=-1, keepdims=True)
+    if (length < 1e-9).any():
+        j = int(np.argwhere(length < 1e-9)[0][-2]) + 1
+        raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
+    return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
+
+
+def _rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+    R = _checked(name, value, shape)
+    if isinstance(R, np.ndarray):
+        error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
+        if (error >= 1e-6).any() or (np.linalg.det(R) < 0).any():
+            raise InputError(f"{name} must hold orthonormal, right-handed rotation matrices.")
+    return R

@@ -107,7 +107,7 @@ def virtual_tx90l_on_rail(*, warm: bool = False, disturbed: bool = True) -> Virt
     robot = library.tx90l_on_rail()
     most = np.asarray(robot.limits.force)
     robot = robot.replace(
-        drives=Drives.of(
+        drives=Drives(
             7,
             reduction=GEAR_RATIOS,
             max_torques=most / np.array(GEAR_RATIOS),

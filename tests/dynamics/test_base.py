@@ -22,8 +22,8 @@ from jaxid.dynamics.terms import (
 )
 from jaxid.robot import library
 from jaxid.robot.dh import from_dh
+from jaxid.robot.kinematics import axis_rotation
 from jaxid.robot.robot import Robot
-from jaxid.robot.snap import axis_rotation
 
 DRIVES = (ViscousFriction(), CoulombFriction(), RotorInertia())
 SEVEN, TEN = RigidBodies(principal_axes=True), RigidBodies()
@@ -119,7 +119,7 @@ def test_rounded_quarter_turns_are_reported():
     def arm(quarter):
         turn = np.array([[1, 0, 0], [0, np.cos(quarter), -np.sin(quarter)],
                          [0, np.sin(quarter), np.cos(quarter)]])  # fmt: skip
-        return Robot.of(
+        return Robot(
             "arm",
             revolute=(True,) * 4,
             axis=[(0, 0, 1)] * 4,

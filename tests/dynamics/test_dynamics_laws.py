@@ -44,7 +44,7 @@ TERMS = (
 
 @pytest.fixture(scope="module")
 def model():
-    robot = TREE.robot(drives=Drives.of(N, reduction=REDUCTION))
+    robot = TREE.robot(drives=Drives(N, reduction=REDUCTION))
     return Model(robot, TERMS)
 
 

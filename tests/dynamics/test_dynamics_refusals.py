@@ -90,7 +90,7 @@ def test_velocities_of_other_instants():
 
 
 def test_motors_in_another_order_than_their_joints():
-    robot = robots.planar_arm(2).replace(drives=Drives.of(2, reduction=[[0, 50], [40, 10]]))
+    robot = robots.planar_arm(2).replace(drives=Drives(2, reduction=[[0, 50], [40, 10]]))
     with _refused("`drives.reduction` of `planar arm, 2 joints` must name the motors in the order"):
         Model(robot, (CoupledDrives(),))
 

@@ -228,7 +228,7 @@ def test_single_precision_where_nobody_asked_for_double():
         from jaxid.robot.robot import Robot
         import jax.numpy as jnp
         data = np.load(sys.argv[1])
-        robot = Robot.of("tree", parent=(-1, 0, 1), revolute=(True, False, True),
+        robot = Robot("tree", parent=(-1, 0, 1), revolute=(True, False, True),
                          axis=data["axis"], rotation=data["rotation"], offset=data["offset"],
                          gravity=data["gravity"])
         motion = Motion(*(jnp.asarray(x, jnp.float32) for x in data["motion"]))

@@ -83,7 +83,7 @@ def test_moments_move_down_a_planar_arm():
 
 
 def test_gravity_is_a_symbol_on_a_lift():
-    lift = Robot.of(
+    lift = Robot(
         "lift",
         revolute=(False, True, True),
         axis=[Z, Z, Y],
@@ -97,7 +97,7 @@ def test_gravity_is_a_symbol_on_a_lift():
 
 
 def test_bodies_with_several_children_name_both_ends():
-    tree = Robot.of(
+    tree = Robot(
         "tree",
         parent=(-1, 0, 0),
         revolute=(True, True, True),
@@ -112,7 +112,7 @@ def test_bodies_with_several_children_name_both_ends():
 
 def test_lengths_that_must_stay_equal_change_together():
     # Joint 4 turns about the same line as joint 1 only because two offsets cancel each other.
-    arm = Robot.of(
+    arm = Robot(
         "arm",
         revolute=(True, False, True, True),
         axis=[Z, Z, Z, Y],

@@ -67,7 +67,7 @@ def test_tool_forces_are_newton_euler_of_the_tool(point_mass):
     rng = np.random.default_rng(4)
     load = trees.random_bodies(rng, 1)[0]
     inertia = None if point_mass else load.inertia
-    tool = Tool.of(2, mass=load.mass, centre_of_mass=load.centre, inertia=inertia)
+    tool = Tool(2, mass=load.mass, centre_of_mass=load.centre, inertia=inertia)
     motion = trees.random_motion(rng, SAMPLES, TREE.joints)
 
     m, c = load.mass, load.centre
@@ -91,7 +91,7 @@ def test_known_tool_is_apart_from_the_models_own_forces(forces):
     rng = np.random.default_rng(5)
     motion = Motion(*trees.random_motion(rng, SAMPLES, TREE.joints))
     load = trees.random_bodies(rng, 1)[0]
-    tool = Tool.of(4, mass=load.mass, centre_of_mass=load.centre, inertia=load.inertia)
+    tool = Tool(4, mass=load.mass, centre_of_mass=load.centre, inertia=load.inertia)
     carrying = Model(TREE.robot(tool=tool), BODIES)
     p = rng.normal(size=(TREE.joints, 10))
     heavier = p.copy()

@@ -67,7 +67,7 @@ FORCE = ("N m", "N", "N m")
 
 @pytest.fixture(scope="module")
 def robot():
-    return TREE.robot(drives=Drives.of(N, reduction=REDUCTION))
+    return TREE.robot(drives=Drives(N, reduction=REDUCTION))
 
 
 def _columns(term, robot, q=Q, qd=QD, qdd=QDD):
@@ -325,7 +325,7 @@ def test_base_parameters_see_friction_near_standstill():
 
 def test_a_coupled_motor_has_the_transition_of_its_own_joint():
     """Widths for each joint: the wrist's motor 3 turns two axes, with one friction on both."""
-    robot = TREE.robot().replace(drives=Drives.of(N, reduction=REDUCTION))
+    robot = TREE.robot().replace(drives=Drives(N, reduction=REDUCTION))
     widths = (0.01, 0.3, 0.7)
     found = CoupledDrives(Tanh(widths)).columns(robot, Q, QD, QDD)
     for column, motor in zip(found[:, -2:].T, (1, 2), strict=True):

@@ -31,7 +31,7 @@ class Tree:
         return len(self.parent)
 
     def robot(self, **fields) -> Robot:
-        return Robot.of(
+        return Robot(
             "tree",
             parent=self.parent,
             revolute=self.revolute,

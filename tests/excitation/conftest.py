@@ -12,7 +12,7 @@ from jaxid.robot.limits import Limits
 @pytest.fixture(scope="package")
 def arm():
     return library.planar_arm(2).replace(
-        limits=Limits.of(
+        limits=Limits(
             2,
             position_min=[-2.0, -1.0],
             position_max=[1.0, 2.5],
@@ -31,7 +31,7 @@ def base(arm):
 @pytest.fixture(scope="package")
 def pendulum():
     """The base parameters of one joint, for designs that differ in their settings."""
-    limits = Limits.of(
+    limits = Limits(
         1, position_min=[-2.0], position_max=[2.0], velocity=[2.0], acceleration=[4.0], force=[9.0]
     )
     return base_parameters(Model(library.planar_arm(1).replace(limits=limits)))

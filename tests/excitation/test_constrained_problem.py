@@ -16,8 +16,7 @@ from jaxid.excitation.judge import PRICE, Best, Judge
 from jaxid.excitation.limits import CERTIFIED, JointLimits, calmed
 from jaxid.excitation.problem import CHECKED, MARGIN, PEAKS, WATCHED, Context, Problem
 from jaxid.excitation.search import random_starts
-from jaxid.robot.capsules import Capsule, HalfSpace
-from jaxid.robot.collision import CollisionModel
+from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
 from jaxid.trajectory.basis import FourierBasis
 from jaxid.trajectory.leads_basis import LeadsBasis
 
@@ -26,10 +25,10 @@ BASIS = LeadsBasis(3, 1.1, lead=0.4)
 
 @pytest.fixture(scope="module")
 def shapes(pendulum):
-    return CollisionModel.of(
+    return CollisionModel(
         pendulum.model.robot,
-        (Capsule.of("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),),
-        (HalfSpace.of("wall", normal=(1.0, 0.0, 0.0), height=-0.3),),
+        (Capsule("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),),
+        (HalfSpace("wall", normal=(1.0, 0.0, 0.0), height=-0.3),),
         (("hand", "wall"),),
     )
 

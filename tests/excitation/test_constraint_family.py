@@ -14,15 +14,14 @@ from jaxid.excitation.constraints.clearance import SIZE, Clearance
 from jaxid.excitation.constraints.forces import JointForces, MotorTorques, NominalForces
 from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace, tip_motion
 from jaxid.robot import library
-from jaxid.robot.capsules import Box, Capsule, HalfSpace
-from jaxid.robot.collision import CollisionModel
+from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.drives import Drives
 from jaxid.robot.limits import Limits
 from jaxid.trajectory.fourier import random_fourier_series
 
 # Three joints in a vertical plane; the third motor turns with the second joint.
 ROBOT = library.planar_arm(3, [0.5, 0.4, 0.3]).replace(
-    limits=Limits.of(
+    limits=Limits(
         3,
         position_min=[-2.0, -2.5, -2.5],
         position_max=[2.0, 2.5, 2.5],
@@ -30,7 +29,7 @@ ROBOT = library.planar_arm(3, [0.5, 0.4, 0.3]).replace(
         acceleration=[9.0] * 3,
         force=[60.0, np.inf, 9.0],
     ),
-    drives=Drives.of(
+    drives=Drives(
         3,
         reduction=[[30.0, 0.0, 0.0], [0.0, 45.0, 0.0], [0.0, 20.0, -32.0]],
         max_torques=[1.0, np.inf, 0.4],
@@ -42,17 +41,17 @@ RANDOM = np.random.default_rng(0)
 NOMINAL = RANDOM.standard_normal(BASE.size)
 ROOT = 0.1 * RANDOM.standard_normal((BASE.size, BASE.size))
 EXPECTED = NominalForces.of(BASE, NOMINAL, ROOT @ ROOT.T, deviations=2.0)
-SHAPES = CollisionModel.of(
+SHAPES = CollisionModel(
     ROBOT,
     (
-        Capsule.of("trunk", -1, start=(0, -0.6, 0), end=(0, -0.1, 0), radius=0.1),
-        Capsule.of("upper arm", 0, start=(0, 0, 0), end=(0.5, 0, 0), radius=0.06),
-        Capsule.of("forearm", 1, start=(0, 0, 0.03), end=(0.4, 0, 0.03), radius=0.05),
-        Capsule.of("hand", 2, start=(0.3, 0, 0.1), radius=0.05),
+        Capsule("trunk", -1, start=(0, -0.6, 0), end=(0, -0.1, 0), radius=0.1),
+        Capsule("upper arm", 0, start=(0, 0, 0), end=(0.5, 0, 0), radius=0.06),
+        Capsule("forearm", 1, start=(0, 0, 0.03), end=(0.4, 0, 0.03), radius=0.05),
+        Capsule("hand", 2, start=(0.3, 0, 0.1), radius=0.05),
     ),
     (
-        HalfSpace.of("ground", normal=(0.0, 1.0, 0.0), height=-0.6),
-        Box.of("table", centre=(0.7, -0.3, 0.1), size=(0.3, 0.4, 1.0)),
+        HalfSpace("ground", normal=(0.0, 1.0, 0.0), height=-0.6),
+        Box("table", centre=(0.7, -0.3, 0.1), size=(0.3, 0.4, 1.0)),
     ),
     (("trunk", "forearm"), ("upper arm", "hand"), ("hand", "ground"), ("forearm", "table")),
 )

@@ -14,8 +14,7 @@ from jaxid.excitation.criteria import ConditionNumber, DOptimal
 from jaxid.excitation.design import design_excitation
 from jaxid.excitation.information import information
 from jaxid.excitation.state import fingerprint
-from jaxid.robot.capsules import GROUND, Capsule
-from jaxid.robot.collision import CollisionModel
+from jaxid.robot.collision import GROUND, Capsule, CollisionModel
 from jaxid.trajectory.files import load_trajectory
 
 SETTINGS = {
@@ -183,11 +182,11 @@ def test_a_state_belongs_to_the_pairs_that_are_watched(pendulum):
     """They are no arrays, and decide all the same."""
     robot = pendulum.model.robot
     shapes = (
-        Capsule.of("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),
-        Capsule.of("post", GROUND, start=(2.0, 0, 0), end=(2.0, 0, 1.0), radius=0.05),
-        Capsule.of("far", GROUND, start=(9.0, 0, 0), end=(9.0, 0, 1.0), radius=0.05),
+        Capsule("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),
+        Capsule("post", GROUND, start=(2.0, 0, 0), end=(2.0, 0, 1.0), radius=0.05),
+        Capsule("far", GROUND, start=(9.0, 0, 0), end=(9.0, 0, 1.0), radius=0.05),
     )
-    models = [CollisionModel.of(robot, shapes, (), (("hand", x),)) for x in ("post", "far", "far")]
+    models = [CollisionModel(robot, shapes, (), (("hand", x),)) for x in ("post", "far", "far")]
     post, far, again = (fingerprint(Clearance(m, distance=0.02)) for m in models)
     assert post != far
     assert far == again

@@ -81,10 +81,10 @@ def test_scaled_numbers_go_there_and_back(limits, random):
 
 
 def test_unknown_limits_are_assumed_and_known_jerks_are_kept(arm):
-    free = JointLimits.of(arm, BASES[0], Limits.of(2))
+    free = JointLimits.of(arm, BASES[0], Limits(2))
     assert np.isfinite(free.limits.acceleration).all()
     assert len(free.grid(64).kinds) == 3
-    jerky = JointLimits.of(arm, BASES[0], Limits.of(2, jerk=[5.0, np.inf]))
+    jerky = JointLimits.of(arm, BASES[0], Limits(2, jerk=[5.0, np.inf]))
     grid = jerky.grid(64)
     assert len(grid.kinds) == 4
     y = held_within(grid, jerky.still, jnp.ones(jerky.scale.size), grid.bound)

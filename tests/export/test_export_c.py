@@ -101,7 +101,7 @@ def test_counts_of_the_recursion_are_pinned():
 def test_bodies_with_no_symmetry_in_a_tree_with_skew_axes():
     rng = np.random.default_rng(5)
     turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(5)]
-    robot = jid.Robot.of(
+    robot = jid.Robot(
         "tree",
         parent=(-1, 0, 1, 1, 3),
         revolute=(True, False, True, True, False),

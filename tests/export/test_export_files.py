@@ -54,7 +54,7 @@ def source(tmp_path):
 @pytest.fixture
 def fit(source):
     robot = jid.load_urdf(source)
-    limits = jid.Limits.of(3, force=[120.0, np.inf, 25.0])
+    limits = jid.Limits(3, force=[120.0, np.inf, 25.0])
     terms = (*jid.Model(robot).terms, jid.ConstantOffset())
     model = jid.Model(robot.replace(limits=limits), terms)
     return fit_of(model, possible(model), full=True)

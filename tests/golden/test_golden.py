@@ -197,7 +197,7 @@ PANDA = (
 
 
 def test_design():
-    limits = jid.Limits.of(
+    limits = jid.Limits(
         2,
         position_min=[-2.0, -1.0],
         position_max=[1.0, 2.5],

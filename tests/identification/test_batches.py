@@ -24,7 +24,7 @@ WEIGHTS = np.array([0.3, 2.0])
 def base():
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
     robot = jid.robots.planar_arm(2, 0.4)
-    limits = jid.Limits(**{**vars(robot.limits), "force": np.array([50.0, 8.0])})
+    limits = jid.Limits(force=[50.0, 8.0])
     return jid.base_parameters(jid.Model(robot.replace(limits=limits), terms))
 
 

@@ -11,7 +11,7 @@ from jaxid.identification.factors import Factors, factorise
 from jaxid.identification.solutions import Complete, Decomposition
 
 TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
-ROBOT = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits.of(2, force=[40.0, 5.0]))
+ROBOT = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))
 BASE = jid.base_parameters(jid.Model(ROBOT, TERMS))
 NOISE = np.array([0.5, 0.1])
 LINEAR = (

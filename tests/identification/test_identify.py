@@ -15,7 +15,7 @@ WEIGHTED = jid.WeightedLeastSquares(jid.MeasuredForces())
 @pytest.fixture(scope="module")
 def base():
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
-    robot = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits.of(2, force=[40.0, 5.0]))
+    robot = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))
     return jid.base_parameters(jid.Model(robot, terms))
 
 
@@ -53,7 +53,7 @@ def test_least_squares_equal_numpy_on_the_dense_matrix(base, noisy, estimator, w
 
 
 def test_weights_count_only_relative_to_each_other(base, noisy):
-    half = base.model.robot.replace(limits=jid.Limits.of(2, force=[20.0, 2.5]))
+    half = base.model.robot.replace(limits=jid.Limits(2, force=[20.0, 2.5]))
     other = jid.base_parameters(jid.Model(half, base.model.terms))
     a, b = jid.identify(base, noisy), jid.identify(other, noisy)
     np.testing.assert_allclose(a.parameters, b.parameters, rtol=1e-11)

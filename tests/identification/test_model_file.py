@@ -18,7 +18,7 @@ from jaxid.io import from_json, to_json
 @pytest.fixture(scope="module")
 def robot():
     arm = jid.robots.planar_arm(2, 0.4)
-    return arm.replace(limits=jid.Limits.of(2, force=[40.0, 5.0])).with_tool(
+    return arm.replace(limits=jid.Limits(2, force=[40.0, 5.0])).with_tool(
         mass=0.7, centre_of_mass=(0.0, 0.1, 0.0)
     )
 
@@ -89,7 +89,7 @@ def test_everything_works_as_after_identify(fit, path, robot):
 
 
 def test_a_consistent_fit_keeps_bodies_and_verdict(tmp_path):
-    arm = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits.of(2, force=[40.0, 5.0]))
+    arm = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))
     model = jid.Model(arm)
     log = observations(model, standard_parameters(model), noise=0.1)
     estimator = jid.PhysicallyConsistent(throw=False)

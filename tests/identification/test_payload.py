@@ -11,7 +11,7 @@ from jaxid.identification.runs.left_out import block_covariance
 from jaxid.identification.runs.payload import body_columns
 from jaxid.measurement.delay import without_delay
 
-LOAD = jid.Tool.of(
+LOAD = jid.Tool(
     2,
     mass=3.0,
     centre_of_mass=(0.02, -0.03, 0.12),
@@ -22,13 +22,13 @@ LOAD = jid.Tool.of(
 @pytest.fixture(scope="module")
 def base():
     """Three joints about different axes: a load on the last body shows all of its parameters."""
-    robot = jid.Robot.of(
+    robot = jid.Robot(
         "spatial arm",
         revolute=(True,) * 3,
         axis=[(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)],
         rotation=np.tile(np.eye(3), (3, 1, 1)),
         offset=[(0.0, 0.0, 0.3), (0.1, 0.0, 0.2), (0.4, 0.05, 0.0)],
-        limits=jid.Limits.of(3, force=[60.0, 80.0, 20.0]),
+        limits=jid.Limits(3, force=[60.0, 80.0, 20.0]),
     )
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
     return jid.base_parameters(jid.Model(robot, terms))
@@ -198,7 +198,7 @@ def test_refusals(base):
     with pytest.raises(ValueError, match="the model lacks `D3`"):
         body_columns(seven, 2)
     coupled = base.model.robot.replace(
-        drives=jid.Drives.of(3, reduction=[[9, 0, 0], [0, 9, 0], [0, 5, 9]])
+        drives=jid.Drives(3, reduction=[[9, 0, 0], [0, 9, 0], [0, 5, 9]])
     )
     other = jid.base_parameters(jid.Model(coupled, base.model.terms))
     with pytest.raises(ValueError, match="motors of `spatial arm` turn more than one axis"):

@@ -18,11 +18,11 @@ MADE = {
     "a limit that is no number": (lambda: jid.Huber(np.nan), "`limit` of `Huber` must be a posit"),
     "a limit of zero": (lambda: jid.Tukey(0.0), "`limit` of `Tukey` must be a positive number"),
     "a negative torque": (
-        lambda: jid.Drives.of(2, max_torques=[-5.0, 1.0]),
+        lambda: jid.Drives(2, max_torques=[-5.0, 1.0]),
         "`max_torques` must be positive, but that of joint 1 is -5",
     ),
     "a zero beyond all": (
-        lambda: jid.Drives.of(2, zero=[0.0, np.inf]),
+        lambda: jid.Drives(2, zero=[0.0, np.inf]),
         "`zero` must be finite, but that of joint 2 is inf",
     ),
     "complex angles": (

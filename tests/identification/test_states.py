@@ -16,7 +16,7 @@ NOISE = np.array([0.5, 0.1])
 @pytest.fixture(scope="module")
 def base():
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
-    robot = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits.of(2, force=[40.0, 5.0]))
+    robot = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))
     return jid.base_parameters(jid.Model(robot, terms))
 
 

@@ -103,7 +103,7 @@ def test_a_joint_that_moves_late(base):
 
 def test_a_known_tool():
     robot = planar()
-    tool = jid.Tool.of(1, mass=2.5, centre_of_mass=(0.1, 0.0, 0.05))
+    tool = jid.Tool(1, mass=2.5, centre_of_mass=(0.1, 0.0, 0.05))
     base = based(robot.replace(tool=tool))
     o = observed(base)
     agree(base, o)

@@ -20,7 +20,7 @@ DT = 0.001
 
 
 def a_robot(joints=2, drives=None):
-    return Robot.of(
+    return Robot(
         "arm",
         revolute=(True,) * joints,
         axis=np.tile([0.0, 0.0, 1.0], (joints, 1)),
@@ -128,7 +128,7 @@ def test_slow_rows_are_masked_for_their_joint_alone():
 @pytest.mark.parametrize("forces", [True, False])
 def test_motor_side_goes_through_the_drives(angles, forces):
     A = np.array([[45.0, 0.0], [32.0, -32.0]])
-    drives = Drives.of(2, reduction=A, zero=[0.3, -0.7])
+    drives = Drives(2, reduction=A, zero=[0.3, -0.7])
     r = a_recording()
     motors = dataclasses.replace(
         r,
@@ -192,7 +192,7 @@ def test_tx40_by_the_published_settings(shared_data):
     A = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
     A[5, 4] = 32.0
     zero = np.array([0, -np.pi / 2, np.pi / 2, 0, 0, 0])
-    robot = a_robot(6, Drives.of(6, reduction=A, zero=zero))
+    robot = a_robot(6, Drives(6, reduction=A, zero=zero))
     filter = ZeroPhaseButterworth(100, force_cutoff=np.inf, margin=0.004)
     slow = (0.0501, 0.0501, 0.0750, 0.0716, 0.0559, 0.1222)
     o = observe(r, robot, filter, Decimation((10, 10)), slow)

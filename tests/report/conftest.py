@@ -19,14 +19,14 @@ from jaxid.validation.validate import Validation, validate
 
 
 def cart() -> Robot:
-    return Robot.of(
+    return Robot(
         "cart",
         revolute=(False, True),
         axis=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)],
         rotation=np.tile(np.eye(3), (2, 1, 1)),
         offset=np.zeros((2, 3)),
         joint_names=("rail", "swing_$1_$"),
-        limits=Limits.of(2, velocity=[1.0, 3.0], force=[200.0, 30.0]),
+        limits=Limits(2, velocity=[1.0, 3.0], force=[200.0, 30.0]),
         tip_offset=(0.0, 0.0, 0.4),
     )
 

@@ -78,10 +78,10 @@ def test_a_path_fills_its_figure_and_nothing_is_cut_off(motion, flat):
 def test_poses_show_joints_capsules_and_what_stands_still(motion):
     robot = arm_of(2)
     shapes = (
-        jid.Capsule.of("link", 1, start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), radius=0.1),
-        jid.Capsule.of("post", -1, start=(0.0, 1.5, 0.0), end=(0.0, 2.5, 0.0), radius=0.2),
+        jid.Capsule("link", 1, start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), radius=0.1),
+        jid.Capsule("post", -1, start=(0.0, 1.5, 0.0), end=(0.0, 2.5, 0.0), radius=0.2),
     )
-    collision = jid.CollisionModel.of(robot, shapes, pairs=(("link", "post"),))
+    collision = jid.CollisionModel(robot, shapes, pairs=(("link", "post"),))
     figure = jid.plot.poses(robot, motion.q, collision, poses=4)
     (axes,) = figure.axes
     polygons = [c for c in axes.collections if isinstance(c, PolyCollection)]

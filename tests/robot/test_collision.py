@@ -7,8 +7,8 @@ import pytest
 from forward_kinematics import body_transforms, random_configuration
 
 from jaxid.robot import library
-from jaxid.robot.capsules import ROUNDING, Box, Capsule, HalfSpace, segment_distance
-from jaxid.robot.collision import CollisionModel
+from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
+from jaxid.robot.collision.shapes import ROUNDING, segment_distance
 
 ALONG = np.linspace(0.0, 1.0, 401)[:, None]
 
@@ -108,14 +108,14 @@ def test_capsules_agree_with_coal():
 def a_box():
     R = library.tx90l_on_rail().rotation[2]
     turn = np.array([[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]])
-    return Box.of("box", centre=(0.2, -0.1, 0.3), size=(0.6, 0.4, 0.8), rotation=turn @ R)
+    return Box("box", centre=(0.2, -0.1, 0.3), size=(0.6, 0.4, 0.8), rotation=turn @ R)
 
 
 def test_boxes_agree_with_coal():
     coal = pytest.importorskip("coal")
     box, ends = a_box(), segments(5, 80)[:2] * 1.5
     found = np.asarray(box.distance(*map(jnp.asarray, ends)))
-    other = coal.Box(*(2 * box.half)), coal_pose(box.rotation, box.centre)
+    other = coal.Box(*box.size), coal_pose(box.rotation, box.centre)
     compared = 0
     for k in range(80):
         expected = coal_distance(coal_capsule(ends[0, k], ends[1, k], 1e-9), other)
@@ -128,7 +128,7 @@ def test_boxes_agree_with_coal():
 
 
 def test_the_depth_in_a_box_is_that_to_the_nearest_face():
-    box = Box.of("box", centre=(0, 0, 0), size=(2, 2, 2))
+    box = Box("box", centre=(0, 0, 0), size=(2, 2, 2))
     inside = jnp.array([[0.0, 0.0, 0.9], [0.0, 0.7, 0.0]])
     np.testing.assert_allclose(box.distance(inside, inside), [-0.1, -0.3], atol=2e-6)
     through = box.distance(jnp.array([-3.0, 0.2, 0.1]), jnp.array([3.0, 0.2, 0.1]))
@@ -138,7 +138,7 @@ def test_the_depth_in_a_box_is_that_to_the_nearest_face():
 def test_derivatives_of_boxes_and_planes_are_difference_quotients():
     ends = jnp.asarray(segments(6)[:2] * 1.5)
     direction = np.random.default_rng(7).standard_normal(ends.shape)
-    for obstacle in (a_box(), HalfSpace.of("wall", normal=(1.0, 2.0, 0.5), height=0.3)):
+    for obstacle in (a_box(), HalfSpace("wall", normal=(1.0, 2.0, 0.5), height=0.3)):
         gradient = jax.grad(lambda x, o=obstacle: jnp.sum(o.distance(*x)))(ends)
         h = 1e-6
         up, down = (np.asarray(obstacle.distance(*(ends + s * h * direction))) for s in (1, -1))
@@ -188,20 +188,18 @@ def test_clearances_of_many_poses_are_those_of_each():
 
 def test_pairs_are_found_where_none_are_named():
     robot = library.planar_arm(4)
-    links = [
-        Capsule.of(f"link {i}", i, start=(0, 0, 0), end=(1, 0, 0), radius=0.05) for i in range(4)
-    ]
-    hub = Capsule.of("hub", -1, start=(0, 0, 0), radius=0.1)
-    model = CollisionModel.of(
-        robot, [*links, hub], [HalfSpace.of("floor", normal=(0, 1, 0), height=-9.0)]
+    links = [Capsule(f"link {i}", i, start=(0, 0, 0), end=(1, 0, 0), radius=0.05) for i in range(4)]
+    hub = Capsule("hub", -1, start=(0, 0, 0), radius=0.1)
+    model = CollisionModel(
+        robot, [*links, hub], [HalfSpace("floor", normal=(0, 1, 0), height=-9.0)]
     )
     assert "link 0 and link 2" in model.pair_names
     assert "link 0 and link 1" not in model.pair_names  # neighbours
     assert "link 0 and hub" not in model.pair_names
     assert "link 1 and hub" in model.pair_names
     assert "link 3 and floor" in model.pair_names
-    fat = [*links[:3], Capsule.of("link 3", 3, start=(0, 0, 0), end=(1, 0, 0), radius=9.0)]
-    model = CollisionModel.of(robot, fat)
+    fat = [*links[:3], Capsule("link 3", 3, start=(0, 0, 0), end=(1, 0, 0), radius=9.0)]
+    model = CollisionModel(robot, fat)
     assert "link 0 and link 3" not in model.pair_names
     assert any("link 0 and link 3" in note for note in model.notes)
 
@@ -212,24 +210,22 @@ ROD = {"start": (0, 0, 0), "end": (1, 0, 0), "radius": 0.1}
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda r: Capsule.of("a", 0, start=(0, 0), radius=0.1), "three finite numbers"),
-        (lambda r: Capsule.of("a", 0, start=(0, 0, 0), radius=0.0), "radius of capsule `a`"),
-        (lambda r: Box.of("b", centre=(0, 0, 0), size=(1, 0, 1)), "edges of box `b`"),
-        (lambda r: HalfSpace.of("h", normal=(0, 0, 0)), "`h` needs a normal"),
-        (lambda r: CollisionModel.of(r, [Capsule.of("a", 7, **ROD)]), "body from 0 to 6"),
+        (lambda r: Capsule("a", 0, start=(0, 0), radius=0.1), "three finite numbers"),
+        (lambda r: Capsule("a", 0, start=(0, 0, 0), radius=0.0), "radius of capsule `a`"),
+        (lambda r: Box("b", centre=(0, 0, 0), size=(1, 0, 1)), "edges of box `b`"),
+        (lambda r: HalfSpace("h", normal=(0, 0, 0)), "`h` needs a normal"),
+        (lambda r: CollisionModel(r, [Capsule("a", 7, **ROD)]), "body from 0 to 6"),
         (
-            lambda r: CollisionModel.of(r, [Capsule.of("a", 0, **ROD)] * 2),
+            lambda r: CollisionModel(r, [Capsule("a", 0, **ROD)] * 2),
             "two shapes are named `a`",
         ),
-        (lambda r: CollisionModel.of(r, [Capsule.of("a", 0, **ROD)]), "at least one pair"),
+        (lambda r: CollisionModel(r, [Capsule("a", 0, **ROD)]), "at least one pair"),
         (
-            lambda r: CollisionModel.of(r, [Capsule.of("a", 0, **ROD)], pairs=[("a", "c")]),
+            lambda r: CollisionModel(r, [Capsule("a", 0, **ROD)], pairs=[("a", "c")]),
             "`c` is none of the shapes `a`",
         ),
         (
-            lambda r: CollisionModel.of(
-                r, [], [HalfSpace.of("f"), HalfSpace.of("g")], pairs=[("f", "g")]
-            ),
+            lambda r: CollisionModel(r, [], [HalfSpace("f"), HalfSpace("g")], pairs=[("f", "g")]),
             "both obstacles",
         ),
     ],

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxid.robot import library
 from jaxid.robot.inverse_kinematics import inverse_kinematics, inverse_kinematics_along
+from jaxid.robot.kinematics import rotation_vectors, tip_jacobian
 from jaxid.robot.limits import Limits
-from jaxid.robot.tip_jacobian import rotation_vectors, tip_jacobian
 
 RAIL = library.tx90l_on_rail()
 ROBOTS = [library.tx90l_on_rail, library.panda, library.ur10, library.kr300]
@@ -110,7 +110,7 @@ def test_says_what_cannot_be_reached():
     with pytest.raises(ValueError, match=r"comes to within 0\.\d+ m and .* rad of it"):
         inverse_kinematics(library.ur10(), [1.9, 0.0, 0.3], np.eye(3))
     tight = RAIL.replace(
-        limits=Limits.of(
+        limits=Limits(
             7, position_min=[-0.1, *[-0.2] * 6], position_max=[0.1, *[0.2] * 6], force=[1.0] * 7
         )
     )

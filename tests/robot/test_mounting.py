@@ -18,7 +18,7 @@ INERTIA = np.diag([0.01, 0.02, 0.015])
 def test_mounting_moves_every_body_by_the_same_placement(seed):
     rng = np.random.default_rng(seed)
     base = from_rpy(rng.uniform(-3, 3, 3), rng.uniform(-1, 1, 3))
-    robot = Robot.of(
+    robot = Robot(
         "two arms",
         parent=(-1, 0, -1, 2),
         revolute=(True, False, True, True),
@@ -64,7 +64,7 @@ def test_tool_parameters_are_moments_of_point_masses():
     inertia = sum(
         w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(masses, about, strict=True)
     )
-    p = Tool.of(0, mass=m, centre_of_mass=com, inertia=inertia).parameters
+    p = Tool(0, mass=m, centre_of_mass=com, inertia=inertia).parameters
     x, y, z = points.T
     expected = [
         *(m, *(m * com)),
@@ -101,23 +101,23 @@ def test_a_tip_or_a_tool_on_no_body_is_refused():
         "offset": [(0.0, 0.0, 0.0)],
     }
     with pytest.raises(ValueError, match="`tip_body` must be a body from 0 to 0, but is 1"):
-        Robot.of("arm", **arm, tip_body=1)
-    load = Tool.of(2, mass=1.0, centre_of_mass=(0, 0, 0))
+        Robot("arm", **arm, tip_body=1)
+    load = Tool(2, mass=1.0, centre_of_mass=(0, 0, 0))
     with pytest.raises(ValueError, match=r"`tool\.body` must be a body from 0 to 0, but is 2"):
-        Robot.of("arm", **arm, tool=load)
+        Robot("arm", **arm, tool=load)
     with pytest.raises(ValueError, match="`tip_rotation` is no rotation matrix"):
-        Robot.of("arm", **arm, tip_rotation=2 * np.eye(3))
+        Robot("arm", **arm, tip_rotation=2 * np.eye(3))
 
 
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"tool": Tool.of(3, mass=1.0, centre_of_mass=(0, 0, 0))}, "`tool.body` must be a body"),
+        ({"tool": Tool(3, mass=1.0, centre_of_mass=(0, 0, 0))}, "`tool.body` must be a body"),
         ({"tip_body": -1}, "`tip_body` must be a body from 0 to 2, but is -1"),
         ({"parent": (-1, 1, 0)}, "`parent` must name for each of the 3 bodies an earlier one"),
         ({"joint_names": ("a", "b")}, "`joint_names` must be 3 different names"),
-        ({"limits": Limits.of(2)}, "`limits` must be of 3 joints, like the robot, but are of 2"),
-        ({"drives": Drives.of(4)}, "`drives` must be of 3 joints, like the robot, but are of 4"),
+        ({"limits": Limits(2)}, "`limits` must be of 3 joints, like the robot, but are of 2"),
+        ({"drives": Drives(4)}, "`drives` must be of 3 joints, like the robot, but are of 4"),
     ],
 )
 def test_a_replaced_field_is_checked_like_a_given_one(fields, sentence):

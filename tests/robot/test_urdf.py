@@ -92,7 +92,7 @@ def test_real_trees_agree_with_pinocchio(file):
         oracle.set(ours.joint_names, q)
         expected = np.array([oracle.joint(name) for name in ours.joint_names])
         np.testing.assert_allclose(body_transforms(ours, q), expected, atol=1e-10)
-    p = urdf_parameters(path, snap_tolerance=0.0, possible=False).reshape(-1, 10)
+    p = urdf_parameters(path, snap_tolerance=0.0, check=False).reshape(-1, 10)
     expected = [oracle.parameters(name) for name in ours.joint_names]
     np.testing.assert_allclose(p, expected, rtol=1e-9, atol=1e-10)
 
@@ -186,7 +186,7 @@ def test_fixed_joints_in_between_change_nothing(tmp_path_factory, seed):
     assert split.revolute == plain.revolute
     for field in ("axis", "rotation", "offset"):
         np.testing.assert_allclose(getattr(split, field), getattr(plain, field), atol=1e-12)
-    p = [urdf_parameters(path, snap_tolerance=0.0, possible=False) for path in paths]
+    p = [urdf_parameters(path, snap_tolerance=0.0, check=False) for path in paths]
     np.testing.assert_allclose(p[1], p[0], atol=1e-11)
 
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from forward_kinematics import body_transforms
 
-from jaxid.robot.collision import CollisionModel
-from jaxid.robot.enclose import enclose
+from jaxid.robot.collision import CollisionModel, fit_capsules
+from jaxid.robot.collision.fitting import enclose
 from jaxid.robot.urdf import load_urdf
-from jaxid.robot.urdf_collision import fit_capsules
 
 TEXT = """<robot name="arm">
   <link name="base">
@@ -106,7 +105,7 @@ def test_capsules_hold_the_geometry_on_its_bodies(tmp_path):
     assert outside(placed, plate.start, plate.end, plate.radius).max() <= 1e-9
     assert float(plate.radius) < 0.06
     np.testing.assert_allclose(tool.start, 0.0, atol=1e-12)
-    model = CollisionModel.of(robot, capsules)
+    model = CollisionModel(robot, capsules)
     assert "base and tool" in model.pair_names
     # The frames are those of the robot: the upright cylinder is where its joint is.
     pose = body_transforms(robot, np.zeros(2))

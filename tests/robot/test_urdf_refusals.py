@@ -200,7 +200,7 @@ def test_what_no_body_could_be_is_named_and_not_used(tmp_path, case):
         urdf_parameters(path)
     (note,) = load_urdf(path).notes
     assert re.search(f"link `a`: .* belongs to no body: .*{sentence}", note)
-    assert urdf_parameters(path, possible=False)[0] == claimed[0]
+    assert urdf_parameters(path, check=False)[0] == claimed[0]
 
 
 @pytest.mark.parametrize(

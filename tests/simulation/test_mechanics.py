@@ -21,7 +21,7 @@ FREE = SmoothFriction(ZERO, ZERO)
 
 def cart():
     """A rail and a pendulum, hanging at q = 0."""
-    return Robot.of(
+    return Robot(
         "cart",
         revolute=(False, True),
         axis=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)],

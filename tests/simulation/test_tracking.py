@@ -109,7 +109,7 @@ def test_seeds_decide_and_a_log_can_be_slower(virtual, motion, run):
 
 
 def test_drives_do_not_give_more_than_they_can(virtual, motion):
-    weak = Limits.of(7, force=0.1 * np.asarray(virtual.robot.max_forces))
+    weak = Limits(7, force=0.1 * np.asarray(virtual.robot.max_forces))
     robot = virtual.replace(robot=virtual.robot.replace(limits=weak))
     run = robot.track(motion, servo=virtual.servo(), duration=0.3, seed=1)
     assert run.saturated.max() > 0.2
@@ -123,7 +123,7 @@ def test_what_does_not_fit_is_refused(virtual, motion):
         virtual.track(motion, duration=0.0, seed=0)
     with pytest.raises(ValueError, match="`feed_forward` must give one finite force"):
         virtual.track(motion, feed_forward=lambda m: m.q[:, :3], duration=0.1, seed=0)
-    strong = virtual.robot.replace(limits=Limits.of(7), drives=Drives.of(7))
+    strong = virtual.robot.replace(limits=Limits(7), drives=Drives(7))
     free = virtual.replace(robot=strong)
     stiff = Servo(1e9 * np.ones(7), 1e9 * np.ones(7))
     with pytest.raises(ValueError, match="ran away after"):

@@ -194,7 +194,7 @@ def test_leads_keep_the_limits_and_follow_the_series_between(robot):
 
 def test_leads_that_no_limit_allows_name_the_joint():
     robot = PANDA.replace(
-        limits=Limits.of(7, velocity=PANDA.limits.velocity, acceleration=[*[10.0] * 6, 1e-3])
+        limits=Limits(7, velocity=PANDA.limits.velocity, acceleration=[*[10.0] * 6, 1e-3])
     )
     with pytest.raises(ValueError, match="joint `joint7` exceeds"):
         with_leads(series(), robot)

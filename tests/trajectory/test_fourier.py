@@ -105,7 +105,7 @@ def test_reach_leaves_room():
 
 def test_unknown_limits_are_assumed_as_documented():
     robot = library.tx90l_on_rail()
-    robot = robot.replace(limits=Limits.of(7, position_min=[0.2, *[-np.inf] * 6]))
+    robot = robot.replace(limits=Limits(7, position_min=[0.2, *[-np.inf] * 6]))
     s = random_fourier_series(robot, omega=0.8, seed=4)
     m = s.motion(np.linspace(0.0, s.period, 5000))
     assert np.min(m.q[:, 0]) >= 0.2

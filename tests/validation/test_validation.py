@@ -64,7 +64,7 @@ def test_a_perfect_prediction_explains_everything():
 def fit_of(parameters):
     """A planar arm's fit with given rotor inertias and nothing else."""
     robot = jid.robots.planar_arm(2, 0.4).replace(
-        limits=jid.Limits.of(2, position_min=[-1.0, 0.5], position_max=[1.0, 2.0])
+        limits=jid.Limits(2, position_min=[-1.0, 0.5], position_max=[1.0, 2.0])
     )
     base = jid.base_parameters(jid.Model(robot, (jid.RotorInertia(),)))
     return jid.Fit(

@@ -3,10 +3,9 @@
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Bool, Float, Numbers
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin, pseudo_inertia
-from jaxid.robot.limits import Numbers
 from jaxid.robot.robot import Robot
 
 

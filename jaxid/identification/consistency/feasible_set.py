@@ -11,7 +11,8 @@ from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.identification.consistency.bounds import BodyBounds
 from jaxid.identification.consistency.pseudo_inertia import Values, ball
-from jaxid.robot.robot import AXES, Robot
+from jaxid.robot.inertia import AXES
+from jaxid.robot.robot import Robot
 
 Number = Float[AnyArray, "*batch"] | np.floating
 """One number of a problem, or one for each of a batch."""

@@ -9,13 +9,13 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.terms import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds, consistency_margin, consistent_body
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
+from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot, Tool
 
 TEN = len(INERTIAL_NAMES)
@@ -69,7 +69,7 @@ class Payload(eqx.Module):
         Raises:
             InputError: If it is no body that could exist.
         """
-        return Tool.of(
+        return Tool(
             self.body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia
         )
 

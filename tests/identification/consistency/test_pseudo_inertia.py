@@ -24,7 +24,7 @@ def test_it_is_the_integral_of_points():
 
 
 def test_the_order_is_that_of_tools():
-    tool = jid.Tool.of(0, mass=2.0, centre_of_mass=(0.1, -0.2, 0.3), inertia=0.08 * np.eye(3))
+    tool = jid.Tool(0, mass=2.0, centre_of_mass=(0.1, -0.2, 0.3), inertia=0.08 * np.eye(3))
     radius = np.sqrt(0.08 / 2.0 * 5 / 2)
     P = ball(np.array(2.0), np.array([0.1, -0.2, 0.3]), np.array(radius))
     np.testing.assert_allclose(jid.pseudo_inertia(tool.parameters), P, rtol=1e-12)

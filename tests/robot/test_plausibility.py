@@ -4,11 +4,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxid.robot.snap import (
+from jaxid.robot.kinematics import axis_rotation, rpy_rotation
+from jaxid.robot.plausibility import (
     angle_notes,
-    axis_rotation,
     check_tolerance,
-    rpy_rotation,
     snap_angles,
     snap_axis,
     snap_rotation,
