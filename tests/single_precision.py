@@ -22,6 +22,7 @@ jax.config.update("jax_enable_x64", DOUBLE)
 from virtual import observations, standard_parameters
 
 import jaxid as jid
+from jaxid.trajectory.fourier import fourier_series
 from jaxid.validation.validate import validate
 
 URDF = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
@@ -81,7 +82,7 @@ def loaded():
 
 def written_motion():
     a = np.array([[0.1, 0.2], [0.3, -0.1]])
-    series = jid.FourierSeries(np.array([0.3, 0.1]), a, a[::-1], 1.1)
+    series = fourier_series(np.array([0.3, 0.1]), a, a[::-1], 1.1)
     jid.save_trajectory(series, FOLDER / "motion.json")
     return jid.load_trajectory(FOLDER / "motion.json").motion(np.linspace(0.0, 1.0, 5)).qdd
 

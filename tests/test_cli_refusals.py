@@ -135,8 +135,8 @@ def test_files_of_nothing_but_brackets(folder, run):  # noqa: F811
     assert refused(run("excite", "experiment.toml", "-o", "deep.csv"), "`deep.json` is there al")
     with pytest.raises(ValueError, match=said):
         load_trajectory(folder / "deep.json")
-    nested = '{"kind": "WithLeads", "series": '
-    head = '{"format": "jaxid trajectory", "version": 1, "kind": "WithLeads", "series": '
+    nested = '{"kind": "PaddedToCycle", "inner": '
+    head = '{"format": "jaxid trajectory", "version": 2, "trajectory": '
     (folder / "deep.json").write_text(head + 900 * nested + "1" + 901 * "}")
     with pytest.raises(ValueError, match="is damaged"):
         load_trajectory(folder / "deep.json")

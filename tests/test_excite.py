@@ -30,7 +30,7 @@ from jaxid.report.blocks import Tone
 from jaxid.report.excitation_words import remarks
 from jaxid.report.excited import excitation_page
 from jaxid.trajectory.files import save_trajectory
-from jaxid.trajectory.fourier import FourierSeries
+from jaxid.trajectory.fourier import fourier_series
 
 PENDULUM = """\
 <robot name="pendulum">
@@ -456,7 +456,7 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch, kept
 def test_refuses_what_does_not_fit(written, run, key, said):
     text = EXPERIMENT.replace("harmonics = 2", "harmonics = 1")
     (written / "wrong.toml").write_text(text + key + "\n")
-    arm = FourierSeries(np.zeros(2), np.zeros((2, 1)), np.ones((2, 1)), 1.0)
+    arm = fourier_series(np.zeros(2), np.zeros((2, 1)), np.ones((2, 1)), 1.0)
     save_trajectory(arm, written / "arm.json")
     code, out, err = run("excite", "wrong.toml")
     assert (code, out) == (2, "")

@@ -63,7 +63,7 @@ def test_friction_takes_energy_on_every_joint(term, seed, qd):
 )
 def test_derivatives_belong_to_their_motion_and_files_keep_it(seed, harmonics, omega, periods):
     series = jid.random_fourier_series(ARM, omega=omega, harmonics=harmonics, seed=seed)
-    for trajectory in (series, jid.RestToRest.of(series, periods=periods)):
+    for trajectory in (series, jid.RestToRestBasis(harmonics, omega, periods).nearest(series)):
         t = np.linspace(0.05, 0.95, 11) * float(trajectory.duration)
         h = 1e-4 / omega
         ahead, now, behind = (trajectory.motion(x) for x in (t + h, t, t - h))

@@ -21,7 +21,8 @@ from jaxid.excitation.search import Search, Searched, random_starts
 from jaxid.excitation.state import fingerprint, load_state, save_state
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.basis import AbstractBasis, FourierBasis
+from jaxid.trajectory.basis import AbstractBasis
+from jaxid.trajectory.fourier import FourierBasis
 
 NOISE = 0.01
 """Standard deviation of the noise that is assumed, as a share of the largest forces."""

@@ -4,7 +4,6 @@ Numbers x of a trajectory are scaled, x = scale * y, so that each y alone meets 
 All rows are scaled alike: a motion keeps its limits if |R y - c| <= 1 in every row.
 """
 
-import dataclasses
 import itertools
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from jaxid.errors import InputError
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.basis import AbstractBasis
-from jaxid.trajectory.fourier import assumed_bounds
+from jaxid.trajectory.fourier import complete_limits
 
 CERTIFIED = 512
 """Rows of each order by which a motion is made to keep its limits at all times."""
@@ -75,19 +74,12 @@ class JointLimits(eqx.Module):
             InputError: If no trajectory of the basis stands still anywhere else than at zero.
         """
         limits = robot.limits if limits is None else limits
-        low, high, velocity, acceleration = assumed_bounds(robot.replace(limits=limits))
         assumed = tuple(
             (name, int(j))
             for name in ("position_min", "position_max", "velocity", "acceleration")
             for j in np.flatnonzero(~np.isfinite(np.asarray(getattr(limits, name))))
         )
-        limits = dataclasses.replace(
-            limits,
-            position_min=low,
-            position_max=high,
-            velocity=velocity,
-            acceleration=acceleration,
-        )
+        limits = complete_limits(robot.replace(limits=limits))
         size = _sizes(limits)
         rows = basis.envelope(enough(CERTIFIED, basis)).rows
         reach = np.array([np.abs(r).max(axis=0) for r in rows])

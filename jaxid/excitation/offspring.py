@@ -59,7 +59,7 @@ class Offspring:
         of_mate, of_kind, of_time, of_share, of_joint, of_others = jax.random.split(key, 6)
         starts, (joints, _) = len(y), self._problem.limits.shape
         ahead = jax.random.randint(of_mate, (starts,), 1, max(starts, 2))
-        retimings = jnp.asarray(self._problem.basis.retimings)
+        retimings = jnp.asarray(self._problem.basis.retimings())
         which = jax.random.randint(of_time, (starts,), 0, len(retimings))
         as_it_is = jax.random.uniform(of_kind, (starts,), float) < AS_IT_IS
         T = retimings[jnp.where(as_it_is, 0, which)]

@@ -24,12 +24,12 @@ from jaxid.experiment.excited_forces import force_limits
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.nominal import Nominal
 from jaxid.experiment.tables import ExcitationTable
-from jaxid.trajectory.basis import AbstractBasis, FourierBasis
+from jaxid.trajectory.basis import AbstractBasis
 from jaxid.trajectory.files import load_trajectory
-from jaxid.trajectory.held import ROUNDING, cycles
-from jaxid.trajectory.leads_basis import LeadsBasis
-from jaxid.trajectory.rest import RestToRestBasis
+from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
+from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
+from jaxid.trajectory.trajectory import count_cycles
 
 CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
     "d_optimal": DOptimal,
@@ -65,7 +65,7 @@ def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
         return RestToRestBasis(*table.series)
     series = FourierBasis(*table.series)
     if table.led is None:
-        _require_division(table.sample_time, series.duration)
+        _require_division(table.sample_time, float(series.duration))
         return series
     if not constrained and table.led.time is None:
         return series
@@ -77,8 +77,8 @@ def _require_division(sample_time: float | None, period: float) -> None:
     """Refuses samples of a motion at full speed that would end before it or go on after it."""
     if sample_time is None:
         return
-    count = cycles(period, sample_time)
-    if abs(count * sample_time - period) > ROUNDING * sample_time:
+    count = count_cycles(period, sample_time)
+    if abs(count * sample_time - period) > 1e-6 * sample_time:
         raise InputError(
             f"`sample_time` must divide the period of {period:.9g} s where there are no `leads`, "
             f"for the motion repeats at full speed, but is {sample_time:g} s: choose `omega` = "

@@ -24,12 +24,9 @@ from jaxid.experiment.robot_tables import within
 from jaxid.io import atomic_folder
 from jaxid.report.blocks import Remark, Tone
 from jaxid.report.excited import Aside, write_pictures
-from jaxid.trajectory.basis import FourierBasis
-from jaxid.trajectory.files import save_trajectory, write_csv
-from jaxid.trajectory.held import Held
+from jaxid.trajectory.files import save_trajectory, write_csv, write_ros_json, write_ros_yaml
 from jaxid.trajectory.leads import with_leads
-from jaxid.trajectory.ros import write_ros_json, write_ros_yaml
-from jaxid.trajectory.trajectory import AbstractTrajectory
+from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
 
 FEW = 8
 """Starts of the designs that only show what a criterion buys."""
@@ -176,9 +173,8 @@ def _played(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | Non
     # Where constraints were found, leads were designed together with the motion.
     if led is not None and led.time is None and not plan.findings:
         robot = experiment.robot.replace(limits=plan.limits.limits)
-        series = FourierBasis(*table.series).trajectory(plan.numbers)
         try:
-            motion = with_leads(series, robot, periods=led.periods)
+            motion = with_leads(motion, robot, periods=led.periods)
         except ValueError as error:
             refused = str(error)
         else:
@@ -194,7 +190,7 @@ def _played(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | Non
     step = step if table.sample_time is None else table.sample_time
     rests = led is not None or table.rest or table.spline is not None
     whole_cycles = table.sample_time is not None and rests and not refused
-    sampled = Held(motion, step) if whole_cycles else motion
+    sampled = PaddedToCycle(motion, step) if whole_cycles else motion
     return Excited(plan, motion, window, Aside(said, settings), sampled, step, table.ros)
 
 

@@ -1,168 +1,149 @@
-"""Trajectories that are linear in their numbers: what a design can choose from."""
+"""Families of trajectories: each joint's motion is a basis times the joint's coefficients."""
 
-import math
 from abc import abstractmethod
-from typing import NamedTuple
+from collections.abc import Callable
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
-from jaxid.errors import InputError
-from jaxid.trajectory.fourier import FourierSeries
-from jaxid.trajectory.trajectory import AbstractTrajectory
+from jaxid.arrays import AnyArray, Array, Float, namespace
+from jaxid.dynamics.motion import Motion
+from jaxid.trajectory.trajectory import AbstractTrajectory, as_scalar
 
-ORDERS = 4
-"""Position, velocity, acceleration and jerk."""
-SHIFTS = 40
-"""Parts of a motion's time by which it is tried to begin it later."""
-ANEW = 1e-9
-"""How well a motion must be met when it is begun later or run backwards, relative."""
-
-
-class Envelope(NamedTuple):
-    """Rows whose largest value bounds a motion at all times, between samples as well.
-
-    For numbers x of a joint, |f(t) - c| <= factor * max |rows[k] @ x - c| at every time t, where f
-    is the k-th derivative of the joint's motion and c any constant.
-
-    Attributes:
-        rows: For each order of derivative a matrix [rows, variables].
-        factor: At least 1.
-    """
-
-    rows: tuple[Float[np.ndarray, "rows variables"], ...]
-    factor: float
+Envelope = tuple[tuple[Float[np.ndarray, "rows variables"], ...], float]
+"""Rows for each order of derivative, and a factor of at least 1; see `AbstractBasis.envelope`."""
 
 
 class AbstractBasis(eqx.Module):
-    """A family of trajectories: each joint's motion is linear in the joint's numbers.
+    """A family of trajectories: functions of time that are the same for all joints.
 
-    All joints have the same functions of time. Their numbers are a matrix x of shape
-    [joints, variables]; limits of position, velocity, acceleration and jerk are linear in them.
+    The coefficients of a trajectory are a matrix x [joints, variables]. Limits of position,
+    velocity, acceleration and jerk are linear in them.
 
     Attributes:
-        duration: Time from the start of the motion to its end, for a periodic one its period [s].
+        duration: Time from the start of the motion to its end; the period of a periodic one [s].
     """
 
     duration: eqx.AbstractVar[float]
 
     @abstractmethod
-    def rows(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "4 samples variables"]:
-        """Position, velocity, acceleration and jerk of a joint at some times, by its numbers.
+    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+        """Return position, velocity, acceleration and jerk of every function.
 
         Args:
-            t: Times [s].
+            t: Times [s]; NumPy arrays give NumPy arrays.
         """
 
     @abstractmethod
     def envelope(self, points: int) -> Envelope:
-        """Rows that bound the motion at all times.
+        """Return rows whose largest value bounds the motion at all times, and their factor.
+
+        For coefficients x of a joint, |f(t) - c| <= factor * max |rows[k] @ x - c| at every time t,
+        where f is the derivative of order k (from 0 to 3) of the joint's motion and c any constant.
 
         Args:
-            points: About how many rows for each order; more rows, tighter bounds.
+            points: Approximate number of rows for each order; more rows give tighter bounds.
         """
 
-    @abstractmethod
-    def trajectory(self, x: Float[AnyArray, "joints variables"]) -> AbstractTrajectory:
-        """The trajectory of some numbers.
+    def trajectory(self, x: Float[AnyArray, "joints variables"]) -> "LinearTrajectory":
+        """Return the trajectory with these coefficients.
 
         Args:
-            x: One row for each joint.
+            x: Coefficients, one row for each joint.
         """
+        return LinearTrajectory(self, x)
 
     @property
     def variables(self) -> int:
-        """Numbers of each joint."""
+        """Number of coefficients of each joint."""
         return self.rows(np.zeros(1)).shape[2]
 
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
-        """Equidistant times at which a run is measured, without their end [s].
+        """Return equidistant times at which a run is measured, without their end [s].
 
         Args:
-            samples: How many.
+            samples: Number of times.
         """
-        return np.arange(samples) * (self.duration / samples)
-
-    @property
-    def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:
-        """Maps of a joint's numbers to those of the same motion begun later, or run backwards.
-
-        Those that stay in the family: a periodic motion may begin at any time, one between
-        standstills may run backwards. The first changes nothing. All keep the limits of the joint.
-        """
-        part = -(-4 * self.variables // SHIFTS)
-        step = self.duration / (SHIFTS * part)
-        rows = self.rows((np.arange(SHIFTS * part) + 0.5) * step)[0]
-        inverse, size = np.linalg.pinv(rows), np.abs(rows).max()
-        moved = [np.roll(r, k * part, axis=0) for r in (rows, rows[::-1]) for k in range(SHIFTS)]
-        maps = [inverse @ wanted for wanted in moved]
-        return np.array(
-            [
-                T
-                for T, wanted in zip(maps, moved, strict=True)
-                if np.abs(rows @ T - wanted).max() <= ANEW * size
-            ]
-        )
+        return np.arange(samples) * (float(self.duration) / samples)
 
     def instants(self, points: int) -> Float[np.ndarray, " points"]:
-        """Equidistant times over everything that is moved, for what must hold all along [s].
+        """Return equidistant times over the whole motion, for limits that hold throughout [s].
 
         Args:
-            points: How many.
+            points: Number of times.
         """
         return self.times(points)
 
+    def retimings(
+        self, shifts: int = 40, tolerance: float = 1e-9
+    ) -> Float[np.ndarray, "retimings variables variables"]:
+        """Return maps to the coefficients of the same motion begun later or run backwards.
 
-class FourierBasis(AbstractBasis):
-    r"""Finite Fourier series: numbers are the offset, then all a, then all b (Eqs. 34, 35).
+        Only maps that stay in the family are returned: a periodic motion may begin at any time, a
+        motion between standstills may run backwards. The first map changes nothing. All of them
+        keep the limits of the joint.
+
+        Args:
+            shifts: Number of equidistant times at which the motion may begin.
+            tolerance: Largest relative deviation from the shifted motion.
+        """
+        part = -(-4 * self.variables // shifts)
+        step = float(self.duration) / (shifts * part)
+        rows = np.asarray(self.rows((np.arange(shifts * part) + 0.5) * step)[0])
+        inverse, size = np.linalg.pinv(rows), np.abs(rows).max()
+        moved = [np.roll(r, k * part, axis=0) for r in (rows, rows[::-1]) for k in range(shifts)]
+        maps = [(inverse @ wanted, wanted) for wanted in moved]
+        return np.array(
+            [T for T, wanted in maps if np.abs(rows @ T - wanted).max() <= tolerance * size]
+        )
+
+
+class LinearTrajectory(AbstractTrajectory):
+    """A trajectory of a basis.
 
     Attributes:
-        harmonics: Number of harmonics.
-        omega: Ground frequency [rad/s].
-        duration: The period [s].
+        basis: The functions of time.
+        coefficients: Coefficients of the functions, one row for each joint.
     """
 
-    harmonics: int = eqx.field(static=True)
-    omega: float = eqx.field(static=True)
-    duration: float = eqx.field(static=True)
+    basis: AbstractBasis
+    coefficients: Float[AnyArray, "joints variables"]
 
-    def __init__(self, harmonics: int, omega: float):
-        if harmonics < 1:
-            raise InputError(f"`harmonics` must be at least 1, but is {harmonics}.")
-        if not 0 < omega < math.inf:
-            raise InputError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
-        self.harmonics, self.omega = harmonics, float(omega)
-        self.duration = 2 * math.pi / omega
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self.coefficients.shape[0]
 
-    def rows(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "4 samples variables"]:
-        """Sines and cosines and their derivatives."""
-        w = self.omega * np.arange(1, self.harmonics + 1)
-        phase = np.outer(np.asarray(t, np.float64), w)
-        sin, cos = np.sin(phase), np.cos(phase)
-        one, zero = np.ones((len(phase), 1)), np.zeros((len(phase), 1))
-        return np.stack(
-            [
-                np.hstack([one, sin / w, -cos / w]),
-                np.hstack([zero, cos, sin]),
-                np.hstack([zero, -sin * w, cos * w]),
-                np.hstack([zero, -cos * w**2, -sin * w**2]),
-            ]
-        )
+    @property
+    def duration(self) -> Float[AnyArray, ""] | float:
+        """Duration of the basis [s]."""
+        return self.basis.duration
 
-    def envelope(self, points: int) -> Envelope:
-        r"""Samples of a period: $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$.
+    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
+        """Return the motion at one time or at many [s]."""
+        return _motion(self.basis, self.coefficients, jnp.asarray(t, float))
 
-        The bound holds for every trigonometric polynomial of degree n at M > 2 n equidistant points
-        (Ehlich and Zeller).
-        """
-        points = max(points, 2 * self.harmonics + 1)
-        return Envelope(
-            tuple(self.rows(self.times(points))),
-            1.0 / math.cos(math.pi * self.harmonics / points),
-        )
 
-    def trajectory(self, x: Float[AnyArray, "joints variables"]) -> FourierSeries:
-        """The series with these offsets and coefficients."""
-        n = self.harmonics
-        return FourierSeries(x[:, 0], x[:, 1 : n + 1], x[:, n + 1 :], self.omega)
+@eqx.filter_jit
+def _motion(basis: AbstractBasis, x: AnyArray, t: Array) -> Motion:
+    rows = jnp.asarray(basis.rows(t.reshape(-1)))
+    return Motion(*((part @ x.T).reshape(*t.shape, -1) for part in rows[:3]))
+
+
+def stand_outside(
+    rows: Callable[[AnyArray], AnyArray], t: Float[AnyArray, " samples"], duration: AnyArray | float
+) -> Float[AnyArray, "4 samples variables"]:
+    """Return rows of a motion that stands still before its start and after its end.
+
+    Args:
+        rows: Rows from the start at zero to the end.
+        t: Times [s].
+        duration: Time of the end [s].
+    """
+    xp = namespace(t, as_scalar(duration))
+    # Written with `where`, because the derivative of `clip` at its ends is one half.
+    inner = rows(xp.where(t < 0.0, 0.0, xp.where(t > duration, duration, t)))
+    inside = ((t >= 0.0) & (t <= duration))[None, :, None]
+    position = np.array([True, False, False, False])[:, None, None]
+    return xp.where(position | inside, inner, 0.0)

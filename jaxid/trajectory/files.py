@@ -1,62 +1,46 @@
-"""Trajectories as files: exact and versioned for this package, a table of samples for others."""
+"""Files of trajectories: exact JSON for this package, CSV tables and ROS messages for others."""
 
-import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.io import atomic_folder, read_json
+from jaxid.io import from_json, json_text, read_json, to_json, write_text
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import FourierSeries
-from jaxid.trajectory.held import Held
-from jaxid.trajectory.joint_path import JointPath
-from jaxid.trajectory.leads import WithLeads
-from jaxid.trajectory.rest import RestToRest
-from jaxid.trajectory.segments import Segments
-from jaxid.trajectory.spline import Spline
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
-FORMAT = "jaxid trajectory"
-VERSION = 1
-MEMBERS = (FourierSeries, RestToRest, WithLeads, Spline, Segments, JointPath, Held)
-"""What a file may hold, each by the name of its class."""
+FORMAT, VERSION = "jaxid trajectory", 2
 
 
 def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
-    """Writes a trajectory so that `load_trajectory` gives back the same numbers, bit by bit.
+    """Write a trajectory so that `load_trajectory` returns the same numbers, bit by bit.
 
     Args:
-        trajectory: A member of the family.
-        path: Of the JSON file.
+        trajectory: Any trajectory.
+        path: Path of the JSON file.
 
     Raises:
         InputError: If a number is not finite, or the path is a folder.
     """
-    content = {"format": FORMAT, "version": VERSION, **_record(trajectory)}
-    try:
-        text = json.dumps(content, indent=1, allow_nan=False)
-    except ValueError as error:
-        raise InputError(
-            "a trajectory with numbers that are not finite cannot be saved."
-        ) from error
-    write_text(path, text + "\n")
+    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(trajectory)):
+        raise InputError("a `trajectory` with numbers that are not finite cannot be saved.")
+    content = {"format": FORMAT, "version": VERSION, "trajectory": to_json(trajectory)}
+    write_text(path, json_text(content))
 
 
-def load_trajectory(
-    path: str | Path, members: tuple[type[AbstractTrajectory], ...] = MEMBERS
-) -> AbstractTrajectory:
-    """Reads a trajectory that `save_trajectory` has written.
+def load_trajectory(path: str | Path) -> AbstractTrajectory:
+    """Read a trajectory that `save_trajectory` has written.
 
     Args:
-        path: Of the JSON file.
-        members: What the file may hold; add your own.
+        path: Path of the JSON file. Import the modules of your own trajectories before.
 
     Raises:
         FileNotFoundError: If the file does not exist.
-        InputError: If it holds no trajectory, or one of a later version or unknown kind.
+        InputError: If it holds no trajectory, or one of another version or an unknown kind.
     """
     path = Path(path)
     if not path.is_file():
@@ -70,10 +54,10 @@ def load_trajectory(
     if content.get("version") != VERSION:
         raise InputError(
             f"`{path}` has version {content.get('version')}, but this package reads version "
-            f"{VERSION}: load it with the package that wrote it, or a newer one."
+            f"{VERSION}: load it with the package that wrote it."
         )
     try:
-        return _restore(content, {member.__name__: member for member in members})
+        return from_json(content.get("trajectory"), AbstractTrajectory, "trajectory")
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"`{path}` is damaged: {' '.join(map(str, error.args))}.") from error
 
@@ -81,20 +65,21 @@ def load_trajectory(
 def write_csv(
     trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
 ) -> None:
-    """Writes a table of samples: time, positions, velocities and accelerations of all joints.
+    """Write a table of samples: time, positions, velocities and accelerations of all joints.
 
     The header names joint and unit: `time [s],q_joint1 [rad],...,qdd_joint1 [rad/s^2],...`.
 
     Args:
-        trajectory: Sampled from its start to its end.
-        robot: Whose joints move.
-        path: Of the CSV file.
+        trajectory: Trajectory, sampled from its start to its end.
+        robot: Robot whose joints move.
+        path: Path of the CSV file.
         sample_time: Largest time between two samples [s].
 
     Raises:
-        InputError: If the trajectory has not the robot's joints, or `sample_time` is not positive.
+        InputError: If the trajectory does not move the robot's joints, or `sample_time` is not
+            positive.
     """
-    require_joints(trajectory, robot)
+    _check_joints(trajectory, robot)
     times, motion = trajectory.sample(sample_time)
     header = ["time [s]"]
     for symbol, rate in (("q", ""), ("qd", "/s"), ("qdd", "/s^2")):
@@ -103,69 +88,103 @@ def write_csv(
             for j, name in enumerate(robot.joint_names)
         ]
     rows = np.column_stack([times, motion.q, motion.qd, motion.qdd]).tolist()
-    lines = [",".join(map(_quoted, header)), *(",".join(map(repr, row)) for row in rows)]
+    lines = [",".join(map(_quote, header)), *(",".join(map(repr, row)) for row in rows)]
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _quoted(field: str) -> str:
-    """A field of a CSV file: names may hold what separates fields."""
+def joint_trajectory(
+    trajectory: AbstractTrajectory, robot: Robot, *, sample_time: float
+) -> dict[str, Any]:
+    """Return the ROS 2 message `trajectory_msgs/JointTrajectory` as dictionaries and lists.
+
+    ROS 1 calls the parts of a time `secs` and `nsecs`.
+
+    Args:
+        trajectory: Trajectory, sampled from its start to its end.
+        robot: Robot whose joint names the message carries.
+        sample_time: Largest time between two points [s].
+
+    Raises:
+        InputError: If the trajectory does not move the robot's joints, or `sample_time` is not
+            positive.
+    """
+    _check_joints(trajectory, robot)
+    times, motion = trajectory.sample(sample_time)
+    nanoseconds = [round(t * 1_000_000_000) for t in times]
+    rows = (np.asarray(x).tolist() for x in (motion.q, motion.qd, motion.qdd))
+    return {
+        "header": {"stamp": _ros_time(0), "frame_id": ""},
+        "joint_names": list(robot.joint_names),
+        "points": [
+            {
+                "positions": q,
+                "velocities": qd,
+                "accelerations": qdd,
+                "effort": [],
+                "time_from_start": _ros_time(t),
+            }
+            for t, q, qd, qdd in zip(nanoseconds, *rows, strict=True)
+        ],
+    }
+
+
+def write_ros_json(
+    trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
+) -> None:
+    """Write a `JointTrajectory` as JSON; arguments as of `joint_trajectory` and the file's path."""
+    message = joint_trajectory(trajectory, robot, sample_time=sample_time)
+    write_text(path, json.dumps(message, allow_nan=False) + "\n")
+
+
+def write_ros_yaml(
+    trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
+) -> None:
+    """Write a `JointTrajectory` as YAML; arguments as of `joint_trajectory` and the file's path.
+
+    `ros2 topic pub --once TOPIC trajectory_msgs/msg/JointTrajectory "$(cat FILE)"` publishes it.
+    """
+    message = joint_trajectory(trajectory, robot, sample_time=sample_time)
+    write_text(path, "\n".join(_yaml_lines(message)) + "\n")
+
+
+def _yaml_lines(message: dict[str, Any]) -> Iterator[str]:
+    yield "header:"
+    yield f"  stamp: {_yaml_time(message['header']['stamp'])}"
+    yield '  frame_id: ""'
+    # JSON's strings are YAML's strings in double quotes.
+    yield f"joint_names: {json.dumps(message['joint_names'])}"
+    yield "points:"
+    for point in message["points"]:
+        lead = "- "
+        for key in ("positions", "velocities", "accelerations", "effort"):
+            yield f"{lead}{key}: [{', '.join(map(_yaml_number, point[key]))}]"
+            lead = "  "
+        yield f"  time_from_start: {_yaml_time(point['time_from_start'])}"
+
+
+def _ros_time(nanoseconds: int) -> dict[str, int]:
+    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+    return {"sec": seconds, "nanosec": rest}
+
+
+def _yaml_time(time: dict[str, int]) -> str:
+    return f"{{sec: {time['sec']}, nanosec: {time['nanosec']}}}"
+
+
+def _yaml_number(x: float) -> str:
+    """Return a number of YAML 1.1, which would read `1e-05` without a point as text."""
+    digits, exponent, power = repr(x).partition("e")
+    return digits + ("" if "." in digits else ".0") + exponent + power
+
+
+def _quote(field: str) -> str:
+    """Return a field of a CSV file, in quotes if it holds a separator."""
     return '"' + field.replace('"', '""') + '"' if {",", '"'} & set(field) else field
 
 
-def require_joints(trajectory: AbstractTrajectory, robot: Robot) -> None:
-    """Refuses a trajectory of another robot.
-
-    Raises:
-        InputError: If it moves more or fewer joints.
-    """
+def _check_joints(trajectory: AbstractTrajectory, robot: Robot) -> None:
     if trajectory.joints != robot.joints:
         raise InputError(
-            f"the trajectory must move the {robot.joints} joints of `{robot.name}`, but moves "
+            f"`trajectory` must move the {robot.joints} joints of `{robot.name}`, but moves "
             f"{trajectory.joints}."
         )
-
-
-def write_text(path: str | Path, text: str) -> None:
-    """Writes one file whole or not at all."""
-    path = Path(path)
-    with atomic_folder(path.parent) as folder:
-        (folder / path.name).write_text(text, encoding="utf-8")
-
-
-def _record(trajectory: AbstractTrajectory) -> dict[str, Any]:
-    fields = {f.name: _plain(getattr(trajectory, f.name)) for f in dataclasses.fields(trajectory)}
-    return {"kind": type(trajectory).__name__, **fields}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, AbstractTrajectory):
-        return _record(value)
-    if isinstance(value, tuple):
-        return [_plain(one) for one in value]
-    if isinstance(value, int):
-        return value
-    return np.asarray(value, np.float64).tolist()
-
-
-def _restore(content: dict[str, Any], members: dict[str, type]) -> AbstractTrajectory:
-    kind = content["kind"]
-    if kind not in members:
-        raise InputError(f"it holds a `{kind}`, which is none of {', '.join(members)}")
-    values = {}
-    for field in dataclasses.fields(members[kind]):
-        if field.name not in content:
-            raise InputError(f"`{kind}` has no `{field.name}`")
-        values[field.name] = _value(content[field.name], members)
-    return members[kind](**values)
-
-
-def _value(value: Any, members: dict[str, type]) -> Any:
-    if isinstance(value, dict):
-        return _restore(value, members)
-    if isinstance(value, list):
-        if value and isinstance(value[0], dict):
-            return tuple(_restore(one, members) for one in value)
-        return np.array(value, np.float64)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{value!r} is no number")
-    return value

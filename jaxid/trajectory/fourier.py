@@ -1,76 +1,164 @@
-"""Fourier series: periodic excitation whose derivatives are exact (Eqs. 34, 35)."""
+"""Fourier series: periodic, or between standstills, with exact derivatives (Eqs. 34, 35)."""
 
+import dataclasses
 import math
 
-import jax.numpy as jnp
+import equinox as eqx
 import numpy as np
+from scipy.linalg import block_diag
 
-from jaxid.arrays import AnyArray, Float
-from jaxid.dynamics.motion import Motion
+from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
+from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.trajectory import AbstractTrajectory
-
-ASSUMED_RANGE = (1.0, math.pi)
-"""Half of the range of a joint without limits: of a rail [m], of a joint that turns [rad]."""
-ASSUMED_SPEED = (0.5, math.pi / 2)
-"""Largest speed of a joint whose own is not known: of a rail [m/s], of one that turns [rad/s]."""
-ASSUMED_RISE = 0.25
-"""Time [s] in which a joint gathers its largest speed where its acceleration is not known."""
-GRID = 512
-"""Points of a period on which the peaks of a random series are measured."""
+from jaxid.trajectory.basis import AbstractBasis, Envelope, LinearTrajectory, stand_outside
+from jaxid.trajectory.trajectory import as_scalar
 
 
-class FourierSeries(AbstractTrajectory):
-    r"""A finite Fourier series for each joint about its offset (Eqs. 34, 35).
+class FourierBasis(AbstractBasis):
+    r"""Finite Fourier series about an offset (Eqs. 34, 35).
 
     $$q_i(t) = q_{i,0} + \sum_{l=1}^{N} \left( \frac{a_{i,l}}{\omega l} \sin(\omega l t)
     - \frac{b_{i,l}}{\omega l} \cos(\omega l t) \right)$$
 
+    The coefficients of a joint are its offset $q_{i,0}$ [rad or m], all $a_{i,l}$ and all
+    $b_{i,l}$ [rad/s or m/s].
+
     Attributes:
-        offset: Centre $q_{i,0}$ of each joint's motion, its mean over a period [rad or m].
+        harmonics: Number of harmonics $N$.
+        omega: Ground frequency $\omega$ [rad/s].
+
+    Raises:
+        InputError: If one of them is not positive.
+    """
+
+    harmonics: int = eqx.field(static=True)
+    omega: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+
+    def __check_init__(self):
+        _check_series(self.harmonics, self.omega, least=1)
+
+    @property
+    def duration(self) -> Float[AnyArray, ""] | float:
+        """Period [s]."""
+        return 2 * math.pi / self.omega
+
+    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+        """Return a constant, sines and cosines, and their derivatives."""
+        xp = namespace(t, self.omega)
+        w = self.omega * np.arange(1.0, self.harmonics + 1.0)[None]
+        phase = t[:, None] * w
+        sin, cos = xp.sin(phase), xp.cos(phase)
+        one = xp.ones_like(phase[:, :1])
+        return xp.stack(
+            [
+                xp.concatenate([one, sin / w, -cos / w], axis=1),
+                xp.concatenate([0 * one, cos, sin], axis=1),
+                xp.concatenate([0 * one, -sin * w, cos * w], axis=1),
+                xp.concatenate([0 * one, -cos * w**2, -sin * w**2], axis=1),
+            ]
+        )
+
+    def envelope(self, points: int) -> Envelope:
+        r"""Return samples of a period: $\max |p| \le \max_k |p(t_k)| / \cos(\pi n / M)$.
+
+        The bound holds for every trigonometric polynomial of degree n at M > 2 n equidistant points
+        (Ehlich and Zeller).
+        """
+        points = max(points, 2 * self.harmonics + 1)
+        rows = np.asarray(self.rows(self.times(points)))
+        return tuple(rows), 1.0 / math.cos(math.pi * self.harmonics / points)
+
+
+class RestToRestBasis(AbstractBasis):
+    r"""Whole periods of a Fourier series between standstill and standstill.
+
+    Velocity $\sum_l a_{i,l}$ and acceleration $\omega \sum_l l\, b_{i,l}$ at the start of a period
+    are zero, which Eq. 34 as printed does not require. The coefficients of a joint are its offset
+    and those along the directions that keep both conditions. Before the start and after the end the
+    robot stands still.
+
+    Attributes:
+        harmonics: Number of harmonics, at least 2.
+        omega: Ground frequency [rad/s].
+        periods: Number of periods.
+
+    Raises:
+        InputError: If there is one harmonic only, or another number is not positive.
+    """
+
+    harmonics: int = eqx.field(static=True)
+    omega: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+    periods: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        _check_series(self.harmonics, self.omega, least=2)
+        if self.periods < 1:
+            raise InputError(f"`periods` must be at least 1, but is {self.periods}.")
+
+    @property
+    def series(self) -> FourierBasis:
+        """Fourier series without the conditions at the ends."""
+        return FourierBasis(self.harmonics, self.omega)
+
+    @property
+    def duration(self) -> Float[AnyArray, ""] | float:
+        """Time from standstill to standstill [s]."""
+        return self.periods * self.series.duration
+
+    @property
+    def directions(self) -> Float[np.ndarray, "coefficients variables"]:
+        """Orthonormal coefficients of the series that keep a joint at rest at both ends."""
+        order = np.arange(1.0, self.harmonics + 1.0)
+        a, b = (np.linalg.svd(x[None])[2][1:].T for x in (np.ones(self.harmonics), order))
+        return np.asarray(block_diag(np.ones((1, 1)), a, b))
+
+    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+        """Return sines and cosines in the directions that keep the joint at rest at both ends."""
+        return stand_outside(lambda t: self.series.rows(t) @ self.directions, t, self.duration)
+
+    def envelope(self, points: int) -> Envelope:
+        """Return samples of a period, as for any series."""
+        rows, factor = self.series.envelope(points)
+        return tuple(x @ self.directions for x in rows), factor
+
+    def times(self, samples: int) -> Float[np.ndarray, " samples"]:
+        """Return equidistant times over one period [s]."""
+        return self.series.times(samples)
+
+    def nearest(self, series: LinearTrajectory) -> LinearTrajectory:
+        """Return the trajectory between standstills with the least change of the coefficients.
+
+        Args:
+            series: Trajectory of a `FourierBasis` with as many harmonics.
+        """
+        return self.trajectory(series.coefficients @ self.directions)
+
+
+def _check_series(harmonics: int, omega: AnyArray | float, least: int) -> None:
+    if harmonics < least:
+        raise InputError(f"`harmonics` must be at least {least}, but is {harmonics}.")
+    if not is_traced(omega) and not 0 < omega < math.inf:
+        raise InputError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
+
+
+def fourier_series(
+    offset: Float[AnyArray, " joints"],
+    a: Float[AnyArray, "joints harmonics"],
+    b: Float[AnyArray, "joints harmonics"],
+    omega: Float[AnyArray, ""] | float,
+) -> LinearTrajectory:
+    """Return a Fourier series from the coefficients of the paper (Eqs. 34, 35).
+
+    Args:
+        offset: Centre of each joint's motion [rad or m].
         a: Amplitudes of the velocity's cosines [rad/s or m/s].
         b: Amplitudes of the velocity's sines [rad/s or m/s].
         omega: Ground frequency [rad/s].
     """
-
-    offset: Float[AnyArray, " joints"]
-    a: Float[AnyArray, "joints harmonics"]
-    b: Float[AnyArray, "joints harmonics"]
-    omega: Float[AnyArray, ""] | float
-
-    @property
-    def joints(self) -> int:
-        """Number of joints."""
-        return self.a.shape[0]
-
-    @property
-    def harmonics(self) -> int:
-        """Number of harmonics $N$."""
-        return self.a.shape[1]
-
-    @property
-    def period(self) -> Float[AnyArray, ""] | float:
-        """Time after which the motion repeats [s]."""
-        return 2 * math.pi / self.omega
-
-    @property
-    def duration(self) -> Float[AnyArray, ""] | float:
-        """One period [s]."""
-        return self.period
-
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """The motion at one time or at many [s]."""
-        a, b, offset = (jnp.asarray(x) for x in (self.a, self.b, self.offset))
-        w = jnp.asarray(self.omega, a.dtype) * jnp.arange(1, self.harmonics + 1, dtype=a.dtype)
-        phase = jnp.tensordot(jnp.asarray(t, a.dtype), w, axes=0)
-        sin, cos = jnp.sin(phase), jnp.cos(phase)
-        swing = sin @ (a / w[None]).T - cos @ (b / w[None]).T
-        return Motion(
-            q=jnp.broadcast_to(offset, swing.shape) + swing,
-            qd=cos @ a.T + sin @ b.T,
-            qdd=cos @ (b * w[None]).T - sin @ (a * w[None]).T,
-        )
+    xp = namespace(offset, a, b)
+    x = xp.concatenate([offset[:, None], a, b], axis=1)
+    return FourierBasis(a.shape[1], omega).trajectory(x)
 
 
 def random_fourier_series(
@@ -80,71 +168,75 @@ def random_fourier_series(
     harmonics: int = 5,
     reach: float = 0.95,
     seed: int = 0,
-) -> FourierSeries:
-    """Draws a series that uses the limits of every joint: a start for designs, and for tests.
+    points: int = 512,
+) -> LinearTrajectory:
+    """Draw a Fourier series that uses the limits of every joint: a start for designs and tests.
 
-    The coefficients are normal numbers over their harmonic's order. Each joint is scaled until it
-    meets its tightest limit, and its offset is uniform in the range that is left. Limits hold
-    between the grid's points as well, by the bound for trigonometric polynomials.
-
-    Where a limit is not known, one is assumed: half a turn or 1 m to either side; 90 degrees/s or
-    0.5 m/s; the acceleration that gathers the largest speed in 0.25 s.
+    The coefficients are normal random numbers divided by the order of their harmonic. Each joint is
+    scaled until it meets its tightest limit, and its offset is uniform in the range that is left.
+    The limits hold at all times. Unknown limits are assumed, see `complete_limits`.
 
     Args:
-        robot: Whose limits of position, velocity and acceleration hold. Forces are not looked at.
+        robot: Robot whose limits of position, velocity and acceleration hold; forces are ignored.
         omega: Ground frequency [rad/s].
         harmonics: Number of harmonics.
-        reach: Share of every limit that may be used, of 1.
-        seed: Of the coefficients and offsets.
+        reach: Fraction of every limit that may be used, from 0 to 1.
+        seed: Seed of the coefficients and offsets.
+        points: Points of a period at which the peaks are measured.
 
     Raises:
         InputError: If `omega` or `harmonics` is not positive, or `reach` not between 0 and 1.
     """
-    if not 0 < omega < math.inf:
-        raise InputError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
-    if not 1 <= harmonics <= GRID // 8:
-        raise InputError(f"`harmonics` must be from 1 to {GRID // 8}, but is {harmonics}.")
+    if not 1 <= harmonics <= points // 8:
+        raise InputError(f"`harmonics` must be from 1 to {points // 8}, but is {harmonics}.")
     if not 0 < reach <= 1:
         raise InputError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
-    low, high, velocity, acceleration = assumed_bounds(robot)
+    basis, limits = FourierBasis(harmonics, omega), complete_limits(robot)
+    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
     centre, half = 0.5 * (low + high), reach * 0.5 * (high - low)
 
     random = np.random.default_rng(seed)
-    order = np.arange(1, harmonics + 1)
-    a, b = random.standard_normal((2, robot.joints, harmonics)) / order
-    angle = 2 * np.pi / GRID * np.outer(order, np.arange(GRID))
-    sin, cos = np.sin(angle), np.cos(angle)
-    # max |p| <= max over M points / cos(pi n / M) for every trigonometric polynomial of degree n.
-    between = 1.0 / math.cos(math.pi * harmonics / GRID)
-    w = omega * order
-    q, qd, qdd = (
-        (a / w) @ sin - (b / w) @ cos,
-        a @ cos + b @ sin,
-        (b * w) @ cos - (a * w) @ sin,
-    )
-    middle, swing = 0.5 * (q.max(1) + q.min(1)), 0.5 * between * np.ptp(q, axis=1)
+    a, b = random.standard_normal((2, robot.joints, harmonics)) / np.arange(1, harmonics + 1)
+    x = np.concatenate([np.zeros((robot.joints, 1)), a, b], axis=1)
+    rows, factor = basis.envelope(points)
+    q, qd, qdd = (x @ part.T for part in rows[:3])
+    middle, swing = 0.5 * (q.max(1) + q.min(1)), 0.5 * factor * np.ptp(q, axis=1)
     scale = np.min(
         [
             half / swing,
-            reach * velocity / (between * np.abs(qd).max(1)),
-            reach * acceleration / (between * np.abs(qdd).max(1)),
+            reach * limits.velocity / (factor * np.abs(qd).max(1)),
+            reach * limits.acceleration / (factor * np.abs(qdd).max(1)),
         ],
         axis=0,
     )
     left = np.maximum(half - scale * swing, 0.0)
-    offset = centre - scale * middle + random.uniform(-1.0, 1.0, robot.joints) * left
-    return FourierSeries(offset, scale[:, None] * a, scale[:, None] * b, float(omega))
+    x *= scale[:, None]
+    x[:, 0] = centre - scale * middle + random.uniform(-1.0, 1.0, robot.joints) * left
+    return basis.trajectory(x)
 
 
-def assumed_bounds(robot: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Ends of ranges, speeds and accelerations, with assumptions where they are not known."""
-    turns, limits = np.array(robot.revolute, int), robot.limits
-    half, speed = np.array(ASSUMED_RANGE)[turns], np.array(ASSUMED_SPEED)[turns]
+def complete_limits(robot: Robot) -> Limits:
+    """Return the limits of a robot, with assumed positions, speeds and accelerations if unknown.
+
+    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the acceleration that
+    reaches the largest speed in 0.25 s.
+
+    Args:
+        robot: Robot with its joints and limits.
+    """
+    turns, limits = np.array(robot.revolute, bool), robot.limits
+    half, speed = np.where(turns, math.pi, 1.0), np.where(turns, math.pi / 2, 0.5)
     low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
-    ends_low, ends_high = np.isfinite(low), np.isfinite(high)
-    # A range that is open on one side reaches as far from its end as a free one in all.
-    lowest = np.where(ends_low, low, np.where(ends_high, high - 2 * half, -half))
-    highest = np.where(ends_high, high, np.where(ends_low, low + 2 * half, half))
+    has_low, has_high = np.isfinite(low), np.isfinite(high)
+    # A range that is open on one side is as long as one that is open on both.
+    lowest = np.where(has_low, low, np.where(has_high, high - 2 * half, -half))
+    highest = np.where(has_high, high, np.where(has_low, low + 2 * half, half))
     velocity = np.where(np.isfinite(limits.velocity), limits.velocity, speed)
     known = np.isfinite(limits.acceleration)
-    return lowest, highest, velocity, np.where(known, limits.acceleration, velocity / ASSUMED_RISE)
+    return dataclasses.replace(
+        limits,
+        position_min=lowest,
+        position_max=highest,
+        velocity=velocity,
+        acceleration=np.where(known, limits.acceleration, velocity / 0.25),
+    )

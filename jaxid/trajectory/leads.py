@@ -1,100 +1,238 @@
-"""From standstill into a periodic motion and out of it, within the limits of the joints."""
+"""Leads: from standstill into a periodic motion and out of it, within the limits of the joints."""
 
+import math
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision
+from jaxid.arrays import AnyArray, Array, Float, double_precision, is_traced, namespace
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import FourierSeries, assumed_bounds
-from jaxid.trajectory.trajectory import AbstractTrajectory, each_time
+from jaxid.trajectory.basis import AbstractBasis, Envelope, stand_outside
+from jaxid.trajectory.fourier import FourierBasis, complete_limits
+from jaxid.trajectory.trajectory import AbstractTrajectory, as_scalar
 
-PHASES = 360
-"""Instants of a period at which the lead-in may hand over."""
-DURATIONS = np.geomspace(0.02, 10.0, 120)
-"""Durations [s] that are tried for the lead of a joint."""
-ROUNDING = 1e-9
+
+class LeadMotion(NamedTuple):
+    """Motion of a lead-in: the velocity is a cubic polynomial of the time since its start.
+
+    Attributes:
+        travel: Position relative to the end of the lead [rad or m].
+        velocity: Velocity [rad/s or m/s].
+        acceleration: Acceleration [rad/s² or m/s²].
+        jerk: Jerk [rad/s³ or m/s³].
+    """
+
+    travel: Any
+    velocity: Any
+    acceleration: Any
+    jerk: Any
+
+
+def lead_motion(qd: Any, qdd: Any, duration: Any, x: Any) -> LeadMotion:
+    r"""Return the motion of a lead that ends with a given velocity and acceleration.
+
+    The velocity is $\alpha x^2 + \beta x^3$; a lead-out is a lead-in that is run backwards.
+
+    Args:
+        qd: Velocity at the end.
+        qdd: Acceleration at the end.
+        duration: Time of the lead [s].
+        x: Time since its start [s].
+    """
+    alpha, beta = _cubic(qd, qdd, duration)
+    return LeadMotion(
+        alpha * (x**3 - duration**3) / 3 + beta * (x**4 - duration**4) / 4,
+        alpha * x**2 + beta * x**3,
+        2 * alpha * x + 3 * beta * x**2,
+        2 * alpha + 6 * beta * x,
+    )
+
+
+def _cubic(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
+    return 3 * qd / duration**2 - qdd / duration, qdd / duration**2 - 2 * qd / duration**3
+
+
+class LeadsBasis(AbstractBasis):
+    """Fourier series with a lead-in and a lead-out; the coefficients are those of the series.
+
+    All joints start together and take the time `lead` into the series, and out of it at the end.
+    Limits and constraints hold in the leads as well, unlike with `with_leads`, which finds leads
+    for a given motion. One period between the leads is measured.
+
+    Attributes:
+        harmonics: Number of harmonics.
+        omega: Ground frequency [rad/s].
+        lead: Time of a lead [s].
+        periods: Number of periods between the leads.
+
+    Raises:
+        InputError: If one of them is not positive.
+    """
+
+    harmonics: int = eqx.field(static=True)
+    omega: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+    lead: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
+    periods: int = eqx.field(static=True, default=1, kw_only=True)
+
+    def __check_init__(self):
+        FourierBasis(self.harmonics, self.omega)
+        if not is_traced(self.lead) and not 0 < self.lead < math.inf:
+            raise InputError(f"`lead` must be a positive time [s], but is {self.lead:g}.")
+        if self.periods < 1:
+            raise InputError(f"`periods` must be at least 1, but is {self.periods}.")
+
+    @property
+    def series(self) -> FourierBasis:
+        """Fourier series between the leads."""
+        return FourierBasis(self.harmonics, self.omega)
+
+    @property
+    def duration(self) -> Float[AnyArray, ""] | float:
+        """Time from standstill to standstill [s]."""
+        return self.periods * self.series.duration + 2 * self.lead
+
+    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+        """Return the series, or the polynomials that lead into it and out of it."""
+        return stand_outside(self._rows, t, self.duration)
+
+    def _rows(self, t: AnyArray) -> AnyArray:
+        xp = namespace(t, self.omega, self.lead)
+        early, late = t < self.lead, t > self.duration - self.lead
+        inner = self.series.rows(t - self.lead)
+        outer = xp.where(late[None, :, None], self._lead_out(self.duration - t), inner)
+        return xp.where(early[None, :, None], self._lead_in(t), outer)
+
+    def _lead_in(self, t: AnyArray) -> AnyArray:
+        """Return the rows of the lead-in at times since the start."""
+        q, qd, qdd, _ = self.series.rows(np.zeros(1))
+        lead = lead_motion(qd, qdd, self.lead, t[:, None])
+        return namespace(t, self.omega).stack([q + lead.travel, *lead[1:]])
+
+    def _lead_out(self, t: AnyArray) -> AnyArray:
+        """Return the rows of the lead-out at times before the end."""
+        q, qd, qdd, _ = self.series.rows(np.zeros(1))
+        lead = lead_motion(-qd, qdd, self.lead, t[:, None])
+        rows = [q + lead.travel, -lead.velocity, lead.acceleration, -lead.jerk]
+        return namespace(t, self.omega).stack(rows)
+
+    def envelope(self, points: int, degree: int = 4, pieces: int = 8) -> Envelope:
+        """Return samples of a period, as for any series, and control points of the leads.
+
+        A polynomial lies within the range of its control points (Bernstein).
+
+        Args:
+            points: Approximate number of rows for each order.
+            degree: Degree of the leads.
+            pieces: Parts of a lead, each of which is bounded by its own control points.
+        """
+        rows, factor = self.series.envelope(points)
+        u, order = np.linspace(0.0, 1.0, degree + 1), np.arange(degree + 1)
+        binomials = np.array([math.comb(degree, k) for k in order])
+        to_points = np.linalg.inv(
+            binomials * u[:, None] ** order * (1 - u[:, None]) ** (degree - order)
+        )
+        leads = []
+        for start in self.lead / pieces * np.arange(pieces):
+            t = start + self.lead / pieces * u
+            leads += [to_points @ self._lead_in(t), to_points @ self._lead_out(t)]
+        return tuple(np.concatenate(parts) for parts in zip(rows, *leads, strict=True)), factor
+
+    def times(self, samples: int) -> Float[np.ndarray, " samples"]:
+        """Return equidistant times over one period between the leads [s]."""
+        return float(self.lead) + self.series.times(samples)
+
+    def instants(self, points: int) -> Float[np.ndarray, " points"]:
+        """Return equidistant times over the leads and one period [s]."""
+        period, lead = float(self.series.duration), float(self.lead)
+        t = np.arange(points) * ((period + 2 * lead) / (points - 1))
+        return np.where(t > lead + period, t + (self.periods - 1) * period, t)
 
 
 class WithLeads(AbstractTrajectory):
-    r"""A motion with a lead-in from standstill and a lead-out to standstill, smooth throughout.
+    """A motion between a lead-in from standstill and a lead-out to standstill, smooth throughout.
 
-    In a lead the velocity of a joint is the cubic polynomial $\alpha \tau^2 + \beta \tau^3$ of the
-    time since the joint started, which meets velocity and acceleration of the motion; so position,
-    velocity and acceleration are continuous. Every joint takes its own time; all arrive together.
-    `with_leads` chooses the times within limits.
+    Position, velocity and acceleration are continuous. Every joint takes its own time; all arrive
+    together. `with_leads` chooses the times within limits.
 
     Attributes:
-        inner: The motion between the leads.
-        start: Time of `inner` at which the lead-in hands over [s].
-        length: Time that `inner` is followed [s].
-        lead_in: Time that each joint needs before it [s].
-        lead_out: Time that each joint needs after it [s].
+        inner: Motion between the leads.
+        start: Time of `inner` at which the lead-in ends [s].
+        length: Time for which `inner` is followed [s].
+        lead_in: Time of each joint's lead-in [s].
+        lead_out: Time of each joint's lead-out [s].
     """
 
     inner: AbstractTrajectory
-    start: Float[AnyArray, ""] | float
-    length: Float[AnyArray, ""] | float
+    start: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+    length: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
     lead_in: Float[AnyArray, " joints"]
     lead_out: Float[AnyArray, " joints"]
 
     @property
     def window(self) -> tuple[Float[AnyArray, ""], Float[AnyArray, ""]]:
-        """Times between which the inner motion is followed [s]: the part that a log needs."""
-        begin = jnp.max(self.lead_in)
+        """Times between which the inner motion is followed [s]: the part to be measured."""
+        begin = jnp.max(jnp.asarray(self.lead_in))
         return begin, begin + self.length
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
-        """From standstill to standstill [s]."""
-        return self.window[1] + jnp.max(self.lead_out)
+        """Time from standstill to standstill [s]."""
+        return self.window[1] + jnp.max(jnp.asarray(self.lead_out))
 
     def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """The motion at one time or at many [s]: standstill before the start and after the end."""
-        return each_time(self._at, t)
+        """Return the motion at one time or at many [s]; standstill outside."""
+        return _motion_with_leads(self, jnp.asarray(t, float))
 
-    def _at(self, time: Float[Array, ""]) -> Motion:
-        begin, end = self.window
-        lead_in, lead_out = jnp.asarray(self.lead_in), jnp.asarray(self.lead_out)
-        first = self.inner.motion(self.start)
-        last = self.inner.motion(self.start + self.length)
-        inner = self.inner.motion(self.start + time - begin)
-        rise = _lead(first.qd, first.qdd, lead_in, time - begin + lead_in)
-        # A lead-out is a lead-in that is run backwards.
-        fall = _lead(-last.qd, last.qdd, lead_out, end + lead_out - time)
-        early = Motion(first.q + rise.q, rise.qd, rise.qdd)
-        late = Motion(last.q + fall.q, -fall.qd, fall.qdd)
-        return jax.tree.map(
-            lambda x, y, z: jnp.where(time < begin, x, jnp.where(time > end, z, y)),
-            early,
-            inner,
-            late,
-        )
+
+@eqx.filter_jit
+def _motion_with_leads(whole: WithLeads, t: Array) -> Motion:
+    begin, end = whole.window
+    time = t.reshape(-1, 1)
+    lead_in, lead_out = (jnp.asarray(x)[None] for x in (whole.lead_in, whole.lead_out))
+    first = whole.inner.motion(jnp.reshape(whole.start, 1))
+    last = whole.inner.motion(jnp.reshape(whole.start + whole.length, 1))
+    since = jnp.clip(time - begin + lead_in, 0.0, lead_in)
+    left = jnp.clip(end + lead_out - time, 0.0, lead_out)
+    rise = lead_motion(first.qd, first.qdd, lead_in, since)
+    fall = lead_motion(-last.qd, last.qdd, lead_out, left)
+    early = Motion(first.q + rise.travel, rise.velocity, rise.acceleration)
+    late = Motion(last.q + fall.travel, -fall.velocity, fall.acceleration)
+    between = whole.inner.motion(whole.start + time[:, 0] - begin)
+    return jax.tree.map(
+        lambda x, y, z: jnp.where(time < begin, x, jnp.where(time > end, z, y)).reshape(
+            *t.shape, -1
+        ),
+        early,
+        between,
+        late,
+    )
 
 
 def with_leads(
-    series: FourierSeries, robot: Robot, *, periods: int = 1, reach: float = 1.0
+    series: AbstractTrajectory, robot: Robot, *, periods: int = 1, reach: float = 1.0
 ) -> WithLeads:
-    """Lets a periodic motion start from standstill and end there, within the robot's limits.
+    """Add a lead-in and a lead-out to a periodic motion, within the robot's limits.
 
     The motion enters the period at the instant that makes the leads shortest. Limits of position,
-    velocity, acceleration and jerk hold in the leads for all times: extremes of polynomials are
-    computed, not sampled. Where a limit is not known, one is assumed as in
-    `random_fourier_series`. The robot must be brought to the start of the lead-in,
-    `motion(0.0).q`; whether the leads are free of collisions is for the constraints to say.
+    velocity, acceleration and jerk hold in the leads at all times: extremes of the polynomials are
+    computed, not sampled. Unknown limits are assumed as in `random_fourier_series`. The robot must
+    be brought to the start of the lead-in, `motion(0.0).q`. Collisions in the leads are not
+    checked.
 
     Args:
-        series: The periodic motion.
-        robot: Whose limits hold.
+        series: Periodic motion, for instance of a `FourierBasis`.
+        robot: Robot whose limits hold.
         periods: Number of periods between the leads.
-        reach: Share of every limit that may be used, of 1.
+        reach: Fraction of every limit that may be used, from 0 to 1.
 
     Raises:
-        InputError: If there is no period, the series is not one of this robot, or no instant of
+        InputError: If there is no period, the motion is not one of this robot, or no instant of
             the period can be reached within the limits; the message names the joint.
     """
     if periods < 1:
@@ -103,14 +241,14 @@ def with_leads(
         raise InputError(
             f"`series` must move the robot's {robot.joints} joints, but moves {series.joints}."
         )
-    period = float(series.period)
-    phases = period * np.arange(PHASES) / PHASES
+    period = float(series.duration)
+    phases = period * np.arange(360) / 360
     with double_precision():
         at = series.motion(phases)
     q, qd, qdd = (np.asarray(x) for x in (at.q, at.qd, at.qdd))
-    bounds = _Bounds.of(robot, reach)
-    lead_in, excess_in = _shortest(q, qd, qdd, bounds)
-    lead_out, excess_out = _shortest(q, -qd, qdd, bounds)
+    limits = complete_limits(robot)
+    lead_in, excess_in = _shortest_leads(q, qd, qdd, limits, reach)
+    lead_out, excess_out = _shortest_leads(q, -qd, qdd, limits, reach)
     total = lead_in.max(axis=1) + lead_out.max(axis=1)
     best = int(np.argmin(total))
     if not np.isfinite(total[best]):
@@ -126,70 +264,38 @@ def with_leads(
     return WithLeads(series, phases[best], periods * period, lead_in[best], lead_out[best])
 
 
-class _Bounds(NamedTuple):
-    """What the joints may do in a lead."""
-
-    low: np.ndarray
-    high: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    jerk: np.ndarray
-
-    @classmethod
-    def of(cls, robot: Robot, reach: float) -> "_Bounds":
-        low, high, velocity, acceleration = assumed_bounds(robot)
-        centre, half = 0.5 * (low + high), 0.5 * reach * (high - low)
-        jerk = reach * np.asarray(robot.limits.jerk)
-        return cls(centre - half, centre + half, reach * velocity, reach * acceleration, jerk)
-
-
-def _lead(qd: AnyArray, qdd: AnyArray, duration: AnyArray, time: AnyArray) -> Motion:
-    """The motion of a lead, its positions counted from where it ends."""
-    alpha, beta = _cubic(qd, qdd, duration)
-    x = jnp.clip(time, 0.0, duration)
-    travelled = alpha * x**3 / 3 + beta * x**4 / 4
-    whole = alpha * duration**3 / 3 + beta * duration**4 / 4
-    return Motion(travelled - whole, alpha * x**2 + beta * x**3, 2 * alpha * x + 3 * beta * x**2)
-
-
-def _cubic(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
-    """Coefficients of the velocity that has these values at the end of a duration."""
-    return 3 * qd / duration**2 - qdd / duration, qdd / duration**2 - 2 * qd / duration**3
-
-
-def _shortest(
-    q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, bounds: _Bounds
+def _shortest_leads(
+    q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, limits: Limits, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For every phase and joint the shortest lead within the bounds, and the least excess.
+    """Return the shortest lead of every phase and joint within the limits, and the least excess.
 
-    An infinite duration says that there is none.
+    The duration is infinite where there is none.
     """
-    T = DURATIONS[:, None, None]
+    T = np.geomspace(0.02, 10.0, 120)[:, None, None]
     alpha, beta = _cubic(qd, qdd, T)
 
     def between(x: np.ndarray) -> np.ndarray:
         return np.where(np.isfinite(x) & (x > 0) & (x < T), x, T)
 
+    # The extremes lie where the next derivative is zero, or at the ends.
     with np.errstate(divide="ignore", invalid="ignore"):
         turning, steepest = between(-alpha / beta), between(-alpha / (3 * beta))
         fastest = between(-2 * alpha / (3 * beta))
-    # The extremes lie where the next derivative is zero, or at the ends.
-    travel = np.stack([alpha * x**3 / 3 + beta * x**4 / 4 for x in (0 * T, turning, T)])
-    place = q + travel - travel[-1]
-    speed = np.stack([np.abs(alpha * x**2 + beta * x**3) for x in (fastest, T)])
-    force = np.stack([np.abs(2 * alpha * x + 3 * beta * x**2) for x in (steepest, T)])
-    jerk = np.stack([np.abs(2 * alpha), np.abs(2 * alpha + 6 * beta * T)])
-    half = 0.5 * (bounds.high - bounds.low)
+    place = np.stack([q + lead_motion(qd, qdd, T, x).travel for x in (0 * T, turning, T)])
+    speed = np.stack([np.abs(lead_motion(qd, qdd, T, x).velocity) for x in (fastest, T)])
+    rate = np.stack([np.abs(lead_motion(qd, qdd, T, x).acceleration) for x in (steepest, T)])
+    jerk = np.stack([np.abs(lead_motion(qd, qdd, T, x).jerk) for x in (0 * T, T)])
+    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
     excess = np.max(
         [
-            (place.max(0) - bounds.high) / half,
-            (bounds.low - place.min(0)) / half,
-            speed.max(0) / bounds.velocity - 1,
-            force.max(0) / bounds.acceleration - 1,
-            jerk.max(0) / bounds.jerk - 1,
+            (place.max(0) - middle) / half - reach,
+            (middle - place.min(0)) / half - reach,
+            speed.max(0) / limits.velocity - reach,
+            rate.max(0) / limits.acceleration - reach,
+            jerk.max(0) / limits.jerk - reach,
         ],
         axis=0,
     )
-    allowed = excess <= ROUNDING
-    durations = np.where(allowed, T, np.inf).min(axis=0)
-    return durations, excess.min(axis=0)
+    durations = np.where(excess <= 1e-9 * reach, T, np.inf).min(axis=0)
+    return durations, excess.min(axis=0) / reach

@@ -1,36 +1,39 @@
-"""Paths of the end-effector in space: lines and circles, each from standstill to standstill."""
+"""Paths of the end-effector in space, the path of ISO 9283, and the joints' motion along a path."""
 
+import itertools
 from abc import abstractmethod
 
 import equinox as eqx
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array
 from jaxid.errors import InputError
-
-PEAK_SPEED, PEAK_ACCELERATION = 15.0 / 8.0, 10.0 / np.sqrt(3.0)
-"""Of the speed profile, over mean speed, and over way by time squared."""
+from jaxid.robot.inverse_kinematics import inverse_kinematics_along
+from jaxid.robot.robot import Robot
+from jaxid.trajectory.spline import spline_polynomials
+from jaxid.trajectory.trajectory import PiecewisePolynomial
 
 
 class AbstractPiece(eqx.Module):
-    """A curve from one place to another."""
+    """A curve in space."""
 
     @property
     @abstractmethod
     def length(self) -> float:
-        """Way along the curve [m]."""
+        """Length of the curve [m]."""
 
     @property
     @abstractmethod
     def radius(self) -> float:
-        """Of its curvature; infinite of a line [m]."""
+        """Radius of curvature; infinite for a line [m]."""
 
     @abstractmethod
-    def at(self, share: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Places along the curve [m].
+    def at(self, fraction: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
+        """Return places along the curve [m].
 
         Args:
-            share: Of the way, from 0 to 1.
+            fraction: Fraction of the length, from 0 to 1.
         """
 
 
@@ -38,8 +41,8 @@ class Line(AbstractPiece):
     """A straight line.
 
     Attributes:
-        start: Where it begins [m].
-        end: Where it ends [m].
+        start: Start of the line [m].
+        end: End of the line [m].
     """
 
     start: Float[AnyArray, "3"]
@@ -47,28 +50,32 @@ class Line(AbstractPiece):
 
     @property
     def length(self) -> float:
-        """Way along the line [m]."""
+        """Length of the line [m]."""
         return float(np.linalg.norm(np.asarray(self.end) - np.asarray(self.start)))
 
     @property
     def radius(self) -> float:
-        """Infinite."""
+        """Radius of curvature: infinite [m]."""
         return np.inf
 
-    def at(self, share: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Places along the line [m]."""
+    def at(self, fraction: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
+        """Return places along the line [m]."""
         start = np.asarray(self.start)
-        return start + np.asarray(share)[:, None] * (np.asarray(self.end) - start)
+        return start + np.asarray(fraction)[:, None] * (np.asarray(self.end) - start)
 
 
 class Circle(AbstractPiece):
-    """A whole circle, once or several times round.
+    """A whole circle, run once or several times.
 
     Attributes:
-        centre: Of the circle [m].
-        first: From the centre to where it begins and ends [m].
-        second: From the centre to where a quarter of it lies: as long, at a right angle [m].
-        rounds: How often it is run without a stop.
+        centre: Centre of the circle [m].
+        first: Vector from the centre to the start and end [m].
+        second: Vector from the centre to the point after a quarter of the circle: equally long, at
+            a right angle to `first` [m].
+        rounds: Number of rounds without a stop.
+
+    Raises:
+        InputError: If there is no round.
     """
 
     centre: Float[AnyArray, "3"]
@@ -82,112 +89,225 @@ class Circle(AbstractPiece):
 
     @property
     def length(self) -> float:
-        """Way round the circle, all rounds [m]."""
+        """Length of all rounds [m]."""
         return 2 * np.pi * self.rounds * self.radius
 
     @property
     def radius(self) -> float:
-        """Of the circle [m]."""
+        """Radius of the circle [m]."""
         return float(np.linalg.norm(np.asarray(self.first)))
 
-    def at(self, share: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Places round the circle [m]."""
-        angle = 2 * np.pi * self.rounds * np.asarray(share)[:, None]
+    def at(self, fraction: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
+        """Return places along the circle [m]."""
+        angle = 2 * np.pi * self.rounds * np.asarray(fraction)[:, None]
         first, second = np.asarray(self.first), np.asarray(self.second)
         return np.asarray(self.centre) + np.cos(angle) * first + np.sin(angle) * second
 
 
 class TipPath(eqx.Module):
-    """Pieces one after the other, the end-effector at rest where they meet, its attitude held.
+    """Curves that the end-effector follows one after the other, at rest where they meet.
 
-    Along a piece the way is the polynomial $10 u^3 - 15 u^4 + 6 u^5$ of the share $u$ of its time:
-    speed and acceleration are zero at both ends and smooth between.
+    The attitude stays constant. Along a curve the fraction of the length is the polynomial
+    $10 u^3 - 15 u^4 + 6 u^5$ of the fraction $u$ of its time: speed and acceleration are zero at
+    both ends and continuous between.
 
     Attributes:
-        pieces: In the order in which they are run.
-        rotation: Attitude of the end-effector: columns are its axes on the ground.
+        pieces: Curves in the order in which they are run.
+        rotation: Attitude of the end-effector: columns are its axes in the frame of the ground.
         speed: Largest speed [m/s].
-        acceleration: Largest acceleration along the way, and largest across it [m/s²].
+        acceleration: Largest acceleration along the path, and largest across it [m/s²].
+
+    Raises:
+        InputError: If there is no piece, one has no length or does not start where the one before
+            it ends, or a limit is not positive.
     """
 
-    pieces: tuple[AbstractPiece, ...]
-    rotation: Float[AnyArray, "3 3"]
-    speed: float
-    acceleration: float
+    pieces: tuple[AbstractPiece, ...] = eqx.field(converter=tuple)
+    rotation: Float[AnyArray, "3 3"] = eqx.field(converter=lambda x: as_array("rotation", x))
+    speed: float = eqx.field(converter=float, default=1.0)
+    acceleration: float = eqx.field(converter=float, default=4.0)
 
-    @classmethod
-    def of(
-        cls,
-        pieces: tuple[AbstractPiece, ...],
-        rotation: Numbers,
-        *,
-        speed: float = 1.0,
-        acceleration: float = 4.0,
-    ) -> "TipPath":
-        """Puts pieces together.
-
-        Args:
-            pieces: In the order in which they are run.
-            rotation: Attitude of the end-effector on the ground.
-            speed: Largest speed [m/s].
-            acceleration: Largest acceleration along the way, and largest across it [m/s²].
-
-        Raises:
-            InputError: If there is no piece, one has no length or does not start where the one
-                before it ends, or a limit is not positive.
-        """
-        for name, limit in (("speed", speed), ("acceleration", acceleration)):
+    def __check_init__(self):
+        for name, limit in (("speed", self.speed), ("acceleration", self.acceleration)):
             if not 0 < limit < np.inf:
                 raise InputError(f"`{name}` must be positive, but is {limit:g}.")
-        if not pieces:
+        if not self.pieces:
             raise InputError("`pieces` must hold at least one piece, but is empty.")
-        ends = [piece.at(np.array([0.0, 1.0])) for piece in pieces]
-        for k, piece in enumerate(pieces):
+        ends = [piece.at(np.array([0.0, 1.0])) for piece in self.pieces]
+        for k, piece in enumerate(self.pieces):
             gap = float(np.linalg.norm(ends[k][0] - ends[k - 1][1])) if k else 0.0
             if gap > 1e-9:
                 raise InputError(
-                    f"piece {k + 1} must start where the one before it ends, but lies {gap:.3g} m "
-                    "from it."
+                    f"piece {k + 1} of `pieces` must start where the one before it ends, but lies "
+                    f"{gap:.3g} m from it."
                 )
             if not 0 < piece.length < np.inf:
-                raise InputError(f"piece {k + 1} must have a length, but it is {piece.length:g} m.")
-        return cls(tuple(pieces), as_array("rotation", rotation), float(speed), float(acceleration))
+                raise InputError(
+                    f"piece {k + 1} of `pieces` must have a length, but it is {piece.length:g} m."
+                )
 
     @property
     def durations(self) -> tuple[float, ...]:
         """Time of each piece [s]: the shortest that keeps speed and acceleration."""
+        # Largest speed and acceleration of the polynomial, over a unit length in unit time.
+        speed, acceleration = 15.0 / 8.0, 10.0 / np.sqrt(3.0)
         return tuple(
             max(
-                PEAK_SPEED * p.length / min(self.speed, np.sqrt(self.acceleration * p.radius)),
-                np.sqrt(PEAK_ACCELERATION * p.length / self.acceleration),
+                speed * p.length / min(self.speed, np.sqrt(self.acceleration * p.radius)),
+                np.sqrt(acceleration * p.length / self.acceleration),
             )
             for p in self.pieces
         )
 
     @property
     def duration(self) -> float:
-        """Of all pieces together [s]."""
+        """Total time [s]."""
         return float(sum(self.durations))
 
     @property
     def length(self) -> float:
-        """Of all pieces together [m]."""
+        """Total length [m]."""
         return float(sum(piece.length for piece in self.pieces))
 
     def positions(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Where the end-effector is at some times [m]; before and after it stands still.
+        """Return positions of the end-effector [m]; it stands still before and after the path.
 
         Args:
             t: Times [s].
         """
         t = np.asarray(t)
-        begins = np.concatenate([[0.0], np.cumsum(self.durations)[:-1]])
-        piece = np.clip(np.searchsorted(begins, t, side="right") - 1, 0, len(begins) - 1)
+        starts = np.concatenate([[0.0], np.cumsum(self.durations)[:-1]])
+        piece = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(starts) - 1)
         places = np.empty((len(t), 3))
-        for k, (one, begin, time) in enumerate(
-            zip(self.pieces, begins, self.durations, strict=True)
+        for k, (curve, start, time) in enumerate(
+            zip(self.pieces, starts, self.durations, strict=True)
         ):
-            own = piece == k
-            u = np.clip((t[own] - begin) / time, 0.0, 1.0)
-            places[own] = one.at(u**3 * (10.0 + u * (6.0 * u - 15.0)))
+            u = np.clip((t[piece == k] - start) / time, 0.0, 1.0)
+            places[piece == k] = curve.at(u**3 * (10.0 + u * (6.0 * u - 15.0)))
         return places
+
+
+def iso9283_path(
+    centre: Numbers,
+    edge: float,
+    rotation: Numbers,
+    *,
+    leans_along: int = 0,
+    rounds: int = 1,
+    speed: float = 1.0,
+    acceleration: float = 4.0,
+) -> TipPath:
+    """Return the verification path: straight lines, a rectangle and two circles (Fig. 8).
+
+    The paper takes it from the standard ISO 9283. An inclined plane passes through two opposite
+    horizontal edges of a cube whose edges are along x, y and z. On it lie the cube's centre P1 and,
+    a tenth of the plane's diagonal inside its corners, the points P2 to P5. The path goes from P1
+    to P2, along the rectangle P2 P3 P4 P5, along the diagonal to P4 and back to P1; then along a
+    large circle (80 % of the edge) and a small one (a tenth of that) about P1. At every corner, and
+    before and after each circle, the end-effector is at rest.
+
+    Args:
+        centre: Centre of the cube in the frame of the ground [m].
+        edge: Edge of the cube [m].
+        rotation: Constant attitude of the end-effector in the frame of the ground.
+        leans_along: Horizontal axis along which the plane rises: 0 for x, 1 for y.
+        rounds: Number of rounds of each circle without a stop.
+        speed: Largest speed [m/s].
+        acceleration: Largest acceleration along the path, and largest across it [m/s²].
+
+    Raises:
+        InputError: If the cube has no size, a limit is not positive, or there is no round.
+    """
+    if not 0 < edge < np.inf:
+        raise InputError(f"`edge` of the cube must be positive [m], but is {edge:g}.")
+    if leans_along not in (0, 1):
+        raise InputError(f"`leans_along` must be 0 (x) or 1 (y), but is {leans_along}.")
+    c = as_array("centre", centre)
+    if c.shape != (3,) or not np.isfinite(c).all():
+        raise InputError("`centre` must hold three finite numbers [m].")
+    rising = np.eye(3)[leans_along] + np.eye(3)[2]
+    level = np.eye(3)[1 - leans_along]
+    # The corners lie a tenth of the diagonal inside, so that 80 % of the half edges are left.
+    u, v = 0.8 * edge / 2 * rising, 0.8 * edge / 2 * level
+    p2, p3, p4, p5 = c + u + v, c - u + v, c - u - v, c + u - v
+    large, small = 0.8 * edge / 2, 0.08 * edge / 2
+    up = rising / np.sqrt(2.0)
+    corners = (c, p2, p3, p4, p5, p2, p4, c, c + large * up)
+    pieces = (
+        *(Line(a, b) for a, b in itertools.pairwise(corners)),
+        Circle(c, large * up, large * level, rounds),
+        Line(c + large * up, c + small * up),
+        Circle(c, small * up, small * level, rounds),
+        Line(c + small * up, c),
+    )
+    return TipPath(pieces, rotation, speed, acceleration)
+
+
+def joint_path(
+    robot: Robot,
+    path: TipPath,
+    *,
+    posture: Numbers | None = None,
+    spacing: float = 0.01,
+    starts: int = 32,
+    seed: int = 0,
+) -> PiecewisePolynomial:
+    """Return the joints' motion that takes the end-effector along a path.
+
+    Inverse kinematics at close instants; between them quintic splines that stand still where pieces
+    of the path meet.
+
+    Args:
+        robot: Robot whose end-effector moves.
+        path: Path of the end-effector.
+        posture: Preferred coordinates [rad or m]; the middle of the ranges if None.
+        spacing: Largest time between two instants [s].
+        starts: Number of random coordinates to start from.
+        seed: Seed of the starts.
+
+    Raises:
+        InputError: If a part of the path is out of reach, a joint would have to move faster than it
+            can, or `spacing` is not positive.
+    """
+    if not 0 < spacing < np.inf:
+        raise InputError(f"`spacing` must be positive [s], but is {spacing:g}.")
+    counts = [max(12, int(np.ceil(time / spacing))) for time in path.durations]
+    ends = np.concatenate([[0.0], np.cumsum(path.durations)])
+    instants = [
+        np.linspace(a, b, count + 1)
+        for a, b, count in zip(ends[:-1], ends[1:], counts, strict=True)
+    ]
+    times = np.concatenate([*(t[:-1] for t in instants), ends[-1:]])
+    q = inverse_kinematics_along(
+        robot, path.positions(times), path.rotation, posture=posture, starts=starts, seed=seed
+    )
+    rest = [(order, np.zeros(robot.joints)) for order in (1, 2)]
+    knots, polynomials, begin = [], [], 0
+    for t, count in zip(instants, counts, strict=True):
+        nodes = q[begin : begin + count + 1]
+        spline = make_interp_spline(t - t[0], nodes, 5, bc_type=(rest, rest))
+        knots.append(t[0] + spline.t[5:-6])
+        polynomials.append(spline_polynomials(spline))
+        begin += count
+    coefficients = np.concatenate(polynomials, axis=1)
+    _check_rates(robot, path, coefficients[-2], 2 * coefficients[-3])
+    return PiecewisePolynomial(np.concatenate([*knots, ends[-1:]]), coefficients)
+
+
+def _check_rates(
+    robot: Robot, path: TipPath, qd: np.ndarray, qdd: np.ndarray, tolerance: float = 1e-3
+) -> None:
+    """Raise an error if velocities or accelerations at the knots exceed their limits."""
+    speed = np.abs(qd).max(axis=0) / np.asarray(robot.limits.velocity)
+    acceleration = np.abs(qdd).max(axis=0) / np.asarray(robot.limits.acceleration)
+    # A path that is run f times slower needs a fraction 1/f of speeds and 1/f² of accelerations.
+    slower = np.maximum(speed, np.sqrt(acceleration))
+    j = int(slower.argmax())
+    if slower[j] > 1.0 + tolerance:
+        name = "speed" if speed[j] == slower[j] else "acceleration"
+        f = 1.01 * slower[j]
+        raise InputError(
+            f"joint `{robot.joint_names[j]}` would need {max(speed[j], acceleration[j]):.2f} times "
+            f"its largest {name}: give the path a `speed` of {path.speed / f:.3g} m/s and an "
+            f"`acceleration` of {path.acceleration / f**2:.3g} m/s², or choose another posture."
+        )

@@ -17,8 +17,8 @@ from jaxid.excitation.limits import CERTIFIED, JointLimits, calmed
 from jaxid.excitation.problem import CHECKED, MARGIN, PEAKS, WATCHED, Context, Problem
 from jaxid.excitation.search import random_starts
 from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
-from jaxid.trajectory.basis import FourierBasis
-from jaxid.trajectory.leads_basis import LeadsBasis
+from jaxid.trajectory.fourier import FourierBasis
+from jaxid.trajectory.leads import LeadsBasis
 
 BASIS = LeadsBasis(3, 1.1, lead=0.4)
 

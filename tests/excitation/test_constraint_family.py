@@ -65,7 +65,7 @@ FAMILY = {
     "clearance": Clearance(SHAPES),
 }
 SERIES = random_fourier_series(ROBOT, omega=1.2, harmonics=3, seed=2)
-MOTION = SERIES.motion(np.linspace(0.0, SERIES.period, 40))
+MOTION = SERIES.motion(np.linspace(0.0, SERIES.duration, 40))
 
 
 def shifted(motion, direction, h):

@@ -10,7 +10,7 @@ from jaxid.excitation import criteria as members
 from jaxid.excitation.information import Information, InformationMap, information
 from jaxid.excitation.plan import CRITERIA, deviations
 from jaxid.excitation.spectral import log_condition, spectral
-from jaxid.trajectory.basis import FourierBasis
+from jaxid.trajectory.fourier import FourierBasis
 
 SIZE = 7
 

@@ -91,7 +91,7 @@ def test_writes_a_table_and_itself(plan, tmp_path):
     assert table.shape == (201, 7)
     plan.save(tmp_path / "motion.json")
     again = load_trajectory(tmp_path / "motion.json")
-    np.testing.assert_array_equal(again.a, plan.trajectory.a)
+    np.testing.assert_array_equal(again.coefficients, plan.trajectory.coefficients)
 
 
 def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(base, plan, tmp_path):

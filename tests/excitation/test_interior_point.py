@@ -6,7 +6,7 @@ import scipy.optimize
 
 from jaxid.excitation.interior_point import Evaluation, InteriorPoint, Stage
 from jaxid.excitation.limits import JointLimits
-from jaxid.trajectory.basis import FourierBasis
+from jaxid.trajectory.fourier import FourierBasis
 
 RANDOM = np.random.default_rng(0)
 

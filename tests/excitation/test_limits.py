@@ -8,8 +8,7 @@ import pytest
 from jaxid.excitation.limits import JointLimits, calmed, held_within, random_motion
 from jaxid.excitation.search import random_starts
 from jaxid.robot.limits import Limits
-from jaxid.trajectory.basis import FourierBasis
-from jaxid.trajectory.rest import RestToRestBasis
+from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 
 BASES = (FourierBasis(4, 1.1), RestToRestBasis(4, 1.1), RestToRestSplineBasis(12, 6.0))

@@ -11,7 +11,7 @@ from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.offspring import Offspring
 from jaxid.excitation.problem import Problem
 from jaxid.excitation.search import random_starts
-from jaxid.trajectory.basis import FourierBasis
+from jaxid.trajectory.fourier import FourierBasis
 
 BASIS = FourierBasis(3, 1.1)
 
@@ -38,7 +38,7 @@ def test_when_a_motion_begins_and_which_way_it_runs_does_not_matter(problem):
     """What children rely on: all joints retimed together tell the same."""
     y = np.asarray(random_starts(problem.limits, jax.random.key(0), 1))[0]
     x = problem.limits.numbers(y)
-    retimed = [problem.value(x @ T.T) for T in BASIS.retimings[::9]]
+    retimed = [problem.value(x @ T.T) for T in BASIS.retimings()[::9]]
     np.testing.assert_allclose(retimed, problem.value(x), atol=1e-9)
 
 
@@ -53,7 +53,7 @@ def test_each_joint_of_a_child_moves_as_in_a_parent(problem):
                 continue
             foreign += 1
             others = np.delete(own[:, joint], place, axis=0)
-            possible = np.einsum("rvw,ow->orv", BASIS.retimings, others).reshape(-1, len(x))
+            possible = np.einsum("rvw,ow->orv", BASIS.retimings(), others).reshape(-1, len(x))
             assert np.abs(possible - x).max(axis=1).min() < 1e-9 * np.abs(x).max()
     assert 6 <= foreign < own.shape[0] * own.shape[1]
     again = Offspring(problem)(y, jax.random.key(2))

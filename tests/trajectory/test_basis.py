@@ -1,14 +1,22 @@
-"""Contract of every basis: linear, derivatives that belong together, envelopes that hold."""
+"""Contract of every basis: derivatives that belong together, envelopes that hold, retimings."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.trajectory.basis import SHIFTS, FourierBasis
-from jaxid.trajectory.leads_basis import LeadsBasis
-from jaxid.trajectory.rest import RestToRestBasis
+from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis, fourier_series
+from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 
-BASES = [FourierBasis(5, 0.8), FourierBasis(1, 3.0)]
+PERIODIC = FourierBasis(5, 0.8)
+BETWEEN_RESTS = (
+    RestToRestBasis(4, 0.9),
+    RestToRestSplineBasis(9, 5.0),
+    LeadsBasis(3, 1.1, lead=0.4),
+    LeadsBasis(5, 0.8, lead=0.4, periods=2),
+)
+BASES = (PERIODIC, FourierBasis(1, 3.0), *BETWEEN_RESTS)
 
 
 @pytest.fixture(params=BASES, ids=lambda basis: type(basis).__name__)
@@ -16,74 +24,127 @@ def basis(request):
     return request.param
 
 
-def numbers(basis, joints=3, seed=0):
+def coefficients(basis, joints=3, seed=0):
     return np.random.default_rng(seed).standard_normal((joints, basis.variables))
 
 
-def test_rows_are_the_trajectorys_motion(basis):
-    x, t = numbers(basis), np.linspace(0.0, basis.duration, 17)
-    motion, rows = basis.trajectory(x).motion(t), basis.rows(t)
-    for k, exact in enumerate((motion.q, motion.qd, motion.qdd)):
-        np.testing.assert_allclose(rows[k] @ x.T, exact, atol=1e-12)
-
-
 def test_each_order_is_the_derivative_of_the_one_before(basis):
-    t, h = np.linspace(0.1, 0.9, 9) * basis.duration, 1e-5 * basis.duration
+    h = 1e-5 * basis.duration
+    t = basis.instants(40)[1:-1] + 0.01
     before, rows, after = (basis.rows(x) for x in (t - h, t, t + h))
     for k in range(3):
         slope = (after[k] - before[k]) / (2 * h)
         np.testing.assert_allclose(rows[k + 1], slope, atol=1e-6 * np.abs(rows[k + 1]).max())
 
 
-@pytest.mark.parametrize("points", [12, 64, 512])
-def test_envelopes_bound_the_motion_at_all_times(basis, points):
-    envelope = basis.envelope(points)
-    fine = basis.rows(np.linspace(0.0, basis.duration, 4001))
+def test_the_trajectory_is_the_rows_times_the_coefficients(basis):
+    x = coefficients(basis)
+    trajectory, t = basis.trajectory(x), basis.instants(50)[1:-1]
+    assert float(trajectory.duration) == pytest.approx(basis.duration)
+    motion = trajectory.motion(t)
+    expected = (motion.q, motion.qd, motion.qdd, trajectory.jerk(t))
+    for rows, values in zip(basis.rows(t), expected, strict=True):
+        np.testing.assert_allclose(rows @ x.T, values, atol=1e-10 * np.abs(values).max())
+
+
+@pytest.mark.parametrize("points", [16, 64, 512])
+def test_envelopes_bound_the_motion_at_all_times_and_get_tight(basis, points):
+    rows, factor = basis.envelope(points)
+    fine = basis.rows(basis.instants(20_000))
     for seed in range(5):
-        x = numbers(basis, 1, seed)[0]
+        x = coefficients(basis, 1, seed)[0]
         for k in range(4):
             for centre in (0.0, 0.7):
-                bound = envelope.factor * np.abs(envelope.rows[k] @ x - centre).max()
-                assert np.abs(fine[k] @ x - centre).max() <= bound * (1 + 1e-12)
+                bound = factor * np.abs(rows[k] @ x - centre).max()
+                peak = np.abs(fine[k] @ x - centre).max()
+                assert peak <= bound * (1 + 1e-9)
+                assert points < 512 or bound <= 1.02 * peak
 
 
-def test_envelopes_get_tight(basis):
-    assert 1.0 <= basis.envelope(512).factor < 1.001 < basis.envelope(24).factor
+@pytest.mark.parametrize("basis", BETWEEN_RESTS, ids=lambda basis: type(basis).__name__)
+def test_stands_still_at_the_ends_and_beyond(basis):
+    x, end = coefficients(basis), float(basis.duration)
+    q, *rates = basis.rows(np.array([0.0, end])) @ x.T
+    np.testing.assert_allclose(rates[:2], 0.0, atol=1e-11)
+    q_beyond, *rates = basis.rows(np.array([-0.1, end + 0.1])) @ x.T
+    np.testing.assert_allclose(q_beyond, q, atol=1e-12)
+    np.testing.assert_array_equal(rates, 0.0)
 
 
-def test_refuses_what_is_no_frequency():
-    with pytest.raises(ValueError, match="`omega` must be a positive"):
-        FourierBasis(5, 0.0)
-    with pytest.raises(ValueError, match="`harmonics` must be at least 1"):
-        FourierBasis(0, 0.8)
-
-
-def test_a_periodic_motion_begins_later_or_runs_backwards(basis):
-    retimings, x = basis.retimings, numbers(basis)
-    t, step = basis.times(23), basis.duration / SHIFTS
-    assert len(retimings) == 2 * SHIFTS
-    np.testing.assert_allclose(retimings[0], np.eye(basis.variables), atol=1e-12)
-    for k in (1, 7, SHIFTS - 1):
-        later, backwards = (
-            basis.rows(t) @ (x @ T.T).T for T in (retimings[k], retimings[SHIFTS + k])
-        )
-        np.testing.assert_allclose(later, basis.rows(t - k * step) @ x.T, atol=1e-9)
-        turned = basis.rows(k * step - t) @ x.T
+def test_a_periodic_motion_begins_later_or_runs_backwards():
+    maps, x = PERIODIC.retimings(), coefficients(PERIODIC)
+    t, step = PERIODIC.times(23), PERIODIC.duration / 40
+    assert len(maps) == 80
+    np.testing.assert_allclose(maps[0], np.eye(PERIODIC.variables), atol=1e-12)
+    for k in (1, 7, 39):
+        later, backwards = (PERIODIC.rows(t) @ (x @ T.T).T for T in (maps[k], maps[40 + k]))
+        np.testing.assert_allclose(later, PERIODIC.rows(t - k * step) @ x.T, atol=1e-9)
+        turned = PERIODIC.rows(k * step - t) @ x.T
         turned[1::2] *= -1
         np.testing.assert_allclose(backwards, turned, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "basis",
-    [RestToRestBasis(4, 0.9), RestToRestSplineBasis(9, 5.0), LeadsBasis(3, 1.1, lead=0.4)],
-    ids=lambda basis: type(basis).__name__,
-)
+@pytest.mark.parametrize("basis", BETWEEN_RESTS[:3], ids=lambda basis: type(basis).__name__)
 def test_a_motion_between_standstills_only_runs_backwards(basis):
-    retimings, x = basis.retimings, numbers(basis)
+    maps, x = basis.retimings(), coefficients(basis)
     t = np.linspace(0.0, basis.duration, 41)
-    assert len(retimings) == 2
-    np.testing.assert_allclose(retimings[0], np.eye(basis.variables), atol=1e-8)
-    own, turned = basis.rows(t) @ x.T, basis.rows(basis.duration - t) @ (x @ retimings[1].T).T
+    assert len(maps) == 2
+    np.testing.assert_allclose(maps[0], np.eye(basis.variables), atol=1e-8)
+    ahead, turned = basis.rows(t) @ x.T, basis.rows(basis.duration - t) @ (x @ maps[1].T).T
     for order, sign in enumerate((1.0, -1.0, 1.0)):
-        scale = np.abs(own[order]).max()
-        np.testing.assert_allclose(turned[order], sign * own[order], atol=1e-7 * scale)
+        scale = np.abs(ahead[order]).max()
+        np.testing.assert_allclose(turned[order], sign * ahead[order], atol=1e-7 * scale)
+
+
+def test_a_fourier_series_is_the_papers_sum():
+    random, t = np.random.default_rng(0), 1.37
+    a, b = random.standard_normal((2, 3, 4))
+    offset, k = random.standard_normal(3), np.arange(1, 5)
+    expected = (
+        offset + a @ (np.sin(0.8 * k * t) / (0.8 * k)) - b @ (np.cos(0.8 * k * t) / (0.8 * k))
+    )
+    np.testing.assert_allclose(fourier_series(offset, a, b, 0.8).motion(t).q, expected, atol=1e-14)
+
+
+def test_gradients_by_coefficients_and_frequency():
+    random, t, k = np.random.default_rng(3), 2.1, np.arange(1, 5)
+    offset, (a, b) = random.standard_normal(3), random.standard_normal((2, 3, 4))
+
+    def total(offset, a, b, omega):
+        return jnp.sum(fourier_series(offset, a, b, omega).motion(t).q)
+
+    arguments = (*map(jnp.asarray, (offset, a, b)), jnp.asarray(0.8))
+    g = jax.grad(total, argnums=(0, 1, 2, 3))(*arguments)
+    w = 0.8 * k
+    np.testing.assert_array_equal(g[0], np.ones(3))
+    np.testing.assert_allclose(g[1], np.tile(np.sin(w * t) / w, (3, 1)), atol=1e-14)
+    np.testing.assert_allclose(g[2], np.tile(-np.cos(w * t) / w, (3, 1)), atol=1e-14)
+    h = 1e-6
+    slope = (total(offset, a, b, 0.8 + h) - total(offset, a, b, 0.8 - h)) / (2 * h)
+    assert float(g[3]) == pytest.approx(float(slope), rel=1e-6)
+
+
+def test_the_nearest_motion_between_rests():
+    random = np.random.default_rng(1)
+    series = PERIODIC.trajectory(random.standard_normal((7, 11)))
+    basis = RestToRestBasis(5, 0.8, periods=2)
+    nearest = basis.nearest(series)
+    Z, order = basis.directions, np.arange(1.0, 6.0)
+    assert Z.shape == (11, 9)
+    np.testing.assert_allclose(Z.T @ Z, np.eye(9), atol=1e-14)
+    x = nearest.coefficients @ Z.T
+    np.testing.assert_allclose(x[:, 1:6].sum(axis=1), 0.0, atol=1e-14)
+    np.testing.assert_allclose(x[:, 6:] @ order, 0.0, atol=1e-14)
+    np.testing.assert_allclose((series.coefficients - x) @ Z, 0.0, atol=1e-14)
+
+
+def test_leads_are_checked_and_one_period_between_them_is_measured():
+    basis = BETWEEN_RESTS[3]
+    times, instants = basis.times(50), basis.instants(200)
+    assert times[0] == pytest.approx(0.4)
+    assert times[-1] < 0.4 + basis.series.duration
+    assert instants[0] == 0.0
+    assert instants[-1] == pytest.approx(basis.duration)
+    assert (np.diff(instants) > 0).all()
+    assert (instants < 0.4).any()
+    assert (instants > basis.duration - 0.4).any()

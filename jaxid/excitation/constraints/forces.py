@@ -17,7 +17,7 @@ from jaxid.dynamics.transitions import AbstractTransition, Reversal
 from jaxid.errors import InputError
 from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import assumed_bounds
+from jaxid.trajectory.fourier import complete_limits
 
 REVERSING = 0.02
 """Share of a joint's largest speed below which its dry friction may have either direction."""
@@ -107,7 +107,7 @@ class NominalForces(eqx.Module):
         """The expected forces of one sample: as they are, and with dry friction to either side."""
         model = self.base.model
         p = self.base.to_standard(jnp.asarray(self.parameters))
-        width = REVERSING * np.asarray(assumed_bounds(model.robot)[2])
+        width = REVERSING * np.asarray(complete_limits(model.robot).velocity)
         found = jnp.stack(
             [
                 jnp.asarray(m.forces(p, q, qd, qdd))

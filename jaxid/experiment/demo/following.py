@@ -11,8 +11,8 @@ from jaxid.robot.kinematics import tip_jacobian
 from jaxid.simulation.tracking import Tracking
 from jaxid.simulation.tx90l import cad_tx90l_on_rail
 from jaxid.simulation.virtual import VirtualRobot
-from jaxid.trajectory.joint_path import JointPath
 from jaxid.trajectory.tip_path import TipPath
+from jaxid.trajectory.trajectory import PiecewisePolynomial
 
 NO_MODEL, CAD, IDENTIFIED = "no model", "CAD values", "identified model"
 """What is fed forward."""
@@ -47,7 +47,7 @@ class Followed(NamedTuple):
 
 
 def followed(
-    virtual: VirtualRobot, path: TipPath, joints: JointPath, fit: Fit, seed: int
+    virtual: VirtualRobot, path: TipPath, joints: PiecewisePolynomial, fit: Fit, seed: int
 ) -> tuple[Followed, ...]:
     """Runs the path by the servo alone, and with two models fed forward.
 

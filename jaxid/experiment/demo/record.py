@@ -9,7 +9,6 @@ from jaxid.experiment.demo import study as settings
 from jaxid.experiment.demo.study import Judged, Study
 from jaxid.experiment.demo.tables import ASKED, TEMPERATURE, errors, keeps, moving_errors
 from jaxid.report.content import plain, versions
-from jaxid.trajectory.fourier import FourierSeries
 
 
 def record(study: Study) -> dict[str, Any]:
@@ -71,7 +70,7 @@ def record(study: Study) -> dict[str, Any]:
                     }
                     for plan in excitation.plans
                 ],
-                "series": _series(excitation.played.inner),
+                "series": _series(excitation.played.inner, settings.HARMONICS),
                 "tip_speed": excitation.speed,
                 "tip_acceleration": excitation.acceleration,
                 "window": [float(t) for t in excitation.played.window],
@@ -123,13 +122,13 @@ def record(study: Study) -> dict[str, Any]:
     )
 
 
-def _series(series: Any) -> dict[str, Any]:
-    found: FourierSeries = series
+def _series(series: Any, harmonics: int) -> dict[str, Any]:
+    x = np.asarray(series.coefficients)
     return {
-        "offset": np.asarray(found.offset),
-        "a": np.asarray(found.a),
-        "b": np.asarray(found.b),
-        "omega": float(found.omega),
+        "offset": x[:, 0],
+        "a": x[:, 1 : harmonics + 1],
+        "b": x[:, harmonics + 1 :],
+        "omega": float(series.basis.omega),
     }
 
 

@@ -32,12 +32,11 @@ from jaxid.robot.robot import Robot
 from jaxid.simulation.tracking import Tracking
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
 from jaxid.simulation.virtual import VirtualRobot
-from jaxid.trajectory.basis import FourierBasis
-from jaxid.trajectory.fourier import FourierSeries
-from jaxid.trajectory.iso9283 import iso9283_path
-from jaxid.trajectory.joint_path import JointPath, joint_path
+from jaxid.trajectory.basis import LinearTrajectory
+from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.leads import WithLeads, with_leads
-from jaxid.trajectory.tip_path import TipPath
+from jaxid.trajectory.tip_path import TipPath, iso9283_path, joint_path
+from jaxid.trajectory.trajectory import PiecewisePolynomial
 from jaxid.validation.validate import Validation, validate
 
 HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800
@@ -179,7 +178,7 @@ class Study(NamedTuple):
     base: BaseParameters
     excitation: Excitation
     path: TipPath
-    verification: JointPath
+    verification: PiecewisePolynomial
     measured: Measured
     unweighted: Judged
     weighted: Judged
@@ -211,7 +210,7 @@ STAGES = 14
 
 
 def study(
-    seed: int, stage: Stages, effort: Effort = EFFORT, motion: FourierSeries | None = None
+    seed: int, stage: Stages, effort: Effort = EFFORT, motion: LinearTrajectory | None = None
 ) -> Study:
     """Does everything that the paper does.
 
@@ -328,13 +327,13 @@ def _within_torques(limits: Limits) -> Limits:
 def _excitation(
     base: BaseParameters,
     plans: tuple[ExcitationPlan, ...],
-    motion: FourierSeries | None,
+    motion: LinearTrajectory | None,
     periods: int,
 ) -> Excitation:
     robot = base.model.robot
     if motion is None:
         motion = FourierBasis(HARMONICS, OMEGA).trajectory(plans[0].numbers)
-    times = np.linspace(0.0, float(motion.period), FINE, endpoint=False)
+    times = np.linspace(0.0, float(motion.duration), FINE, endpoint=False)
     tip = tip_motion(robot, motion.motion(times))
     speed, acceleration = (
         float(np.linalg.norm(np.asarray(x), axis=1).max()) for x in (tip.velocity, tip.acceleration)
@@ -346,7 +345,7 @@ def _measured(
     cold: VirtualRobot,
     warm: VirtualRobot,
     excitation: WithLeads,
-    verification: JointPath,
+    verification: PiecewisePolynomial,
     seed: int,
     stage: Stages,
 ) -> Measured:

@@ -1,0 +1,342 @@
+"""Contract of every trajectory, limits of random series and leads, and files."""
+
+import csv
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import polars as pl
+import pytest
+
+from jaxid.robot import library
+from jaxid.robot.limits import Limits
+from jaxid.trajectory import (
+    FourierBasis,
+    LeadsBasis,
+    LinearTrajectory,
+    PaddedToCycle,
+    RestToRestBasis,
+    RestToRestSplineBasis,
+    Segments,
+    WithLeads,
+    fourier_series,
+    iso9283_path,
+    joint_path,
+    joint_trajectory,
+    load_trajectory,
+    random_fourier_series,
+    save_trajectory,
+    spline_through,
+    with_leads,
+    write_csv,
+    write_ros_json,
+    write_ros_yaml,
+)
+
+PANDA = library.panda()
+POINTS = np.random.default_rng(4).standard_normal((6, 7))
+
+
+def series(seed=0, reach=1.0) -> LinearTrajectory:
+    return random_fourier_series(PANDA, omega=0.8, reach=reach, seed=seed)
+
+
+def chain() -> Segments:
+    middle = RestToRestBasis(5, 0.8).nearest(series(1))
+    start = middle.motion(0.0).q
+    members = (
+        spline_through(POINTS, 3.0),
+        spline_through([POINTS[-1], start], 1.5),
+        middle,
+        spline_through([start, POINTS[-1]], 1.0),
+        spline_through(POINTS[::-1], 2.0),
+    )
+    return Segments(members)
+
+
+FAMILY = {
+    "series": series(),
+    "rest to rest": RestToRestBasis(5, 0.8, periods=2).nearest(series()),
+    "with leads": with_leads(series(), PANDA, periods=2),
+    "leads of a basis": LeadsBasis(5, 0.8).trajectory(np.asarray(series().coefficients)),
+    "spline by handles": RestToRestSplineBasis(6, 2.5).trajectory(POINTS.T),
+    "spline through points": spline_through(POINTS, 4.0),
+    "padded": PaddedToCycle(spline_through(POINTS, 4.0), 0.03),
+    "segments": chain(),
+    "path of the end-effector": joint_path(
+        library.tx90l_on_rail(),
+        iso9283_path([0.0, 0.65, 0.65], 0.5, np.diag([1.0, -1.0, -1.0]), acceleration=3.0),
+        posture=[0.0, 1.57, 0.3, 1.6, 0.0, 0.5, 0.0],
+        spacing=0.05,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_derivatives_are_those_of_the_position(name):
+    trajectory = FAMILY[name]
+    duration = float(trajectory.duration)
+    t = np.random.default_rng(0).uniform(0.01 * duration, 0.99 * duration, 400)
+    h = 1e-5
+    ahead, behind, now = trajectory.motion(t + h), trajectory.motion(t - h), trajectory.motion(t)
+    for x, derivative in (("q", now.qd), ("qd", now.qdd), ("qdd", trajectory.jerk(t))):
+        quotient = (getattr(ahead, x) - getattr(behind, x)) / (2 * h)
+        near = np.abs(quotient - derivative) <= 1e-5 * (1 + np.abs(derivative).max())
+        # The jerk of leads and segments jumps where they meet.
+        assert near.mean() > (0.999 if x != "qdd" else 0.98), (x, near.mean())
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_nothing_jumps_and_ends_are_at_rest(name):
+    trajectory = FAMILY[name]
+    times, m = trajectory.sample(2e-3)
+    assert times[0] == 0.0
+    assert times[-1] == float(trajectory.duration)
+    for x, rate in ((m.q, m.qd), (m.qd, m.qdd), (m.qdd, trajectory.jerk(times))):
+        step = np.abs(np.diff(x, axis=0)).max()
+        assert step <= 1.5 * np.diff(times).max() * np.abs(rate).max() + 1e-12
+    if name != "series":
+        ends = trajectory.motion(times[[0, -1]])
+        np.testing.assert_allclose(ends.qd, 0.0, atol=1e-9)
+        np.testing.assert_allclose(ends.qdd, 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_any_shape_of_times_and_jit(name):
+    trajectory = FAMILY[name]
+    t = np.linspace(0.0, float(trajectory.duration), 6)
+    flat = trajectory.motion(t)
+    assert trajectory.motion(0.5).q.shape == (trajectory.joints,)
+    folded = jax.jit(lambda x: trajectory.motion(x))(t.reshape(2, 3))
+    np.testing.assert_allclose(folded.qdd.reshape(6, 7), flat.qdd, atol=1e-9)
+    mapped = jax.vmap(trajectory.jerk)(jnp.asarray(t))
+    np.testing.assert_allclose(mapped, trajectory.jerk(t), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_a_file_keeps_every_bit(name, tmp_path):
+    trajectory = FAMILY[name]
+    save_trajectory(trajectory, tmp_path / "t.json")
+    loaded = load_trajectory(tmp_path / "t.json")
+    assert jax.tree.structure(loaded) == jax.tree.structure(trajectory)
+    for x, y in zip(jax.tree.leaves(loaded), jax.tree.leaves(trajectory), strict=True):
+        np.testing.assert_array_equal(x, y)
+    t = np.linspace(0.0, float(trajectory.duration), 17)
+    np.testing.assert_array_equal(loaded.motion(t).qdd, trajectory.motion(t).qdd)
+
+
+def test_splines_pass_their_points_and_keep_to_the_range_of_their_handles():
+    through = spline_through(POINTS, 5.0)
+    np.testing.assert_allclose(through.motion(np.arange(6.0)).q, POINTS, atol=1e-12)
+    q = np.asarray(FAMILY["spline by handles"].motion(np.linspace(0, 2.5, 1000)).q)
+    assert (q <= POINTS.max(axis=0) + 1e-12).all()
+    assert (q >= POINTS.min(axis=0) - 1e-12).all()
+
+
+@pytest.mark.parametrize("robot", [PANDA, library.tx90l_on_rail()], ids=lambda r: r.name)
+@pytest.mark.parametrize(("harmonics", "seed"), [(1, 0), (5, 1), (20, 2)])
+def test_random_series_keep_and_use_limits_on_a_finer_grid(robot, harmonics, seed):
+    s = random_fourier_series(robot, omega=0.8, harmonics=harmonics, reach=1.0, seed=seed)
+    m = s.motion(np.arange(20_000) * s.duration / 20_000)
+    lim = robot.limits
+    assert (np.asarray(m.q) >= lim.position_min - 1e-9).all()
+    assert (np.asarray(m.q) <= lim.position_max + 1e-9).all()
+    use = [
+        np.ptp(m.q, axis=0) / (lim.position_max - lim.position_min),
+        np.abs(m.qd).max(0) / lim.velocity,
+        np.abs(m.qdd).max(0) / lim.acceleration,
+    ]
+    assert np.max(use) <= 1 + 1e-9
+    # Every joint meets its tightest limit, up to the bound for what lies between grid points.
+    assert np.max(use, axis=0).min() > math.cos(math.pi * harmonics / 512) - 1e-3
+
+
+def test_reach_leaves_room_and_the_seed_decides():
+    first, again, other = (
+        random_fourier_series(PANDA, omega=0.8, reach=0.5, seed=s) for s in (5, 5, 6)
+    )
+    np.testing.assert_array_equal(first.coefficients, again.coefficients)
+    assert not np.array_equal(first.coefficients, other.coefficients)
+    m, lim = first.motion(np.linspace(0.0, first.duration, 5000)), PANDA.limits
+    centre, half = (
+        0.5 * (lim.position_min + lim.position_max),
+        0.25 * np.subtract(lim.position_max, lim.position_min),
+    )
+    assert (np.abs(np.asarray(m.q) - centre) <= half).all()
+    assert (np.abs(m.qd).max(0) <= 0.5 * lim.velocity).all()
+    assert (np.abs(m.qdd).max(0) <= 0.5 * lim.acceleration).all()
+
+
+def test_unknown_limits_are_assumed_as_documented():
+    robot = library.tx90l_on_rail()
+    robot = robot.replace(limits=Limits(7, position_min=[0.2, *[-np.inf] * 6]))
+    s = random_fourier_series(robot, omega=0.8, seed=4)
+    m = s.motion(np.linspace(0.0, s.duration, 5000))
+    assert np.min(m.q[:, 0]) >= 0.2
+    assert np.max(m.q[:, 0]) <= 2.2
+    assert np.abs(m.q[:, 1:]).max() <= np.pi
+    assert np.abs(m.qd[:, 0]).max() <= 0.5
+    assert np.abs(m.qd[:, 1:]).max() <= np.pi / 2
+    assert np.abs(m.qdd[:, 1:]).max() <= 2 * np.pi
+
+
+@pytest.mark.parametrize("robot", [PANDA, library.tx90l_on_rail()], ids=lambda r: r.name)
+def test_leads_keep_the_limits_and_follow_the_series_between(robot):
+    for seed in range(4):
+        inner = random_fourier_series(robot, omega=0.8, reach=1.0, seed=seed)
+        led = with_leads(inner, robot, periods=2)
+        times = np.linspace(0.0, float(led.duration), 40_000)
+        m, lim = jax.tree.map(np.asarray, led.motion(times)), robot.limits
+        assert np.max([m.q - lim.position_max, lim.position_min - m.q]) <= 1e-8
+        assert (np.abs(m.qd) / lim.velocity).max() <= 1 + 1e-8
+        assert (np.abs(m.qdd) / lim.acceleration).max() <= 1 + 1e-8
+        assert (np.abs(np.asarray(led.jerk(times))) / lim.jerk).max() <= 1 + 1e-6
+        begin, end = (float(x) for x in led.window)
+        assert end - begin == pytest.approx(2 * inner.duration)
+        t = np.linspace(begin, end, 300)
+        expected = inner.motion(t - begin + led.start).q
+        np.testing.assert_allclose(led.motion(t).q, expected, atol=1e-9)
+        assert begin < 1.0
+
+
+def test_leads_are_differentiable_in_their_series():
+    led = with_leads(series(), PANDA)
+
+    def total(x):
+        whole = WithLeads(
+            led.inner.basis.trajectory(x), led.start, led.length, led.lead_in, led.lead_out
+        )
+        return jnp.sum(whole.motion(np.linspace(0.0, 9.0, 40)).q ** 2)
+
+    x, h = jnp.asarray(led.inner.coefficients), 1e-6
+    direction = np.random.default_rng(0).standard_normal(x.shape)
+    quotient = (total(x + h * direction) - total(x - h * direction)) / (2 * h)
+    slope = float(jnp.sum(jax.grad(total)(x) * direction))
+    assert slope == pytest.approx(float(quotient), rel=1e-7)
+
+
+def test_impossible_leads_name_the_joint():
+    robot = PANDA.replace(
+        limits=Limits(7, velocity=PANDA.limits.velocity, acceleration=[*[10.0] * 6, 1e-3])
+    )
+    with pytest.raises(ValueError, match="`joint7`"):
+        with_leads(series(), robot)
+
+
+def jump(change):
+    """Two members of which the second is changed at its start."""
+    spline = spline_through(POINTS, 1.0)
+    x = np.array(series().coefficients)
+    x[:, 0] += POINTS[-1] - np.asarray(series().motion(0.0).q) + change
+    return lambda: Segments((spline, FourierBasis(5, 0.8).trajectory(x)))
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: RestToRestBasis(5, 0.8, periods=0), "`periods`"),
+        (lambda: RestToRestBasis(1, 0.8), "`harmonics`"),
+        (lambda: FourierBasis(0, 0.8), "`harmonics`"),
+        (lambda: FourierBasis(5, 0.0), "`omega`"),
+        (lambda: LeadsBasis(3, 1.1, lead=0.0), "`lead`"),
+        (lambda: LeadsBasis(3, 1.1, periods=0), "`periods`"),
+        (lambda: random_fourier_series(PANDA, omega=0.0), "`omega`"),
+        (lambda: random_fourier_series(PANDA, omega=1.0, harmonics=0), "`harmonics`"),
+        (lambda: random_fourier_series(PANDA, omega=1.0, reach=1.5), "`reach`"),
+        (lambda: with_leads(series(), PANDA, periods=0), "`periods`"),
+        (lambda: with_leads(series(), library.ur10()), "`series`"),
+        (lambda: spline_through(POINTS[:1], 1.0), "`points`"),
+        (lambda: spline_through(POINTS, 0.0), "`duration`"),
+        (lambda: RestToRestSplineBasis(1, 1.0), "`points`"),
+        (lambda: RestToRestSplineBasis(5, -1.0), "`duration`"),
+        (lambda: series().sample(0.0), "`sample_time`"),
+        (lambda: Segments(()), "`members`"),
+        (jump(1e-3), r"coordinate of joint \d"),
+        (jump(0.0), "velocity of joint"),
+        (
+            lambda: Segments((spline_through(POINTS, 1.0), spline_through(POINTS[:, :3], 1.0))),
+            "`members` 1 and 2 must move the same joints",
+        ),
+    ],
+)
+def test_refuses(make, name):
+    with pytest.raises(ValueError, match=name):
+        make()
+
+
+def test_files_that_hold_no_trajectory_are_refused(tmp_path):
+    path = tmp_path / "t.json"
+    with pytest.raises(FileNotFoundError, match=r"t\.json"):
+        load_trajectory(path)
+    s = series()
+    with pytest.raises(ValueError, match="`trajectory`"):
+        save_trajectory(s.basis.trajectory(s.coefficients * np.nan), path)
+    assert not path.exists()
+    save_trajectory(s, path)
+    good = json.loads(path.read_text())
+    inner = good["trajectory"]
+    for change, name in (
+        ({"format": "other"}, "`format`"),
+        ({"version": 1}, "version 1"),
+        ({"trajectory": {**inner, "kind": "Waltz"}}, "`Waltz`"),
+        ({"trajectory": {**inner, "coefficients": "fast"}}, r"`trajectory\.coefficients`"),
+        ({"trajectory": {k: inner[k] for k in inner if k != "basis"}}, "`basis`"),
+    ):
+        path.write_text(json.dumps({**good, **change}))
+        with pytest.raises(ValueError, match=name):
+            load_trajectory(path)
+    path.write_text("{")
+    with pytest.raises(ValueError, match=r"t\.json`"):
+        load_trajectory(path)
+
+
+def test_a_table_has_units_and_exact_numbers(tmp_path):
+    robot = library.tx90l_on_rail()
+    trajectory = random_fourier_series(robot, omega=0.8, seed=0)
+    write_csv(trajectory, robot, tmp_path / "t.csv", sample_time=0.01)
+    table = pl.read_csv(tmp_path / "t.csv")
+    assert table.columns[:3] == ["time [s]", "q_rail [m]", "q_joint1 [rad]"]
+    assert table.columns[8] == "qd_rail [m/s]"
+    assert table.columns[-1] == "qdd_joint6 [rad/s^2]"
+    times, motion = trajectory.sample(0.01)
+    expected = np.column_stack([times, motion.q, motion.qd, motion.qdd])
+    np.testing.assert_array_equal(table.to_numpy(), expected)
+    assert np.diff(times).max() <= 0.01 + 1e-15
+    assert times[-1] == trajectory.duration
+    with pytest.raises(ValueError, match="`trajectory` must move the 6 joints of `UR10`"):
+        write_csv(series(), library.ur10(), tmp_path / "t.csv", sample_time=0.1)
+
+
+def test_ros_messages_parse_back(tmp_path):
+    yaml = pytest.importorskip("yaml")
+    trajectory = FAMILY["rest to rest"]
+    message = joint_trajectory(trajectory, PANDA, sample_time=0.05)
+    write_ros_json(trajectory, PANDA, tmp_path / "t.json", sample_time=0.05)
+    write_ros_yaml(trajectory, PANDA, tmp_path / "t.yaml", sample_time=0.05)
+    assert json.loads((tmp_path / "t.json").read_text()) == message
+    assert yaml.safe_load((tmp_path / "t.yaml").read_text()) == message
+    assert set(message) == {"header", "joint_names", "points"}
+    times, motion = trajectory.sample(0.05)
+    point, t = message["points"][7], message["points"][-1]["time_from_start"]
+    np.testing.assert_array_equal(point["positions"], motion.q[7])
+    np.testing.assert_array_equal(point["velocities"], motion.qd[7])
+    np.testing.assert_array_equal(point["accelerations"], motion.qdd[7])
+    assert t["sec"] + 1e-9 * t["nanosec"] == pytest.approx(times[-1], abs=1e-9)
+
+
+def test_tiny_numbers_and_separators_in_names_survive_files(tmp_path):
+    yaml = pytest.importorskip("yaml")
+    tiny = fourier_series(np.full(7, 1e-7), np.full((7, 2), 1e-12), np.full((7, 2), 3.0), 0.8)
+    names = ('rail, "x"', "a: b # c", "- d", "e", "null", "g", "h")
+    robot = PANDA.replace(joint_names=names)
+    write_ros_yaml(tiny, robot, tmp_path / "t.yaml", sample_time=1.0)
+    message = yaml.safe_load((tmp_path / "t.yaml").read_text())
+    assert message["joint_names"] == list(names)
+    points = message["points"]
+    assert all(isinstance(x, float) for p in points for x in p["positions"] + p["velocities"])
+    write_csv(tiny, robot, tmp_path / "t.csv", sample_time=1.0)
+    with (tmp_path / "t.csv").open(newline="") as file:
+        header = next(csv.reader(file))
+    assert header[1:8] == [f"q_{name} [rad]" for name in names]
