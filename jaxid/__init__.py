@@ -44,12 +44,11 @@ from jaxid.excitation.design import DesignProgress as DesignProgress
 from jaxid.excitation.design import design_excitation as design_excitation
 from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
 from jaxid.export.c_code import export_c as export_c
-from jaxid.export.compiled_model import CompiledModel as CompiledModel
-from jaxid.export.jax_function import export_jax as export_jax
-from jaxid.export.jax_function import exported_function as exported_function
+from jaxid.export.feed_forward import export_jax as export_jax
+from jaxid.export.feed_forward import exported_function as exported_function
+from jaxid.export.inertials import export_pinocchio as export_pinocchio
+from jaxid.export.inertials import pinocchio_parameters as pinocchio_parameters
 from jaxid.export.mjcf import export_mjcf as export_mjcf
-from jaxid.export.pinocchio import export_pinocchio as export_pinocchio
-from jaxid.export.pinocchio import pinocchio_parameters as pinocchio_parameters
 from jaxid.export.urdf import export_urdf as export_urdf
 from jaxid.identification.batches import identify_batch as identify_batch
 from jaxid.identification.bootstrap import bootstrap as bootstrap

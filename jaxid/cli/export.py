@@ -10,9 +10,9 @@ from jaxid.cli.options import open_console
 from jaxid.errors import InputError
 from jaxid.experiment import terminal
 from jaxid.export.c_code import export_c
-from jaxid.export.jax_function import export_jax
+from jaxid.export.feed_forward import export_jax
+from jaxid.export.inertials import export_pinocchio
 from jaxid.export.mjcf import export_mjcf
-from jaxid.export.pinocchio import export_pinocchio
 from jaxid.export.urdf import export_urdf
 from jaxid.identification.fit import Fit, load
 from jaxid.io import require_writable

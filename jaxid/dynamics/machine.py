@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Numbers, as_array, content, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Program, chosen, evaluate, evaluate_packed, lower, trace
+from jaxid.program import Program, evaluate, evaluate_packed, lower, select_outputs, trace
 
 FEW = 4096
 """Samples up to which NumPy is faster than what compiling costs."""
@@ -113,7 +113,7 @@ def _translated(owner: eqx.Module, definition: Callable, shapes: tuple) -> Progr
     program = program_of(other, whole, *shapes)
     (shape,) = program.output_shapes
     entries = np.arange(math.prod(shape)).reshape(shape)
-    return chosen(program, entries[:, np.array(columns, int)])
+    return select_outputs(program, entries[:, np.array(columns, int)])
 
 
 def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:

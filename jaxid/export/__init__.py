@@ -1,1 +1,1 @@
-"""Hands an identified model over: C for controllers, files for simulators, vectors for tools."""
+"""Export of an identified model: C for controllers, files for simulators, vectors for tools."""

@@ -1,72 +1,162 @@
 """The feed-forward as one C99 file and its header."""
 
+import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.export.feed_forward import Form, forms
+from jaxid.dynamics.machine import program_of
+from jaxid.export.feed_forward import other_forces, torques
 from jaxid.identification.fit import Fit
 from jaxid.io import atomic_folder
-from jaxid.program import Library, declaration, definition, evaluate
+from jaxid.program import CWriter, Program, evaluate, trace
 
-STATES = 4
-"""States at which the file can check itself."""
-TOLERANCE = {True: 1e-10, False: 2e-3}
-"""Largest error of the self-test, relative to the largest number of each result."""
+
+class CFunction(NamedTuple):
+    """One function of the C file.
+
+    Attributes:
+        name: Name, without that of the model.
+        summary: Description for the header.
+        program: Program of the function.
+        inputs: Names of the inputs.
+        output: Name of the output.
+    """
+
+    name: str
+    summary: str
+    program: Program
+    inputs: tuple[str, ...]
+    output: str
+
+    @property
+    def size(self) -> int:
+        """Number of entries of the output."""
+        return math.prod(self.program.output_shapes[0])
 
 
 def export_c(fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = True) -> Path:
-    """Writes the model as one C99 file and its header, for a real-time controller (Eqs. 38, 39).
+    """Write the model as one C99 file and its header, for a real-time controller (Eqs. 38, 39).
 
     The file needs no library, allocates nothing and does not branch on data, so that every call
-    takes the same time. It compiles as C++ too. A known tool is not in it, as it is not in
-    `Fit.predict`.
+    takes the same time. It compiles as C++ too. A known tool is not included, as in `Fit.predict`.
 
     Args:
-        fit: The model.
-        folder: Where the files shall be.
-        name: Of the files, and before the functions' names.
-        double: Whether the code computes in `double`; in `float` otherwise.
+        fit: Identified model.
+        folder: Folder of the files.
+        name: Name of the files and prefix of the functions.
+        double: Whether the code computes in `double` (otherwise `float`).
 
     Returns:
-        The C file; the header lies beside it.
+        Path of the C file; the header is beside it.
 
     Raises:
-        InputError: If `name` is no identifier of C.
+        InputError: If `name` is not an identifier of C.
     """
     source, header = c_code(fit, name, double)
-    folder = Path(folder)
     with atomic_folder(folder) as staging:
         (staging / f"{name}.c").write_text(source, encoding="ascii")
         (staging / f"{name}.h").write_text(header, encoding="ascii")
-    return folder / f"{name}.c"
+    return Path(folder) / f"{name}.c"
 
 
 def c_code(fit: Fit, name: str, double: bool) -> tuple[str, str]:
-    """The texts of the C file and of its header.
+    """Return the texts of the C file and of its header.
 
     Args:
-        fit: The model.
-        name: Of the files, and before the functions' names.
-        double: Whether the code computes in `double`; in `float` otherwise.
+        fit: Identified model.
+        name: Name of the files and prefix of the functions.
+        double: Whether the code computes in `double` (otherwise `float`).
 
     Raises:
-        InputError: If `name` is no identifier of C.
+        InputError: If `name` is not an identifier of C.
     """
-    declaration(name, (), (), double=double)
-    found = forms(fit)
-    library = Library.of([form.program for form in found], name, double=double)
-    return _source(fit, library, found), _header(fit, library, found)
+    CWriter(double).declaration(name, (), ())
+    functions = c_functions(fit)
+    writer = CWriter(double, name, [x.program for x in functions])
+    return _source(fit, writer, functions), _header(fit, writer, functions)
 
 
-def _full(name: str, form: Form) -> str:
-    return f"{name}_{form.name}"
+def c_functions(fit: Fit) -> tuple[CFunction, ...]:
+    """Return all functions of a model, with its estimates as constants.
+
+    Args:
+        fit: Identified model.
+    """
+    model, base = fit.base.model, fit.base
+    one, rest = (model.robot.joints,), np.zeros(model.robot.joints)
+    torque, others = torques(fit), other_forces(fit)
+    # Only the base parameters: composite bodies have fewer operations then.
+    p = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
+
+    def friction(q, qd):
+        return others(q, qd, rest) - others(q, rest, rest)
+
+    motion = ("q", "qd", "qdd")
+    return (
+        CFunction(
+            "torque",
+            "Feed-forward torques on base parameters (Eq. 39, factored).",
+            trace(torque, one, one, one),
+            motion,
+            "tau",
+        ),
+        CFunction(
+            "torque_of_parameters",
+            "The same for given base parameters p, as Theta_B p (Eq. 39).",
+            trace(lambda q, v, a, x: base.columns(q, v, a) @ x, one, one, one, (base.size,)),
+            (*motion, "p"),
+            "tau",
+        ),
+        CFunction(
+            "torque_of_masses",
+            "The same as M qdd + h, with M by composite bodies (Eq. 38).",
+            trace(lambda q, v, a: model.inertia(p, q) @ a + model.bias(p, q, v), one, one, one),
+            motion,
+            "tau",
+        ),
+        CFunction(
+            "mass_matrix",
+            "Mass matrix M, rotors included, row by row (Eq. 38).",
+            trace(lambda q: model.inertia(p, q), one),
+            ("q",),
+            "m",
+        ),
+        CFunction(
+            "bias",
+            "Forces h without accelerations: Coriolis, gravity, friction (Eq. 38).",
+            trace(lambda q, v: torque(q, v, rest), one, one),
+            ("q", "qd"),
+            "h",
+        ),
+        CFunction(
+            "gravity",
+            "Forces at rest: gravity, springs, offsets.",
+            trace(lambda q: torque(q, rest, rest), one),
+            ("q",),
+            "tau",
+        ),
+        CFunction(
+            "friction",
+            "Friction: the forces that motion adds to those at rest.",
+            trace(friction, one, one),
+            ("q", "qd"),
+            "tau",
+        ),
+        CFunction(
+            "regressor",
+            "Base regressor Theta_B, row by row (Eq. 23).",
+            program_of(base, base.columns, one, one, one),
+            motion,
+            "theta",
+        ),
+    )
 
 
-def _header(fit: Fit, library: Library, found: tuple[Form, ...]) -> str:
-    robot, base = fit.base.model.robot, fit.base
-    name, double = library.prefix, library.double
+def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
+    robot, name = fit.base.model.robot, writer.prefix
     joints = "\n".join(
         f"     {j}  {_ascii(robot.joint_names[j])}: {'turns' if turns else 'slides'}, "
         f"q in {robot.joint_unit(j)}, tau in {robot.force_unit(j)}"
@@ -74,12 +164,11 @@ def _header(fit: Fit, library: Library, found: tuple[Form, ...]) -> str:
     )
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
     terms = ", ".join(type(t).__name__ for t in fit.base.model.terms)
-    kind, guard = "double" if double else "float", f"{name.upper()}_H"
     prototypes = "\n\n".join(
-        f"/* {_ascii(form.words)}\n   {form.program.counts.total} operations: "
-        f"{form.program.counts}.\n   {_sizes(form)} */\n"
-        f"{declaration(_full(name, form), form.inputs, (form.output,), double=double)};"
-        for form in found
+        f"/* {_ascii(x.summary)}\n   {x.program.counts.total} operations: {x.program.counts}.\n"
+        f"   {_sizes(x)} */\n"
+        f"{writer.declaration(f'{name}_{x.name}', x.inputs, (x.output,))};"
+        for x in functions
     )
     return f"""/* Identified model of the robot "{_ascii(robot.name)}", for a controller.
 
@@ -92,19 +181,19 @@ def _header(fit: Fit, library: Library, found: tuple[Form, ...]) -> str:
 {joints}
 
    q, qd, qdd: positions, velocities and accelerations [rad or m, per s, per s^2].
-   tau: generalized forces on the side of the joints [N m or N], without a known tool.
+   tau: generalised forces on the side of the joints [N m or N], without a known tool.
 
-   Nothing is allocated, there is no state and no branch on data: every call takes the same time and
-   functions can be called from any thread. All inputs are read before an output is written. Numbers
-   that are not finite, and angles beyond {library.turns:.0f} turns, give NaN.
+   Nothing is allocated, there is no state and no branch on data: every call takes the same time,
+   and functions can be called from any thread. All inputs are read before an output is written.
+   Numbers that are not finite, and angles beyond {writer.turns:.0f} turns, give NaN.
 
    Check the file on its machine: cc -D{name.upper()}_SELF_TEST {name}.c -lm && ./a.out
    Generated code: do not edit. */
-#ifndef {guard}
-#define {guard}
+#ifndef {name.upper()}_H
+#define {name.upper()}_H
 
 #define {name.upper()}_JOINTS {robot.joints}
-#define {name.upper()}_PARAMETERS {base.size}
+#define {name.upper()}_PARAMETERS {fit.base.size}
 #define {name.upper()}_CHECKSUM "{fit.checksum}"
 #define {name.upper()}_DATE "{fit.date}"
 
@@ -113,7 +202,7 @@ extern "C" {{
 #endif
 
 /* The estimates: see the list in {name}.c. */
-extern const {kind} {name}_parameters[{base.size}];
+extern const {writer.type} {name}_parameters[{fit.base.size}];
 
 {prototypes}
 
@@ -125,36 +214,21 @@ extern const {kind} {name}_parameters[{base.size}];
 """
 
 
-def _sizes(form: Form) -> str:
-    sizes = [
-        f"{x}[{int(np.prod(s))}]"
-        for x, s in zip(form.inputs, form.program.input_shapes, strict=True)
-    ]
-    return (
-        f"From {', '.join(sizes)} to {form.output}[{int(np.prod(form.program.output_shapes[0]))}]."
-    )
+def _sizes(function: CFunction) -> str:
+    shapes = zip(function.inputs, function.program.input_shapes, strict=True)
+    inputs = ", ".join(f"{x}[{math.prod(shape)}]" for x, shape in shapes)
+    return f"From {inputs} to {function.output}[{function.size}]."
 
 
-def _source(fit: Fit, library: Library, found: tuple[Form, ...]) -> str:
-    base = fit.base
-    name, double = library.prefix, library.double
-    kind = "double" if double else "float"
-    values = np.asarray(fit.parameters, np.float64)
+def _source(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
+    base, name = fit.base, writer.prefix
+    estimates = zip(np.asarray(fit.parameters).tolist(), base.names, base.units, strict=True)
     parameters = "\n".join(
-        f"    {_number(x, double)}{',' if k + 1 < base.size else ' '} "
-        f"/* {base.names[k]} [{_ascii(base.units[k])}] */"
-        for k, x in enumerate(values)
+        f"    {writer.number(x)}{',' if k + 1 < base.size else ' '} /* {label} [{_ascii(unit)}] */"
+        for k, (x, label, unit) in enumerate(estimates)
     )
-    functions = "\n".join(
-        definition(
-            form.program,
-            _full(name, form),
-            form.inputs,
-            (form.output,),
-            double=double,
-            library=library,
-        )
-        for form in found
+    definitions = "\n".join(
+        writer.definition(x.program, f"{name}_{x.name}", x.inputs, (x.output,)) for x in functions
     )
     return f"""/* Identified model of the robot "{_ascii(base.model.robot.name)}": see {name}.h.
    Generated code: do not edit. */
@@ -165,38 +239,36 @@ def _source(fit: Fit, library: Library, found: tuple[Form, ...]) -> str:
 #include <stdint.h>
 #include <string.h>
 
-const {kind} {name}_parameters[{base.size}] = {{
+const {writer.type} {name}_parameters[{base.size}] = {{
 {parameters}
 }};
 
-{library.text()}
-{functions}
-{_self_test(fit, name, double, found)}"""
+{writer.library()}
+{definitions}
+{_self_test(fit, writer, functions)}"""
 
 
-def _self_test(fit: Fit, name: str, double: bool, found: tuple[Form, ...]) -> str:
-    kind, n = "double" if double else "float", fit.base.model.robot.joints
+def _self_test(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
+    """Return a C program that compares all functions with their results in Python."""
+    name, kind, n, samples = writer.prefix, writer.type, fit.base.model.robot.joints, 4
     random = np.random.default_rng(0)
-    states = {x: np.round(random.uniform(-2.0, 2.0, (STATES, n)), 3) for x in ("q", "qd", "qdd")}
-    given = {**states, "p": np.tile(np.asarray(fit.parameters, np.float64), (STATES, 1))}
-    tables = [_table(f"{name}_{x}", kind, values, double) for x, values in states.items()]
-    calls = []
-    for form in found:
-        arrays = [given[x] for x in form.inputs]
-        if not double:
+    states = {x: np.round(random.uniform(-2.0, 2.0, (samples, n)), 3) for x in ("q", "qd", "qdd")}
+    given = {**states, "p": np.tile(np.asarray(fit.parameters, np.float64), (samples, 1))}
+    tables, calls = [_table(f"{name}_{x}", writer, rows) for x, rows in states.items()], []
+    for function in functions:
+        arrays = [given[x] for x in function.inputs]
+        if not writer.double:
             arrays = [x.astype(np.float32).astype(np.float64) for x in arrays]
-        result = evaluate(form.program, *(x.T for x in arrays))
-        size = int(np.prod(form.program.output_shapes[0]))
-        rows = np.broadcast_to(result.reshape(size, -1), (size, STATES)).T
-        tables.append(_table(f"{name}_{form.name}_expected", kind, rows, double))
-        arguments = [f"{name}_parameters" if x == "p" else f"{name}_{x}[k]" for x in form.inputs]
+        result = np.asarray(evaluate(function.program, *(x.T for x in arrays)))
+        rows = np.broadcast_to(result.reshape(function.size, -1), (function.size, samples)).T
+        tables.append(_table(f"{name}_{function.name}_expected", writer, rows))
+        inputs = [f"{name}_parameters" if x == "p" else f"{name}_{x}[k]" for x in function.inputs]
         calls.append(
-            f"        {_full(name, form)}({', '.join(arguments)}, result);\n"
-            f'        wrong |= {name}_differs("{form.name}", result, '
-            f"{name}_{form.name}_expected[k], {size});"
+            f"        {name}_{function.name}({', '.join(inputs)}, result);\n"
+            f'        wrong |= {name}_differs("{function.name}", result, '
+            f"{name}_{function.name}_expected[k], {function.size});"
         )
-    largest = max(int(np.prod(form.program.output_shapes[0])) for form in found)
-    body = "\n".join(calls)
+    body, tolerance = "\n".join(calls), 1e-10 if writer.double else 2e-3
     return f"""#ifdef {name.upper()}_SELF_TEST
 #include <stdio.h>
 
@@ -211,14 +283,14 @@ static int {name}_differs(const char *what, const {kind} *got, const {kind} *wan
             ? error : fabs((double)got[i] - (double)wanted[i]);
     }}
     printf("%-24s largest error %.1e of %.1e\\n", what, error, largest);
-    return !(error <= {TOLERANCE[double]:g} * largest + {TOLERANCE[double]:g});
+    return !(error <= {tolerance:g} * largest + {tolerance:g});
 }}
 
 int main(void)
 {{
-    {kind} result[{largest}];
+    {kind} result[{max(x.size for x in functions)}];
     int wrong = 0, k;
-    for (k = 0; k < {STATES}; ++k) {{
+    for (k = 0; k < {samples}; ++k) {{
 {body}
     }}
     puts(wrong ? "this build is WRONG" : "this build is right");
@@ -228,21 +300,14 @@ int main(void)
 """
 
 
-def _table(name: str, kind: str, rows: Float[np.ndarray, "states entries"], double: bool) -> str:
-    listed = ",\n".join(
-        "    {" + ", ".join(_number(x, double) for x in row) + "}" for row in np.atleast_2d(rows)
-    )
-    return f"static const {kind} {name}[{rows.shape[0]}][{rows.shape[1]}] = {{\n{listed}\n}};\n"
-
-
-def _number(x: float, double: bool) -> str:
-    text = repr(float(x)) if double else f"{float(np.float32(x)):.9g}"
-    text = text if any(c in text for c in ".en") else f"{text}.0"
-    return text if double else f"{text}f"
+def _table(name: str, writer: CWriter, rows: Float[np.ndarray, "states entries"]) -> str:
+    listed = ",\n".join("    {" + ", ".join(map(writer.number, row)) + "}" for row in rows.tolist())
+    shape = f"[{rows.shape[0]}][{rows.shape[1]}]"
+    return f"static const {writer.type} {name}{shape} = {{\n{listed}\n}};\n"
 
 
 def _ascii(text: str) -> str:
-    """Words that can stand in a comment of any compiler."""
+    """Return words that can stand in a comment for any compiler."""
     for symbol, word in (("²", "^2"), ("³", "^3"), ("°", "deg"), ("\\", "/"), ("*/", "* /")):
         text = text.replace(symbol, word)
     return " ".join(text.encode("ascii", "replace").decode().split())

@@ -1,162 +1,185 @@
-"""What a controller asks a model for, as scalar programs with the estimates folded in."""
+r"""The feed-forward of a controller as a scalar program with few operations (Eq. 39).
 
-from collections.abc import Callable
-from typing import NamedTuple
+The same robot can be described in many ways, with the same forces. Before the program is traced, a
+description is chosen that leaves few operations:
 
+* matter on a joint's axis moves alike with the bodies on both sides of it, so that it is carried
+  inward until nothing is left of it: what remains are the base parameters;
+* the origin of a frame may lie anywhere on its joint's axis (where axes meet, forces vanish);
+* the frame of the last body may be turned about its joint so that a first moment vanishes;
+* in a suitable unit of length, some lengths are one.
+"""
+
+import dataclasses
+import importlib.util
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
+from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float
-from jaxid.dynamics.machine import program_of
+from jaxid.arrays import AnyArray, Array, Float, double_precision
+from jaxid.dynamics import projection
 from jaxid.dynamics.model import Model
-from jaxid.export.recursion import Description, simplest
+from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
 from jaxid.identification.fit import Fit
-from jaxid.program import Program, applied, program_of_scalars, trace
+from jaxid.io import write_bytes
+from jaxid.program import Program, lower, trace
+from jaxid.robot.robot import Robot
 
-Q, QD, QDD = "q", "qd", "qdd"
-ALL_TEN = 10
 
-
-class Form(NamedTuple):
-    """One function of the feed-forward.
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """One of many descriptions of the same robot, with the same forces.
 
     Attributes:
-        name: Behind the model's name.
-        words: What it computes.
-        program: How.
-        inputs: Names of its inputs.
-        output: Name of its output.
+        robot: Joints and frames, in the unit of length.
+        bodies: Pseudo-inertias.
+        turned: Angles that are added to those of the joints [rad].
+        unit: Unit of length [m].
     """
 
-    name: str
-    words: str
-    program: Program
-    inputs: tuple[str, ...]
-    output: str
+    robot: Robot
+    bodies: Float[np.ndarray, "joints 4 4"]
+    turned: Float[np.ndarray, " joints"]
+    unit: float = 1.0
+
+    @property
+    def cost(self) -> int:
+        """Estimate of the operations: numbers that are not zero, weighted by experience."""
+        lengths = np.abs(np.asarray(self.robot.offset))
+        present = lengths > 1e-12
+        ones = np.abs(lengths - 1.0) < 1e-12
+        frames = 4 * present.any(axis=1).sum() + 6 * present.sum() - 3 * ones.sum()
+        return int(frames + np.count_nonzero(self.bodies))
+
+    def forces(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> Float[AnyArray, " joints"]:
+        """Return the generalised forces of the bodies at one sample [N m or N] (Eq. 11)."""
+        scale = np.where(self.robot.revolute, 1.0, 1.0 / self.unit)
+        p = inertial_parameters(self.bodies)
+        motion = (scale * q + self.turned, scale * qd, scale * qdd)
+        return scale * projection.rigid_body_forces(self.robot, p, *motion)
+
+    def carry_inward(self) -> "Description":
+        """Move what moves alike with the parent to the parent: the base parameters (Eq. 22).
+
+        For a revolute joint that is matter on the axis (mass, first and second moment along it),
+        for a prismatic one the second moments.
+        """
+        bodies, robot = self.bodies.copy(), self.robot
+        for i in reversed(range(robot.joints)):
+            axis, P, L = np.asarray(robot.axis[i]), bodies[i], np.zeros((4, 4))
+            if robot.revolute[i]:
+                L[3, 3] = P[3, 3]
+                L[:3, 3] = L[3, :3] = (axis @ P[:3, 3]) * axis
+                L[:3, :3] = (axis @ P[:3, :3] @ axis) * axis[:, None] * axis
+            else:
+                L[:3, :3] = P[:3, :3]
+            bodies[i] = _without_rounding(P - L, P)
+            if robot.parent[i] >= 0:
+                T = np.eye(4)
+                T[:3, :3], T[:3, 3] = robot.rotation[i], robot.offset[i]
+                bodies[robot.parent[i]] += T @ L @ T.T
+        return dataclasses.replace(self, bodies=bodies)
+
+    def slide(self, body: int, distance: float) -> "Description":
+        """Move the origin of a frame along its joint's axis."""
+        robot = self.robot
+        axis, R = np.asarray(robot.axis[body]), np.asarray(robot.rotation[body])
+        offset = np.array(robot.offset)
+        offset[body] += R @ axis * distance
+        for child, parent in enumerate(robot.parent):
+            if parent == body:
+                offset[child] -= axis * distance
+        bodies, T = self.bodies.copy(), np.eye(4)
+        T[:3, 3] = -axis * distance
+        bodies[body] = T @ bodies[body] @ T.T
+        moved = robot.replace(offset=_without_rounding(offset, offset))
+        return dataclasses.replace(self, robot=moved, bodies=bodies)
+
+    def turn_last(self, body: int) -> "Description":
+        """Turn the frame of a last body about its joint until a first moment is zero."""
+        axis, P = np.asarray(self.robot.axis[body]), self.bodies[body]
+        h = P[:3, 3] - (axis @ P[:3, 3]) * axis
+        if np.linalg.norm(h) == 0.0:
+            return self
+        k = int(np.argmin(np.abs(axis)))
+        wanted = np.eye(3)[k] - axis[k] * axis
+        wanted /= np.linalg.norm(wanted)
+        angle = float(np.arctan2(axis @ np.cross(wanted, h), wanted @ h))
+        bodies, turned, T = self.bodies.copy(), self.turned.copy(), np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec(-angle * axis).as_matrix()
+        bodies[body] = _without_rounding(T @ P @ T.T, P)
+        turned[body] += angle
+        return dataclasses.replace(self, bodies=bodies, turned=turned)
+
+    def in_unit(self, unit: float) -> "Description":
+        """Use another unit of length [m]; moments keep theirs."""
+        robot, D = self.robot, np.diag([1.0, 1.0, 1.0, unit])
+        offset, gravity = np.asarray(robot.offset) / unit, np.asarray(robot.gravity) / unit
+        return dataclasses.replace(
+            self,
+            robot=robot.replace(offset=offset, gravity=gravity),
+            bodies=D @ self.bodies @ D,
+            unit=self.unit * unit,
+        )
 
 
-def bodies_of(model: Model, p: Float[AnyArray, " standard"]) -> Float[np.ndarray, "joints 10"]:
-    """Ten parameters for each body; zeros for what the model leaves out."""
+def simplest_description(robot: Robot, parameters: Float[np.ndarray, "joints 10"]) -> Description:
+    """Return a description of a robot that leaves few operations.
+
+    Args:
+        robot: Joints and frames.
+        parameters: Ten parameters of each body in the paper's order.
+    """
+    given = Description(robot, pseudo_inertia(parameters), np.zeros(robot.joints))
+    best = given.carry_inward()
+    for body in range(robot.joints):
+        for distance in _distances(given.robot, body):
+            slid = given.slide(body, distance)
+            if slid.carry_inward().cost < best.cost:
+                given, best = slid, slid.carry_inward()
+    for body in set(range(robot.joints)) - set(robot.parent):
+        if robot.revolute[body]:
+            best = min(best, best.turn_last(body), key=lambda x: x.cost)
+    lengths = [round(float(abs(x)), 12) for x in np.ravel(best.robot.offset) if abs(x) > 1e-9]
+    units = sorted(set(lengths), key=lambda x: -lengths.count(x))
+    return min([best, *map(best.in_unit, units[:3])], key=lambda x: x.cost)
+
+
+def _distances(robot: Robot, body: int) -> Iterator[float]:
+    """Return where the origin comes nearest to that of the parent, or of a child."""
+    if not robot.revolute[body]:
+        return
+    axis, R = np.asarray(robot.axis[body]), np.asarray(robot.rotation[body])
+    nearest = [-float((R @ axis) @ robot.offset[body])]
+    nearest += [float(axis @ robot.offset[c]) for c, p in enumerate(robot.parent) if p == body]
+    yield from (x for x in dict.fromkeys(nearest) if abs(x) > 1e-9)
+
+
+def _without_rounding(x: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Set to zero what cancels up to rounding, compared with the largest entry before."""
+    return np.where(np.abs(x) < 1e-13 * np.abs(before).max(), 0.0, x)
+
+
+def body_parameters(
+    model: Model, p: Float[AnyArray, " standard"]
+) -> Float[np.ndarray, "joints 10"]:
+    """Return ten parameters of each body, with zeros for those that the model leaves out."""
     n = model.robot.joints
-    bodies = np.zeros((n, ALL_TEN))
+    bodies = np.zeros((n, 10))
     for term, own in zip(model.terms, model.split(np.asarray(p, np.float64)), strict=True):
         if term.body_parameters:
             bodies[:, : term.body_parameters] += np.asarray(own).reshape(n, -1)
     return bodies
 
 
-def torque_program(fit: Fit) -> Program:
-    """The feed-forward by the recursion on base parameters (Eq. 39).
-
-    Args:
-        fit: The model.
-    """
-    return _torque(fit.base.model, _description(fit), _beside(fit))
-
-
-def _torque(model: Model, description: Description, beside: Callable) -> Program:
-    def torque(q, qd, qdd):
-        return description.torques(q, qd, qdd) + applied(beside, q, qd, qdd)
-
-    one = (model.robot.joints,)
-    return program_of_scalars(torque, one, one, one)
-
-
-def _description(fit: Fit) -> Description:
-    model = fit.base.model
-    return simplest(Description.of(model.robot, bodies_of(model, fit.standard_parameters)))
-
-
-def forms(fit: Fit) -> tuple[Form, ...]:
-    """All functions of a model, with its estimates as constants.
-
-    Args:
-        fit: The model.
-    """
-    model, base = fit.base.model, fit.base
-    one, still = (model.robot.joints,), np.zeros(model.robot.joints)
-    beside, description = _beside(fit), _description(fit)
-
-    def bias(q, qd):
-        rest = still.astype(object)
-        return description.torques(q, qd, rest) + applied(lambda x, v: beside(x, v, still), q, qd)
-
-    def gravity(q):
-        rest = still.astype(object)
-        return description.torques(q, rest, rest) + applied(lambda x: beside(x, still, still), q)
-
-    def friction(q, qd):
-        return beside(q, qd, still) - beside(q, still, still)
-
-    # Only what the base parameters hold: composite bodies are lighter for it.
-    own = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
-
-    def of_masses(q, qd, qdd):
-        return model.inertia(own, q) @ qdd + model.bias(own, q, qd)
-
-    regressor = program_of(base, base.columns, one, one, one)
-    return (
-        Form(
-            "torque",
-            "Feed-forward torques by the recursion on base parameters (Eq. 39, factored).",
-            _torque(model, description, beside),
-            (Q, QD, QDD),
-            "tau",
-        ),
-        Form(
-            "torque_of_parameters",
-            "The same for base parameters p that are given, as Theta_B p (Eq. 39).",
-            trace(lambda q, v, a, x: base.columns(q, v, a) @ x, one, one, one, (base.size,)),
-            (Q, QD, QDD, "p"),
-            "tau",
-        ),
-        Form(
-            "torque_of_masses",
-            "The same as M qdd + h, with M by composite bodies (Eq. 38).",
-            trace(of_masses, one, one, one),
-            (Q, QD, QDD),
-            "tau",
-        ),
-        Form(
-            "mass_matrix",
-            "Mass matrix M, rotors included, row by row (Eq. 38).",
-            trace(lambda q: model.inertia(own, q), one),
-            (Q,),
-            "m",
-        ),
-        Form(
-            "bias",
-            "Forces h without accelerations: Coriolis, gravity, friction (Eq. 38).",
-            program_of_scalars(bias, one, one),
-            (Q, QD),
-            "h",
-        ),
-        Form(
-            "gravity",
-            "Forces at rest: gravity, springs, offsets.",
-            program_of_scalars(gravity, one),
-            (Q,),
-            "tau",
-        ),
-        Form(
-            "friction",
-            "What friction adds to them by moving.",
-            trace(friction, one, one),
-            (Q, QD),
-            "tau",
-        ),
-        Form(
-            "regressor",
-            "Base regressor Theta_B, row by row (Eq. 23).",
-            regressor,
-            (Q, QD, QDD),
-            "theta",
-        ),
-    )
-
-
-def _beside(fit: Fit) -> Callable:
-    """The forces of all terms but the bodies."""
+def other_forces(fit: Fit) -> Callable[..., Any]:
+    """Return the function of one sample that gives the forces of all terms but the bodies."""
     model = fit.base.model
     parts = [
         (term, own)
@@ -171,3 +194,68 @@ def _beside(fit: Fit) -> Callable:
         return total
 
     return forces
+
+
+def torques(fit: Fit) -> Callable[..., Any]:
+    """Return the function of one sample that gives the forces of a fit in few operations."""
+    model = fit.base.model
+    bodies = body_parameters(model, fit.standard_parameters)
+    description, others = simplest_description(model.robot, bodies), other_forces(fit)
+    return lambda q, qd, qdd: description.forces(q, qd, qdd) + others(q, qd, qdd)
+
+
+def torque_program(fit: Fit) -> Program:
+    """Return the program of the feed-forward on base parameters (Eq. 39).
+
+    Args:
+        fit: Identified model.
+    """
+    one = (fit.base.model.robot.joints,)
+    return trace(torques(fit), one, one, one)
+
+
+def exported_function(fit: Fit) -> export.Exported:
+    """Return the forces of any number of samples as an exported function of JAX (Eq. 39).
+
+    `exported.call(q, qd, qdd)` takes arrays [samples, joints] of float64 and returns forces of the
+    same shape; `exported.serialize()` gives bytes that `jax.export.deserialize` reads elsewhere.
+
+    Args:
+        fit: Identified model.
+    """
+    lowered = lower(torque_program(fit))
+    joints = fit.base.model.robot.joints
+
+    def on_samples(
+        q: Float[Array, "samples joints"],
+        qd: Float[Array, "samples joints"],
+        qdd: Float[Array, "samples joints"],
+    ) -> Float[Array, "samples joints"]:
+        # One sample at a time, since the number of samples is not known here.
+        return jax.vmap(lambda *sample: jnp.asarray(lowered.dense(*sample)))(q, qd, qdd)
+
+    with double_precision():
+        (samples,) = export.symbolic_shape("samples")
+        shape = jax.ShapeDtypeStruct((samples, joints), np.float64)
+        return export.export(jax.jit(on_samples), platforms=("cpu", "cuda"))(shape, shape, shape)
+
+
+def export_jax(fit: Fit, path: str | Path) -> Path:
+    """Write the feed-forward as a function of JAX that runs without jaxid (Eq. 39).
+
+    Read it with `jax.export.deserialize(bytearray(Path(path).read_bytes()))` in 64-bit mode.
+
+    Args:
+        fit: Identified model.
+        path: Path of the file; an existing file is replaced.
+
+    Raises:
+        RuntimeError: If the package `flatbuffers` is not installed.
+    """
+    if importlib.util.find_spec("flatbuffers") is None:
+        raise RuntimeError(
+            "JAX writes exported functions with the package `flatbuffers`, which is not installed: "
+            "`pip install flatbuffers`."
+        )
+    write_bytes(path, bytes(exported_function(fit).serialize()))
+    return Path(path)

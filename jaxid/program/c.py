@@ -1,80 +1,315 @@
-"""A scalar program as plain C for a real-time controller."""
+"""A scalar program as plain C for a real-time controller.
+
+Sine, cosine and tanh come with the code: no branches, no tables, the same time for any number. The
+functions of C compilers branch on their argument and take several times as long. Ours work on short
+arrays of a fixed length, which compilers turn into vector instructions; since a controller's call
+waits for them, their chains of operations are short.
+"""
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from fractions import Fraction
 
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.program.c_library import KINDS, SINE_COSINE, Library
-from jaxid.program.operation import TRUTH_VALUED, Operation
+from jaxid.program.operations import Operation
 from jaxid.program.program import Program, Reference
+from jaxid.program.sincos import DOUBLE, SINGLE, Precision
 
-_INFIX = {
-    Operation.ADD: "+",
-    Operation.SUBTRACT: "-",
-    Operation.MULTIPLY: "*",
-    Operation.DIVIDE: "/",
-    Operation.LESS: "<",
-    Operation.LESS_EQUAL: "<=",
-    Operation.EQUAL: "==",
-    Operation.NOT_EQUAL: "!=",
-    Operation.AND: "&",
-    Operation.OR: "|",
+_LIBRARY = {
+    "sine_cosine": (Operation.SINE, Operation.COSINE),
+    "tanh": (Operation.HYPERBOLIC_TANGENT,),
 }
-# A NaN on either side must come through, which C's fmax and fmin do not do.
-_FORMAT: dict[Operation, Callable[..., str]] = {
-    Operation.NEGATE: lambda x: f"-{x}",
-    Operation.NOT: lambda x: f"!{x}",
-    Operation.SELECT: lambda c, x, y: f"{c} ? {x} : {y}",
-    Operation.MAXIMUM: lambda x, y: f"(({x} > {y}) | ({x} != {x})) ? {x} : {y}",
-    Operation.MINIMUM: lambda x, y: f"(({x} < {y}) | ({x} != {x})) ? {x} : {y}",
-}
-_OF_LIBRARY = frozenset(kind for kinds in KINDS.values() for kind in kinds)
-_NAMES = {Operation.ABSOLUTE: "fabs"}
-_KEYWORDS = re.compile(
+"""Operations that each function of the library computes for many numbers at once."""
+_RESERVED = re.compile(
     "alignas|alignof|and|asm|auto|bool|break|case|catch|char|class|const|constexpr|continue|default|"
     "delete|do|double|else|enum|explicit|export|extern|false|float|for|friend|goto|if|inline|int|"
     "long|mutable|namespace|new|not|operator|or|private|protected|public|register|restrict|return|"
     "short|signed|sizeof|static|struct|switch|template|this|throw|true|try|typedef|typename|union|"
-    "unsigned|using|virtual|void|volatile|while|xor"
+    "unsigned|using|virtual|void|volatile|while|xor|t[a-z]?[0-9]+[ab]?"
 )
+"""Keywords of C and C++, and the names of the generated variables."""
 
 
-class _Writer:
-    """Spells one program's numbers and operations in one precision."""
+class CWriter:
+    """Writer of C99 code, which is also valid C++, in one precision.
 
-    def __init__(self, double: bool):
-        self.type = "double" if double else "float"
-        self.round = np.float64 if double else np.float32
-        self.suffix = "" if double else "f"
+    Args:
+        double: Whether numbers are `double` (otherwise `float`).
+        prefix: Prefix of the names of the library's functions.
+        programs: Programs that call the library, which is made for the largest number of angles in
+            one of them; the C compiler's own functions are called if there are none.
+    """
+
+    def __init__(self, double: bool, prefix: str = "", programs: Sequence[Program] = ()):
+        self.double, self.prefix = double, prefix
+        self.type, self._suffix = ("double", "") if double else ("float", "f")
+        self._dtype = np.float64 if double else np.float32
+        # Fewer and longer pieces of pi/2 than in JAX, for a shorter chain and smaller angles.
+        own = Precision(33, 2, 20, DOUBLE.sine, DOUBLE.cosine) if double else SINGLE
+        self._precision = own
+        self.turns = own.limit / 4
+        self.widths: dict[str, int] = {}
+        for name, kinds in _LIBRARY.items():
+            counts = [
+                len({node.operands for node in program.nodes if node.operation in kinds})
+                for program in programs
+            ]
+            largest = max(counts, default=0)
+            if largest:
+                # Compilers make vector instructions of an even number.
+                self.widths[name] = largest + largest % 2
 
     def number(self, x: float) -> str:
-        rounded = self.round(x)
+        """Write a number with as many digits as its precision needs."""
+        rounded = self._dtype(x)
         if math.isnan(x):
             return "NAN"
         if np.isinf(rounded):
             return "INFINITY" if x > 0 else "(-INFINITY)"
-        digits = np.format_float_scientific(rounded, unique=True, trim="0")
-        text = digits if "e" not in digits or abs(x) > 1e6 or 0 < abs(x) < 1e-4 else None
-        text = text or np.format_float_positional(rounded, unique=True, trim="0")
-        return f"({text}{self.suffix})" if text.startswith("-") else text + self.suffix
+        scientific = abs(x) > 1e6 or 0 < abs(x) < 1e-4
+        write = np.format_float_scientific if scientific else np.format_float_positional
+        text = write(rounded, unique=True, trim="0") + self._suffix
+        return f"({text})" if text.startswith("-") else text
 
-    def operand(self, x: Reference) -> str:
+    def declaration(self, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> str:
+        """Write the prototype of a program's function, without a semicolon.
+
+        Args:
+            name: Name of the C function.
+            inputs: Names of the inputs.
+            outputs: Names of the outputs.
+
+        Raises:
+            InputError: If a name is not an identifier of C, or is used twice.
+        """
+        _check_names([name, *inputs, *outputs])
+        arguments = [f"const {self.type} *{x}" for x in inputs]
+        arguments += [f"{self.type} *{x}" for x in outputs]
+        return f"void {name}({', '.join(arguments) or 'void'})"
+
+    def definition(
+        self, program: Program, name: str, inputs: Sequence[str], outputs: Sequence[str]
+    ) -> str:
+        """Write a program as the definition of a C function, as `to_c` describes it.
+
+        Args:
+            program: Program made by `trace`.
+            name: Name of the C function.
+            inputs: Names of the inputs.
+            outputs: Names of the outputs.
+
+        Raises:
+            InputError: If a name is not an identifier of C, or is used twice.
+        """
+        lines = self._statements(program, inputs)
+        read = {node.place[0] for node in program.nodes if node.operation is Operation.INPUT}
+        lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in read]
+        for output, entries in zip(outputs, program.split(program.outputs), strict=True):
+            if not entries:
+                lines.append(f"(void){output};")
+            lines += [f"{output}[{k}] = {self._operand(x)};" for k, x in enumerate(entries)]
+        body = "\n".join(f"    {line}" for line in lines)
+        return f"{self.declaration(name, inputs, outputs)}\n{{\n{body}\n}}\n"
+
+    def _operand(self, x: Reference) -> str:
         return f"t{x}" if isinstance(x, int) else self.number(x)
 
-    def expression(self, operation: Operation, operands: Sequence[Reference]) -> str:
-        spelled = [self.operand(x) for x in operands]
-        if operation in _INFIX:
-            return f" {_INFIX[operation]} ".join(spelled)
-        if operation is Operation.SIGN:
-            (x,) = spelled
-            return f"({x} != {x}) ? {x} : ({self.type})(({x} > 0) - ({x} < 0))"
-        if operation in _FORMAT:
-            return _FORMAT[operation](*spelled)
-        name = _NAMES.get(operation, operation.value)
-        return f"{name}{self.suffix}({', '.join(spelled)})"
+    def _statements(self, program: Program, inputs: Sequence[str]) -> list[str]:
+        """Write one line for each node; functions of the library are called together."""
+        formats = {
+            Operation.NEGATE: "-{0}",
+            Operation.NOT: "!{0}",
+            Operation.SELECT: "{0} ? {1} : {2}",
+            # A NaN on either side must be kept, unlike in C's fmax and fmin.
+            Operation.MAXIMUM: "(({0} > {1}) | ({0} != {0})) ? {0} : {1}",
+            Operation.MINIMUM: "(({0} < {1}) | ({0} != {0})) ? {0} : {1}",
+            Operation.SIGN: f"({{0}} != {{0}}) ? {{0}} : ({self.type})(({{0}} > 0) - ({{0}} < 0))",
+            Operation.ABSOLUTE: f"fabs{self._suffix}({{0}})",
+        }
+        called = [kind for name in self.widths for kind in _LIBRARY[name]]
+        # The number of library functions on the longest chain before each node.
+        stages: list[int] = []
+        for node in program.nodes:
+            before = max((stages[k] for k in node.uses), default=0)
+            stages.append(before + (node.operation in called))
+        lines: list[str] = []
+        for stage in range(max(stages, default=0) + 1):
+            nodes = [k for k, s in enumerate(stages) if s == stage]
+            for name in self.widths:
+                batch = [k for k in nodes if program.nodes[k].operation in _LIBRARY[name]]
+                lines += self._call(program, name, batch, stage) if batch else []
+            for k in nodes:
+                node = program.nodes[k]
+                if node.operation in called:
+                    continue
+                if node.operation is Operation.INPUT:
+                    number, entry = node.place
+                    text = f"{inputs[number]}[{entry}]"
+                else:
+                    operands = [self._operand(x) for x in node.operands]
+                    text = node.operation.spell(operands, formats, self._suffix)
+                kind = "int" if "truth" in node.operation.traits else self.type
+                lines.append(f"const {kind} t{k} = {text};")
+        return lines
+
+    def _call(self, program: Program, name: str, nodes: Sequence[int], stage: int) -> list[str]:
+        """Write a call of the library for several nodes, and its results as these nodes."""
+        width = self.widths[name]
+        arguments = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
+        filled = [self._operand(x) for x in arguments]
+        filled += [self.number(0.0)] * (width - len(arguments))
+        label = f"t{name[0]}{stage}"
+        results = [f"{label}a", f"{label}b"][: len(_LIBRARY[name])]
+        lines = [
+            f"const {self.type} {label}[{width}] = {{{', '.join(filled)}}};",
+            f"{self.type} {', '.join(f'{x}[{width}]' for x in results)};",
+            f"{self.prefix}_{name}({label}, {', '.join(results)});",
+        ]
+        for k in nodes:
+            operation, (x,) = program.nodes[k]
+            result = results[operation is Operation.COSINE]
+            lines.append(f"const {self.type} t{k} = {result}[{arguments.index(x)}];")
+        return lines
+
+    def library(self) -> str:
+        """Write the functions `{prefix}_sine_cosine` and `{prefix}_tanh` that are needed."""
+        if not self.widths:
+            return ""
+        restrict = f"{self.prefix.upper()}_RESTRICT"
+        head = f"""/* Operations must not be reordered, and there must be no excess precision. */
+#if defined __FAST_MATH__ || (defined FLT_EVAL_METHOD && FLT_EVAL_METHOD == 2) \\
+    || (defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__)
+#error "compile without -ffast-math, and for x86 with -msse2 -mfpmath=sse"
+#endif
+#if defined __GNUC__ || defined _MSC_VER
+#define {restrict} __restrict
+#else
+#define {restrict}
+#endif
+"""
+        write = {"sine_cosine": self._sine_cosine, "tanh": self._tanh}
+        bodies = [write[name](width, f"{restrict} ") for name, width in self.widths.items()]
+        return "\n".join([head, *bodies])
+
+    def _polynomial(self, coefficients: Sequence[float], powers: Sequence[str]) -> str:
+        """Write a polynomial in Estrin's scheme; its chain grows with the logarithm of the degree.
+
+        Args:
+            coefficients: Coefficients, lowest power first.
+            powers: Names of x, x^2, x^4, ...
+        """
+        terms = [self.number(c) for c in coefficients]
+        for power in powers:
+            pairs = [terms[k : k + 2] for k in range(0, len(terms), 2)]
+            terms = [f"({p[0]} + {power} * {p[1]})" if len(p) == 2 else p[0] for p in pairs]
+        (whole,) = terms
+        return whole
+
+    def _bits(self) -> tuple[int, int, int, str]:
+        """Return the bits of a number, of its mantissa, the exponent's bias, and a rounder.
+
+        Adding the rounder rounds to a whole number, in the last bits of the sum.
+        """
+        bits, mantissa, bias = (64, 52, 1023) if self.double else (32, 23, 127)
+        return bits, mantissa, bias, self.number(1.5 * 2.0**mantissa)
+
+    def _sine_cosine(self, width: int, alone: str) -> str:
+        precision, number, kind = self._precision, self.number, self.type
+        bits, _, _, rounder = self._bits()
+        *leading, middle, last = precision.pieces
+        reduce = "\n".join(f"        r = r - k * {number(p)};" for p in leading)
+        huge = float(np.finfo(self._dtype).max) / precision.limit
+        powers = ("z", "z2", "z4")[: 3 if self.double else 2]
+        fourth = f"\n        const {kind} z4 = z2 * z2;" if self.double else ""
+        return f"""/* Cosine and sine of each number, by Cody-Waite reduction and polynomials. The
+   additions of {rounder} round to whole numbers. Beyond {precision.limit:.0f} quarter
+   turns the product with the huge number overflows, and infinity times zero is NaN. */
+static void {self.prefix}_sine_cosine(const {kind} *{alone}x, {kind} *{alone}s,
+    {kind} *{alone}c)
+{{
+    int i;
+    for (i = 0; i < {width}; ++i) {{
+        const uint{bits}_t top = (uint{bits}_t)1 << {bits - 1};
+        const {kind} t = x[i] * {number(2 / math.pi)} + {rounder};
+        const {kind} k = t - {rounder};
+        const {kind} far = (k * {number(huge)}) * {number(0.0)};
+        {kind} r = x[i];
+        uint{bits}_t bits, a, b, swap;
+{reduce}
+        r = r - (k * {number(middle)} + (k * {number(last)} + far));
+        {{
+        const {kind} z = r * r;
+        const {kind} z2 = z * z;{fourth}
+        const {kind} sine = r + (r * z)
+            * {self._polynomial(precision.sine, powers)};
+        const {kind} cosine = ({number(1.0)} - {number(0.5)} * z) + z2
+            * {self._polynomial(precision.cosine, powers)};
+        memcpy(&bits, &t, sizeof bits);
+        memcpy(&a, &sine, sizeof a);
+        memcpy(&b, &cosine, sizeof b);
+        }}
+        swap = (a ^ b) & (0u - (bits & 1u));
+        a = a ^ swap ^ ((bits << {bits - 2}) & top);
+        b = b ^ swap ^ (((bits + 1u) << {bits - 2}) & top);
+        memcpy(&s[i], &a, sizeof a);
+        memcpy(&c[i], &b, sizeof b);
+    }}
+}}
+"""
+
+    def _tanh(self, width: int, alone: str) -> str:
+        number, kind, largest = self.number, self.type, 22.0  # there tanh is 1 to the last bit
+        bits, mantissa, bias, rounder = self._bits()
+        ln2 = Fraction("0.693147180559945309417232121458176568075500134360255254120680009")
+        one = 2 ** (32 if self.double else 15)
+        high = Fraction(int(ln2 * one), one)
+        terms = 14 if self.double else 7
+        exponential = [1 / math.factorial(n) for n in range(2, terms + 1)]
+        powers = ("r", "r2", "r4", "r8")[: 4 if self.double else 3]
+        pattern = int(np.array(largest, self._dtype).view(f"uint{bits}"))
+        eighth = f"\n        const {kind} r8 = r4 * r4;" if self.double else ""
+        return f"""/* Hyperbolic tangent of each number: e / (e + 2) with e = exp(2 |x|) - 1.
+   The smaller of |x| and {largest:g} is chosen by the sign of their difference, since compilers
+   make a branch of a comparison. */
+static void {self.prefix}_tanh(const {kind} *{alone}x, {kind} *{alone}y)
+{{
+    int i;
+    for (i = 0; i < {width}; ++i) {{
+        const uint{bits}_t top = (uint{bits}_t)1 << {bits - 1};
+        {kind} size, rest, v, t, k, p, scale, e;
+        uint{bits}_t bits, sign, far;
+        memcpy(&bits, &x[i], sizeof bits);
+        sign = bits & top;
+        bits = bits & ~top;
+        memcpy(&size, &bits, sizeof size);
+        rest = {number(largest)} - size;
+        memcpy(&far, &rest, sizeof far);
+        far = 0u - (far >> {bits - 1});
+        bits = (bits & ~far) | ((uint{bits}_t){pattern:#x}u & far);
+        memcpy(&size, &bits, sizeof size);
+        v = size + size;
+        t = v * {number(1 / math.log(2))} + {rounder};
+        k = t - {rounder};
+        {{
+        const {kind} r = (v - k * {number(float(high))}) - k * {number(float(ln2 - high))};
+        const {kind} r2 = r * r;
+        const {kind} r4 = r2 * r2;{eighth}
+        p = r + r2 * {self._polynomial(exponential, powers)};
+        }}
+        memcpy(&bits, &t, sizeof bits);
+        bits = (bits + {bias}u) << {mantissa};
+        memcpy(&scale, &bits, sizeof scale);
+        e = scale * p + (scale - 1);
+        e = e / (e + 2);
+        memcpy(&bits, &e, sizeof bits);
+        bits = bits | sign;
+        memcpy(&y[i], &bits, sizeof bits);
+    }}
+}}
+"""
 
 
 def to_c(
@@ -85,159 +320,41 @@ def to_c(
     *,
     double: bool = True,
 ) -> str:
-    """Writes a program as one C99 function, which is also valid C++.
+    """Write a program as one C99 function, which is also valid C++.
 
     The function allocates nothing and has no loops, and its choices compile to selections: its run
-    time does not depend on the data, if the mathematical library's does not. It takes a pointer for
-    each input, then one for each output, all to rows of numbers in C order. Every entry of an
+    time does not depend on the data, if that of the mathematical library does not. It takes a
+    pointer for each input, then one for each output, all to numbers in C order. Every entry of an
     output is written, constants too. All inputs are read before an output is written, so that they
-    may be the same memory.
+    may share memory.
 
     Args:
-        program: Made by `trace`.
+        program: Program made by `trace`.
         name: Name of the C function.
         inputs: Names of the inputs; by default `input0`, `input1`, ...
         outputs: Names of the outputs; by default `output0`, `output1`, ...
-        double: Whether the C code computes in `double`; in `float` otherwise.
+        double: Whether the C code computes in `double` (otherwise `float`).
 
     Raises:
-        InputError: If a name is no identifier of C, is used twice, or there are not
-            as many names as inputs or outputs.
+        InputError: If a name is not an identifier of C or is used twice, or there are not as many
+            names as inputs or outputs.
     """
+    writer = CWriter(double)
     inputs = _names(inputs, "input", len(program.input_shapes))
     outputs = _names(outputs, "output", len(program.output_shapes))
-    head = declaration(name, inputs, outputs, double=double)
+    shapes = zip([*inputs, *outputs], [*program.input_shapes, *program.output_shapes], strict=True)
+    sizes = "\n".join(f"   {x}: {math.prod(s)} numbers, shape {list(s)}." for x, s in shapes)
     return f"""#include <math.h>
 
 /* Generated code: do not edit.
-{_description(program, inputs, outputs)}
+{sizes}
    {program.counts}. */
 #ifdef __cplusplus
 extern "C"
 #endif
-{head};
+{writer.declaration(name, inputs, outputs)};
 
-{definition(program, name, inputs, outputs, double=double)}"""
-
-
-def declaration(name: str, inputs: Sequence[str], outputs: Sequence[str], *, double: bool) -> str:
-    """The prototype of a program's function, without a semicolon.
-
-    Args:
-        name: Name of the C function.
-        inputs: Names of the inputs.
-        outputs: Names of the outputs.
-        double: Whether its numbers are of `double`; of `float` otherwise.
-
-    Raises:
-        InputError: If a name is no identifier of C, or is used twice.
-    """
-    _check_names([name, *inputs, *outputs])
-    kind = "double" if double else "float"
-    arguments = [f"const {kind} *{x}" for x in inputs] + [f"{kind} *{x}" for x in outputs]
-    return f"void {name}({', '.join(arguments) or 'void'})"
-
-
-def definition(
-    program: Program,
-    name: str,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    *,
-    double: bool,
-    library: Library | None = None,
-) -> str:
-    """A program as the definition of a C function, as `to_c` describes it.
-
-    Args:
-        program: Made by `trace`.
-        name: Name of the C function.
-        inputs: Names of the inputs.
-        outputs: Names of the outputs.
-        double: Whether the C code computes in `double`; in `float` otherwise.
-        library: Functions for many sines, cosines and tanh at once that stand before it in the
-            file, made for this program and others; the compiler's own functions if None.
-
-    Raises:
-        InputError: If a name is no identifier of C, or is used twice.
-    """
-    head = declaration(name, inputs, outputs, double=double)
-    writer = _Writer(double)
-    lines = _statements(program, writer, inputs, library)
-    read = {int(node.operands[0]) for node in program.nodes if node.operation is Operation.INPUT}
-    lines += [f"(void){x};" for k, x in enumerate(inputs) if k not in read]
-    start = 0
-    for output, shape in zip(outputs, program.output_shapes, strict=True):
-        size = math.prod(shape)
-        if not size:
-            lines.append(f"(void){output};")
-        entries = program.outputs[start : start + size]
-        lines += [f"{output}[{k}] = {writer.operand(x)};" for k, x in enumerate(entries)]
-        start += size
-    body = "\n".join(f"    {line}" for line in lines)
-    return f"{head}\n{{\n{body}\n}}\n"
-
-
-def _statements(
-    program: Program, writer: _Writer, inputs: Sequence[str], library: Library | None
-) -> list[str]:
-    """One line for each node; functions of the library wait until there are many of them."""
-    lines: list[str] = []
-    stages = _stages(program) if library else [0] * len(program.nodes)
-    for stage in range(max(stages, default=0) + 1):
-        own = [k for k, s in enumerate(stages) if s == stage]
-        if stage and library:
-            for call, kinds in KINDS.items():
-                nodes = [k for k in own if program.nodes[k].operation in kinds]
-                lines += _called(program, writer, library, call, nodes, stage) if nodes else []
-            own = [k for k in own if program.nodes[k].operation not in _OF_LIBRARY]
-        for k in own:
-            operation, operands = program.nodes[k]
-            if operation is Operation.INPUT:
-                number, entry = operands
-                expression = f"{inputs[int(number)]}[{entry}]"
-            else:
-                expression = writer.expression(operation, operands)
-            kind = "int" if operation in TRUTH_VALUED else writer.type
-            lines.append(f"const {kind} t{k} = {expression};")
-    return lines
-
-
-def _stages(program: Program) -> list[int]:
-    """For each node how many functions of the library stand before it, one after the other."""
-    stages: list[int] = []
-    for node in program.nodes:
-        before = max((stages[k] for k in node.uses), default=0)
-        stages.append(before + (node.operation in _OF_LIBRARY))
-    return stages
-
-
-def _called(
-    program: Program, writer: _Writer, library: Library, call: str, nodes: Sequence[int], stage: int
-) -> list[str]:
-    """Some functions of the library at once, and their results as nodes."""
-    width = library.width(call)
-    arguments = list(dict.fromkeys(program.nodes[k].operands[0] for k in nodes))
-    filled = [writer.operand(x) for x in arguments]
-    filled += [writer.number(0.0)] * (width - len(arguments))
-    label = f"t{call[0]}{stage}"
-    results = [f"{label}a"] + ([f"{label}b"] if call == SINE_COSINE else [])
-    lines = [
-        f"const {writer.type} {label}[{width}] = {{{', '.join(filled)}}};",
-        f"{writer.type} {', '.join(f'{x}[{width}]' for x in results)};",
-        f"{library.prefix}_{call}({label}, {', '.join(results)});",
-    ]
-    for k in nodes:
-        operation, (x,) = program.nodes[k]
-        result = results[operation is Operation.COSINE]
-        lines.append(f"const {writer.type} t{k} = {result}[{arguments.index(x)}];")
-    return lines
-
-
-def _description(program: Program, inputs: Sequence[str], outputs: Sequence[str]) -> str:
-    shapes = [*program.input_shapes, *program.output_shapes]
-    rows = zip([*inputs, *outputs], shapes, strict=True)
-    return "\n".join(f"   {name}: {math.prod(s)} numbers, shape {list(s)}." for name, s in rows)
+{writer.definition(program, name, inputs, outputs)}"""
 
 
 def _names(given: Sequence[str] | None, stem: str, count: int) -> list[str]:
@@ -249,9 +366,9 @@ def _names(given: Sequence[str] | None, stem: str, count: int) -> list[str]:
 
 def _check_names(names: list[str]) -> None:
     for name in names:
-        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _KEYWORDS.fullmatch(name):
-            raise InputError(f"A name in C code must be an identifier of C, but got {name!r}.")
-        if re.fullmatch(r"t[a-z]?[0-9]+[ab]?", name):
-            raise InputError(f"The name {name!r} is taken by the generated code: choose another.")
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or _RESERVED.fullmatch(name):
+            raise InputError(
+                f"names in C code must be identifiers of C and not reserved, but one is {name!r}."
+            )
     if len(set(names)) < len(names):
-        raise InputError(f"Names in C code must differ from each other, but are {names}.")
+        raise InputError(f"names in C code must differ from each other, but are {names}.")

@@ -1,4 +1,4 @@
-"""Compiled functions that outlive the process: JAX's persistent cache in the user's own folder."""
+"""JAX's persistent cache of compiled functions in the user's cache folder."""
 
 import os
 import sys
@@ -8,44 +8,42 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 VARIABLE = "JAXID_CACHE_DIR"
-OFF = ("", "0", "off", "none")
-"""Values of the variable that turn the cache off."""
-LARGEST = 2**28
-"""Bytes that the cache may hold: some hundreds of functions."""
-SHORTEST = 0.2
-"""Compile time from which a function is kept [s]."""
+"""Environment variable that names the folder of the cache, or turns the cache off."""
+MAX_BYTES = 2**28
+"""Maximum size of the cache [bytes]: some hundreds of functions."""
 
 
 def keep_compiled(folder: str | Path | None = None) -> Path | None:
-    """Lets JAX keep what it compiles on the disk: the next process finds it.
+    """Store compiled functions on disk, where the next process finds them.
 
-    The commands call it; in a notebook call it first. A cache that JAX was given otherwise
-    (`JAX_COMPILATION_CACHE_DIR`) stays. What was not used for longest goes when the folder holds
-    more than 256 MiB.
+    The commands call it; call it first in a notebook. A cache that JAX was given otherwise
+    (`JAX_COMPILATION_CACHE_DIR`) stays in use. The least recently used functions are removed when
+    the folder holds more than 256 MiB.
 
     Args:
-        folder: Of the cache. If None, that of the environment variable `JAXID_CACHE_DIR` (`off`
-            turns the cache off), or `jaxid` where the system keeps users' caches.
+        folder: Folder of the cache. If None, the one in the environment variable
+            `JAXID_CACHE_DIR` (`off` turns the cache off), or `jaxid` in the user's cache folder.
 
     Returns:
-        The folder; None if there is no cache, because it is off or nothing can be written there.
+        Folder in use; None if the cache is off or nothing can be written there.
     """
-    given = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if folder is None and given:
-        return Path(given)
-    asked = os.environ.get(VARIABLE)
-    if folder is None and asked is not None and asked.strip().lower() in OFF:
+    present = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder is None and present:
+        return Path(present)
+    variable = os.environ.get(VARIABLE)
+    turned_off = variable is not None and variable.strip().lower() in ("", "0", "off", "none")
+    if folder is None and turned_off:
         return None
-    place = Path(folder or asked or user_cache()).expanduser().absolute()
+    place = Path(folder or variable or user_cache()).expanduser().absolute()
     try:
         place.mkdir(parents=True, exist_ok=True)
-        _shrink(place, LARGEST)
+        _remove_oldest(place, MAX_BYTES)
     except OSError:
         return None
     if not os.access(place, os.W_OK):
         return None
     jax.config.update("jax_compilation_cache_dir", str(place))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     # JAX looks for its cache once, at the first compilation.
     compilation_cache.reset_cache()
@@ -53,30 +51,30 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
 
 
 def user_cache() -> Path:
-    """Where the system keeps this user's caches, with a folder of this package."""
+    """Return the folder of this package among the user's caches."""
     home = Path.home()
     if sys.platform == "darwin":
         return home / "Library" / "Caches" / "jaxid"
     if sys.platform == "win32":
         local = os.environ.get("LOCALAPPDATA")
         return (Path(local) if local else home / "AppData" / "Local") / "jaxid" / "Cache"
-    chosen = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(chosen) if Path(chosen).is_absolute() else home / ".cache") / "jaxid"
+    xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (xdg if xdg.is_absolute() else home / ".cache") / "jaxid"
 
 
-def _shrink(folder: Path, most: int) -> None:
-    """Removes what was not used for longest; other processes may do the same at the same time."""
-    found = []
+def _remove_oldest(folder: Path, max_bytes: int) -> None:
+    """Remove the least recently used files; other processes may do so at the same time."""
+    files = []
     for path in folder.iterdir():
         try:
             status = path.stat()
         except FileNotFoundError:
             continue
         if path.is_file():
-            found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
-    size = sum(bytes_ for _, bytes_, _ in found)
-    for _, bytes_, path in sorted(found):
-        if size <= most:
+            files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+    size = sum(bytes_ for _, bytes_, _ in files)
+    for _, bytes_, path in sorted(files):
+        if size <= max_bytes:
             return
         path.unlink(missing_ok=True)
         size -= bytes_

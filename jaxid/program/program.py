@@ -1,6 +1,8 @@
-"""A scalar program: a straight line of scalar operations, and where its results go."""
+"""A scalar program: a sequence of scalar operations without branches, and its results."""
 
 import functools
+import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -9,8 +11,8 @@ import jax
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.program.operation import COMPARISONS, FUNCTIONS, LOGIC, Operation
-from jaxid.program.rewrite import live, rewrite
+from jaxid.program.operations import Operation
+from jaxid.program.rewrite import live_scalars, rewrite
 from jaxid.program.scalar import Graph, Operand, Scalar
 
 Reference = int | float
@@ -18,42 +20,48 @@ Reference = int | float
 
 
 class Node(NamedTuple):
-    """One operation. The operands of an `INPUT` are the input's number and the entry's position."""
+    """An operation; an `INPUT` has the input's number and the entry's position as operands."""
 
     operation: Operation
     operands: tuple[Reference, ...]
 
     @property
     def uses(self) -> tuple[int, ...]:
-        """Positions of the nodes that this one reads."""
+        """Positions of the nodes that are operands."""
         if self.operation is Operation.INPUT:
             return ()
         return tuple(x for x in self.operands if isinstance(x, int))
 
     @property
     def place(self) -> tuple[int, int]:
-        """The input's number and the entry's position, of an `INPUT`."""
+        """Number of the input and position of the entry, for an `INPUT`."""
         number, entry = self.operands
         return int(number), int(entry)
 
 
 @dataclass(frozen=True)
 class OperationCounts:
-    """How many operations of each kind a program does."""
+    """Numbers of operations of a program.
+
+    Attributes:
+        multiplications: Multiplications.
+        additions: Additions and subtractions.
+        negations: Changes of sign.
+        divisions: Divisions.
+        functions: Calls of sin, cos, sqrt, tanh and similar functions.
+        selections: Comparisons, choices, absolute values and signs.
+    """
 
     multiplications: int
     additions: int
-    """Additions and subtractions."""
     negations: int
     divisions: int
     functions: int
-    """Calls of sin, cos, sqrt, tanh and their kin."""
     selections: int
-    """Comparisons, choices, absolute values and signs."""
 
     @property
     def total(self) -> int:
-        """All operations except negations, which are free inside a sum."""
+        """Number of operations except negations, which cost nothing inside a sum."""
         return (
             self.multiplications
             + self.additions
@@ -72,61 +80,69 @@ class OperationCounts:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A function as a straight line of scalar operations; made by `trace`.
+    """A function as a sequence of scalar operations; made by `trace`.
 
     Equality and hash are by identity, so that a program can be static metadata under `jit`.
+
+    Attributes:
+        input_shapes: Shapes of the inputs, without batch axes.
+        nodes: Operations; each one reads only nodes before it.
+        outputs: Packed result: for each entry of each output, in order, a node or a constant.
+        output_shapes: Shapes of the outputs, without batch axes.
+        structure: PyTree structure of the function's result.
     """
 
     input_shapes: tuple[tuple[int, ...], ...]
-    """The shapes of the inputs, without batch axes."""
     nodes: tuple[Node, ...] = field(repr=False)
-    """The operations; each one reads only nodes that stand before it."""
     outputs: tuple[Reference, ...] = field(repr=False)
-    """The packed result: for each entry of each output, in order, a node or a constant."""
     output_shapes: tuple[tuple[int, ...], ...]
     structure: Any = field(repr=False)
-    """How the outputs stand in what the function returned."""
 
     @functools.cached_property
     def counts(self) -> OperationCounts:
-        """How many operations of each kind the program does."""
+        """Numbers of operations of the program."""
+        operations = Counter(node.operation for node in self.nodes)
 
-        def count(*kinds: Operation) -> int:
-            return sum(node.operation in kinds for node in self.nodes)
+        def count(*traits: str) -> int:
+            return sum(n for x, n in operations.items() if x.traits.intersection(traits))
 
         return OperationCounts(
-            multiplications=count(Operation.MULTIPLY),
-            additions=count(Operation.ADD, Operation.SUBTRACT),
-            negations=count(Operation.NEGATE),
-            divisions=count(Operation.DIVIDE),
-            functions=count(*FUNCTIONS),
-            selections=count(
-                *COMPARISONS,
-                *LOGIC,
-                Operation.SELECT,
-                Operation.MAXIMUM,
-                Operation.MINIMUM,
-                Operation.ABSOLUTE,
-                Operation.SIGN,
-            ),
+            multiplications=operations[Operation.MULTIPLY],
+            additions=operations[Operation.ADD] + operations[Operation.SUBTRACT],
+            negations=operations[Operation.NEGATE],
+            divisions=operations[Operation.DIVIDE],
+            functions=count("function"),
+            selections=count("truth", "choice"),
         )
+
+    @functools.cached_property
+    def uses(self) -> tuple[int, ...]:
+        """Number of nodes and outputs that read each node."""
+        uses = [0] * len(self.nodes)
+        for k in (k for node in self.nodes for k in node.uses):
+            uses[k] += 1
+        for x in self.outputs:
+            if isinstance(x, int):
+                uses[x] += 1
+        return tuple(uses)
 
     @property
     def nonzeros(self) -> Any:
-        """Boolean arrays in the structure of the outputs: False where an entry is always 0."""
-        return self.arrange([not (isinstance(x, float) and x == 0) for x in self.outputs], bool)
+        """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
+        varies = [not (isinstance(x, float) and x == 0) for x in self.outputs]
+        leaves = zip(self.split(varies), self.output_shapes, strict=True)
+        return jax.tree.unflatten(self.structure, [np.array(x, bool).reshape(s) for x, s in leaves])
 
-    def arrange(self, entries: Sequence, dtype: Any) -> Any:
-        """One value for each packed entry, as NumPy arrays in the structure of the outputs."""
-        leaves, start = [], 0
-        for shape in self.output_shapes:
-            size = int(np.prod(shape, dtype=int))
-            leaves.append(np.array(entries[start : start + size], dtype).reshape(shape))
-            start += size
-        return jax.tree.unflatten(self.structure, leaves)
+    def split(self, packed: Sequence) -> list[Sequence]:
+        """Split values of the packed entries into those of each output."""
+        ends = np.cumsum([math.prod(shape) for shape in self.output_shapes], dtype=int)
+        return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
 
     def batch_shape(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-        """The trailing batch axes of arrays with these shapes, broadcast against each other.
+        """Return the trailing batch axes of arrays, broadcast against each other.
+
+        Args:
+            shapes: Shapes of the arrays, those of the inputs first.
 
         Raises:
             InputError: If the arrays are not as many as the inputs, or a shape does
@@ -154,9 +170,9 @@ def assemble(
     output_shapes: tuple[tuple[int, ...], ...],
     structure: Any,
 ) -> Program:
-    """Writes the live part of a graph as a program; what no output needs is left out."""
+    """Make a program of the part of a graph that the outputs need."""
     outputs = rewrite(outputs)
-    scalars = live(outputs)
+    scalars = live_scalars(outputs)
     place = {scalar.index: k for k, scalar in enumerate(scalars)}
 
     def reference(x: Operand) -> Reference:
@@ -171,12 +187,12 @@ def assemble(
     return Program(input_shapes, nodes, tuple(map(reference, outputs)), output_shapes, structure)
 
 
-def chosen(program: Program, entries: np.ndarray) -> Program:
-    """The program of some of a program's results: what they do not need is left out.
+def select_outputs(program: Program, entries: np.ndarray) -> Program:
+    """Return a program that computes only some results of a program.
 
     Args:
-        program: Of which some results are wanted.
-        entries: Their positions in the packed result, in the shape of the new result.
+        program: Program with further results.
+        entries: Positions in the packed result, in the shape of the new result.
     """
     graph = Graph()
     scalars: list[Scalar] = []

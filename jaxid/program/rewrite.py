@@ -1,4 +1,4 @@
-"""Simplifications that need to know who else uses an expression.
+"""Simplifications that depend on all uses of an expression.
 
 `c x + c y` becomes `c (x + y)` where nothing else needs the products, and `-(x - y)` becomes
 `y - x` where nothing else needs the difference.
@@ -7,7 +7,7 @@
 from collections import Counter
 from collections.abc import Sequence
 
-from jaxid.program.operation import Operation
+from jaxid.program.operations import Operation
 from jaxid.program.scalar import Operand, Scalar, add, multiply, negate
 
 _SUMS = (Operation.ADD, Operation.SUBTRACT)
@@ -15,8 +15,8 @@ _Term = tuple[bool, Operand]
 """Whether a summand is subtracted, and the summand."""
 
 
-def live(outputs: Sequence[Operand]) -> list[Scalar]:
-    """The scalars that the outputs need, each one after its operands."""
+def live_scalars(outputs: Sequence[Operand]) -> list[Scalar]:
+    """Return the scalars that the outputs need, each one after its operands."""
     seen, stack = {}, [x for x in outputs if isinstance(x, Scalar)]
     while stack:
         scalar = stack.pop()
@@ -27,18 +27,18 @@ def live(outputs: Sequence[Operand]) -> list[Scalar]:
 
 
 def rewrite(outputs: Sequence[Operand]) -> list[Operand]:
-    """The same outputs with fewer operations, or as they were if nothing is to be gained."""
+    """Return the same outputs with fewer operations, or unchanged if none can be saved."""
     best = list(outputs)
     while True:
-        factored = _Rewriting(best).factored()
+        factored = _Rewriting(best).factor_sums()
         if _work(factored) >= _work(best):
-            return _Rewriting(best).without_negated_differences()
+            return _Rewriting(best).turn_negated_differences()
         best = factored
 
 
 def _work(outputs: Sequence[Operand]) -> int:
     free = (Operation.INPUT, Operation.NEGATE)
-    return sum(x.operation not in free for x in live(outputs))
+    return sum(x.operation not in free for x in live_scalars(outputs))
 
 
 class _Rewriting:
@@ -46,54 +46,53 @@ class _Rewriting:
 
     def __init__(self, outputs: Sequence[Operand]):
         self.outputs = outputs
-        self.scalars = live(outputs)
+        self.scalars = live_scalars(outputs)
         self.uses = Counter(x for x in outputs if isinstance(x, Scalar))
         for scalar in self.scalars:
             self.uses.update(x for x in scalar.operands if isinstance(x, Scalar))
         self.new: dict[Scalar, Operand] = {}
 
-    def factored(self) -> list[Operand]:
+    def factor_sums(self) -> list[Operand]:
         inner = {
             x
             for scalar in self.scalars
             if scalar.operation in _SUMS
             for x in scalar.operands
-            if self._once(x) and x.operation in _SUMS
+            if self._is_used_once(x) and x.operation in _SUMS
         }
         for scalar in self.scalars:
             terms = None
             if scalar.operation in _SUMS and scalar not in inner:
-                terms = self._factor(self._terms(scalar, False, inner))
-            self.new[scalar] = self._again(scalar) if terms is None else _total(terms)
-        return [self._of(x) for x in self.outputs]
+                terms = self._factor(_flatten_sum(scalar, inner))
+            self.new[scalar] = self._rebuild(scalar) if terms is None else _sum(terms)
+        return [self._rewritten(x) for x in self.outputs]
 
-    def without_negated_differences(self) -> list[Operand]:
+    def turn_negated_differences(self) -> list[Operand]:
         for scalar in self.scalars:
             (x, *_) = scalar.operands
-            negates = scalar.operation is Operation.NEGATE and self._once(x)
+            negates = scalar.operation is Operation.NEGATE and self._is_used_once(x)
             if negates and x.operation is Operation.SUBTRACT:
-                left, right = map(self._of, x.operands)
+                left, right = map(self._rewritten, x.operands)
                 self.new[scalar] = scalar.graph.node(Operation.SUBTRACT, right, left)
             elif scalar.operation is Operation.INPUT:
                 self.new[scalar] = scalar
             else:
-                # Not by `_again`: its canonical order would bring the negation back.
-                self.new[scalar] = scalar.graph.node(
-                    scalar.operation, *map(self._of, scalar.operands)
-                )
-        return [self._of(x) for x in self.outputs]
+                # `_rebuild` would restore the canonical order, and with it the negation.
+                operands = map(self._rewritten, scalar.operands)
+                self.new[scalar] = scalar.graph.node(scalar.operation, *operands)
+        return [self._rewritten(x) for x in self.outputs]
 
-    def _of(self, x: Operand) -> Operand:
+    def _rewritten(self, x: Operand) -> Operand:
         return self.new[x] if isinstance(x, Scalar) else x
 
-    def _once(self, x: Operand) -> bool:
+    def _is_used_once(self, x: Operand) -> bool:
         return isinstance(x, Scalar) and self.uses[x] == 1
 
-    def _again(self, scalar: Scalar) -> Operand:
-        """The same operation on operands that may have become others."""
+    def _rebuild(self, scalar: Scalar) -> Operand:
+        """Return the same operation on rewritten operands."""
         if scalar.operation is Operation.INPUT:
             return scalar
-        operands = [self._of(x) for x in scalar.operands]
+        operands = [self._rewritten(x) for x in scalar.operands]
         if scalar.operation is Operation.ADD:
             return add(*operands)
         if scalar.operation is Operation.SUBTRACT:
@@ -104,52 +103,51 @@ class _Rewriting:
             return negate(operands[0])
         return scalar.graph.node(scalar.operation, *operands)
 
-    def _terms(self, x: Operand, negated: bool, inner: set[Scalar]) -> list[_Term]:
-        stack, terms = [(x, negated, True)], []
-        while stack:
-            x, negated, outermost = stack.pop()
-            if isinstance(x, Scalar) and (outermost or x in inner):
-                left, right = x.operands
-                stack += [
-                    (right, negated != (x.operation is Operation.SUBTRACT), False),
-                    (left, negated, False),
-                ]
-            else:
-                terms.append((negated, x))
-        return terms
-
     def _factor(self, terms: list[_Term]) -> list[_Term] | None:
-        """Draws common factors out of products that nothing else needs; None if there are none."""
+        """Draw common factors out of products that nothing else needs; None if there are none."""
         products = [
             (k, x)
             for k, (_, x) in enumerate(terms)
-            if isinstance(x, Scalar) and self._once(x) and _is_product(x)
+            if isinstance(x, Scalar) and self._is_used_once(x) and x.operation is Operation.MULTIPLY
         ]
-        done: list[_Term] = []
-        taken: set[int] = set()
+        factored: list[_Term] = []
+        used: set[int] = set()
         while True:
-            counts = Counter(f for k, x in products if k not in taken for f in set(x.operands))
+            counts = Counter(f for k, x in products if k not in used for f in set(x.operands))
             factor, count = max(
                 counts.items(), key=lambda c: (c[1], _order(c[0])), default=(0.0, 0)
             )
             if count < 2:
                 break
-            group = [(k, x) for k, x in products if k not in taken and factor in x.operands]
-            rest = [(terms[k][0], self._of(_cofactor(x, factor))) for k, x in group]
-            taken.update(k for k, _ in group)
-            done.append((False, multiply(self._of(factor), _total(rest))))
-        if not taken:
+            group = [(k, x) for k, x in products if k not in used and factor in x.operands]
+            rest = [(terms[k][0], self._rewritten(_cofactor(x, factor))) for k, x in group]
+            used.update(k for k, _ in group)
+            factored.append((False, multiply(self._rewritten(factor), _sum(rest))))
+        if not used:
             return None
-        kept = [(n, self._of(x)) for k, (n, x) in enumerate(terms) if k not in taken]
-        return kept + done
+        others = [(n, self._rewritten(x)) for k, (n, x) in enumerate(terms) if k not in used]
+        return others + factored
 
 
-def _is_product(x: Scalar) -> bool:
-    return x.operation is Operation.MULTIPLY
+def _flatten_sum(x: Scalar, inner: set[Scalar]) -> list[_Term]:
+    """Return the terms of a sum, with those of the sums inside it."""
+    stack: list[tuple[Operand, bool, bool]] = [(x, False, True)]
+    terms: list[_Term] = []
+    while stack:
+        term, negated, outermost = stack.pop()
+        if isinstance(term, Scalar) and (outermost or term in inner):
+            left, right = term.operands
+            stack += [
+                (right, negated != (term.operation is Operation.SUBTRACT), False),
+                (left, negated, False),
+            ]
+        else:
+            terms.append((negated, term))
+    return terms
 
 
 def _order(x: Operand) -> float:
-    """Breaks ties always in the same way: constants first, then what was made first."""
+    """Return a key that breaks ties reproducibly: constants first, then older expressions."""
     return -float(x.index) if isinstance(x, Scalar) else 1.0 + abs(x)
 
 
@@ -158,7 +156,7 @@ def _cofactor(product: Scalar, factor: Operand) -> Operand:
     return y if x is factor or x == factor else x
 
 
-def _total(terms: list[_Term]) -> Operand:
+def _sum(terms: list[_Term]) -> Operand:
     total: Operand = 0.0
     for negated, x in terms:
         total = add(total, negate(x) if negated else x)

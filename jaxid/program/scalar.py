@@ -1,20 +1,20 @@
-"""Scalars as expressions that simplify themselves while they are built.
+"""Scalar expressions that are simplified while they are built.
 
-Equal expressions are the same object: each one is looked up in the table of its `Graph`
-before it is made. A graph belongs to one trace and dies with it.
+Equal expressions are the same object: each one is looked up in the table of its `Graph` before it
+is made. A graph belongs to one trace and is freed with it.
 
 The rules keep the value of every finite computation up to the rounding of one operation. They fold
-`0 x` to 0 and `x - x` to 0, so that a NaN or an infinity in x can disappear from
-the result: check inputs before they come here.
+`0 x` and `x - x` to 0, so that a NaN or an infinity in x can disappear from the result: check
+inputs beforehand.
 """
 
 from typing import overload
 
-from jaxid.program.operation import COMMUTATIVE, EVEN, ODD, TRUTH_VALUED, Operation, on_constants
+from jaxid.program.operations import Operation
 
 
 class Graph:
-    """The expressions of one trace, each one once."""
+    """Expressions of one trace, without repetitions."""
 
     __slots__ = ("_table",)
 
@@ -22,17 +22,17 @@ class Graph:
         self._table = {}
 
     def node(self, operation: Operation, *operands: object) -> "Scalar":
-        """Finds the expression, or makes it; expressions are numbered as they are made."""
+        """Return the expression, making it if it is new; new ones are numbered in order."""
         key = (operation, *operands)
-        found = self._table.get(key)
-        if found is None:
-            found = Scalar(self, operation, operands, len(self._table))
-            self._table[key] = found
-        return found
+        scalar = self._table.get(key)
+        if scalar is None:
+            scalar = Scalar(self, operation, operands, len(self._table))
+            self._table[key] = scalar
+        return scalar
 
 
 class Scalar:
-    """One scalar operation in a `Graph`. Equality is identity, which the table makes sufficient."""
+    """A scalar operation in a `Graph`; equal ones are identical."""
 
     __slots__ = ("graph", "index", "operands", "operation")
 
@@ -75,14 +75,14 @@ def _magnitude(x: Scalar) -> tuple[bool, Scalar]: ...
 @overload
 def _magnitude(x: float | bool) -> tuple[bool, float | bool]: ...
 def _magnitude(x: Operand) -> tuple[bool, Operand]:
-    """Splits x into (is negated, rest)."""
+    """Split x into (is negated, rest)."""
     if isinstance(x, Scalar):
         return (True, x.operands[0]) if x.operation is Operation.NEGATE else (False, x)
     return (True, -x) if x < 0 else (False, x)
 
 
 def negate(x: Operand) -> Operand:
-    """-x; two minus signs cancel."""
+    """Return -x; two minus signs cancel."""
     if not isinstance(x, Scalar):
         return -x
     if x.operation is Operation.NEGATE:
@@ -91,7 +91,7 @@ def negate(x: Operand) -> Operand:
 
 
 def add(x: Operand, y: Operand) -> Operand:
-    """Sum, ordered so that x + y, y + x and -(-x - y) share a node, as do x - y and y - x."""
+    """Return x + y, ordered so that x + y, y + x and -(-x - y) are one node, up to its sign."""
     if not isinstance(x, Scalar):
         if not isinstance(y, Scalar):
             return float(x + y)
@@ -110,13 +110,13 @@ def add(x: Operand, y: Operand) -> Operand:
             return 0.0
         total = multiply(2.0, x)
     else:
-        kind = Operation.ADD if x_negated == y_negated else Operation.SUBTRACT
-        total = x.graph.node(kind, x, y)
+        operation = Operation.ADD if x_negated == y_negated else Operation.SUBTRACT
+        total = x.graph.node(operation, x, y)
     return negate(total) if x_negated else total
 
 
 def multiply(x: Operand, y: Operand) -> Operand:
-    """Product with the sign in front; a constant factor stands first, merged with one in y."""
+    """Return x y with the sign in front and constant factors merged into one."""
     if not isinstance(y, Scalar):
         if not isinstance(x, Scalar):
             return float(x * y)
@@ -144,11 +144,11 @@ def _scale(factor: float, x: Scalar) -> Scalar:
 
 
 def divide(x: Operand, y: Operand) -> Operand:
-    """Quotient; a division by a constant becomes a multiplication by its reciprocal."""
+    """Return x / y; a constant divisor becomes a multiplication by its reciprocal."""
     if not isinstance(y, Scalar):
         if not isinstance(x, Scalar):
-            return on_constants(Operation.DIVIDE, float(x), float(y))
-        reciprocal = on_constants(Operation.DIVIDE, 1.0, float(y))
+            return Operation.DIVIDE.on_constants(float(x), float(y))
+        reciprocal = Operation.DIVIDE.on_constants(1.0, float(y))
         if 1e-300 < abs(reciprocal) < 1e300:
             return multiply(reciprocal, x)
         return x.graph.node(Operation.DIVIDE, x, float(y))
@@ -160,7 +160,7 @@ def divide(x: Operand, y: Operand) -> Operand:
 
 
 def integer_power(x: Operand, exponent: int) -> Operand:
-    """Whole power of x, by repeated squaring."""
+    """Return a whole power of x by repeated squaring."""
     if exponent < 0:
         return divide(1.0, integer_power(x, -exponent))
     power, square = 1.0, x
@@ -174,7 +174,7 @@ def integer_power(x: Operand, exponent: int) -> Operand:
 
 
 def power(x: Operand, y: Operand) -> Operand:
-    """Power x^y, where a small whole or half exponent needs no call of `pow`."""
+    """Return x^y; small whole exponents and 1/2 need no call of `pow`."""
     if not isinstance(y, Scalar) and isinstance(x, Scalar):
         if float(y).is_integer() and abs(y) <= 16:
             return integer_power(x, int(y))
@@ -184,7 +184,7 @@ def power(x: Operand, y: Operand) -> Operand:
 
 
 def select(condition: Operand, if_true: Operand, if_false: Operand) -> Operand:
-    """if_true where the condition holds, else if_false."""
+    """Return `if_true` where the condition holds, else `if_false`."""
     if not isinstance(condition, Scalar):
         return if_true if condition else if_false
     if if_true is if_false or (
@@ -195,7 +195,7 @@ def select(condition: Operand, if_true: Operand, if_false: Operand) -> Operand:
 
 
 def logic(operation: Operation, *operands: Operand) -> Operand:
-    """Truth values combined by `AND`, `OR` or `NOT`."""
+    """Combine truth values by `AND`, `OR` or `NOT`."""
     unknown = [x for x in operands if isinstance(x, Scalar)]
     if operation is Operation.NOT:
         return apply(operation, *operands)
@@ -208,38 +208,36 @@ def logic(operation: Operation, *operands: Operand) -> Operand:
 
 
 def apply(operation: Operation, *operands: Operand) -> Operand:
-    """Any other operation; a sign moves out of an odd function and vanishes in an even one."""
+    """Apply any other operation; signs move out of odd functions and vanish in even ones."""
     constants = [x for x in operands if not isinstance(x, Scalar)]
     if len(constants) == len(operands):
-        return on_constants(operation, *constants)
+        return operation.on_constants(*constants)
     graph = next(x.graph for x in operands if isinstance(x, Scalar))
-    if operation in ODD or operation in EVEN:
+    if operation.traits & {"odd", "even"}:
         negated, x = _magnitude(operands[0])
         result = graph.node(operation, x)
-        return negate(result) if negated and operation in ODD else result
-    if operation in COMMUTATIVE:
-        operands = tuple(
-            sorted(operands, key=lambda x: -1 if not isinstance(x, Scalar) else x.index)
-        )
+        return negate(result) if negated and "odd" in operation.traits else result
+    if "commutative" in operation.traits:
+        operands = tuple(sorted(operands, key=lambda x: x.index if isinstance(x, Scalar) else -1))
         if operation in (Operation.MAXIMUM, Operation.MINIMUM) and operands[0] is operands[1]:
             return operands[0]
     return graph.node(operation, *operands)
 
 
 def is_truth(x: Operand) -> bool:
-    """Whether x is a truth value, not a number."""
-    return isinstance(x, bool) if not isinstance(x, Scalar) else x.operation in TRUTH_VALUED
+    """Return whether x is a truth value, not a number."""
+    return "truth" in x.operation.traits if isinstance(x, Scalar) else isinstance(x, bool)
 
 
 def as_number(x: Operand) -> Operand:
-    """A truth value as 1 or 0; numbers stay."""
+    """Return a truth value as 1 or 0, and a number as it is."""
     if not isinstance(x, Scalar):
         return float(x)
-    return select(x, 1.0, 0.0) if x.operation in TRUTH_VALUED else x
+    return select(x, 1.0, 0.0) if is_truth(x) else x
 
 
 def as_truth(x: Operand) -> Operand:
-    """A number as the truth value `x != 0`; truth values stay."""
+    """Return a number as the truth value `x != 0`, and a truth value as it is."""
     if not isinstance(x, Scalar):
         return bool(x)
-    return x if x.operation in TRUTH_VALUED else apply(Operation.NOT_EQUAL, x, 0.0)
+    return x if is_truth(x) else apply(Operation.NOT_EQUAL, x, 0.0)

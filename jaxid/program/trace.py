@@ -1,4 +1,9 @@
-"""From an ordinary JAX function to a scalar program: run its jaxpr on arrays of scalars."""
+"""Translation of a JAX function into a scalar program: its jaxpr runs on arrays of scalars.
+
+Primitives that only move entries of an array are written out for NumPy if they are common; the
+others (gather, scatter, dynamic slices) move the *positions* of the entries with JAX itself, and
+the entries follow.
+"""
 
 import functools
 import math
@@ -13,36 +18,17 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jaxid.arrays import double_precision
 from jaxid.errors import InputError
 from jaxid.program import scalar
-from jaxid.program.moves import (
-    INDEXED_MOVES,
-    MOVES,
-    is_symbolic,
-    move_by_index,
-    on_numbers,
-    scatter_add,
-)
-from jaxid.program.operation import COMPARISONS, FUNCTIONS, Operation
+from jaxid.program.operations import Operation
 from jaxid.program.program import Program, assemble
-from jaxid.program.scalar import Graph, Operand
+from jaxid.program.scalar import Graph
 
-
-class Free:
-    """The mark of an entry that varies; see `FREE`."""
-
-    __slots__ = ()
-
-    def __repr__(self):
-        return "FREE"
-
-
-FREE = Free()
-"""Marks the entries of an input that vary; the entries beside it stay constants.
+FREE = object()
+"""Mark of the entries of an input that vary; numbers beside it become constants.
 
 `np.where(offset != 0, FREE, offset)` is an input whose zeros are known.
 """
 
-_INNER_JAXPR = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-_INSTEAD = {
+_UNSUPPORTED = {
     "scan": "a program has no loops, so write the loop in Python",
     "while": "a program has no loops, so write a loop of known length in Python",
     "cond": "a program has no branches, so choose between values with `jnp.where`",
@@ -53,18 +39,126 @@ _INSTEAD = {
 }
 
 
+def _is_symbolic(x: np.ndarray) -> bool:
+    """Return whether an array holds scalars of a trace."""
+    return x.dtype == object
+
+
+def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__) -> np.ndarray:
+    placed = [1] * len(shape)
+    for source, target in enumerate(broadcast_dimensions):
+        placed[target] = x.shape[source]
+    return np.broadcast_to(x.reshape(placed), shape)
+
+
+def _slice(x: np.ndarray, *, start_indices, limit_indices, strides) -> np.ndarray:
+    steps = strides or (1,) * x.ndim
+    return x[tuple(slice(*s) for s in zip(start_indices, limit_indices, steps, strict=True))]
+
+
+def _split(x: np.ndarray, *, sizes, axis) -> list[np.ndarray]:
+    return np.split(x, np.cumsum(sizes)[:-1], axis=axis)
+
+
+def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
+    for axis, (low, high, interior) in enumerate(padding_config):
+        x = np.moveaxis(x, axis, 0)
+        spread = max(len(x) + (len(x) - 1) * interior, 0)
+        padded = np.full((max(low, 0) + spread + max(high, 0), *x.shape[1:]), filler, x.dtype)
+        padded[max(low, 0) : max(low, 0) + spread : interior + 1] = x
+        x = np.moveaxis(padded[max(-low, 0) : len(padded) - max(-high, 0)], 0, axis)
+    return x
+
+
+_MOVEMENTS: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda *x, dimension: np.concatenate(x, axis=dimension),
+    "copy": lambda x, **_: x,
+    "copy_p": lambda x, **_: x,
+    "expand_dims": lambda x, *, dimensions: np.expand_dims(x, dimensions),
+    "pad": _pad,
+    "reshape": lambda x, *_, new_sizes, **__: x.reshape(new_sizes),
+    "rev": lambda x, *, dimensions: np.flip(x, dimensions),
+    "slice": _slice,
+    "split": _split,
+    "squeeze": lambda x, *, dimensions: np.squeeze(x, tuple(dimensions)),
+    "stack": lambda *x, axis: np.stack(x, axis=axis),
+    "tile": lambda x, *, reps: np.tile(x, reps),
+    "transpose": lambda x, *, permutation: np.transpose(x, permutation),
+    "unstack": lambda x, *, axis: list(np.moveaxis(x, axis, 0)),
+}
+
+_INDEXED_MOVEMENTS = {
+    "dynamic_slice": (0,),
+    "dynamic_update_slice": (0, 1),
+    "gather": (0,),
+    "scatter": (0, 2),
+}
+"""Positions of the operands that hold entries; the others hold indices."""
+
+
+def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
+    """Run one equation with JAX on known numbers, also inside another trace."""
+    with jax.ensure_compile_time_eval():
+        # A NumPy array would take the precision of the process; a JAX array keeps its own.
+        arrays = [jax.numpy.asarray(x, x.dtype) for x in operands]
+        results = equation.primitive.bind(*arrays, **equation.params)
+        results = results if equation.primitive.multiple_results else [results]
+        return [np.asarray(x) for x in results]
+
+
+def _move_by_index(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
+    """Move entries to the places that the indices among the operands give."""
+    name = equation.primitive.name
+    carriers = _INDEXED_MOVEMENTS[name]
+    entries, labels, start = [], list(operands), 0
+    for k in carriers:
+        entries.append(operands[k].astype(object).ravel())
+        positions = np.arange(start, start + operands[k].size, dtype=np.float64)
+        labels[k] = positions.reshape(operands[k].shape)
+        start += operands[k].size
+    if any(_is_symbolic(x) for x in labels):
+        raise InputError(
+            f"`trace` cannot translate `{name}` with an index that depends on the inputs: "
+            "index with constant integers."
+        )
+    (moved,) = _on_numbers(equation, *labels)
+    if not ((moved >= 0) & (moved < start)).all():
+        raise InputError(f"`trace` met an index outside of its array in `{name}`: correct it.")
+    return np.concatenate(entries)[moved.astype(int)]
+
+
+def _scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
+    """Add entries at known places, as the transpose of a gather does."""
+    target, indices, updates = operands
+    if _is_symbolic(indices):
+        raise InputError(
+            "`trace` cannot add at an index that depends on the inputs: "
+            "index with constant integers."
+        )
+    total = target.astype(object).copy()
+    for k, update in enumerate(updates.astype(object).ravel()):
+        one = np.zeros(updates.size)
+        one[k] = 1
+        zeros = np.zeros(target.shape)
+        (places,) = _on_numbers(equation, zeros, indices, one.reshape(updates.shape))
+        for place in np.argwhere(places):
+            total[tuple(place)] = total[tuple(place)] + update
+    return total
+
+
 def _each(function: Callable, operands: int) -> np.ufunc:
     return np.frompyfunc(function, operands, 1)
 
 
-def _operation(operation: Operation, operands: int) -> np.ufunc:
-    return _each(lambda *x: scalar.apply(operation, *x), operands)
+def _operation(operation: Operation) -> np.ufunc:
+    return _each(lambda *x: scalar.apply(operation, *x), operation.numpy.nin)
 
 
 _add, _subtract, _multiply = (
     _each(f, 2) for f in (scalar.add, lambda x, y: scalar.add(x, scalar.negate(y)), scalar.multiply)
 )
-_maximum, _minimum = _operation(Operation.MAXIMUM, 2), _operation(Operation.MINIMUM, 2)
+_maximum, _minimum = _operation(Operation.MAXIMUM), _operation(Operation.MINIMUM)
 _negate, _select = _each(scalar.negate, 1), _each(scalar.select, 3)
 _and, _or, _not = (
     _each(lambda *x, o=o: scalar.logic(o, *x), n)
@@ -94,18 +188,26 @@ def _dot_general(x: np.ndarray, y: np.ndarray, *, dimension_numbers, **_) -> np.
 
 
 def _select_n(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
-    if not is_symbolic(which):
+    if not _is_symbolic(which):
         return np.choose(np.broadcast_to(which, cases[0].shape).astype(int), cases)
     return np.asarray(_select(which, cases[1], cases[0]), object)
 
 
 def _select_truth(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
-    if not is_symbolic(which):
+    if not _is_symbolic(which):
         return _select_n(which, *cases)
     return np.asarray(_or(_and(which, cases[1]), _and(_not(which), cases[0])), object)
 
 
+_ELEMENTARY = [
+    o
+    for o in Operation
+    if "function" in o.traits
+    or o in (Operation.LESS, Operation.LESS_EQUAL, Operation.EQUAL, Operation.NOT_EQUAL)
+    or o in (Operation.ABSOLUTE, Operation.SIGN)
+]
 _ARITHMETIC: dict[str, Callable] = {
+    **{o.value: _operation(o) for o in _ELEMENTARY},
     "add": _add,
     "add_any": _add,
     "sub": _subtract,
@@ -139,19 +241,11 @@ _ARITHMETIC: dict[str, Callable] = {
     "reduce_prod": lambda x, *, axes, **_: _reduce(_multiply, x, axes, 1.0),
     "optimization_barrier": lambda *x: list(x),
     "tie": lambda _, x: x,
-    **{o.value: _operation(o, 2) for o in COMPARISONS},
-    **{
-        o.value: _operation(o, 1)
-        for o in (*FUNCTIONS, Operation.ABSOLUTE, Operation.SIGN)
-        if o not in (Operation.POWER, Operation.ARC_TANGENT_2)
-    },
-    Operation.ARC_TANGENT_2.value: _operation(Operation.ARC_TANGENT_2, 2),
 }
-_WITH_PARAMETERS = ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")
 
 
 def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    if not is_symbolic(x):
+    if not _is_symbolic(x):
         return x.astype(dtype)
     if dtype.kind == "b":
         return np.asarray(_each(scalar.as_truth, 1)(x), object)
@@ -164,24 +258,26 @@ def _convert(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
 
 
 def _entries(x: np.ndarray) -> np.ndarray:
-    """Numbers as Python's numbers, so that they mix with scalars."""
-    if is_symbolic(x) or x.dtype == bool:
+    """Return an array of scalars, or of Python's own numbers, which mix with them."""
+    if _is_symbolic(x) or x.dtype == bool:
         return x.astype(object)
     return x.astype(np.float64).astype(object)
 
 
 def _dtype(equation: JaxprEqn) -> np.dtype:
-    """The type of what an equation gives, if that is one array."""
+    """Return the type of the only result of an equation."""
     return np.dtype(equation.outvars[0].aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """One equation on arrays of which at least one is symbolic."""
+    """Run one equation on arrays of which at least one is symbolic."""
     name = equation.primitive.name
-    if name in INDEXED_MOVES:
-        return [move_by_index(equation, [_entries_of_floats(x) for x in operands])]
+    if name in _INDEXED_MOVEMENTS:
+        integers = [np.issubdtype(x.dtype, np.integer) for x in operands]
+        arrays = [x if whole else _entries(x) for x, whole in zip(operands, integers, strict=True)]
+        return [_move_by_index(equation, arrays)]
     if name in ("scatter-add", "scatter_add"):
-        return [scatter_add(equation, operands)]
+        return [_scatter_add(equation, operands)]
     if name == "select_n":
         truth = _dtype(equation).kind == "b"
         which, cases = operands[0], [_entries(x) for x in operands[1:]]
@@ -189,16 +285,13 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
     if name in ("div", "pow") and np.issubdtype(_dtype(equation), np.integer):
         raise InputError(f"`trace` cannot translate `{name}` of integers: use real numbers.")
     if name in _ARITHMETIC:
-        parameters = equation.params if name in _WITH_PARAMETERS else {}
+        with_parameters = name in ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")
+        parameters = equation.params if with_parameters else {}
         result = _ARITHMETIC[name](*map(_entries, operands), **parameters)
         results = result if equation.primitive.multiple_results else [result]
         return [np.asarray(x, object) for x in results]
-    reason = _INSTEAD.get(name, "it is not elementwise arithmetic, a sum, or a move of entries")
+    reason = _UNSUPPORTED.get(name, "it is not elementwise arithmetic, a sum, or a move of entries")
     raise InputError(f"`trace` cannot translate the JAX primitive `{name}`: {reason}.")
-
-
-def _entries_of_floats(x: np.ndarray) -> np.ndarray:
-    return x if np.issubdtype(x.dtype, np.integer) else _entries(x)
 
 
 def _known(constant: object) -> np.ndarray:
@@ -220,22 +313,23 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.
     for equation in jaxpr.eqns:
         primitive = equation.primitive.name
         operands = [read(name) for name in equation.invars]
-        inner = next((equation.params[k] for k in _INNER_JAXPR if k in equation.params), None)
-        symbolic = any(is_symbolic(x) for x in operands)
-        if inner is not None and primitive not in _INSTEAD:
+        keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+        inner = next((equation.params[k] for k in keys if k in equation.params), None)
+        symbolic = any(_is_symbolic(x) for x in operands)
+        if inner is not None and primitive not in _UNSUPPORTED:
             closed = isinstance(inner, ClosedJaxpr)
             results = _run(
                 inner.jaxpr if closed else inner, inner.consts if closed else [], operands
             )
-        elif primitive in MOVES:
-            results = MOVES[primitive](*operands, **equation.params)
+        elif primitive in _MOVEMENTS:
+            results = _MOVEMENTS[primitive](*operands, **equation.params)
             results = results if equation.primitive.multiple_results else [results]
         elif primitive == "convert_element_type":
             results = [_convert(operands[0], np.dtype(equation.params["new_dtype"]))]
         elif symbolic:
             results = _translate(equation, operands)
         else:
-            results = on_numbers(equation, *operands)
+            results = _on_numbers(equation, *operands)
         dtype = object if symbolic else None
         values.update(
             (name, np.asarray(x, dtype)) for name, x in zip(equation.outvars, results, strict=True)
@@ -254,67 +348,32 @@ def _argument(graph: Graph, number: int, given: tuple[int, ...] | np.ndarray) ->
 
 
 def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
-    """Translates a function of a few arrays into a scalar program.
+    """Translate a function of a few arrays into a scalar program.
 
     The function is ordinary JAX: arithmetic, elementwise functions, `jnp.where` and comparisons,
-    sums, matrix products, and whatever moves entries; also `jvp`, `jacfwd`, `vjp` and
-    `linear_transpose` of such. Loops are Python loops, which the trace unrolls. Constants are
+    sums, matrix products, and movements of entries; also `jvp`, `jacfwd`, `vjp` and
+    `linear_transpose` of these. Loops are Python loops, which the trace unrolls. Constants are
     folded and equal expressions are merged.
 
     The trace is in float64, whatever the precision of the process. Folding `0 x` to 0 hides a NaN
-    in x: check inputs before they come to the program.
+    in x: check inputs beforehand.
 
     Args:
-        function: Takes one array per input and returns any PyTree of arrays.
-        inputs: For each argument its shape, or an object array that mixes `FREE` entries
-            with numbers; the numbers become constants of the program.
+        function: Function of one array for each input; returns any PyTree of arrays.
+        inputs: Shape of each argument, or an object array that mixes `FREE` entries with
+            numbers; the numbers become constants of the program.
 
     Raises:
-        InputError: If the function does what a scalar program cannot, such as a loop
-            of JAX or a sort; or if it closes over a value that JAX is tracing.
+        InputError: If the function does something that a scalar program cannot, such as a JAX
+            loop or a sort, or closes over a value that JAX is tracing.
     """
     graph = Graph()
     arguments = [_argument(graph, k, given) for k, given in enumerate(inputs)]
-    result = applied(function, *arguments)
-    leaves, structure = jax.tree.flatten(result)
-    outputs: list[Operand] = [e for x in leaves for e in x.ravel()]
-    shapes = tuple(x.shape for x in arguments)
-    return assemble(shapes, outputs, tuple(x.shape for x in leaves), structure)
-
-
-def applied(function: Callable, *arrays: np.ndarray) -> Any:
-    """Runs a function, as `trace` takes it, on arrays of scalars of one graph.
-
-    Args:
-        function: Takes these arrays and returns any PyTree of arrays.
-        arrays: Of scalars and numbers.
-
-    Returns:
-        What the function returns, with arrays of scalars and numbers in it.
-
-    Raises:
-        InputError: Like `trace`.
-    """
     with double_precision():
-        avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arrays]
+        avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arguments]
         jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)
-        found = _run(jaxpr.jaxpr, jaxpr.consts, list(arrays))
-    leaves = [np.array([scalar.as_number(e) for e in _entries(x).ravel()], object) for x in found]
-    shaped = [x.reshape(np.shape(y)) for x, y in zip(leaves, found, strict=True)]
-    return jax.tree.unflatten(jax.tree.structure(result), shaped)
-
-
-def program_of_scalars(
-    function: Callable[..., np.ndarray], *inputs: tuple[int, ...] | np.ndarray
-) -> Program:
-    """A program from a function of arrays of scalars, which computes with them itself.
-
-    Args:
-        function: Takes one array of scalars per input and returns one.
-        inputs: As for `trace`.
-    """
-    graph = Graph()
-    arguments = [_argument(graph, k, given) for k, given in enumerate(inputs)]
-    result = function(*arguments)
+        leaves = _run(jaxpr.jaxpr, jaxpr.consts, arguments)
+    outputs = [scalar.as_number(e) for x in leaves for e in _entries(x).ravel()]
     shapes = tuple(x.shape for x in arguments)
-    return assemble(shapes, list(result.ravel()), (result.shape,), jax.tree.structure(0))
+    structure = jax.tree.structure(result)
+    return assemble(shapes, outputs, tuple(np.shape(x) for x in leaves), structure)

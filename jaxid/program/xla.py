@@ -1,5 +1,12 @@
-"""A scalar program as a fused XLA computation on batch-last arrays."""
+"""A scalar program as a fused XLA computation on batch-last arrays.
 
+XLA's CPU backend fuses elementwise operations into the loops of their consumers, and copies a
+shared operation into each of them. A program of a thousand operations with hundreds of results
+would be computed many times over. A fence on a shared value stops that.
+"""
+
+import abc
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,56 +17,122 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array
 from jaxid.errors import InputError
-from jaxid.program.fence import AbstractFence, default_fence, fenced_nodes
-from jaxid.program.operation import Operation
+from jaxid.program.operations import Operation
 from jaxid.program.program import Program
 from jaxid.program.sincos import sine_cosine as polynomial_sine_cosine
 
 ELEMENTWISE: dict[Operation, Callable] = {
-    Operation.ADD: lambda x, y: x + y,
-    Operation.SUBTRACT: lambda x, y: x - y,
-    Operation.MULTIPLY: lambda x, y: x * y,
-    Operation.DIVIDE: lambda x, y: x / y,
-    Operation.NEGATE: lambda x: -x,
-    Operation.POWER: lambda x, y: x**y,
-    Operation.ARC_TANGENT_2: jnp.arctan2,
-    Operation.MAXIMUM: jnp.maximum,
-    Operation.MINIMUM: jnp.minimum,
-    Operation.LESS: lambda x, y: x < y,
-    Operation.LESS_EQUAL: lambda x, y: x <= y,
-    Operation.EQUAL: lambda x, y: x == y,
-    Operation.NOT_EQUAL: lambda x, y: x != y,
-    Operation.AND: lambda x, y: x & y,
-    Operation.OR: lambda x, y: x | y,
-    Operation.NOT: lambda x: ~x,
-    Operation.SELECT: jnp.where,
-    Operation.ABSOLUTE: jnp.abs,
-    Operation.SIGN: jnp.sign,
-    Operation.TANGENT: jnp.tan,
-    Operation.ARC_SINE: jnp.arcsin,
-    Operation.ARC_COSINE: jnp.arccos,
-    Operation.ARC_TANGENT: jnp.arctan,
-    Operation.HYPERBOLIC_SINE: jnp.sinh,
-    Operation.HYPERBOLIC_COSINE: jnp.cosh,
-    Operation.HYPERBOLIC_TANGENT: jnp.tanh,
-    Operation.SQUARE_ROOT: jnp.sqrt,
-    Operation.CUBE_ROOT: jnp.cbrt,
-    Operation.EXPONENTIAL: jnp.exp,
-    Operation.LOGARITHM: jnp.log,
-    Operation.EXPONENTIAL_MINUS_ONE: jnp.expm1,
-    Operation.LOGARITHM_OF_ONE_PLUS: jnp.log1p,
+    o: getattr(jnp, o.numpy.__name__) for o in Operation if o is not Operation.INPUT
 }
 CIRCULAR = (Operation.SINE, Operation.COSINE)
 SineCosine = Callable[[Array], tuple[Array, Array]]
 
 
+class AbstractFence(eqx.Module):
+    """A way to make XLA compute a shared value only once."""
+
+    @abc.abstractmethod
+    def anchor(self, reference: Array) -> Array:
+        """Make the number that the fences of a program use.
+
+        Args:
+            reference: Number known only at run time, in the precision of the program.
+        """
+
+    @abc.abstractmethod
+    def __call__(self, x: Array, anchor: Array) -> Array:
+        """Return x, which XLA now computes once."""
+
+
+class NoFence(AbstractFence):
+    """No fence: XLA decides."""
+
+    def anchor(self, reference: Array) -> Array:
+        """Return any number; it is not used."""
+        return reference
+
+    def __call__(self, x: Array, anchor: Array) -> Array:
+        """Return x itself."""
+        return x
+
+
+class BarrierFence(AbstractFence):
+    """An optimization barrier, which newer versions of XLA respect on a CPU."""
+
+    def anchor(self, reference: Array) -> Array:
+        """Return any number; it is not used."""
+        return reference
+
+    def __call__(self, x: Array, anchor: Array) -> Array:
+        """Return x behind a barrier of its own."""
+        return jax.lax.optimization_barrier(x)
+
+
+class DivisionFence(AbstractFence):
+    """A division by a one that XLA cannot recognise.
+
+    XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for NaN and
+    infinities. The derivative has the same fence.
+    """
+
+    def anchor(self, reference: Array) -> Array:
+        """Return (sign bit of an input | 1), which is 1 for any input, NaN included."""
+        wide = reference.dtype == jnp.float64
+        bits = jax.lax.bitcast_convert_type(
+            jax.lax.stop_gradient(reference), jnp.uint64 if wide else jnp.uint32
+        )
+        sign = jax.lax.shift_right_logical(bits, jnp.full_like(bits, 63 if wide else 31))
+        return (sign | jnp.ones_like(bits)).astype(reference.dtype)
+
+    def __call__(self, x: Array, anchor: Array) -> Array:
+        """Return x divided by one."""
+        return x / anchor
+
+
+def default_fence(backend: str, version: tuple[int, ...]) -> AbstractFence:
+    """Choose a fence that was measured to work (`benchmarks/fences.py`, JAX 0.10.2 and 0.12.0).
+
+    In 0.10 only the division works on a CPU; in 0.12 both do, equally fast, and the barrier adds
+    no arithmetic. On a GPU a fence would break the program into many kernels, and float64 divisions
+    are slow, so that none is placed; nothing was measured there.
+
+    Args:
+        backend: Name of JAX's platform as `jax.default_backend()` gives it.
+        version: Version of JAX as `jax.__version_info__` gives it.
+    """
+    if backend != "cpu":
+        return NoFence()
+    return BarrierFence() if version >= (0, 12) else DivisionFence()
+
+
+def fenced_nodes(program: Program, threshold: int = 6) -> frozenset[int]:
+    """Return positions of the nodes that a fence pays for.
+
+    These are the nodes with (uses - 1) times the cost of computing them again > threshold.
+
+    Args:
+        program: Program to place fences in.
+        threshold: Threshold [operations]; between 0 and 30 the speed hardly depends on it.
+    """
+    free = (Operation.INPUT, Operation.NEGATE)
+    costs, fenced = [], set()
+    for k, node in enumerate(program.nodes):
+        own = 20 if "function" in node.operation.traits else node.operation not in free
+        cost = own + sum(costs[i] for i in node.uses)
+        if cost * (program.uses[k] - 1) > threshold:
+            fenced.add(k)
+            cost = 0
+        costs.append(cost)
+    return frozenset(fenced)
+
+
 class Values(NamedTuple):
-    """Everything that a program has computed.
+    """Values of a program.
 
     Attributes:
-        nodes: For each node its array.
-        pairs: Sines and cosines by their angles' positions.
-        anchor: What the fences hold on to.
+        nodes: Array of each node.
+        pairs: Sines and cosines by the positions of their angles.
+        anchor: Number that the fences use.
     """
 
     nodes: list[Array]
@@ -68,10 +141,16 @@ class Values(NamedTuple):
 
 
 class Lowered(eqx.Module):
-    """A program that runs on JAX arrays whose batch axes stand last.
+    """A program on JAX arrays whose batch axes stand last.
 
-    Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it inside of
-    `jax.jit`: without, each operation is dispatched by itself.
+    Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it inside
+    `jax.jit`: otherwise each operation is dispatched by itself.
+
+    Attributes:
+        program: Program made by `trace`.
+        fence: Fence of shared values.
+        fenced: Positions of the nodes that have a fence.
+        sine_cosine: Function from angles to their sines and cosines.
     """
 
     program: Program = eqx.field(static=True)
@@ -80,20 +159,19 @@ class Lowered(eqx.Module):
     sine_cosine: SineCosine = eqx.field(static=True)
 
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
-        """Computes the packed result.
+        """Compute the packed result.
 
         Args:
-            arrays: For each input an array of the input's shape and any batch axes behind it.
+            arrays: For each input an array of the input's shape, followed by any batch axes.
 
         Returns:
-            For each entry of each output, in order, an array of the batch's shape, or
-            the constant that the entry always is.
+            For each entry of each output, in order, an array of the batch's shape, or a constant.
         """
         values = self.run(self.entries(*arrays), ELEMENTWISE).nodes
         return [values[x] if isinstance(x, int) else x for x in self.program.outputs]
 
     def entries(self, *arrays: AnyArray) -> list[Array]:
-        """The inputs with their own axes made one, and with the whole batch behind."""
+        """Return the inputs with their own axes merged into one, followed by the whole batch."""
         batch = self.program.batch_shape([np.shape(x) for x in arrays])
         dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
         if not jnp.issubdtype(dtype, jnp.floating):
@@ -104,20 +182,20 @@ class Lowered(eqx.Module):
         ]
 
     def dense(self, *arrays: AnyArray) -> Any:
-        """Computes the outputs in the structure of the traced function, batch axes last.
+        """Compute the outputs in the structure of the traced function, batch axes last.
 
-        Writing out the constants costs memory and time; prefer the packed result.
+        Constants cost memory and time here; prefer the packed result.
         """
         packed = self(*arrays)
         batch = self.program.batch_shape([np.shape(x) for x in arrays])
         return unpack(self.program, packed, batch, jnp.result_type(*arrays, float))
 
     def run(self, entries: list[Array], operations: dict[Operation, Callable]) -> Values:
-        """Computes all nodes.
+        """Compute all nodes.
 
         Args:
-            entries: Of each input, its entries first.
-            operations: How each kind of operation is done.
+            entries: Arrays of the inputs, entries first.
+            operations: Function for each kind of operation.
         """
         nodes = self.program.nodes
         dtype = entries[0].dtype if entries else jnp.result_type(float)
@@ -151,21 +229,21 @@ class Lowered(eqx.Module):
 
 
 def primitives(like: Array) -> dict[Operation, Callable]:
-    """The operations with JAX's own primitives for the arithmetic.
+    """Return the operations with JAX's own primitives for the arithmetic.
 
-    They skip what array operators do about types and shapes: a program is traced in a fraction of
-    the time. Only where nothing is differentiated, since JAX differentiates operators faster.
+    They skip the checks of types and shapes in array operators, so that a program is traced in a
+    fraction of the time. JAX differentiates operators faster: do not differentiate these.
 
     Args:
-        like: Some array of the batch's shape.
+        like: Array of the batch's shape.
     """
     numbers: dict[bytes, Array] = {}
 
     def whole(x: Any) -> Array:
-        """A number as an array, made once."""
+        """Return a number as an array, made once."""
         if not isinstance(x, float):
             return x
-        # Plus and minus zero are equal, but not the same.
+        # Plus and minus zero are equal, but not identical.
         bits = np.float64(x).tobytes()
         if bits not in numbers:
             numbers[bits] = jax.lax.full_like(like, x)
@@ -188,13 +266,13 @@ def lower(
     fence: AbstractFence | None = None,
     sine_cosine: SineCosine = polynomial_sine_cosine,
 ) -> Lowered:
-    """Prepares a program for JAX arrays.
+    """Prepare a program for JAX arrays.
 
     Args:
-        program: Made by `trace`.
-        fence: How shared values are kept from being computed again; by default what was
-            measured best for this backend and version of JAX.
-        sine_cosine: Maps angles to their sines and cosines.
+        program: Program made by `trace`.
+        fence: Fence of shared values; by default the fastest one for this backend and version of
+            JAX.
+        sine_cosine: Function from angles to their sines and cosines.
     """
     if fence is None:
         fence = default_fence(jax.default_backend(), jax.__version_info__)
@@ -202,34 +280,30 @@ def lower(
 
 
 def unpack(program: Program, packed: list, batch: tuple[int, ...], dtype: Any) -> Any:
-    """A packed result as dense JAX arrays in the structure of the traced function, batch last."""
+    """Return a packed result as dense arrays in the structure of the traced function."""
     full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in packed]
-    leaves, start = [], 0
-    for shape in program.output_shapes:
-        size = int(np.prod(shape, dtype=int))
-        entries = full[start : start + size]
+    leaves = []
+    for entries, shape in zip(program.split(full), program.output_shapes, strict=True):
         stacked = jnp.stack(entries) if entries else jnp.zeros((0, *batch), dtype)
         leaves.append(stacked.reshape((*shape, *batch)))
-        start += size
     return jax.tree.unflatten(program.structure, leaves)
 
 
 def _entries(x: Array, shape: tuple[int, ...], batch: tuple[int, ...]) -> Array:
-    """The input with its own axes made one, and with the whole batch behind."""
     own = x.shape[len(shape) :]
-    size = int(np.prod(shape, dtype=int))
+    size = math.prod(shape)
     missing = (1,) * (len(batch) - len(own))
     return jnp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch))
 
 
 def _input_angles(program: Program) -> list[int]:
-    """Positions of the inputs of which a sine or a cosine is taken."""
+    """Return positions of the inputs whose sine or cosine is needed."""
     angles = {n.uses[0]: None for n in program.nodes if n.operation in CIRCULAR}
     return [k for k in angles if program.nodes[k].operation is Operation.INPUT]
 
 
 def _fenced(sine_cosine: SineCosine, fence: AbstractFence) -> Callable:
-    """Fences the pair, and makes its derivative from the fenced values."""
+    """Fence the pair, and make its derivative from the fenced values."""
 
     @jax.custom_jvp
     def circular(x: Array, anchor: Array) -> tuple[Array, Array]:

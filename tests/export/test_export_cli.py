@@ -86,7 +86,7 @@ def test_files_hold_the_model(report, run):
         (("empty", "--to", "c"), "`empty` holds no `model.json`"),
         (("stick.urdf", "--to", "c"), "is no model file"),
         (("report", "--to", "c", "-o", "arm.h"), "must be a C file like arm.c"),
-        (("report", "--to", "c", "-o", "7arm.c"), "must be an identifier of C"),
+        (("report", "--to", "c", "-o", "7arm.c"), "names in C code"),
         (("report", "--to", "json", "-o", "empty"), "`empty` is a folder"),
         (("report", "--to", "urdf", "--urdf", "other.urdf"), "`other.urdf` does not exist"),
     ],

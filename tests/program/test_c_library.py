@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.program import Library, definition, trace
+from jaxid.program import CWriter, trace
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
 SIZE = 5
@@ -22,15 +22,15 @@ program = trace(lambda x: (jnp.sin(x), jnp.cos(x), jnp.tanh(x)), (SIZE,))
 @pytest.fixture(scope="module", params=[(d, f) for d in (True, False) for f in FLAGS])
 def built(request, tmp_path_factory):
     double, flags = request.param
-    library = Library.of([program], "arm", double=double)
+    writer = CWriter(double, "arm", [program])
     names = (["x"], ["s", "c", "h"])
-    text = definition(program, "run", *names, double=double, library=library)
+    text = writer.definition(program, "run", *names)
     path = tmp_path_factory.mktemp("library") / "library.c"
-    path.write_text(HEAD + library.text() + text)
+    path.write_text(HEAD + writer.library() + text)
     target = path.with_suffix(".so")
     command = ["gcc", "-O2", *FLAGS[flags], "-shared", "-fPIC", str(path), "-o", str(target)]
     subprocess.run(command, check=True)
-    return double, library, target
+    return double, writer, target
 
 
 @pytest.fixture(scope="module")
@@ -49,16 +49,16 @@ def run(built):
 
 
 def test_only_as_many_as_are_needed_and_an_even_number(built):
-    _, library, _ = built
-    assert dict(library.widths) == {"sine_cosine": 6, "tanh": 6}
-    assert "tanh" not in Library.of([trace(jnp.sin, (2,))], "arm", double=True).text()
-    assert Library.of([trace(jnp.exp, (2,))], "arm", double=True).text() == ""
+    _, writer, _ = built
+    assert writer.widths == {"sine_cosine": 6, "tanh": 6}
+    assert "tanh" not in CWriter(True, "arm", [trace(jnp.sin, (2,))]).library()
+    assert CWriter(True, "arm", [trace(jnp.exp, (2,))]).library() == ""
 
 
 def test_accuracy(built, run):
-    double, library, _ = built
+    double, writer, _ = built
     allowed, random = (2e-16, 1.2e-7)[not double], np.random.default_rng(0)
-    for size in (0.8, 3.0, 50.0, 6.28 * library.turns):
+    for size in (0.8, 3.0, 50.0, 6.28 * writer.turns):
         x, found = run(random.uniform(-size, size, (400, SIZE)))
         for got, function in zip(found, (np.sin, np.cos, np.tanh), strict=True):
             assert np.abs(got - function(x)).max() < allowed
@@ -67,8 +67,8 @@ def test_accuracy(built, run):
 
 
 def test_what_cannot_be_known_is_nan(built, run):
-    _, library, _ = built
-    far = 6.29 * library.turns
+    _, writer, _ = built
+    far = 6.29 * writer.turns
     for bad in (np.nan, np.inf, -np.inf, far, -far, 1e18, -1e30, 2.0**63):
         x = np.full((1, SIZE), 0.3)
         x[0, 2] = bad

@@ -97,7 +97,7 @@ def test_where_nothing_can_be_written_there_is_no_cache(untouched, tmp_path):
 
 
 def test_the_oldest_go_first(untouched, tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "LARGEST", 2500)
+    monkeypatch.setattr(cache, "MAX_BYTES", 2500)
     now = time.time()
     for age, name in enumerate("edcba"):
         (tmp_path / name).write_bytes(bytes(1000))

@@ -5,7 +5,7 @@ import weakref
 import numpy as np
 import pytest
 
-from jaxid.program.operation import Operation
+from jaxid.program.operations import Operation
 from jaxid.program.scalar import (
     Graph,
     add,

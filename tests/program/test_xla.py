@@ -17,7 +17,7 @@ from jaxid.program import (
     trace,
     unpack,
 )
-from jaxid.program.fence import fenced_nodes
+from jaxid.program.xla import fenced_nodes
 
 FENCES = (NoFence(), BarrierFence(), DivisionFence())
 each_fence = pytest.mark.parametrize("fence", FENCES, ids=lambda f: type(f).__name__)

@@ -3,6 +3,7 @@
 import ctypes
 import os
 import statistics
+import subprocess
 import tempfile
 import time
 from pathlib import Path
@@ -11,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.export.c_code import export_c
-from jaxid.export.compiled_model import CompiledModel
 from jaxid.identification.fit import Fit
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
@@ -62,29 +62,30 @@ class Timing(NamedTuple):
         return self.literal / self.full
 
 
-class _Loops(CompiledModel):
-    """The exported model with loops around its functions: a call from Python costs more than one.
+def _compile(fit: Fit, folder: Path) -> ctypes.CDLL:
+    """Compile the exported model with loops around its functions.
 
-    Args:
-        fit: The model.
+    Raises:
+        OSError: If there is no C compiler.
+        subprocess.CalledProcessError: If the compiler fails.
     """
+    export_c(fit, folder, name=NAME)
+    source, target = folder / "loops.c", folder / "loops.so"
+    source.write_text(_LOOPS, encoding="ascii")
+    command = [os.environ.get("CC", "cc"), "-std=c99", *FLAGS, "-shared", "-fPIC", str(source)]
+    subprocess.run([*command, "-o", str(target), "-lm"], check=True, capture_output=True)
+    return ctypes.CDLL(str(target))
 
-    def __init__(self, fit: Fit):
-        with tempfile.TemporaryDirectory(prefix="jaxid-") as folder:
-            export_c(fit, folder, name=NAME)
-            source = Path(folder) / "loops.c"
-            source.write_text(_LOOPS, encoding="ascii")
-            super().__init__(source, fit.base.model.robot.joints, fit.base.size, flags=FLAGS)
 
-    def cost(self, form: str, states: tuple[np.ndarray, ...]) -> float:
-        """Time of one call [s], less what reaching the library takes."""
-        loop = getattr(self._library, f"loop_{form}")
-        loop.restype = None
-        arrays = (*states, np.empty_like(states[0]))
-        places = [ctypes.c_void_p(x.ctypes.data) for x in arrays]
-        begin = time.perf_counter()
-        loop(ctypes.c_long(CALLS), ctypes.c_long(len(states[0])), *places)
-        return (time.perf_counter() - begin) / CALLS
+def _cost(library: ctypes.CDLL, form: str, states: tuple[np.ndarray, ...]) -> float:
+    """Return the time of one call [s]; a call from Python would cost more than the function."""
+    loop = getattr(library, f"loop_{form}")
+    loop.restype = None
+    arrays = (*states, np.empty_like(states[0]))
+    places = [ctypes.c_void_p(x.ctypes.data) for x in arrays]
+    begin = time.perf_counter()
+    loop(ctypes.c_long(CALLS), ctypes.c_long(len(states[0])), *places)
+    return (time.perf_counter() - begin) / CALLS
 
 
 def timing(fit: Fit, trajectory: AbstractTrajectory) -> Timing | str:
@@ -94,13 +95,14 @@ def timing(fit: Fit, trajectory: AbstractTrajectory) -> Timing | str:
         fit: With a complete set of standard parameters.
         trajectory: Whose torques are computed.
     """
-    try:
-        loops = _Loops(fit)
-    except RuntimeError as failure:
-        return f"feed-forward torques were not timed: {failure}"
     motion = trajectory.motion(np.linspace(0.0, float(trajectory.duration), STATES))
     states = tuple(np.ascontiguousarray(x, np.float64) for x in (motion.q, motion.qd, motion.qdd))
     forms = ("torque_of_parameters", "torque", "torque_of_masses")
-    turns = [[loops.cost(form, states) for form in forms] for _ in range(TURNS)]
+    with tempfile.TemporaryDirectory(prefix="jaxid-") as folder:
+        try:
+            library = _compile(fit, Path(folder))
+        except (OSError, subprocess.CalledProcessError) as failure:
+            return f"feed-forward torques were not timed: {failure}"
+        turns = [[_cost(library, form, states) for form in forms] for _ in range(TURNS)]
     where = f"C, {os.environ.get('CC', 'cc')} {' '.join(FLAGS)}"
     return Timing(where, *(statistics.median(column) for column in zip(*turns, strict=True)))

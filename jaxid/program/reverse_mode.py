@@ -1,20 +1,20 @@
-"""Reverse mode of a lowered program, written down node by node.
+"""Reverse-mode derivative of a lowered program, node by node.
 
-JAX finds the same derivative by itself, but looks at each operation many times on its way: that
-takes longer than everything else where the compiled result comes from a cache.
+JAX finds the same derivative, but processes each operation many times: where the compiled result
+comes from a cache, that takes longer than everything else.
 """
 
 import functools
+import math
 from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxid.arrays import AnyArray, Array
-from jaxid.program.operation import Operation
+from jaxid.program.operations import Operation
 from jaxid.program.program import Node, Program, Reference
 from jaxid.program.xla import CIRCULAR, ELEMENTWISE, Lowered, Values, primitives
 
@@ -22,49 +22,49 @@ Groups = tuple[tuple[int, ...], ...]
 
 
 class Reversible(eqx.Module):
-    """A lowered program for `grad` and `vjp`: faster to trace, the same numbers.
+    """A lowered program for `grad` and `vjp`, with the same numbers and faster to trace.
 
-    It has no forward mode: for `jvp`, `jacfwd` and `hessian` use the lowered program itself.
+    It has no forward mode: use the lowered program itself for `jvp`, `jacfwd` and `hessian`.
 
     Attributes:
-        lowered: The program on JAX arrays.
+        lowered: Program on JAX arrays.
     """
 
     lowered: Lowered
 
     @property
     def program(self) -> Program:
-        """What is computed."""
+        """Program that is computed."""
         return self.lowered.program
 
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
-        """Computes the packed result, as `Lowered` does."""
+        """Compute the packed result, as `Lowered` does."""
         entries, varying = self.lowered.entries(*arrays), _varying(self.program)
         values: Any = _values(self.lowered, entries) if varying else []
-        found = dict(zip(varying, values, strict=True))
-        return [found[x] if isinstance(x, int) else x for x in self.program.outputs]
+        by_node = dict(zip(varying, values, strict=True))
+        return [by_node[x] if isinstance(x, int) else x for x in self.program.outputs]
 
     def stacked(self, groups: Groups, *arrays: AnyArray) -> list[Array]:
-        """Computes some entries of the packed result, stacked: faster to trace than one by one.
+        """Compute entries of the packed result, stacked: faster to trace than one by one.
 
         Args:
             groups: Positions in the packed result; each group becomes one array.
-            arrays: As for a call.
+            arrays: For each input an array of the input's shape, followed by any batch axes.
 
         Returns:
-            For each group an array whose last axis but one counts its entries.
+            For each group an array with its entries along the last axis but one.
         """
         stacked: Any = _stacked(self.lowered, groups, self.lowered.entries(*arrays))
         return stacked
 
 
 def _varying(program: Program) -> list[int]:
-    """Positions of the outputs' nodes, each one once."""
+    """Return positions of the nodes that are outputs, without repetitions."""
     return list(dict.fromkeys(x for x in program.outputs if isinstance(x, int)))
 
 
 def _computed(lowered: Lowered, entries: list[Array]) -> tuple[Values, Array]:
-    """All nodes, and some array of the batch's shape."""
+    """Return all nodes, and an array of the batch's shape."""
     first = next(x[0] for x in entries if len(x))
     return lowered.run(entries, primitives(first)), first
 
@@ -75,12 +75,12 @@ def _values(lowered: Lowered, entries: list[Array]) -> list[Array]:
 
 
 def _values_forward(lowered: Lowered, entries: list[Array]) -> tuple[list[Array], Values]:
-    found, _ = _computed(lowered, entries)
-    return [found.nodes[k] for k in _varying(lowered.program)], found
+    values, _ = _computed(lowered, entries)
+    return [values.nodes[k] for k in _varying(lowered.program)], values
 
 
-def _values_backward(lowered: Lowered, found: Values, given: list[Array]) -> tuple[list[Array]]:
-    return (_pulled(lowered, found, zip(_varying(lowered.program), given, strict=True), given[0]),)
+def _values_backward(lowered: Lowered, values: Values, given: list[Array]) -> tuple[list[Array]]:
+    return (_pull(lowered, values, zip(_varying(lowered.program), given, strict=True), given[0]),)
 
 
 _values.defvjp(_values_forward, _values_backward)
@@ -94,22 +94,22 @@ def _stacked(lowered: Lowered, groups: Groups, entries: list[Array]) -> list[Arr
 def _stacked_forward(
     lowered: Lowered, groups: Groups, entries: list[Array]
 ) -> tuple[list[Array], tuple[Values, Array]]:
-    found, first = _computed(lowered, entries)
+    values, first = _computed(lowered, entries)
     axis = max(first.ndim - 1, 0)
     arrays = []
     for group in groups:
         own = [lowered.program.outputs[k] for k in group]
-        rows = [found.nodes[x] if isinstance(x, int) else jax.lax.full_like(first, x) for x in own]
+        rows = [values.nodes[x] if isinstance(x, int) else jax.lax.full_like(first, x) for x in own]
         rows = [jax.lax.expand_dims(x, (axis,)) for x in rows]
         empty = jnp.zeros((*first.shape[:axis], 0, *first.shape[axis:]), first.dtype)
         arrays.append(jax.lax.concatenate(rows, axis) if rows else empty)
-    return arrays, (found, first)
+    return arrays, (values, first)
 
 
 def _stacked_backward(
-    lowered: Lowered, groups: Groups, kept: tuple[Values, Array], given: list[Array]
+    lowered: Lowered, groups: Groups, residuals: tuple[Values, Array], given: list[Array]
 ) -> tuple[list[Array]]:
-    found, first = kept
+    values, first = residuals
     axis = max(first.ndim - 1, 0)
     each = []
     for group, stack in zip(groups, given, strict=True):
@@ -117,22 +117,22 @@ def _stacked_backward(
             x = lowered.program.outputs[k]
             if isinstance(x, int):
                 each.append((x, jax.lax.index_in_dim(stack, row, axis, keepdims=False)))
-    return (_pulled(lowered, found, each, first),)
+    return (_pull(lowered, values, each, first),)
 
 
 _stacked.defvjp(_stacked_forward, _stacked_backward)
 
 
-def _pulled(
-    lowered: Lowered, found: Values, given: Iterable[tuple[int, Array]], like: Array
+def _pull(
+    lowered: Lowered, values: Values, given: Iterable[tuple[int, Array]], like: Array
 ) -> list[Array]:
-    """The cotangents of the inputs from those of some nodes.
+    """Return cotangents of the inputs from those of some nodes.
 
     Args:
-        lowered: The program.
-        found: All that it has computed.
+        lowered: Program on JAX arrays.
+        values: Values of the program.
         given: Positions of nodes with their cotangents.
-        like: Some array of the batch's shape.
+        like: Array of the batch's shape.
     """
     nodes = lowered.program.nodes
     sums: list[Array | None] = [None] * len(nodes)
@@ -140,15 +140,15 @@ def _pulled(
     multiply, negate = table[Operation.MULTIPLY], table[Operation.NEGATE]
 
     def value(x: Reference) -> Array | float:
-        return found.nodes[x] if isinstance(x, int) else x
+        return values.nodes[x] if isinstance(x, int) else x
 
-    def give(x: Reference, c: Array) -> None:
+    def accumulate(x: Reference, c: Array) -> None:
         if isinstance(x, int):
             old = sums[x]
             sums[x] = c if old is None else jax.lax.add(old, c)
 
     for k, c in given:
-        give(k, c)
+        accumulate(k, c)
     for position in reversed(range(len(nodes))):
         node, c = nodes[position], sums[position]
         if c is None or node.operation is Operation.INPUT:
@@ -156,52 +156,52 @@ def _pulled(
         operands = node.operands
         if node.operation in CIRCULAR:
             (angle,) = node.uses
-            sine, cosine = found.pairs[angle]
+            sine, cosine = values.pairs[angle]
             is_sine = node.operation is Operation.SINE
-            give(angle, multiply(c, cosine) if is_sine else negate(multiply(c, sine)))
+            accumulate(angle, multiply(c, cosine) if is_sine else negate(multiply(c, sine)))
             continue
         if position in lowered.fenced:
-            c = lowered.fence(c, found.anchor)
+            c = lowered.fence(c, values.anchor)
         if node.operation is Operation.ADD:
-            give(operands[0], c)
-            give(operands[1], c)
+            accumulate(operands[0], c)
+            accumulate(operands[1], c)
         elif node.operation is Operation.SUBTRACT:
-            give(operands[0], c)
+            accumulate(operands[0], c)
             if isinstance(operands[1], int):
-                give(operands[1], negate(c))
+                accumulate(operands[1], negate(c))
         elif node.operation is Operation.NEGATE:
-            give(operands[0], negate(c))
+            accumulate(operands[0], negate(c))
         elif node.operation is Operation.MULTIPLY:
             for own, other in (operands, operands[::-1]):
                 if isinstance(own, int):
-                    give(own, multiply(c, value(other)))
+                    accumulate(own, multiply(c, value(other)))
         else:
-            for own, share in _shares(node, [value(x) for x in operands], c):
-                give(own, share)
-    return _of_inputs(lowered.program, jax.lax.full_like(like, 0), sums)
+            for own, cotangent in _operand_cotangents(node, [value(x) for x in operands], c):
+                accumulate(own, cotangent)
+    return _input_cotangents(lowered.program, jax.lax.full_like(like, 0), sums)
 
 
-def _shares(node: Node, operands: list[Any], c: Array) -> list[tuple[int, Array]]:
-    """What JAX's own rule gives each operand of an operation."""
+def _operand_cotangents(node: Node, operands: list[Any], c: Array) -> list[tuple[int, Array]]:
+    """Return the cotangents of an operation's operands by JAX's own rule."""
     places = [
         k
         for k, x in enumerate(operands)
         if isinstance(node.operands[k], int) and jnp.issubdtype(x.dtype, jnp.floating)
     ]
 
-    def of_places(*chosen: Array) -> Array:
+    def apply(*differentiated: Array) -> Array:
         full = list(operands)
-        for k, x in zip(places, chosen, strict=True):
+        for k, x in zip(places, differentiated, strict=True):
             full[k] = x
         return ELEMENTWISE[node.operation](*full)
 
-    _, pull = jax.vjp(of_places, *(operands[k] for k in places))
+    _, pull = jax.vjp(apply, *(operands[k] for k in places))
     return [(int(node.operands[k]), x) for k, x in zip(places, pull(c), strict=True)]
 
 
-def _of_inputs(program: Program, zero: Array, sums: list[Array | None]) -> list[Array]:
-    """The cotangents of the inputs, entries first."""
-    rows = [[zero] * int(np.prod(shape, dtype=int)) for shape in program.input_shapes]
+def _input_cotangents(program: Program, zero: Array, sums: list[Array | None]) -> list[Array]:
+    """Return cotangents of the inputs, entries first."""
+    rows = [[zero] * math.prod(shape) for shape in program.input_shapes]
     for node, c in zip(program.nodes, sums, strict=True):
         if node.operation is Operation.INPUT and c is not None:
             number, entry = node.place

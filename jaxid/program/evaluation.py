@@ -1,0 +1,201 @@
+"""A scalar program without a compiler: on NumPy arrays, or on single floats.
+
+NumPy is for few samples, and for decisions that must not depend on the precision in which JAX runs;
+it computes in float64. Floats are for a loop in which each sample needs the one before, such as a
+simulation: NumPy would pay its overhead for every operation and XLA take seconds to compile,
+whereas Python runs a program of a thousand operations in some thirty microseconds at once.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxid.arrays import AnyArray
+from jaxid.program.operations import Operation
+from jaxid.program.program import Program, Reference
+
+_BLOCK = 1024
+"""Samples at a time, so that intermediate values stay in the processor's cache."""
+
+
+class _Plan(NamedTuple):
+    """Assignment of values to memory cells: cells of the results first, then reused cells.
+
+    Attributes:
+        loads: For each entry of an input its cell, the input's number and the entry's position.
+        steps: Function, operands, result's cell, and whether it can write into that cell.
+        results: Cells of the nodes that are results.
+        cells: Number of cells.
+    """
+
+    loads: tuple[tuple[int, int, int], ...]
+    steps: tuple[tuple[Callable, tuple[Reference, ...], int, bool], ...]
+    results: dict[int, int]
+    cells: int
+
+
+def evaluate(program: Program, *arrays: AnyArray) -> Any:
+    """Compute the outputs of a program in NumPy.
+
+    Args:
+        program: Program made by `trace`.
+        arrays: For each input an array of the input's shape, followed by any batch axes.
+
+    Returns:
+        Outputs in the structure of the traced function, each with the batch axes last.
+
+    Raises:
+        InputError: If the arrays do not fit the program's inputs.
+    """
+    plan = _plan(program)
+    table, batch = _evaluate(program, plan, arrays)
+    leaves = []
+    for entries, shape in zip(program.split(program.outputs), program.output_shapes, strict=True):
+        leaf = np.empty((len(entries), table.shape[1]))
+        for row, x in zip(leaf, entries, strict=True):
+            row[:] = table[plan.results[x]] if isinstance(x, int) else x
+        leaves.append(leaf.reshape((*shape, *batch)))
+    return jax.tree.unflatten(program.structure, leaves)
+
+
+def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | float]:
+    """Compute the packed result of a program in NumPy; constants stay numbers.
+
+    Args:
+        program: Program made by `trace`.
+        arrays: For each input an array of the input's shape, followed by any batch axes.
+
+    Returns:
+        For each entry of each output, in order, an array of the batch's shape, or a constant.
+        Equal entries share one array.
+    """
+    plan = _plan(program)
+    table, batch = _evaluate(program, plan, arrays)
+    rows = [row.reshape(batch) for row in table]
+    return [rows[plan.results[x]] if isinstance(x, int) else x for x in program.outputs]
+
+
+@functools.lru_cache(maxsize=64)
+def _plan(program: Program) -> _Plan:
+    results: dict[int, int] = {}
+    for x in program.outputs:
+        if isinstance(x, int):
+            results.setdefault(x, len(results))
+    last_use = {k: position for position, node in enumerate(program.nodes) for k in node.uses}
+    cell, idle, cells, loads, steps = dict(results), [], len(results), [], []
+    for position, node in enumerate(program.nodes):
+        if position not in cell:
+            if idle:
+                cell[position] = idle.pop()
+            else:
+                cell[position], cells = cells, cells + 1
+        if node.operation is Operation.INPUT:
+            number, entry = node.place
+            loads.append((cell[position], number, entry))
+            continue
+        operands = tuple(cell[x] if isinstance(x, int) else x for x in node.operands)
+        function = _select if node.operation is Operation.SELECT else node.operation.numpy
+        in_place = "truth" not in node.operation.traits
+        steps.append((function, operands, cell[position], in_place))
+        # Only now: no operation may overwrite an operand that it still reads.
+        idle += [cell[k] for k in set(node.uses) if last_use[k] == position and k not in results]
+    return _Plan(tuple(loads), tuple(steps), results, cells)
+
+
+def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
+    np.copyto(out, if_false)
+    np.copyto(out, if_true, where=condition)
+    return out
+
+
+def _evaluate(
+    program: Program, plan: _Plan, arrays: tuple[AnyArray, ...]
+) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Return one row for each distinct node among the outputs, and the batch's shape."""
+    given = [np.asarray(x, np.float64) for x in arrays]
+    batch = program.batch_shape([x.shape for x in given])
+    samples = math.prod(batch)
+    inputs = []
+    for x, shape in zip(given, program.input_shapes, strict=True):
+        own = x.shape[len(shape) :]
+        aligned = x.reshape((*shape, *(1,) * (len(batch) - len(own)), *own))
+        whole = np.broadcast_to(aligned, (*shape, *batch))
+        inputs.append(whole.reshape(math.prod(shape), samples))
+    table = np.empty((len(plan.results), samples))
+    scratch = np.empty((plan.cells - len(plan.results), min(samples, _BLOCK)))
+    with np.errstate(all="ignore"):
+        for start in range(0, samples, _BLOCK):
+            block = slice(start, min(start + _BLOCK, samples))
+            width = block.stop - block.start
+            _run(plan, [x[:, block] for x in inputs], [*table[:, block], *scratch[:, :width]])
+    return table, batch
+
+
+def _run(plan: _Plan, inputs: list[np.ndarray], cells: list[np.ndarray]) -> None:
+    values = list(cells)
+    for target, number, entry in plan.loads:
+        values[target][:] = inputs[number][entry]
+    for function, operands, result, in_place in plan.steps:
+        read = [values[x] if isinstance(x, int) else x for x in operands]
+        if in_place:
+            values[result] = function(*read, out=cells[result])
+        else:
+            values[result] = function(*read)
+
+
+def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
+    """Make a function of lists of floats.
+
+    It takes the entries of each input in C order, and returns the entries of all outputs, one after
+    the other. Division by zero, and functions outside their domain, raise Python's own errors,
+    where NumPy gives infinities and NaN.
+
+    Args:
+        program: Program made by `trace`.
+    """
+    formats = {
+        Operation.NEGATE: "-{0}",
+        Operation.NOT: "not {0}",
+        Operation.SELECT: "{1} if {0} else {2}",
+        Operation.MAXIMUM: "{0} if {0} > {1} or {0} != {0} else {1}",
+        Operation.MINIMUM: "{0} if {0} < {1} or {0} != {0} else {1}",
+        Operation.SIGN: "1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else {0}",
+        Operation.POWER: "{0} ** {1}",
+    }
+    repeating = (Operation.MAXIMUM, Operation.MINIMUM, Operation.SIGN)
+    repeated = {k for node in program.nodes if node.operation in repeating for k in node.uses}
+    lines = [
+        f"({''.join(f'x{k}_{entry}, ' for entry in range(math.prod(shape)))}) = x{k}"
+        for k, shape in enumerate(program.input_shapes)
+        if math.prod(shape)
+    ]
+    spelled: list[str] = []
+
+    def spell(x: Reference) -> str:
+        if isinstance(x, int):
+            return spelled[x]
+        # Python has no literals for infinities and NaN: `math` has their names.
+        return f"({x!r})" if math.isfinite(x) else f"({'-' if x < 0 else ''}{abs(x)!s})"
+
+    for position, node in enumerate(program.nodes):
+        if node.operation is Operation.INPUT:
+            number, entry = node.place
+            spelled.append(f"x{number}_{entry}")
+            continue
+        text = node.operation.spell([spell(x) for x in node.operands], formats)
+        # A value that is needed once is written where it is needed, unless the line gets long.
+        if program.uses[position] == 1 and position not in repeated and len(text) <= 200:
+            spelled.append(f"({text})")
+        else:
+            lines.append(f"t{position} = {text}")
+            spelled.append(f"t{position}")
+    results = "".join(f"{spell(x)}, " for x in program.outputs)
+    names = ", ".join(f"x{k}" for k in range(len(program.input_shapes)))
+    body = "".join(f"    {line}\n" for line in lines)
+    scope = {name: getattr(math, name) for name in dir(math) if not name.startswith("_")}
+    exec(f"def run({names}):\n{body}    return ({results})\n", scope)
+    return scope["run"]
