@@ -183,7 +183,9 @@ def test_numbers_that_are_not_finite_give_nan(compiled, fit):
 
 
 def test_names_in_c(small, tmp_path):
-    with pytest.raises(jid.InputError if hasattr(jid, "InputError") else ValueError, match="7 axes"):
+    with pytest.raises(
+        jid.InputError if hasattr(jid, "InputError") else ValueError, match="7 axes"
+    ):
         jid.export_c(small, tmp_path, name="7 axes")
     assert not list(tmp_path.iterdir())
 
