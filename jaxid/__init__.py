@@ -136,7 +136,6 @@ from jaxid.identification.weights import Unweighted as Unweighted
 from jaxid.measurement.columns import Columns as Columns
 from jaxid.measurement.decimation import Decimation as Decimation
 from jaxid.measurement.decimation import Subsample as Subsample
-from jaxid.measurement.delay import remove_delay as remove_delay
 from jaxid.measurement.filters import AbstractFilter as AbstractFilter
 from jaxid.measurement.filters import PaperFilter as PaperFilter
 from jaxid.measurement.filters import PeriodicFourier as PeriodicFourier
@@ -144,8 +143,9 @@ from jaxid.measurement.filters import ZeroPhaseButterworth as ZeroPhaseButterwor
 from jaxid.measurement.log_on_disk import scan_log as scan_log
 from jaxid.measurement.observations import Observations as Observations
 from jaxid.measurement.observations import observe as observe
-from jaxid.measurement.read import read_recording as read_recording
 from jaxid.measurement.recording import Recording as Recording
+from jaxid.measurement.recording import read_recording as read_recording
+from jaxid.measurement.recording import remove_delay as remove_delay
 from jaxid.program.cache import keep_compiled as keep_compiled
 from jaxid.report import plot as plot
 from jaxid.robot import library as robots  # noqa: F401
@@ -205,4 +205,4 @@ from jaxid.trajectory import with_leads as with_leads
 from jaxid.trajectory import write_csv as write_csv
 from jaxid.trajectory import write_ros_json as write_ros_json
 from jaxid.trajectory import write_ros_yaml as write_ros_yaml
-from jaxid.validation.validate import validate as validate
+from jaxid.validation import validate as validate

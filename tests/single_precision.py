@@ -23,7 +23,7 @@ from virtual import observations, standard_parameters
 
 import jaxid as jid
 from jaxid.trajectory.fourier import fourier_series
-from jaxid.validation.validate import validate
+from jaxid.validation import validate
 
 URDF = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
 <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>

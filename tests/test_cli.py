@@ -564,7 +564,7 @@ def assert_same_words(a, b):
 def test_errors_of_many_rows_are_of_every_nth(folder, run, monkeypatch):
     assert run("identify", "experiment.toml", "a.csv", "-o", "short")[0] == 0
     monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
-    monkeypatch.setattr("jaxid.validation.errors.ROWS", 100)
+    monkeypatch.setattr("jaxid.validation.ROWS", 100)
     code, out, _ = run("identify", "experiment.toml", "a.csv", "-o", "long")
     assert code == 0
     assert "torque errors and figures take one of every 3 of its 2" in " ".join(out.split())

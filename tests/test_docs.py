@@ -29,7 +29,7 @@ from jaxid.report.verdict import (
     UNLIKE,
 )
 from jaxid.simulation.virtual import random_bodies
-from jaxid.validation.definiteness import POSES
+from jaxid.validation import POSES
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

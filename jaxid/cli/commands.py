@@ -47,7 +47,7 @@ from jaxid.identification.runs.update import update
 from jaxid.program.cache import keep_compiled
 from jaxid.report.content import Beside
 from jaxid.report.write import write_report
-from jaxid.validation.validate import validate
+from jaxid.validation import validate
 
 DISTRIBUTION = "jaxid-robotics"
 

@@ -42,16 +42,14 @@ from jaxid.identification.stepwise import Stepwise
 from jaxid.identification.streaming import Progress
 from jaxid.identification.uncertainty.methods import AbstractUncertainty
 from jaxid.identification.weights import GivenWeights
+from jaxid.measurement.chunked_files import estimated_rows
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
-from jaxid.measurement.delay import remove_delay
 from jaxid.measurement.filters import AbstractFilter
 from jaxid.measurement.log_on_disk import scan_log
 from jaxid.measurement.observations import Observations, observe
-from jaxid.measurement.parts import estimated_rows
-from jaxid.measurement.read import read_recording
-from jaxid.measurement.recording import Recording
-from jaxid.measurement.survey import NeedsMemory
+from jaxid.measurement.recording import Recording, read_recording, remove_delay
+from jaxid.measurement.timestamps import NeedsMemory
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot, Tool
 

@@ -13,8 +13,8 @@ from jaxid.experiment.sanity import LogCheck, check_log, check_long_log
 from jaxid.identification.filter_choice import FilterChoice, choose_filter
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
-from jaxid.measurement.survey import NeedsMemory
-from jaxid.validation.errors import compared_rows
+from jaxid.measurement.timestamps import NeedsMemory
+from jaxid.validation import comparison_step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None)
     if part.samples < log.samples or examined is None:
         note = f"{part.samples} of the {log.samples} samples were examined for slips{why}"
         log = log.replace(notes=(*log.notes, note))
-    every = compared_rows(log)
+    every = comparison_step(log)
     if every == 1:
         return Loaded(log, log, check, examined)
     note = f"{log.name}: torque errors and figures take one of every {every} of its {log.rows} rows"

@@ -34,8 +34,7 @@ from jaxid.report.tables import (
 )
 from jaxid.report.verdict import LARGE_CONDITION
 from jaxid.robot.robot import Robot
-from jaxid.validation.errors import TorqueErrors
-from jaxid.validation.validate import Validation
+from jaxid.validation import TorqueErrors, Validation
 
 GOOD, DOUBTFUL, BAD = "green", "yellow", "red"
 GAP = 2

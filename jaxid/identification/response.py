@@ -8,8 +8,7 @@ from scipy import signal
 
 from jaxid.arrays import Float
 from jaxid.measurement.decimation import AbstractDecimation
-from jaxid.measurement.filters import AbstractFilter
-from jaxid.measurement.low_pass import LowPass
+from jaxid.measurement.filters import AbstractFilter, LowPass
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

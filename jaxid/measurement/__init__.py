@@ -1,1 +1,1 @@
-"""Logs, recordings, filters, observations (Eqs. 19, 25, 26)."""
+"""Measurement: logs, recordings, filters and observations."""

@@ -1,4 +1,4 @@
-"""Which columns of a log hold what, and in which units."""
+"""Meaning and units of the columns of a log."""
 
 from collections.abc import Iterable
 
@@ -11,7 +11,7 @@ from jaxid.measurement.units import Quantity, Unit
 from jaxid.robot.limits import per_joint
 
 Selection = str | int | tuple[str | int, ...]
-"""A name, a pattern with `{}` for the joint's number, a position from 0, or several of them."""
+"""A name, a pattern with `{}` for the joint's number, a position from 0, or several."""
 
 
 def _selection(value: Selection | range | list) -> Selection:
@@ -39,32 +39,31 @@ def _optional_units(value: Unit | Iterable[Unit] | None) -> Unit | tuple[Unit, .
 
 
 class Columns(eqx.Module):
-    """Says which columns of a log hold the time, the angles and the forces of a robot.
+    """Columns of a log that hold the time, the angles and the forces of a robot.
 
-    A group of columns is a tuple of names, a pattern such as `"q{}"` (the joints' numbers, from 1
-    or from 0, stand for `{}`), a tuple of positions from 0 (files without a header), or one name:
-    of the column of a single joint, or of a whole array (samples x joints) in NPZ and MAT files.
+    A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` stands for the joints'
+    numbers, from 1 or from 0), a tuple of positions from 0 (files without a header), or one name:
+    that of the column of a single joint, or of a whole array (samples x joints) in NPZ and MAT
+    files.
 
     Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and forces
-    `sign * gain * torque constant * unit * value`; one unit serves all joints, or there is one for
-    each.
+    `sign * gain * torque constant * unit * value`. A unit is one for all joints, or one for each.
 
     Attributes:
         angles: Joint or motor angles.
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles; None if there are none.
-        time: Time stamps; None if the log has none, and then `sample_time` says how far apart
-            the rows are.
-        sample_time: Time between two rows [s]: trusted instead of stamps.
-        time_unit: Of the stamps.
-        angle_unit: Of the angles.
-        velocity_unit: Of the velocities; the angles' unit per second if None.
-        force_unit: Of the forces; currents need `torque_constants`.
+        time: Time stamps; None if `sample_time` is given.
+        sample_time: Time between two rows [s], instead of time stamps.
+        time_unit: Unit of the stamps.
+        angle_unit: Unit of the angles.
+        velocity_unit: Unit of the velocities; the angles' unit per second if None.
+        force_unit: Unit of the forces; currents need `torque_constants`.
         torque_constants: Torque of each motor for its current [N m/A].
         angle_signs: +1 or -1 for each joint, for the angles and velocities.
         force_signs: +1 or -1 for each joint.
-        angle_offsets: Added to the angles [rad or m].
-        force_gains: True forces over those of the log, as a known load tells them, of 1.
+        angle_offsets: Offsets that are added to the angles [rad or m].
+        force_gains: Ratio of the true forces to those of the log, as a known load tells.
         angles_on_motor_side: Whether angles and velocities are the motors', before the gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.
     """
@@ -97,7 +96,7 @@ class Columns(eqx.Module):
     forces_on_motor_side: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
-        """Refuses what no log could satisfy."""
+        """Refuse contradictions."""
         if (self.time is None) == (self.sample_time is None):
             raise InputError(
                 "`Columns` needs either `time` (the column of the time stamps) or `sample_time` "
@@ -140,23 +139,23 @@ class Columns(eqx.Module):
             )
 
     def angle_scale(self, joints: int) -> np.ndarray:
-        """Factors from the numbers in the log to angles [rad or m]."""
+        """Return the factors from the numbers in the log to angles [rad or m]."""
         signs = _per_joint("angle_signs", self.angle_signs, joints, 1.0)
         return signs * _factors("angle_unit", self.angle_unit, joints)
 
     def angle_shift(self, joints: int) -> np.ndarray:
-        """What is added to the angles [rad or m]."""
+        """Return the offsets of the angles [rad or m]."""
         return _per_joint("angle_offsets", self.angle_offsets, joints, 0.0)
 
     def velocity_scale(self, joints: int) -> np.ndarray:
-        """Factors from the numbers in the log to velocities [rad/s or m/s]."""
+        """Return the factors from the numbers in the log to velocities [rad/s or m/s]."""
         if self.velocity_unit is None:
             return self.angle_scale(joints)
         signs = _per_joint("angle_signs", self.angle_signs, joints, 1.0)
         return signs * _factors("velocity_unit", self.velocity_unit, joints)
 
     def force_scale(self, joints: int) -> np.ndarray:
-        """Factors from the numbers in the log to forces [N m or N]."""
+        """Return the factors from the numbers in the log to forces [N m or N]."""
         scale = _factors("force_unit", self.force_unit, joints)
         scale = scale * _per_joint("force_signs", self.force_signs, joints, 1.0)
         scale = scale * _per_joint("force_gains", self.force_gains, joints, 1.0)

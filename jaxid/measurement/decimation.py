@@ -10,12 +10,11 @@ from scipy import signal
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.measurement.low_pass import LowPass, as_sections
-from jaxid.measurement.whole import whole
+from jaxid.measurement.filters import LowPass, integer, unit_gain_sections
 
 
 class AbstractDecimation(eqx.Module):
-    """Which samples become rows, and what keeps their band below half of the new rate."""
+    """Choice of the samples that become rows, with filters that prevent aliasing."""
 
     @property
     @abc.abstractmethod
@@ -24,43 +23,47 @@ class AbstractDecimation(eqx.Module):
 
     @abc.abstractmethod
     def low_pass(self, stage: int) -> LowPass:
-        """The filter before a stage, at that stage's own rate."""
+        """Return the filter before a stage, at that stage's own rate."""
 
     @abc.abstractmethod
     def check(self, cutoff: float, sample_time: float) -> None:
-        """Raises ValueError if a signal of band `cutoff` [Hz] would be aliased."""
+        """Refuse a signal of band `cutoff` [Hz] that would be aliased.
+
+        Raises:
+            InputError: If it would.
+        """
 
     @property
     def factor(self) -> int:
-        """Samples for each row."""
+        """Number of samples for each row."""
         return math.prod(self.stages)
 
     def __call__(
         self, x: Float[AnyArray, "samples *columns"]
     ) -> Float[np.ndarray, "rows *columns"]:
-        """Decimates along the first axis: the first row is that of the first sample."""
+        """Decimate along the first axis: the first row is that of the first sample."""
         x = np.asarray(x, np.float64)
         for i, factor in enumerate(self.stages):
             x = self.low_pass(i)(x)[::factor]
         return x
 
     def memory(self) -> int:
-        """Samples (before decimation) after which the filters have forgotten."""
+        """Return the memory of the filters, in samples before decimation."""
         rates = [math.prod(self.stages[:i]) for i in range(len(self.stages))]
         return sum(rate * self.low_pass(i).memory() for i, rate in enumerate(rates))
 
 
 class Subsample(AbstractDecimation):
-    """Takes every n-th sample: for filters whose cut-off lies below half of the new rate.
+    """Every n-th sample, without a filter: for cut-offs below half of the new rate.
 
     Attributes:
         step: Number of samples for each row.
     """
 
-    step: int = eqx.field(static=True, converter=whole("step"), default=1)
+    step: int = eqx.field(static=True, converter=integer("step"), default=1)
 
     def __check_init__(self) -> None:
-        _refuse_factors("step", (self.step,))
+        _require_positive("step", (self.step,))
 
     @property
     def stages(self) -> tuple[int, ...]:  # noqa: D102
@@ -80,24 +83,30 @@ class Subsample(AbstractDecimation):
             )
 
 
-def _factors(values: Iterable[float | int]) -> tuple[int, ...]:
-    return tuple(map(whole("factors"), values))
+def _integers(values: Iterable[float | int]) -> tuple[int, ...]:
+    return tuple(map(integer("factors"), values))
 
 
 class Decimation(AbstractDecimation):
-    """Low-pass filters without phase before every stage: for any filter, or none.
+    """Decimation in stages with a zero-phase low-pass before each: for any filter, or none.
 
-    Chebyshev filters of order eight with 0.05 dB ripple at 0.8 of half of the new rate, forward and
-    backward, with gain one for constants (where scipy's `decimate` keeps the ripple's 0.989).
+    The low-pass filters are Chebyshev filters of order eight with 0.05 dB ripple at 0.8 of half of
+    the new rate, forward and backward, with gain one for constants (where scipy's `decimate` keeps
+    the ripple's 0.989).
 
     Attributes:
-        factors: Of the stages; each should be 13 or less.
+        factors: Factors of the stages, 13 or less each.
     """
 
-    factors: tuple[int, ...] = eqx.field(static=True, converter=_factors)
+    factors: tuple[int, ...] = eqx.field(static=True, converter=_integers)
 
     def __check_init__(self) -> None:
-        _refuse_factors("factors", self.factors)
+        _require_positive("factors", self.factors)
+        if max(self.factors) > 13:
+            raise InputError(
+                f"`factors` must be 13 or less each, or the filters lose their accuracy, but are "
+                f"{self.factors}: decimate in several stages."
+            )
 
     @property
     def stages(self) -> tuple[int, ...]:  # noqa: D102
@@ -108,17 +117,12 @@ class Decimation(AbstractDecimation):
         if factor == 1:
             return LowPass((), math.inf)
         sos = np.asarray(signal.cheby1(8, 0.05, 0.8 / factor, output="sos"), np.float64)
-        return LowPass(as_sections(sos), 0.4 / factor)
+        return LowPass(unit_gain_sections(sos), 0.4 / factor)
 
     def check(self, cutoff: float, sample_time: float) -> None:
-        """Never refuses: it brings its own filters."""
+        """Accept every signal, since each stage has a filter."""
 
 
-def _refuse_factors(name: str, factors: tuple[int, ...]) -> None:
-    if not factors or any(f < 1 for f in factors):
+def _require_positive(name: str, factors: tuple[int, ...]) -> None:
+    if not factors or min(factors) < 1:
         raise InputError(f"`{name}` must be whole numbers from 1 on, but is {factors}.")
-    if any(f > 13 for f in factors) and name == "factors":
-        raise InputError(
-            f"`factors` must be 13 or less each, or the filters lose their accuracy, but are "
-            f"{factors}: decimate in several stages."
-        )

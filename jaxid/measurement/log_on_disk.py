@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+from jaxid.measurement.chunked_files import AbstractLogFile, open_log_file
 from jaxid.measurement.columns import Columns, Selection
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
+from jaxid.measurement.files import LogTable
 from jaxid.measurement.filters import AbstractFilter
 from jaxid.measurement.observations import (
     AbstractSamples,
@@ -22,8 +24,7 @@ from jaxid.measurement.observations import (
     require_fast_rows,
     usable_segments,
 )
-from jaxid.measurement.parts import FIRST, AbstractParts, open_parts
-from jaxid.measurement.survey import NeedsMemory, Survey, survey
+from jaxid.measurement.timestamps import NeedsMemory, TimeGrid, find_grid, uniform_grid
 from jaxid.robot.limits import per_joint
 from jaxid.robot.robot import Robot
 
@@ -45,7 +46,7 @@ class SamplesOnDisk(AbstractSamples):
         sample_time: Time between two samples [s].
     """
 
-    files: dict[str, AbstractParts]
+    files: dict[str, AbstractLogFile] = eqx.field(static=True)
     columns: Columns
     robot: Robot
     filter: AbstractFilter
@@ -100,7 +101,7 @@ class SamplesOnDisk(AbstractSamples):
         begin, _, first = self._segment(samples)
         rows = first + samples.start - begin, first + samples.stop - begin
         columns, n = self.columns, self.robot.joints
-        tables = {id(file): file.part(*rows) for file in self.files.values()}
+        tables = {id(file): file.read(*rows) for file in self.files.values()}
         table = {channel: tables[id(file)] for channel, file in self.files.items()}
         angles = table["angles"].array("angles", columns.angles)
         angles = angles * columns.angle_scale(n) + columns.angle_shift(n)
@@ -163,7 +164,7 @@ def scan_log(
     """
     path, n = Path(path), robot.joints
     decimation = Subsample(1) if decimation is None else decimation
-    files, columns = _Files(path, n).select(columns, forces_path, velocities_path)
+    files, columns = _open_files(path, columns, n, forces_path, velocities_path)
     grid = _find_grid(files["angles"], columns, path.name, largest_gap)
     name = path.stem if name is None else name
     if start > -np.inf or stop < np.inf:
@@ -188,7 +189,9 @@ def scan_log(
         filter=filter,
         decimation=decimation,
         segments=segments,
-        start_times=tuple(t for r, t in zip(grid.ranges, grid.times, strict=True) if r in used),
+        start_times=tuple(
+            t for r, t in zip(grid.ranges, grid.start_times, strict=True) if r in used
+        ),
         mask=np.broadcast_to(np.ones(1, bool), (rows, n)),
         sample_time=dt,
         name=name,
@@ -202,68 +205,67 @@ def scan_log(
     return observations.replace(mask=mask)
 
 
-class _Files:
-    """Files of a log, with the columns that are needed from each."""
-
-    def __init__(self, path: Path, joints: int):
-        self._path, self._joints = path, joints
-        self._files: dict[Path, AbstractParts] = {}
-        self._wanted: dict[Path, list[str]] = {}
-        self._channels: dict[Path, dict[str, Selection | None]] = {}
-
-    def select(
-        self, columns: Columns, forces_path: str | Path | None, velocities_path: str | Path | None
-    ) -> tuple[dict[str, AbstractParts], Columns]:
-        """Return the file of each channel with the columns that it needs, and their names."""
-        paths = {"angles": self._path, "forces": Path(forces_path or self._path)}
-        if columns.velocities is not None:
-            paths["velocities"] = Path(velocities_path or self._path)
-        elif velocities_path is not None:
-            raise InputError(
-                "`velocities_path` is given, but `Columns.velocities` names no columns."
-            )
-        names: dict = {
-            channel: self._want(channel, getattr(columns, channel), path)
-            for channel, path in paths.items()
+def _open_files(
+    path: Path,
+    columns: Columns,
+    joints: int,
+    forces_path: str | Path | None,
+    velocities_path: str | Path | None,
+) -> tuple[dict[str, AbstractLogFile], Columns]:
+    """Return the file of each channel, and the names of the columns."""
+    if velocities_path is not None and columns.velocities is None:
+        raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")
+    paths = {
+        "angles": path,
+        "forces": Path(forces_path or path),
+        "velocities": Path(velocities_path or path),
+        "time": path,
+    }
+    files: dict[Path, AbstractLogFile] = {}
+    names: dict = {}
+    for one in dict.fromkeys(paths.values()):
+        selections: dict[str, Selection] = {
+            channel: getattr(columns, channel)
+            for channel in paths
+            if paths[channel] == one and getattr(columns, channel) is not None
         }
-        if columns.time is not None:
-            (names["time"],) = self._want("time", columns.time, self._path)
-        narrow = {
-            path: file.only(tuple(dict.fromkeys(self._wanted[path])))
-            for path, file in self._files.items()
-        }
-        files = {channel: narrow[path] for channel, path in paths.items()}
-        return files, dataclasses.replace(columns, **names)
+        if not selections:
+            continue
 
-    def _want(self, channel: str, selection: Selection, path: Path) -> tuple[str, ...]:
-        """Return the names of the columns of a selection in one of the files."""
-        if path not in self._files:
-            self._files[path] = open_parts(path)
-        file = self._files[path]
-        first = file.part(0, min(file.rows, FIRST))
-        names = first.expand(channel, selection)
-        self._channels.setdefault(path, {})[channel] = selection
-        first.refuse_shared(self._channels[path])
-        if channel != "time":
-            columns = first.array(channel, selection).shape[1]
-            if columns != self._joints:
-                raise InputError(
-                    f"`{channel}` of `{path.name}` have {columns} columns, but the robot has "
-                    f"{self._joints} joints: name one column for each joint."
-                )
-        rows = self._files[self._path].rows
-        if file.rows != rows:
+        def select(first: LogTable, selections=selections) -> tuple[str, ...]:
+            first.refuse_shared(selections)
+            for channel, selection in selections.items():
+                names[channel] = first.expand(channel, selection)
+                if channel != "time":
+                    _require_joints(first, channel, selection, joints)
+            return tuple(dict.fromkeys(name for c in selections for name in names[c]))
+
+        files[one] = open_log_file(one, select)
+        if files[one].rows != files[path].rows:
             raise InputError(
-                f"`{path.name}` has {file.rows} rows, but `{self._path.name}` has {rows}: they "
-                "must be of one run, row by row."
+                f"`{one.name}` has {files[one].rows} rows, but `{path.name}` has "
+                f"{files[path].rows}: they must be of one run, row by row."
             )
-        self._wanted.setdefault(path, []).extend(names)
-        return names
+    if columns.time is not None:
+        (names["time"],) = names["time"]
+    channels = {channel: files[one] for channel, one in paths.items() if channel in names}
+    return channels, dataclasses.replace(columns, **names)
 
 
-def _find_grid(file: AbstractParts, columns: Columns, source: str, largest_gap: float) -> Survey:
+def _require_joints(table: LogTable, channel: str, selection: Selection, joints: int) -> None:
+    columns = table.array(channel, selection).shape[1]
+    if columns != joints:
+        raise InputError(
+            f"`{channel}` of `{table.source}` have {columns} columns, but the robot has {joints} "
+            "joints: name one column for each joint."
+        )
+
+
+def _find_grid(
+    file: AbstractLogFile, columns: Columns, source: str, largest_gap: float
+) -> TimeGrid:
     if columns.sample_time is not None:
-        return Survey.uniform(file.rows, columns.sample_time)
+        return uniform_grid(file.rows, columns.sample_time)
     selection = str(columns.time)
     file = file.only((selection,))
 
@@ -271,7 +273,7 @@ def _find_grid(file: AbstractParts, columns: Columns, source: str, largest_gap: 
         last, rows = 0.0, file.rows
         for start in range(0, rows, AT_ONCE):
             # Integers and dates count from a part's first row: the row before links parts.
-            table = file.part(max(0, start - 1), min(start + AT_ONCE, rows))
+            table = file.read(max(0, start - 1), min(start + AT_ONCE, rows))
             part, dates = table.stamps(selection)
             part = part if dates else part * columns.time_unit.factor
             if start:
@@ -279,9 +281,14 @@ def _find_grid(file: AbstractParts, columns: Columns, source: str, largest_gap: 
             last = float(part[-1])
             yield part
 
-    first_line = file.part(0, 1).first_line
-    first_row = 1 if first_line is None else first_line
-    return survey(stamps(), source=source, largest_gap=largest_gap, first_row=first_row)
+    first_line = file.read(0, 1).first_line
+    return find_grid(
+        stamps,
+        source=source,
+        largest_gap=largest_gap,
+        first_row=1 if first_line is None else first_line,
+        in_parts=True,
+    )
 
 
 def _fast_rows(

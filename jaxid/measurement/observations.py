@@ -10,14 +10,14 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
-from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth
-from jaxid.measurement.low_pass import said_hasty
-from jaxid.measurement.recording import Recording
+from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth, high_rate_hint
+from jaxid.measurement.recording import Recording, require_finite_delay
 from jaxid.robot.limits import per_joint
 from jaxid.robot.robot import Robot
 
@@ -398,7 +398,7 @@ def observe(
     dt = recording.sample_time
     decimation.check(filter.low_pass(dt).cutoff, dt)
     used, omitted = usable_segments(recording.segments, filter, decimation, dt, recording.name)
-    notes = [*recording.notes, *omitted, *filter.said(recording.velocities is not None)]
+    notes = [*recording.notes, *omitted, *filter.remarks(recording.velocities is not None)]
     angles, velocities, forces = joint_side(
         robot,
         np.asarray(recording.angles),
@@ -452,7 +452,7 @@ def usable_segments(
             f"the longest segment of `{name}` has {longest} samples, but {edge} at each "
             f"end are lost to the filter and {FEWEST_ROWS} rows of {decimation.factor} are needed: "
             "record longer, close the gaps (`largest_gap`), or set a smaller `margin`."
-            f"{said_hasty(sample_time)}"
+            f"{high_rate_hint(sample_time)}"
         )
     short = len(segments) - len(used)
     if not short:
@@ -504,3 +504,39 @@ def _join(parts: list) -> np.ndarray:
 
 def _optional_array(value: ArrayLike | tuple | None) -> np.ndarray | None:
     return None if value is None else np.asarray(value, np.float64)
+
+
+def without_delay(observations: Observations, seconds: float) -> Observations:
+    """Remove a delay of the forces, like `remove_delay`: rows near the ends are left out.
+
+    Args:
+        observations: Observations whose forces are delayed.
+        seconds: Delay of the forces [s]; negative if they are early.
+
+    Raises:
+        InputError: If no rows are left.
+    """
+    require_finite_delay(seconds)
+    time, dt = observations.time, observations.sample_time
+    lost = math.ceil(abs(seconds) / dt - 1e-9)
+    edge = observations.filter.edge(dt)
+    mask, instants = np.array(observations.mask), observations.instants
+    motion = observations.motion
+    parts: dict[str, list[np.ndarray]] = {"q": [], "qd": [], "qdd": []}
+    for (a, b), (r0, r1) in zip(observations.segments, observations.row_segments, strict=True):
+        # Beyond the ends the nearest motion is used, in rows that do not count.
+        at = np.clip(time[a:b] - seconds, time[a], time[b - 1])
+        for key, values in parts.items():
+            x = np.asarray(getattr(motion, key), np.float64)
+            values.append(CubicSpline(time[a:b], x[a:b])(at))
+        rows = instants[r0:r1]
+        first, last = (a + edge + lost, b) if seconds > 0 else (a, b - edge - lost)
+        mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
+    if not mask.any(axis=0).all():
+        raise InputError(
+            f"the delay is {seconds:g} s, but `{observations.name}` lasts "
+            f"{time[-1] - time[0]:g} s: no rows of some joint are left."
+        )
+    return observations.replace(
+        motion=Motion(**{key: np.concatenate(values) for key, values in parts.items()}), mask=mask
+    )

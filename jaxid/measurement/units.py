@@ -1,4 +1,4 @@
-"""Units of the columns of a log: factors to SI, so that all that follows is in SI."""
+"""Units of the columns of a log, with their factors to SI units."""
 
 import dataclasses
 import difflib
@@ -10,7 +10,7 @@ from jaxid.errors import InputError
 
 
 class Quantity(enum.Enum):
-    """What a unit measures."""
+    """Physical quantity that a unit measures."""
 
     TIME = "a time"
     COORDINATE = "an angle or a length"
@@ -21,16 +21,15 @@ class Quantity(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """A unit: its symbol, its size in SI units, and what it measures.
+    """Unit of a measured quantity.
 
-    A drive that counts in its own unit gets one here: `Unit("count", 2 * pi / 4096,
-    Quantity.COORDINATE)` for an encoder, `Unit("permille", 1e-3 * rated, Quantity.FORCE)`
-    for a torque in thousandths of the rated one.
+    Define a unit for drive-specific counts: `Unit("count", 2 * pi / 4096, Quantity.COORDINATE)` for
+    an encoder, `Unit("permille", 1e-3 * rated, Quantity.FORCE)` for thousandths of rated torque.
 
     Attributes:
-        symbol: As it is written, like `deg`.
+        symbol: Symbol, such as `deg`.
         factor: Size in rad, m, rad/s, m/s, N m, N, A or s.
-        quantity: What it measures.
+        quantity: Quantity that is measured.
     """
 
     symbol: str
@@ -38,7 +37,7 @@ class Unit:
     quantity: Quantity
 
     def __post_init__(self) -> None:
-        """Refuses factors that cannot be undone."""
+        """Refuse factors that cannot be inverted."""
         if not np.isfinite(self.factor) or self.factor == 0:
             raise InputError(
                 f"`factor` of the unit `{self.symbol}` must be finite and not zero, "
@@ -71,22 +70,20 @@ ALL = (
     *(RAD_PER_S, DEG_PER_S, RPM, M_PER_S, MM_PER_S),
     *(NM, N, A, MA),
 )
-"""Every unit that has a name here."""
+"""All named units."""
 
 
 def unit(symbol: str) -> Unit:
-    """The unit that is written so: `unit("deg")` is `DEG`.
+    """Return the unit with this symbol: `unit("deg")` is `DEG`.
 
     Raises:
-        InputError: If no unit is written so.
+        InputError: If no unit has this symbol.
     """
-    found = [known for known in ALL if known.symbol == symbol]
-    if not found:
-        symbols = [known.symbol for known in ALL]
-        spelt = [known for known in symbols if len(known) > 1 and symbol.startswith(known)]
-        begun = sorted(spelt, key=len)
-        near = difflib.get_close_matches(symbol, symbols, n=1, cutoff=0.9) or begun[-1:]
-        near = near or difflib.get_close_matches(symbol, symbols, n=1)
+    units = {known.symbol: known for known in ALL}
+    if symbol not in units:
+        begun = [known for known in units if len(known) > 1 and symbol.startswith(known)]
+        near = difflib.get_close_matches(symbol, units, n=1, cutoff=0.9)
+        near = near or sorted(begun, key=len)[-1:] or difflib.get_close_matches(symbol, units, n=1)
         hint = f" (did you mean `{near[0]}`?)" if near else ""
-        raise InputError(f"`{symbol}` is no known unit{hint}: write one of {', '.join(symbols)}.")
-    return found[0]
+        raise InputError(f"`{symbol}` is no known unit{hint}: write one of {', '.join(units)}.")
+    return units[symbol]

@@ -25,7 +25,7 @@ from jaxid.report.style import (
 )
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import TorqueErrors
 
 COLUMNS = 2
 HEIGHT = 1.7

@@ -22,7 +22,7 @@ from jaxid.report.style import (
 )
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import TorqueErrors
 
 BAR = 0.36
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE)

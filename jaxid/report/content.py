@@ -18,8 +18,7 @@ from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.measurement.observations import Observations
 from jaxid.report.bodies import consistency_content
 from jaxid.robot.robot import Robot
-from jaxid.validation.definiteness import Definiteness
-from jaxid.validation.errors import TorqueErrors, torque_errors
+from jaxid.validation import Definiteness, TorqueErrors, torque_errors
 
 SCHEMA = "jaxid-result/1"
 LEVEL = 0.95

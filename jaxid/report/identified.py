@@ -26,8 +26,7 @@ from jaxid.report.sheets import parameter_sheet, sheet_of
 from jaxid.report.tables import error_table, joint_table, motor_table, residual_table
 from jaxid.report.verdict import verdict
 from jaxid.robot.robot import Robot
-from jaxid.validation.definiteness import Definiteness
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import Definiteness, TorqueErrors
 
 PAGE = "report.html"
 """File of the page."""

@@ -9,7 +9,7 @@ from jaxid.identification.uncertainty.residuals import ResidualSpectra
 from jaxid.report.numbers import aligned, percent, significant, with_deviation
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import TorqueErrors
 
 STYLES = {Trust.GOOD: "green", Trust.DOUBTFUL: "yellow", Trust.NONE: "red"}
 

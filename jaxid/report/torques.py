@@ -30,7 +30,7 @@ from jaxid.report.style import (
     new_figure,
 )
 from jaxid.robot.robot import Robot
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import TorqueErrors
 
 OTHERS = (GREEN, ORANGE, PURPLE)
 """Colours of predictions beside the first."""

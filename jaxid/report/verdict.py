@@ -8,8 +8,7 @@ from jaxid.identification.excited import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
 from jaxid.report.blocks import Remark, Tone
 from jaxid.report.numbers import percent, significant
-from jaxid.validation.definiteness import Definiteness
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import Definiteness, TorqueErrors
 
 ACCURATE, TOLERABLE = 1.0, 3.0
 """Mean errors up to which forces are predicted well, or tolerably [% of the largest forces]."""

@@ -22,8 +22,7 @@ from jaxid.report.page import write_page
 from jaxid.report.residuals import residual_figure
 from jaxid.report.style import save
 from jaxid.report.torques import torque_figure
-from jaxid.validation.definiteness import Definiteness
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import Definiteness, TorqueErrors
 
 LONGEST_NAME = 80
 MODEL = "model.json"

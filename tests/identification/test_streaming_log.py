@@ -11,9 +11,9 @@ import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
 from jaxid.identification import streaming
 from jaxid.identification.factors import factorise
-from jaxid.measurement import parts, units
+from jaxid.measurement import chunked_files, units
 from jaxid.measurement.log_on_disk import filter_memory, scan_log
-from jaxid.measurement.survey import NeedsMemory
+from jaxid.measurement.timestamps import NeedsMemory
 
 COLUMNS = jid.Columns(angles="q{}", forces="tau{}", time="t")
 SAMPLES = 20000
@@ -147,7 +147,7 @@ def text(parquet):
 
 @pytest.fixture
 def short_strides(monkeypatch):
-    monkeypatch.setattr(parts, "STRIDE", 5000)
+    monkeypatch.setattr(chunked_files, "BLOCK", 5000)
     monkeypatch.setattr("jaxid.measurement.log_on_disk.AT_ONCE", 3000)
 
 
@@ -209,13 +209,12 @@ def test_bad_cells_of_long_texts_are_named_with_line_and_column(
     lines[15000] = ",".join(row)
     path = tmp_path / "log.csv"
     path.write_text("\n".join(lines))
-    log = scan_log(path, COLUMNS, base.model.robot, SMOOTH)
     with pytest.raises(ValueError, match=rf"column `q2` of `log.csv`, line 15001, {complaint}"):
-        factorise(base, [log])
+        scan_log(path, COLUMNS, base.model.robot, SMOOTH)
     lines[15000] = "1,2,3,4,5,6,7"
     path.write_text("\n".join(lines))
     with pytest.raises(ValueError, match="is no table with 6 columns in every line"):
-        factorise(base, [scan_log(path, COLUMNS, base.model.robot, SMOOTH)])
+        scan_log(path, COLUMNS, base.model.robot, SMOOTH)
 
 
 @pytest.mark.usefixtures("short_strides")
@@ -262,5 +261,5 @@ def test_forces_in_another_file(base, numbers, tmp_path):
     log = scan_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=tmp_path / "f.parquet")
     np.testing.assert_array_equal(log.source.read_unfiltered(slice(100, 200))[2], forces[100:200])
     pl.DataFrame({"tau1": forces[1:, 0], "tau2": forces[1:, 1]}).write_csv(tmp_path / "less.csv")
-    with pytest.raises(ValueError, match=r"has 4999 rows, but `q.csv` has 5000"):
+    with pytest.raises(ValueError, match=r"4999 rows, but `q.csv` has 5000"):
         scan_log(tmp_path / "q.csv", columns, robot, SMOOTH, forces_path=tmp_path / "less.csv")

@@ -11,8 +11,7 @@ from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import Decimation, Subsample
 from jaxid.measurement.filters import PaperFilter, PeriodicFourier, ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
-from jaxid.measurement.read import read_recording
-from jaxid.measurement.recording import Recording
+from jaxid.measurement.recording import Recording, read_recording
 from jaxid.robot.drives import Drives
 from jaxid.robot.robot import Robot
 

@@ -11,9 +11,9 @@ from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
 from jaxid.measurement import units
+from jaxid.measurement.chunked_files import open_log_file
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.parts import open_parts
-from jaxid.measurement.read import read_recording
+from jaxid.measurement.recording import read_recording
 from jaxid.measurement.units import Quantity, Unit
 
 COLUMNS = Columns(angles="q{}", forces="tau{}", velocities="dq{}", time="t")
@@ -295,7 +295,7 @@ def test_damage_that_polars_takes_for_a_bug_of_its_own(tmp_path, monkeypatch):
     """Its panics are no `Exception`, and depend on which bytes are damaged."""
     path = tmp_path / "log.parquet"
     pl.DataFrame(a_log()).write_parquet(path)
-    whole = open_parts(path)
+    whole = open_log_file(path, lambda table: tuple(table.columns))
 
     def panic(*_, **__):
         raise pl.exceptions.PanicException("called `Result::unwrap()` on an `Err` value")
@@ -304,7 +304,7 @@ def test_damage_that_polars_takes_for_a_bug_of_its_own(tmp_path, monkeypatch):
     refused(path, COLUMNS, "`log.parquet` is no Parquet file, or is damaged: called")
     monkeypatch.setattr(pl, "scan_parquet", panic)
     with pytest.raises(ValueError, match="or is damaged: called"):
-        whole.part(0, 3)
+        whole.read(0, 3)
 
 
 @settings(max_examples=60)
@@ -407,7 +407,8 @@ def test_measured_robots(shared_data):
 def test_whole_numbers_beyond_64_bits_are_read_part_by_part(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("q1,tau1\n" + "18446744073709551616,1\n" * 30)
-    found = open_parts(path).part(0, 30).array("angles", "q1")
+    file = open_log_file(path, lambda table: tuple(table.columns))
+    found = file.read(0, 30).array("angles", "q1")
     np.testing.assert_array_equal(found, np.full((30, 1), 2.0**64))
 
 

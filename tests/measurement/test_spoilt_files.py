@@ -4,9 +4,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from jaxid.measurement.chunked_files import open_log_file
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.parts import open_parts
-from jaxid.measurement.read import read_recording
+from jaxid.measurement.recording import read_recording
 
 COLUMNS = Columns("q{}", "tau{}", time="t")
 ROWS = [f"{0.01 * k:.2f},{k},{k},1,2,moving" for k in range(60)]
@@ -27,7 +27,7 @@ def test_quotations_do_not_swallow_rows(tmp_path):
     with pytest.raises(ValueError, match=r"line 12 of `log.csv` opens a quotation"):
         read_recording(path, COLUMNS)
     with pytest.raises(ValueError, match=r"line 12 of `log.csv` opens a quotation"):
-        open_parts(path).part(20, 30)
+        open_log_file(path, lambda table: tuple(table.columns))
 
 
 def test_carriage_returns_alone_are_named(tmp_path):

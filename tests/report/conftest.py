@@ -15,7 +15,7 @@ from jaxid.simulation.gear_friction import SmoothFriction
 from jaxid.simulation.sensors import Sensors
 from jaxid.simulation.virtual import VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
-from jaxid.validation.validate import Validation, validate
+from jaxid.validation import Validation, validate
 
 
 def cart() -> Robot:

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxid.robot import library
 from jaxid.robot.robot import Robot
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import TorqueErrors
 
 
 def errors_of(joints: int, rows: int = 200, *, name: str = "log", seed: int = 0) -> TorqueErrors:

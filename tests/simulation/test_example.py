@@ -10,7 +10,7 @@ from jaxid.identification.identify import identify
 from jaxid.robot import library
 from jaxid.simulation.example import FILES, virtual_log, virtual_panda, write_example
 from jaxid.simulation.virtual import random_bodies
-from jaxid.validation.validate import validate
+from jaxid.validation import validate
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,7 @@ import pytest
 import jaxid as jid
 from jaxid.identification.fit import ConditionNumbers
 from jaxid.identification.uncertainty.uncertainty import Uncertainty
-from jaxid.validation.definiteness import definiteness, position_range
-from jaxid.validation.errors import TorqueErrors
+from jaxid.validation import TorqueErrors, definiteness, position_range
 
 
 def errors(counted=None):

@@ -37,7 +37,7 @@ from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.leads import WithLeads, with_leads
 from jaxid.trajectory.tip_path import TipPath, iso9283_path, joint_path
 from jaxid.trajectory.trajectory import PiecewisePolynomial
-from jaxid.validation.validate import Validation, validate
+from jaxid.validation import Validation, validate
 
 HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800
 """Of the Fourier series: order, ground frequency [rad/s], samples of a period (the paper's)."""

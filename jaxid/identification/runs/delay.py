@@ -23,8 +23,7 @@ from jaxid.identification.runs.comparison import joint_test
 from jaxid.identification.runs.left_out import block_covariance
 from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.identification.weights import AbstractWeights, MaximumForces
-from jaxid.measurement.delay import without_delay
-from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Observations, without_delay
 
 BLOCKS = 20
 """Blocks of time of all recordings together, from which the uncertainty is found."""

@@ -1,0 +1,263 @@
+"""Validation of a model: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.dynamics.compiled import mass_matrices, tool_forces
+from jaxid.identification.fit import Fit
+from jaxid.measurement.observations import Observations, Progress
+from jaxid.robot.robot import Robot
+from jaxid.table import Column, Remark, Status, Table, percent, significant
+
+POSES = 2000
+"""Random poses in which the mass matrix is evaluated."""
+ROWS = 2**18
+"""Largest number of rows that are compared."""
+
+
+class TorqueErrors(eqx.Module):
+    """Measured and predicted forces of one recording, and their differences.
+
+    Attributes:
+        name: Name of the recording.
+        time: Times of the rows [s].
+        measured: Measured forces, filtered and decimated [N m or N].
+        predicted: Forces of the model, filtered and decimated alike [N m or N].
+        counted: Rows that count, for each joint.
+        max_forces: Largest force of each joint [N m or N]; NaN where not known.
+    """
+
+    name: str = eqx.field(static=True)
+    time: Float[AnyArray, " rows"]
+    measured: Float[AnyArray, "rows joints"]
+    predicted: Float[AnyArray, "rows joints"]
+    counted: Bool[AnyArray, "rows joints"]
+    max_forces: Float[AnyArray, " joints"]
+
+    @property
+    def errors(self) -> Float[np.ndarray, "rows joints"]:
+        """Predicted minus measured forces; NaN where a row does not count [N m or N] (Eq. 27)."""
+        return np.where(
+            self.counted, np.asarray(self.predicted) - np.asarray(self.measured), np.nan
+        )
+
+    @property
+    def mean(self) -> Float[np.ndarray, " joints"]:
+        """Mean absolute error of each joint [N m or N] (Eq. 37)."""
+        return np.nanmean(np.abs(self.errors), axis=0)
+
+    @property
+    def rms(self) -> Float[np.ndarray, " joints"]:
+        """RMS error of each joint [N m or N]."""
+        return np.sqrt(np.nanmean(self.errors**2, axis=0))
+
+    @property
+    def mean_percent(self) -> Float[np.ndarray, " joints"]:
+        """Mean absolute errors in percent of the largest force (Eq. 37)."""
+        return 100.0 * self.mean / np.asarray(self.max_forces)
+
+    @property
+    def rms_percent(self) -> Float[np.ndarray, " joints"]:
+        """RMS errors in percent of the largest force."""
+        return 100.0 * self.rms / np.asarray(self.max_forces)
+
+    @property
+    def force_rms(self) -> Float[np.ndarray, " joints"]:
+        """RMS of the measured forces of each joint [N m or N]."""
+        return np.sqrt(np.nanmean(self._measured**2, axis=0))
+
+    @property
+    def rms_relative(self) -> Float[np.ndarray, " joints"]:
+        """RMS errors over the RMS of the measured forces; NaN without any force."""
+        return _ratio(self.rms, self.force_rms)
+
+    @property
+    def relative(self) -> float:
+        r"""Norm of all errors over the norm of all forces, $|Wp - Q| / |Q|$."""
+        squares = np.nansum(self.errors**2), np.nansum(self._measured**2)
+        return float(np.sqrt(_ratio(*squares)))
+
+    @property
+    def explained(self) -> Float[np.ndarray, " joints"]:
+        """Explained fraction of the variance of each joint, $R^2$."""
+        squares = np.nanmean(self.errors**2, axis=0)
+        return 1.0 - _ratio(squares, np.nanvar(self._measured, axis=0))
+
+    @property
+    def _measured(self) -> np.ndarray:
+        return np.where(self.counted, np.asarray(self.measured), np.nan)
+
+
+def _ratio(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray:
+    """Return a ratio; NaN where the denominator is zero."""
+    whole = np.asarray(whole, np.float64)
+    return np.asarray(part / np.where(whole > 0, whole, np.nan))
+
+
+class Definiteness(eqx.Module):
+    """Eigenvalues of the mass matrix over random poses.
+
+    Attributes:
+        smallest: Smallest eigenvalue over all poses, of the mass matrix in SI units.
+        pose: Joint coordinates where it occurs [rad or m].
+        indefinite: Fraction (0 to 1) of the poses in which an eigenvalue is not positive.
+        poses: Number of poses.
+    """
+
+    smallest: float
+    pose: Float[AnyArray, " joints"]
+    indefinite: float
+    poses: int = eqx.field(static=True)
+
+    @property
+    def positive_definite(self) -> bool:
+        """Whether every eigenvalue is positive in every pose."""
+        return self.smallest > 0.0
+
+    def __str__(self) -> str:
+        if self.positive_definite:
+            return f"The mass matrix is positive definite in all of {self.poses} poses."
+        return (
+            f"The mass matrix is indefinite in {percent(self.indefinite)} % of {self.poses} poses; "
+            f"its smallest eigenvalue is {self.smallest:.2g}."
+        )
+
+
+class Validation(eqx.Module):
+    """Torque errors on recordings, and definiteness of the mass matrix.
+
+    Attributes:
+        errors: Torque errors on each recording.
+        definiteness: Definiteness of the mass matrix.
+        joint_names: Names of the joints.
+        units: Unit of each joint's force.
+    """
+
+    errors: tuple[TorqueErrors, ...]
+    definiteness: Definiteness
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+
+    def summary(self) -> Table:
+        """Return a table: RMS errors of each joint on each recording."""
+        rows = [(e, j) for e in self.errors for j in range(len(self.joint_names))]
+        columns = [
+            Column("recording", [e.name for e, _ in rows]),
+            Column("joint", [self.joint_names[j] for _, j in rows]),
+            Column("RMS error", [float(e.rms[j]) for e, j in rows]),
+            Column("unit", [self.units[j] for _, j in rows]),
+            Column("of the forces", [float(e.rms_relative[j]) for e, j in rows], "%", percent),
+            Column("of the largest", [float(e.rms_percent[j]) for e, j in rows], "%", significant),
+        ]
+        status = Status.GOOD if self.definiteness.positive_definite else Status.BAD
+        count = len(self.joint_names)
+        return Table(
+            "Validation",
+            *columns,
+            facts=[(e.name, f"{percent(e.relative)} % of the forces") for e in self.errors],
+            remarks=[Remark(str(self.definiteness), status)],
+            rules=range(count, len(rows), count),
+        )
+
+    def __str__(self) -> str:
+        return str(self.summary())
+
+
+def validate(
+    fit: Fit,
+    observations: Observations | Sequence[Observations],
+    *,
+    poses: int = POSES,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Validation:
+    """Check a model: torque errors on recordings, and the definiteness of its mass matrix.
+
+    Args:
+        fit: Fit of the model.
+        observations: One or several recordings, preferably not used for the fit.
+        poses: Number of random poses in which the mass matrix is evaluated.
+        seed: Seed of the poses.
+        progress: Callback, called with the completed fraction (0 to 1) of each recording.
+    """
+    single = isinstance(observations, Observations)
+    recordings = (observations,) if single else tuple(observations)
+    robot = fit.base.model.robot
+    return Validation(
+        errors=tuple(torque_errors(fit, o, progress) for o in recordings),
+        definiteness=definiteness(fit, poses=poses, seed=seed),
+        joint_names=robot.joint_names,
+        units=tuple(robot.force_unit(j) for j in range(robot.joints)),
+    )
+
+
+def torque_errors(
+    fit: Fit, observations: Observations, progress: Progress | None = None
+) -> TorqueErrors:
+    """Compare the forces that a model predicts with measured ones (Eqs. 27, 37).
+
+    The prediction is filtered and decimated like the measurement, in parts. Of more than `ROWS`
+    rows every n-th is compared.
+
+    Args:
+        fit: Fit of the model.
+        observations: Observations of the same robot.
+        progress: Callback, called with the completed fraction (0 to 1).
+    """
+    known = fit.base.model.robot.known_max_forces
+    step = comparison_step(observations)
+    mask = np.asarray(observations.mask)
+    measured, predicted = np.zeros((2, len(mask[::step]), observations.joints))
+    for chunk in observations.chunks(65536):
+        first, stop = chunk.rows
+        # Masked parts are not evaluated.
+        if mask[first:stop].any():
+            motion, forces = observations.read(slice(*chunk.samples))
+            model_forces = fit.predict(motion) + tool_forces(fit.base, motion)
+            rows = slice(-(-first // step), -(-stop // step))
+            taken = slice(rows.start * step - first, None, step)
+            measured[rows] = chunk.reduce(forces)[taken]
+            predicted[rows] = chunk.reduce(model_forces)[taken]
+        if progress is not None:
+            progress(stop / observations.rows)
+    return TorqueErrors(
+        name=observations.name,
+        time=observations.reduced_time[::step],
+        measured=measured,
+        predicted=predicted,
+        counted=mask[::step],
+        max_forces=np.where(np.isfinite(known), known, np.nan),
+    )
+
+
+def comparison_step(observations: Observations) -> int:
+    """Return the n of the observations of which every n-th row is compared."""
+    return -(-observations.rows // ROWS)
+
+
+def definiteness(fit: Fit, *, poses: int = POSES, seed: int = 0) -> Definiteness:
+    """Look for poses in which the identified mass matrix is not positive definite (Sec. 5).
+
+    Args:
+        fit: Fit of the model.
+        poses: Number of random poses over the range of the joints; a joint without limits turns
+            once, a rail without limits stays within a metre of zero.
+        seed: Seed of the poses.
+    """
+    robot = fit.base.model.robot
+    low, high = position_range(robot)
+    q = np.random.default_rng(seed).uniform(low, high, (poses, robot.joints))
+    M = mass_matrices(fit.base, fit.parameters, q)
+    smallest = np.linalg.eigvalsh(M)[:, 0]
+    worst = int(np.argmin(smallest))
+    return Definiteness(float(smallest[worst]), q[worst], float(np.mean(smallest <= 0.0)), poses)
+
+
+def position_range(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joint ranges; one turn, or a metre to either side, where unlimited [rad or m]."""
+    half = np.where(np.array(robot.revolute), np.pi, 1.0)
+    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
+    return np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
