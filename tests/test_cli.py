@@ -32,7 +32,7 @@ time = "t"
 kind = "butterworth"
 cutoff = 10
 [rows]
-every = 4
+step = 4
 """
 GRAVITY = 9.81
 STICK = (
@@ -496,7 +496,7 @@ def test_what_has_changed_between_two_runs_is_told(folder, run):
     assert refused(run("compare", "cold", "warm", "-o", "."), "`.` holds files but no report")
 
 
-SLOW = EXPERIMENT.replace("every = 4", "every = 4\nslow = 0.05")
+SLOW = EXPERIMENT.replace("step = 4", "step = 4\nmin_speed = 0.05")
 SLOW = SLOW.replace('time = "t"', 'time = "t"\nstart = 0.5\nstop = 5.5')
 
 

@@ -36,7 +36,7 @@ time = "t"
 kind = "butterworth"
 cutoff = 10
 [rows]
-every = 4
+step = 4
 """
 LOAD = """\
 [load]

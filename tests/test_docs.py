@@ -4,6 +4,7 @@ A page may take for granted what its reader has by then (`given`), and nothing e
 """
 
 import re
+import tomllib
 from pathlib import Path
 
 import jax
@@ -14,11 +15,17 @@ import pytest
 
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
+from jaxid.experiment.decoder import check_tables, decode
+from jaxid.experiment.estimator_table import KINDS, choose_uncertainty
+from jaxid.experiment.excitation_tables import Collision, Excitation
+from jaxid.experiment.experiment import TABLES
+from jaxid.experiment.method_tables import FILTERS, SIDES, Effects, Logs, build_rows
 from jaxid.experiment.mistakes import BAD
-from jaxid.experiment.reading import read_tables
+from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
 from jaxid.experiment.sanity import SURE
 from jaxid.identification.excited import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
+from jaxid.measurement.columns import Columns
 from jaxid.report.verdict import (
     ACCURATE,
     ACCURATE_SHARE,
@@ -172,14 +179,38 @@ def test_python_in_a_page_runs(page, given, monkeypatch):
         exec(compile(block, f"{page.name}, block {k + 1}", "exec"), names)
 
 
+FUNCTIONS = {
+    "robot": [RobotSource],
+    "limits": [replace_limits],
+    "drives": [replace_drives],
+    "collision": [Collision],
+    "model": [Effects],
+    "recording": [Columns, Logs],
+    "load": [Load],
+    "rows": [build_rows],
+    "excitation": [Excitation],
+}
+
+
+def _functions(name, table):
+    if name == "filter":
+        return [FILTERS[table.pop("kind", "butterworth")]]
+    if name == "estimator":
+        return [choose_uncertainty, *KINDS[table.pop("kind", "weighted")][1]]
+    return FUNCTIONS[name]
+
+
 @pytest.mark.parametrize("page", _with("toml"))
-def test_keys_in_a_page_exist(page, tmp_path):
+def test_keys_in_a_page_exist(page):
     for block in _blocks(page, "toml"):
-        lines = [line.strip() for line in block.splitlines()]
-        file = tmp_path / "experiment.toml"
-        robot = "" if "[robot]" in lines else '[robot]\nbuiltin = "panda"\n'
-        file.write_text("\n".join([*lines, robot]), encoding="utf-8")
-        read_tables(file)
+        content = tomllib.loads(block)
+        check_tables(content, list(TABLES))
+        for name, table in content.items():
+            if name == "filter" and isinstance(table.get("cutoff"), list):
+                table["cutoff"] = table["cutoff"][0]
+            if name == "robot":
+                table = {"builtin": "panda", **table} if "tool" in table else table
+            decode(_functions(name, table), table, name, complete=False, skip=SIDES)
 
 
 def test_other_packages_bodies_become_ours(given):

@@ -20,12 +20,17 @@ from jax.experimental.compilation_cache import compilation_cache
 from jaxid import cli
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import CRITERIA
-from jaxid.experiment.excitation_tables import build_basis, build_constraints
-from jaxid.experiment.excite import design, side_by_side, write
-from jaxid.experiment.excited_forces import force_remarks
+from jaxid.experiment.decoder import keys_of
+from jaxid.experiment.excitation import (
+    compare_criteria,
+    design_motion,
+    find_constraints,
+    find_nominal,
+    force_remarks,
+    write_design,
+)
+from jaxid.experiment.excitation_tables import Excitation, Leads, spline
 from jaxid.experiment.experiment import load_experiment
-from jaxid.experiment.nominal import build_nominal
-from jaxid.experiment.tables import ExcitationTable, LeadsTable, SplineTable
 from jaxid.report.blocks import Tone
 from jaxid.report.excitation_words import remarks
 from jaxid.report.excited import excitation_page
@@ -95,13 +100,13 @@ def excited(written):
     text = EXPERIMENT.replace("generations = 1\npolish = 1", "generations = 0\npolish = 0")
     (written / "fast.toml").write_text(text)
     experiment = load_experiment(written / "fast.toml")
-    return design(experiment, lambda _: None, written / "fast.npz", False)
+    return design_motion(experiment, lambda _: None, written / "fast.npz", False)
 
 
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing takes longer than all else where a motion is there already."""
-    monkeypatch.setattr("jaxid.experiment.excite.write_pictures", lambda *_: [])
+    monkeypatch.setattr("jaxid.experiment.excitation.write_pictures", lambda *_: [])
 
 
 def listing(folder):
@@ -226,11 +231,11 @@ def test_a_spline_in_place_of_a_series(written, run, no_pictures):
 
 
 def test_keys_that_others_leave_nothing_to_do_are_named():
-    table = ExcitationTable(spline=SplineTable(), harmonics=3, omega=1.0)
-    assert table.idle == [
+    table = Excitation(spline=spline(), harmonics=3, omega=1.0)
+    assert table.unused == [
         "`harmonics` and `omega` do nothing for a `spline`",
     ]
-    assert ExcitationTable(spline=SplineTable()).idle == []
+    assert Excitation(spline=spline()).unused == []
 
 
 def test_an_impossible_motion_is_diagnosed(written, run):
@@ -260,23 +265,23 @@ def test_earlier_results_are_nominal(written, excited):
     (written / "report").mkdir()
     result = written / "report" / "result.json"
     result.write_text(json.dumps(content))
-    found = build_nominal(experiment)
+    found = find_nominal(experiment)
     np.testing.assert_array_equal(found.parameters, 1.0 + np.arange(base.size))
     np.testing.assert_array_equal(found.covariance, covariance)
-    assert found.open == ()
+    assert found.undetermined == ()
     covariance[1][0] = covariance[0][1] = covariance[0][0] = None
     result.write_text(json.dumps(content))
-    found = build_nominal(experiment)
-    assert found.open == base.names[:1]
+    found = find_nominal(experiment)
+    assert found.undetermined == base.names[:1]
     np.testing.assert_array_equal(np.isnan(found.sizes), np.arange(base.size) == 0)
     np.testing.assert_array_equal(np.diag(found.covariance), 0.01 * (np.arange(base.size) > 0))
-    build_constraints(load_experiment(path), found)  # refuses a covariance that is not finite
+    find_constraints(load_experiment(path), found)  # refuses a covariance that is not finite
     (_, said) = force_remarks(experiment, found, excited.played)
     assert said.text.startswith(f"`report` does not determine {base.names[0]}: the forces are")
     rows[0]["name"] = "other"
     result.write_text(json.dumps(content))
     with pytest.raises(ValueError, match="are not the"):
-        build_nominal(experiment)
+        find_nominal(experiment)
 
 
 def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
@@ -284,7 +289,7 @@ def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
         text = EXPERIMENT.replace("[4]", f"[4]\nforce = [{force}]")
         (written / "forces.toml").write_text(text)
         experiment = load_experiment(written / "forces.toml")
-        nominal = build_nominal(experiment) if known else None
+        nominal = find_nominal(experiment) if known else None
         return list(force_remarks(experiment, nominal, excited.played))
 
     # Holding the rod where it points ahead takes 7.8 N m.
@@ -299,17 +304,19 @@ def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
         r"joint `hinge` with 1[4-9]\d\.\d % of 5 N m; give `force_margin`", beyond.text
     )
     (unknown,) = remarks(5.0, known=False)
-    assert unknown.text.startswith("forces were not looked at, although they have limits")
+    assert unknown.text.startswith("forces were not checked, although they have limits")
     assert remarks("inf") == []
 
 
 def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pictures, monkeypatch):
-    monkeypatch.setattr("jaxid.experiment.excite.design_excitation", lambda *_, **__: excited.plan)
+    monkeypatch.setattr(
+        "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
+    )
     keys = ("sample_time = 0.03", "leads = { periods = 2 }", 'ros = "json"')
     experiment = load_experiment(with_keys(written, "cycles.toml", *keys))
-    found = design(experiment, lambda _: None, written / "no.npz", False)
+    found = design_motion(experiment, lambda _: None, written / "no.npz", False)
     assert found.window[1] - found.window[0] == pytest.approx(4 * np.pi / 0.8)
-    files = write(found, written / "cycles" / "motion.csv")
+    files = write_design(found, written / "cycles" / "motion.csv")
     t, q, qd, qdd = table(files[0]).T
     np.testing.assert_allclose(t, 0.03 * np.arange(len(t)), atol=1e-12)
     assert 0.0 <= t[-1] - float(found.played.duration) < 0.03
@@ -323,18 +330,18 @@ def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pict
 
 
 def test_leads_may_be_given_their_time():
-    basis = build_basis(ExcitationTable(leads=LeadsTable(time=0.7, periods=3)), False)
+    basis = Excitation(leads=Leads(time=0.7, periods=3)).basis(False)
     assert (basis.lead, basis.periods) == (0.7, 3)
-    assert build_basis(ExcitationTable(leads=LeadsTable(periods=3)), True).periods == 3
-    rest = ExcitationTable(leads=LeadsTable(), rest=True)
-    assert rest.idle == ["`leads` do nothing for a motion that rests at its ends"]
+    assert Excitation(leads=Leads(periods=3)).basis(True).periods == 3
+    rest = Excitation(leads=Leads(), rest=True)
+    assert rest.unused == ["`leads` do nothing for a motion that rests at its ends"]
 
 
 def test_the_guide_shows_every_key():
     guide = Path(__file__).parent.parent / "docs" / "excitation.md"
     shown = guide.read_text(encoding="utf-8").partition("```toml")[2].partition("```")[0]
-    for kind in (ExcitationTable, LeadsTable, SplineTable):
-        for key in kind.__struct_fields__:
+    for kind in (Excitation, Leads, spline):
+        for key in keys_of(kind):
             assert re.search(rf"\b{key} = ", shown), key
 
 
@@ -352,9 +359,13 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excit
     def refuse(series, robot, periods):
         raise ValueError("no lead is short enough.")
 
-    monkeypatch.setattr("jaxid.experiment.excite.with_leads", refuse)
-    monkeypatch.setattr("jaxid.experiment.excite.design_excitation", lambda *_, **__: excited.plan)
-    led = design(load_experiment(written / "fast.toml"), lambda _: None, written / "no.npz", False)
+    monkeypatch.setattr("jaxid.experiment.excitation.with_leads", refuse)
+    monkeypatch.setattr(
+        "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
+    )
+    led = design_motion(
+        load_experiment(written / "fast.toml"), lambda _: None, written / "no.npz", False
+    )
     assert led.window[0] == 0.0
     page = html.unescape(excitation_page(led.plan, {}, led.aside).html())
     assert "The motion is without leads, and starts and ends at full speed: no lead is" in page
@@ -363,7 +374,7 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excit
 
 def test_a_urdf_claims_inertias_and_knows_no_friction(written):
     experiment = load_experiment(written / "experiment.toml")
-    found = build_nominal(experiment)
+    found = find_nominal(experiment)
     known = dict(zip(experiment.base.names, found.parameters, strict=True))
     assert known["mx1"] == pytest.approx(0.8)
     assert np.isnan(known["fv1"])
@@ -371,9 +382,9 @@ def test_a_urdf_claims_inertias_and_knows_no_friction(written):
 
 
 def test_every_criterion_can_be_compared(written, run, monkeypatch):
-    monkeypatch.setattr("jaxid.experiment.excite.ALL", CRITERIA[:2])
+    monkeypatch.setattr("jaxid.experiment.excitation.ALL", CRITERIA[:2])
     told = []
-    plans = side_by_side(load_experiment(written / "experiment.toml"), told.append)
+    plans = compare_criteria(load_experiment(written / "experiment.toml"), told.append)
     assert [plan.criterion.name for plan in plans] == [c.name for c in CRITERIA[:2]]
     for k, plan in enumerate(plans):
         assert plan.criteria[k].after <= 1.001 * min(p.criteria[k].after for p in plans)
@@ -383,7 +394,7 @@ def test_every_criterion_can_be_compared(written, run, monkeypatch):
 
 def test_ctrl_c_ends_the_comparison_of_criteria_too(excited, run, no_pictures, monkeypatch):
     stopped = dataclasses.replace(excited.plan, interrupted=True)
-    monkeypatch.setattr("jaxid.cli.excite.design", lambda *_: excited._replace(plan=stopped))
+    monkeypatch.setattr("jaxid.cli.excite.design_motion", lambda *_: excited._replace(plan=stopped))
     code, out, err = run("excite", "experiment.toml", "-o", "short/motion.csv", "--all-criteria")
     assert code == 0, err
     assert "wrote short: motion.csv" in out
@@ -403,8 +414,8 @@ def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
             raise KeyboardInterrupt
         return excited.plan
 
-    monkeypatch.setattr("jaxid.cli.excite.design", lambda *_: excited)
-    monkeypatch.setattr("jaxid.experiment.excite.design_excitation", one_design)
+    monkeypatch.setattr("jaxid.cli.excite.design_motion", lambda *_: excited)
+    monkeypatch.setattr("jaxid.experiment.excitation.design_excitation", one_design)
     arguments = ["excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria", "--resume"]
     code, out, err = run(*arguments)
     assert code == 0, err
@@ -424,7 +435,7 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch, kept
             state.touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("jaxid.cli.excite.design", stopped)
+    monkeypatch.setattr("jaxid.cli.excite.design_motion", stopped)
     folder = "early" if kept else "never"
     code, out, err = run("excite", "experiment.toml", "-o", f"{folder}/motion.csv")
     assert (code, out) == (130, "")
@@ -469,7 +480,7 @@ def test_where_pictures_find_no_room_nothing_is_written(excited, tmp_path, monke
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("jaxid.experiment.excite.write_pictures", full)
+    monkeypatch.setattr("jaxid.experiment.excitation.write_pictures", full)
     with pytest.raises(OSError, match="No space left"):
-        write(excited, tmp_path / "motion.csv")
+        write_design(excited, tmp_path / "motion.csv")
     assert list(tmp_path.iterdir()) == []

@@ -7,11 +7,17 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.experiment import tables
+from jaxid.errors import InputError
+from jaxid.experiment.decoder import keys_of
+from jaxid.experiment.estimator_table import KINDS
+from jaxid.experiment.excitation_tables import Collision, Excitation
 from jaxid.experiment.experiment import load_experiment
-from jaxid.experiment.reading import _STRUCTS
+from jaxid.experiment.method_tables import FILTERS, SIDES, Logs, build_rows
+from jaxid.experiment.robot_tables import RobotSource, replace_drives, replace_limits
 from jaxid.experiment.template import render, write_template
 from jaxid.measurement import units
+from jaxid.measurement.columns import Columns
+from jaxid.robot import library
 
 ARM = """\
 [robot]
@@ -40,6 +46,39 @@ URDF = """\
 </robot>
 """
 
+SHAPES = """
+[robot]
+convention = "modified"
+dh = [
+  { alpha = 0, a = 0, d = 0.3, name = "turn" },
+  { alpha = -90, a = 0, d = 0, name = "lift" },
+  { alpha = 0, a = 0.5, d = 0, name = "bend" },
+]
+
+[collision]
+distance = 0.05
+ground = -0.1
+
+[[collision.capsules]]
+name = "column"
+body = "ground"
+start = [0, 0, 0]
+end = [0, 0, 0.3]
+radius = 0.1
+
+[[collision.capsules]]
+name = "hand"
+body = "bend"
+start = [0.4, 0, 0]
+radius = 0.08
+
+[[collision.boxes]]
+name = "table"
+centre = [0.5, 0, 0]
+size = [0.4, 1, 0.1]
+rotation = [0, 0, 90]
+"""
+
 
 @pytest.fixture
 def load(tmp_path):
@@ -64,16 +103,16 @@ def test_defaults_are_said(load):
     ]
     assert experiment.filter == jid.ZeroPhaseButterworth(10.0)
     assert experiment.decimation == jid.Subsample(1)
-    assert experiment.slow is None
+    assert experiment.min_speed is None
     assert experiment.columns is None
-    assert isinstance(experiment.estimator.weights, jid.ResidualVariances)
+    assert isinstance(experiment.estimation.estimator.weights, jid.ResidualVariances)
     assert "10 Hz is assumed" in experiment.notes[0]
     assert "largest forces" in experiment.notes[1]
 
 
 def test_weights_are_the_largest_forces_where_they_are_known(load):
     experiment = load('[robot]\nbuiltin = "ur10"\n')
-    assert isinstance(experiment.estimator.weights, jid.MaximumForces)
+    assert isinstance(experiment.estimation.estimator.weights, jid.MaximumForces)
     assert len(experiment.notes) == 1
 
 
@@ -269,11 +308,13 @@ def test_filters(load, text, expected):
 
 
 def test_rows(load):
-    assert load(ARM + "[rows]\nevery = 50\n").decimation == jid.Subsample(50)
-    experiment = load(ARM + "[rows]\nfactors = [10, 5]\nslow = 0.1\n")
+    assert load(ARM + "[rows]\nstep = 50\n").decimation == jid.Subsample(50)
+    experiment = load(ARM + "[rows]\nfactors = [10, 5]\nmin_speed = 0.1\n")
     assert experiment.decimation == jid.Decimation((10, 5))
-    np.testing.assert_array_equal(experiment.slow, [0.1, 0.1])
-    np.testing.assert_array_equal(load(ARM + "[rows]\nslow = [0.1, 2]\n").slow, [0.1, 2.0])
+    np.testing.assert_array_equal(experiment.min_speed, [0.1, 0.1])
+    np.testing.assert_array_equal(
+        load(ARM + "[rows]\nmin_speed = [0.1, 2]\n").min_speed, [0.1, 2.0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -287,11 +328,11 @@ def test_rows(load):
 )
 def test_estimators(load, text, estimator, solution):
     experiment = load(f"{ARM}[estimator]\n{text}\n")
-    assert isinstance(experiment.estimator, estimator)
-    assert isinstance(experiment.estimator.solution, solution)
-    assert experiment.regularised == (solution is not jid.Complete)
+    assert isinstance(experiment.estimation.estimator, estimator)
+    assert isinstance(experiment.estimation.estimator.solution, solution)
+    assert experiment.estimation.regularised == (solution is not jid.Complete)
     if solution in (jid.Ridge, jid.Truncated):
-        assert experiment.estimator.solution.share == 0.02
+        assert experiment.estimation.estimator.solution.share == 0.02
 
 
 @pytest.mark.parametrize(
@@ -313,8 +354,8 @@ def test_estimators(load, text, estimator, solution):
 )
 def test_estimators_of_other_kinds(load, text, estimator):
     experiment = load(f"{ARM}[estimator]\n{text}\n")
-    assert experiment.estimator == estimator
-    assert experiment.plain == jid.WeightedLeastSquares(
+    assert experiment.estimation.estimator == estimator
+    assert experiment.estimation.plain == jid.WeightedLeastSquares(
         jid.ResidualVariances(), jid.Ridge(0.1) if "ridge" in text else jid.Complete()
     )
 
@@ -323,7 +364,7 @@ def test_estimators_of_files(load, tmp_path):
     motion = jid.random_fourier_series(jid.robots.planar_arm(2), omega=1.0, seed=3)
     jid.save_trajectory(motion, tmp_path / "motion.json")
     text = '[estimator]\nkind = "instrumental"\nreference = ["motion.json"]\nreference_start = 2\n'
-    estimator = load(ARM + text).estimator
+    estimator = load(ARM + text).estimation.estimator
     assert isinstance(estimator, jid.InstrumentalVariables)
     assert (len(estimator.references), estimator.starts) == (1, (2.0,))
     inertia = (
@@ -338,9 +379,13 @@ def test_estimators_of_files(load, tmp_path):
         '[robot]\nurdf = "arm.urdf"\n[model]\nprincipal_axes = true\n[estimator]\nprior = "urdf"\n'
     )
     experiment = load(robot + "ridge = 0.1\n")
-    assert isinstance(experiment.estimator, jid.RelativeTo)
+    assert isinstance(experiment.estimation.estimator, jid.RelativeTo)
     named = dict(
-        zip(experiment.model.parameter_names, experiment.estimator.parameters, strict=True)
+        zip(
+            experiment.model.parameter_names,
+            experiment.estimation.estimator.parameters,
+            strict=True,
+        )
     )
     assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [5.0, 7.0, 7.0, 6.0, 0.0]
     bounds = """kind = "consistent"
@@ -353,7 +398,7 @@ ellipsoid_centre = [0.0, 0.1, 0.0]
 ellipsoid_axes = [[inf, inf, inf], [0.3, 0.2, 0.2]]
 total_mass = 12
 """
-    consistent = load(robot + bounds).estimator
+    consistent = load(robot + bounds).estimation.estimator
     assert consistent.pull.bodies[1, 0] == 7.0
     assert consistent.bounds.total_mass == 12.0
     np.testing.assert_array_equal(consistent.bounds.mass_min, [0.5, 0.5])
@@ -367,7 +412,7 @@ total_mass = 12
 
 @pytest.mark.parametrize("name", ["spectral", "jackknife", "independent"])
 def test_uncertainties(load, name):
-    found = load(f'{ARM}[estimator]\nuncertainty = "{name}"\n').uncertainty
+    found = load(f'{ARM}[estimator]\nuncertainty = "{name}"\n').estimation.uncertainty
     kinds = {
         "spectral": jid.SpectralSandwich,
         "jackknife": jid.BlockJackknife,
@@ -396,224 +441,147 @@ def test_logs_are_read_cropped_and_filtered(load, tmp_path):
 
 
 BODIES = '[estimator]\nkind = "consistent"\n'
+COLUMNS = ARM + RECORDING
+BUTTERWORTH = ARM + "[filter]\nkind = 'butterworth'\n"
+TOOL = ARM + "[robot.tool]\nmass = 1\ncentre_of_mass = [0, 0, 0]\n"
 REFUSALS = [
-    ("robot = 3", "`robot` must be a table, but is 3."),
-    ("[robt]\nurdf = 'a'", "`robt` is no known key: did you mean `robot`?"),
-    ("", "the table `[robot]` is missing: give it `urdf`, `builtin` or `dh`."),
-    ("[robot]", "`robot` needs one of `urdf`, `builtin` and `dh`, but has none of them."),
-    (ARM + 'urdf = "a"', "needs one of `urdf`, `builtin` and `dh`, but has `urdf` and `builtin`."),
-    ('[robot]\nbuiltin = "tx9"', '`robot.builtin`: "tx9" is none of the robots tx90l_on_rail'),
-    ('[robot]\nbuiltin = "panda"\ntip = "x"', "`robot.tip` belongs to `urdf`"),
-    (ARM + "snap_tolerance = 0.01", "leave out `robot.snap_tolerance`"),
-    ('[robot]\nurdf = "no.urdf"', "`robot.urdf`: "),
-    ("[robot]\ndh = [{alpha = 0, a = 0, d = 0}]", "`robot.convention`"),
-    ("[robot]\ndh = []\nconvention = 'standard'", "`robot.dh`: "),
-    (
-        "[robot]\ndh = [{alpha = 0, a = 0}]",
-        "`robot.dh[0].d` is missing: `[robot.dh]` needs it.",
-    ),
-    (
-        "[robot]\ndh = [{alpha = 0, a = 0, d = 0, teta = 0}]",
-        "`robot.dh[0].teta` is no known key: did you mean `theta`?",
-    ),
-    (ARM + "gravity = [0, -9.81]", "`robot.gravity` must hold 3 numbers, but holds 2."),
-    (ARM + "gravity = [0, 0, 'g']", '`robot.gravity[2]` must be a number, but is "g".'),
-    (ARM + "gravty = 1", "`robot.gravty` is no known key: did you mean `gravity`?"),
-    (ARM + "cutoff = 1", "`robot.cutoff` is no known key: `cutoff` belongs into the table `[filt"),
-    (ARM + "xyzzy = 1", "`robot.xyzzy` is no known key: the table `[robot]` has urdf, builtin"),
-    (
-        ARM + "[robot.tool]\nmass = 0\ncentre_of_mass = [0, 0, 0]",
-        "`robot.tool.mass` must be positive, but is 0.",
-    ),
-    (
-        ARM + "[robot.tool]\nmass = 1\ncentre_of_mass = [0, 0, 0]\nbody = 'hand'",
-        "`robot.tool`: `body` must be the name of the joint that moves it (joint1, joint2), b",
-    ),
-    (
-        ARM
-        + "[robot.tool]\nmass = 1\ncentre_of_mass = [0, 0, 0]\ninertia = {xx = 1, yy = 1, zz = 9}",
-        "`robot.tool`: `inertia` of the tool belongs to no body",
-    ),
-    (
-        ARM + "[limits]\nvelocity = [1, 2, 3]",
-        "`limits`: `velocity` must hold one value for each of the 2 joints (joint1, joint2), but "
-        "holds 3.",
-    ),
-    (ARM + "[limits]\nvelocity = 1", "`limits.velocity` must be a list, but is 1."),
-    (ARM + "[limits]\nvelocity = [1, -2]", "`limits`: `velocity` must be positive, but joint 2"),
-    (ARM + "[limits]\nangle_unit = 'grad'", '`limits.angle_unit` must be "rad" or "deg", but is "'),
-    (
-        ARM + "[limits]\nposition_min = [1, 1]\nposition_max = [0, 2]",
-        "`limits`: `position_min` must be below",
-    ),
+    ("robot = 3", "`robot`"),
+    ("[robt]\nurdf = 'a'", "`robt`.*did you mean `robot`"),
+    ("", "`[robot]`"),
+    ("[robot]", "`urdf`, `builtin` and `dh`"),
+    ("[[robot]]", "`[[…]]`"),
+    (ARM + 'urdf = "a"', "`urdf` and `builtin`"),
+    ('[robot]\nbuiltin = "tx9"', "`builtin`"),
+    ('[robot]\nbuiltin = "panda"\ntip = "x"', "`tip` belongs to `urdf`"),
+    (ARM + "snap_tolerance = 0.01", "`snap_tolerance`"),
+    ('[robot]\nurdf = "no.urdf"', "`urdf`: `.*no.urdf`"),
+    ("[robot]\ndh = [{alpha = 0, a = 0, d = 0}]", "`convention`"),
+    ("[robot]\ndh = []\nconvention = 'standard'", "`robot`"),
+    ("[robot]\ndh = [{alpha = 0, a = 0}]", "`robot.dh[0].d`.*`[robot.dh]`"),
+    ("[robot]\ndh = [{alpha = 0, a = 0, d = 0, teta = 0}]", "`robot.dh[0].teta`.*`theta`"),
+    (ARM + "gravity = [0, -9.81]", "`robot.gravity`"),
+    (ARM + "gravity = [0, 0, 'g']", "`robot.gravity[2]`"),
+    (ARM + "gravity = [0, 0, nan]", "`gravity`"),
+    (ARM + "gravty = 1", "`robot.gravty`.*`gravity`"),
+    (ARM + "xyzzy = 1", "`robot.xyzzy`.*`[robot]` has urdf"),
+    (ARM + 'name = "a\\u001b[31m"', "`robot.name`.*U+001B"),
+    (TOOL.replace("mass = 1", "mass = 0"), "`robot.tool.mass`"),
+    (TOOL.replace("mass = 1", "mass = 1e300"), "`mass`"),
+    (TOOL + "body = 'hand'", "`body`.*joint1, joint2"),
+    (TOOL + "inertia = {xx = 1, yy = 1, zz = 9}", "`inertia`"),
+    (ARM + "[limits]\nvelocity = [1, 2, 3]", "`limits`: `velocity`.*joint1, joint2"),
+    (ARM + "[limits]\nvelocity = 1", "`limits.velocity`"),
+    (ARM + "[limits]\nvelocity = [1, -2]", "`limits`: `velocity`"),
+    (ARM + "[limits]\nangle_unit = 'grad'", "`limits.angle_unit`"),
+    (ARM + "[limits]\nposition_min = [1, 1]\nposition_max = [0, 2]", "`position_min`"),
+    (ARM + "[limits]\nposition_max = [150, 150]", "`joint1`.*`angle_unit"),
+    (ARM + "[limits]\nforce = [1e-300, 20]", "`force`"),
+    (ARM + "[limits]\nforce = [80, 1e300]", "`force`"),
     (
         ARM + "[drives]\ngear_ratios = [1, 1]\nmatrix = [[1, 0], [0, 1]]",
-        "`drives`: give `gear_ratios` or `matrix`, but not both.",
+        "`gear_ratios` or `matrix`",
     ),
-    (ARM + "[drives]\ngear_ratios = [1]", "each of the 2 joints"),
-    (ARM + "[drives]\ngear_ratios = [1, 0]", "is a gear ratio zero?"),
-    (ARM + "[drives]\nmatrix = [[1, 0], [0]]", "`drives`: `matrix` must hold 2 rows of 2 numbers"),
-    (ARM + "[drives]\nzero = [1]", "`drives`: `zero` must hold one value for each of the 2 joints"),
-    (ARM + "[model]\nviscous = 1", "`model.viscous` must be true or false, but is 1."),
-    (ARM + "[model]\ncoulomb = 'hard'", "`model.coulomb` must be true or false or a table, but is"),
-    (ARM + "[model.coulomb]\nepsilon = 0", "`model.coulomb.epsilon` must be positive, but is 0."),
-    (
-        ARM + "[model.coulomb]\nepsilon = [1]",
-        "`model`: `coulomb.epsilon` must hold one value for ea",
-    ),
-    (
-        ARM + "[model]\ncoupled_drives = true",
-        "`model`: the drives of `planar arm, 2 joints` are not",
-    ),
-    (ARM + "[recording]\nangles = 'q{}'", "`recording.forces` is missing: `[recording]` needs it."),
-    (
-        ARM + RECORDING.replace('time = "t"', ""),
-        "`recording`: give `time` (the column of the time stamps) or `sample_time` [s] (rows "
-        "equally far apart): it has neither.",
-    ),
-    (ARM + RECORDING + "sample_time = 1", "apart): not both."),
-    (
-        ARM + RECORDING + "side = 'link'",
-        '`recording.side` must be "joint" or "motor", but is "link"',
-    ),
-    (ARM + RECORDING + "angle_unit = 'degree'", "`recording`: `degree` is no known unit (did you"),
-    (ARM + RECORDING + "angle_unit = ['deg']", "`recording`: `angle_unit` must hold one value for"),
-    (ARM + RECORDING + "force_unit = 's'", "`recording`: `force_unit` must measure"),
-    (ARM + RECORDING + "force_unit = 'A'", "`recording`: `torque_constants` [N m/A] are needed"),
-    (
-        ARM + RECORDING + "angle_signs = [1, 2]",
-        "`recording.angle_signs[1]` must be 1 or -1, but is",
-    ),
-    (
-        ARM + RECORDING + "angle_offsets = [1]",
-        "`recording`: `angle_offsets` must hold one value fo",
-    ),
-    (
-        ARM + RECORDING.replace('"q{}"', '["q1"]'),
-        "`recording`: `angles` must hold one value for eac",
-    ),
-    (ARM + RECORDING + "angels = 1", "`recording.angels` is no known key: did you mean `angles`?"),
-    (
-        ARM + "[filter]\ncutoff = 1",
-        '`filter.kind` is missing: `[filter]` needs it ("butterworth", ',
-    ),
-    (
-        ARM + "[filter]\nkind = 'buterworth'",
-        '`filter.kind` must be "butterworth", "paper" or "periodic", but is "buterworth".',
-    ),
-    (
-        ARM + "[filter]\nkind = 'butterworth'\ncutoff = -3",
-        "`filter.cutoff` must be positive, but is -3.",
-    ),
-    (
-        ARM + "[filter]\nkind = 'butterworth'\ncutoff = nan",
-        "`filter.cutoff` must be positive, but i",
-    ),
-    (
-        ARM + "[filter]\nkind = 'paper'\ncutoff = 3",
-        "`filter.cutoff` is no known key: the table `[filter]` has kind, velocity, acceleration, m",
-    ),
-    (ARM + "[filter]\nkind = 'butterworth'\ncutof = 3", "is no known key: did you mean `cutoff`?"),
-    (
-        ARM + "[filter]\nkind = 'periodic'\nperiod = 1\nharmonics = 1.5",
-        "must be a whole number, but",
-    ),
-    (ARM + "[rows]\nevery = 0", "`rows.every` must be at least 1, but is 0."),
-    (ARM + "[rows]\nevery = 2\nfactors = [2]", "`rows`: give `every`"),
-    (ARM + "[rows]\nfactors = [50]", "`rows`: `factors` must be 13 or less"),
-    (ARM + "[rows]\nslow = [1]", "`rows`: `slow` must hold one value for each of the 2 joints"),
-    (ARM + "[rows]\nslow = -1", "`rows.slow` must be at least 0, but is -1."),
-    (
-        ARM + "[estimator]\nkind = 'wls'",
-        '`estimator.kind` must be "weighted", "least_squares", "huber", "tukey", "correlated"',
-    ),
-    (
-        ARM + "[estimator]\nweights = 'maximum_forces'",
-        '`estimator`: `weights = "maximum_forces"`: the largest force of joint `joint1`',
-    ),
+    (ARM + "[drives]\ngear_ratios = [1]", "`gear_ratios`"),
+    (ARM + "[drives]\ngear_ratios = [nan, 1]", "`gear_ratios`"),
+    (ARM + "[drives]\ngear_ratios = [1, 0]", "`drives`"),
+    (ARM + "[drives]\nmatrix = [[1, 0], [0]]", "`matrix`"),
+    (ARM + "[drives]\nzero = [1]", "`zero`"),
+    (ARM + "[drives]\nzero = [inf, 1]", "`zero`"),
+    (ARM + "[drives]\nmax_torques = [0, 1]", "`drives.max_torques[0]`"),
+    (ARM + "[model]\nviscous = 1", "`model.viscous`"),
+    (ARM + "[model]\ncoulomb = 'hard'", "`model.coulomb`"),
+    (ARM + "[model.coulomb]\nepsilon = 0", "`model.coulomb.epsilon`"),
+    (ARM + "[model.coulomb]\nepsilon = [1]", "`coulomb.epsilon`"),
+    (ARM + "[model.coulomb]\nasymmetric = true\nstribeck = 1", "`coulomb.stribeck`"),
+    (ARM + "[model]\ncoupled_drives = true", "`model`"),
+    (ARM + "[recording]\nangles = 'q{}'", "`recording.forces`"),
+    (COLUMNS.replace('time = "t"', ""), "`time`.*`sample_time`"),
+    (COLUMNS + "sample_time = 1", "`time`.*`sample_time`"),
+    (COLUMNS + "side = 'link'", "`recording.side`"),
+    (COLUMNS + "angle_unit = 'degree'", "`degree`"),
+    (COLUMNS + "angle_unit = ['deg']", "`angle_unit`"),
+    (COLUMNS + "force_unit = 's'", "`force_unit`"),
+    (COLUMNS + "force_unit = 'A'", "`torque_constants`"),
+    (COLUMNS + "force_unit = 'A'\ntorque_constants = [0, 1]", "`torque_constants`"),
+    (COLUMNS + "angle_signs = [1, 2]", "`angle_signs`"),
+    (COLUMNS + "angle_offsets = [1]", "`angle_offsets`"),
+    (COLUMNS + "largest_gap = 0.5", "`recording.largest_gap`"),
+    (COLUMNS.replace('"q{}"', '["q1"]'), "`angles`"),
+    (COLUMNS + "angels = 1", "`recording.angels`.*`angles`"),
+    (ARM + "[filter]\ncutoff = 1", "`filter.kind`"),
+    (ARM + "[filter]\nkind = 'buterworth'", "`filter.kind`"),
+    (BUTTERWORTH + "cutoff = -3", "`cutoff`"),
+    (BUTTERWORTH + "cutoff = nan", "`cutoff`"),
+    (BUTTERWORTH + "cutoff = 'low'", "`filter.cutoff`"),
+    (BUTTERWORTH + "cutoff = []", "`filter.cutoff`"),
+    (BUTTERWORTH + "cutof = 3", "`filter.cutof`.*`cutoff`"),
+    (ARM + "[filter]\nkind = 'paper'\ncutoff = 3", "`filter.cutoff`.*velocity"),
+    (ARM + "[filter]\nkind = 'periodic'\nperiod = 1\nharmonics = 1.5", "`filter.harmonics`"),
+    (ARM + "[rows]\nevery = 2", "`rows.every` was renamed to `step`"),
+    (ARM + "[rows]\nmin_speed = 2", "`rows.slow` was renamed to `min_speed`"),
+    (ARM + "[rows]\nstep = 0", "`rows.step`"),
+    (ARM + "[rows]\nstep = 2\nfactors = [2]", "`step`.*`factors`"),
+    (ARM + "[rows]\nfactors = [50]", "`factors`"),
+    (ARM + "[rows]\nmin_speed = [1]", "`min_speed`"),
+    (ARM + "[rows]\nmin_speed = -1", "`rows.min_speed`"),
+    (ARM + "[estimator]\nkind = 'wls'", "`estimator.kind`"),
+    (ARM + "[estimator]\nweights = 'maximum_forces'", "`weights = .*`joint1`"),
     (
         ARM + "[estimator]\nkind = 'least_squares'\nweights = 'residual_variances'",
-        '`estimator`: `weights` belongs to `kind = "weighted" or "huber" or "tukey"',
+        "`estimator.weights`: belongs to `kind",
     ),
-    (
-        ARM + "[estimator]\nlimit = 2.0",
-        '`estimator`: `limit` belongs to `kind = "huber" or "tukey"`',
-    ),
-    (
-        ARM + "[estimator]\nkind = 'instrumental'",
-        '`estimator`: `kind = "instrumental"` needs `refe',
-    ),
-    (
-        ARM + "[estimator]\nridge = 0.1\nprior = 'urdf'",
-        "takes the inertias of the robot's URDF file",
-    ),
-    (ARM + BODIES + "mass_min = -1", "`estimator.mass_min` must be at least 0, but is -1."),
-    (ARM + BODIES + "mass_min = [1, 2, 3]", "`mass_min` must hold numbers for all bodies or for e"),
-    (ARM + BODIES + "mass_min = 2\nmass_max = 1", "`mass_min` must lie between 0 and `mass_max`"),
-    (ARM + BODIES + "radius = 0", "`estimator.radius` must be positive, but is 0."),
-    (ARM + BODIES + "radius = [1, 2, 3]", "`radius` must hold numbers for all bodies or for each"),
-    (ARM + BODIES + "centre_min = [0, 0]", "`centre_min` must hold three numbers for all bodies, "),
-    (ARM + BODIES + "centre_max = [[1, 1, 1]]", "a list of three for each of the 2 bodies."),
-    (
-        ARM + BODIES + "centre_min = [1, 0, 0]\ncentre_max = [0, 1, 1]",
-        "`centre_min` must be below `centre_max` for every body",
-    ),
-    (ARM + BODIES + "ellipsoid_centre = [0, 0, 0]", "`ellipsoid_centre` needs `ellipsoid_axes`"),
-    (ARM + BODIES + "ellipsoid_axes = [0, 1, 1]", "`ellipsoid_axes` must be positive"),
-    (ARM + "[estimator]\nradius = 1", '`estimator`: `radius` belongs to `kind = "consistent"`'),
-    (ARM + "[estimator]\nessential = 1", "`estimator.essential` must be below 1, but is 1."),
-    (ARM + BODIES + "essential = 0.1", '`essential` belongs to `kind = "weighted" or "least_s'),
-    (ARM + "[estimator]\nessential = 0.1\nridge = 0.1", "`essential` does not go with `ridge`"),
-    (ARM + "[estimator]\ntruncate = 1", "`estimator.truncate` must be below 1, but is 1."),
-    (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge` must be a number or"),
-    (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`estimator`: give `truncate` or `ridge`"),
-    ("[robot\n", "is no TOML: "),
-    (ARM + ARM, "is no TOML: "),
-    (
-        ARM + "[excitation.spline]\npionts = 3",
-        "`excitation.spline.pionts` is no known key: did you mean `points`?",
-    ),
-    (
-        ARM + "[excitation.spline]\npoints = 3",
-        "`excitation.spline.points` must be at least 4, but is 3.",
-    ),
-    (ARM + "[excitation]\nspline = 3", "`excitation.spline` must be a table, but is 3."),
-    (
-        ARM + "[excitation]\nseed = 1180591620717411303424",
-        "`excitation.seed` must be at most 4294967295, but is 1180591620717411303424.",
-    ),
-    (
-        ARM + "[excitation]\nsamples = 1_000_000_000_000_000",
-        "`excitation.samples` must be at most 10000000, but is 1000000000000000.",
-    ),
-    (
-        ARM + "[excitation]\nnoise = [inf, 1]",
-        "`excitation.noise[0]` must be below 1000000000, but is inf.",
-    ),
-    (ARM + "x = " + 3000 * "[", "is no TOML: brackets are nested too deeply."),
-    (ARM + "x = " + 3000 * "{a = ", "is no TOML: brackets are nested too deeply."),
-    (
-        ARM + "x = " + 9999 * "9",
-        "holds a number of thousands of digits.",
-    ),
-    (
-        ARM + 'name = "a\\u001b[31m"',
-        "`robot.name` holds the control character U+001B: remove it.",
-    ),
+    (ARM + "[estimator]\nlimit = 2.0", '`estimator.limit`: belongs to `kind = "huber" or "tuk'),
+    (ARM + "[estimator]\nkind = 'instrumental'", "`estimator.reference`"),
+    (ARM + "[estimator]\nridge = 0.1\nprior = 'urdf'", "`prior"),
+    (ARM + "[estimator]\nnonlinear_friction = true\nessential = 0.1", "`nonlinear_friction`"),
+    (ARM + BODIES + "mass_min = -1", "`mass_min`"),
+    (ARM + BODIES + "mass_min = [1, 2, 3]", "`mass_min`"),
+    (ARM + BODIES + "mass_min = 2\nmass_max = 1", "`mass_min`"),
+    (ARM + BODIES + "radius = 0", "`radius`"),
+    (ARM + BODIES + "radius = 'wide'", "`estimator.radius`"),
+    (ARM + BODIES + "centre_min = [0, 0]", "`centre_min`"),
+    (ARM + BODIES + "centre_max = [[1, 1, 1]]", "`centre_max`"),
+    (ARM + BODIES + "centre_max = [[1, 1, 1], [1, 1]]", "`estimator.centre_max`"),
+    (ARM + BODIES + "centre_min = [1, 0, 0]\ncentre_max = [0, 1, 1]", "`centre_min`"),
+    (ARM + BODIES + "ellipsoid_centre = [0, 0, 0]", "`ellipsoid_axes`"),
+    (ARM + BODIES + "ellipsoid_axes = [0, 1, 1]", "`ellipsoid_axes`"),
+    (ARM + "[estimator]\nradius = 1", '`estimator.radius`: belongs to `kind = "consistent"`'),
+    (ARM + "[estimator]\nessential = 1", "`estimator.essential`"),
+    (ARM + BODIES + "essential = 0.1", "`estimator.essential`: belongs to"),
+    (ARM + "[estimator]\nessential = 0.1\nridge = 0.1", "`essential`.*`ridge`"),
+    (ARM + "[estimator]\ntruncate = 1", "`estimator.truncate`"),
+    (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge`"),
+    (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`truncate` or `ridge`"),
+    (ARM + "[excitation.spline]\npionts = 3", "`excitation.spline.pionts`.*`points`"),
+    (ARM + "[excitation.spline]\npoints = 3", "`excitation.spline.points`"),
+    (ARM + "[excitation]\nspline = 3", "`excitation.spline`"),
+    (ARM + "[excitation]\nseed = 1180591620717411303424", "`excitation.seed`"),
+    (ARM + "[excitation]\nsamples = 1_000_000_000_000_000", "`excitation.samples`"),
+    (ARM + "[excitation]\nnoise = [inf, 1]", "`excitation.noise[0]`"),
+    (ARM + "[excitation]\nharmonics = 1000", "`excitation.harmonics`"),
+    (ARM + "[excitation]\nomega = 1e9", "`excitation.omega`"),
+    ("[robot\n", "TOML"),
+    (ARM + ARM, "TOML"),
+    (ARM + "x = " + 3000 * "[", "TOML"),
+    (ARM + "x = " + 9999 * "9", "TOML"),
+    (SHAPES.replace('body = "bend"', 'body = "wrist"'), "`body` of capsule `hand`.*turn, lift"),
+    (SHAPES.replace("radius = 0.08", "radius = -1"), "`collision.capsules[1].radius`"),
+    (SHAPES.replace("ground = -0.1", 'pairs = [["hand", "chair"]]'), "`chair`"),
+    (SHAPES.replace("ground = -0.1", "fit = true"), "`fit`.*`robot.urdf`"),
+    (SHAPES.replace("ground = -0.1", "grund = 1.0"), "`collision.grund`.*`ground`"),
 ]
 
 
 @pytest.mark.parametrize(("text", "expected"), REFUSALS, ids=range(len(REFUSALS)))
 def test_mistakes_are_one_sentence_with_file_and_key(load, text, expected):
-    with pytest.raises(ValueError, match=re.escape(expected)) as caught:
+    pattern = re.escape(expected).replace(r"\.\*", ".*")
+    with pytest.raises(InputError, match=pattern) as caught:
         load(text)
     message = str(caught.value)
     assert message.startswith("experiment.toml: ")
     assert "\n" not in message
     assert message.endswith((".", "?"))
     assert not message.endswith("..")
-    for machinery in ("$", "null", "msgspec", "Object", "`float`", "Expected"):
-        assert machinery not in message
 
 
 def test_files_that_cannot_be_read(tmp_path):
@@ -670,14 +638,15 @@ def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
     tool = r"^# (?=\[(robot.tool|load|collision)\]|mass = |centre_of_mass = )"
     text = re.sub(tool, "", text, flags=re.M)
     path = tmp_path / "experiment.toml"
-    keys = dict.fromkeys(re.findall(r"^# ?(\w+) = ", text, flags=re.M))
+    keys = dict.fromkeys(re.findall(r"^# (\w+) = ", text, flags=re.M))
     assert len(keys) > 25
     for key in keys:
-        path.write_text(re.sub(rf"^# ?({key} = )", r"\1", text, count=1, flags=re.M))
+        path.write_text(re.sub(rf"^# ({key} = )", r"\1", text, count=1, flags=re.M))
         said = _refusal(path)
-        # The keys of other kinds of filter follow their kind, which stands twice then.
+        # The keys of other kinds follow their kind, which stands twice then.
         foreign = re.search(r"`filter.\w+` is no known key", said)
-        assert "no known key" not in said or foreign, said
+        wrong = re.search(r"no known key|must be (a|true)|is missing", said)
+        assert not wrong or foreign, said
 
 
 def _refusal(path):
@@ -689,13 +658,12 @@ def _refusal(path):
 
 
 def test_the_template_documents_every_key():
-    from jaxid.experiment import tables
-    from jaxid.experiment.reading import _STRUCTS
-
     text = render(jid.robots.tx90l_on_rail(), "arm.urdf")
-    structs = [*_STRUCTS.values(), *tables.FILTERS.values()]
-    for key in {k for s in structs for k in s.__struct_encode_fields__}:
-        assert re.search(rf"(?<![\w]){key}(?![\w])", text), key
+    tables = (RobotSource, replace_limits, replace_drives, Columns, Logs, build_rows)
+    kinds = [f for _, functions in KINDS.values() for f in functions]
+    for function in (*tables, *FILTERS.values(), *kinds, Excitation, Collision):
+        for key in set(keys_of(function)) - {*SIDES, "tool"}:
+            assert re.search(rf"^(# )?{key} = .", text, flags=re.M), key
 
 
 def test_the_template_of_a_missing_urdf(tmp_path):
@@ -730,11 +698,6 @@ def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
         urdf.write_text(URDF.replace('"tool"', f'"t{sign}"'))
         with pytest.raises(ValueError, match=r"the name of link `t .* control character U\+"):
             write_template(urdf, folder=tmp_path)
-
-
-def test_every_table_has_its_place_in_the_messages():
-    known = {*_STRUCTS.values(), *tables.FILTERS.values()}
-    assert known == set(tables._Table.__subclasses__())
 
 
 def test_the_template_breaks_long_lists(tmp_path):
@@ -795,3 +758,22 @@ def test_the_path_of_the_urdf_where_the_file_goes_elsewhere(tmp_path):
     path.parent.mkdir()
     path.write_text(write_template(tmp_path / "arm.urdf", folder=None), encoding="utf-8")
     assert load_experiment(path).robot.joints == 2
+
+
+def test_shapes_come_from_the_file(load):
+    experiment = load(SHAPES)
+    model = experiment.collision
+    assert model.pair_names == ("column and hand", "hand and table", "hand and ground")
+    assert experiment.clearance == 0.05
+    gaps = np.asarray(model.clearance(experiment.robot, np.zeros(3)))
+    # At zero the hand is at 0.9 m along x, at the height of the shoulder.
+    assert gaps[2] == pytest.approx(0.3 + 0.1 - 0.08, abs=1e-5)
+    assert gaps[0] == pytest.approx(0.9 - 0.18, abs=1e-5)
+    named = SHAPES.replace("ground = -0.1", 'pairs = [["hand", "table"]]')
+    assert load(named).collision.pair_names == ("hand and table",)
+    assert load(ARM).collision is None
+
+
+def test_the_built_in_shapes_are_those_of_the_library(load):
+    model = load('[robot]\nbuiltin = "tx90l_on_rail"\n[collision]\nfit = true\n').collision
+    assert model.pair_names == library.tx90l_on_rail_collision().pair_names

@@ -127,7 +127,7 @@ VALUES = {
     "limits": "velocity = [1, 1]\n",
     "recording": 'angles = "q{}"\nforces = "f{}"\ntime = "t"\n',
     "filter": 'kind = "butterworth"\ncutoff = 10\n',
-    "rows": "every = 2\n",
+    "rows": "step = 2\n",
     "excitation": "harmonics = 3\n",
 }
 

@@ -178,14 +178,14 @@ def inspect(
         terminal.show_check(console, loaded.robot, log.check, doubts)
         console.print()
         terminal.show_rows(console, (log.observations,), fit)
-        terminal.show_undetermined(console, fit, loaded.regularised)
+        terminal.show_undetermined(console, fit, loaded.estimation.regularised)
 
 
 def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fit, tuple[str, ...]]:
     log = load_log(experiment, path, stage)
     stage(f"factorising {path.name}")
     progress = stage.through(log.recording.samples)
-    fit = estimate(experiment.base, log.observations, experiment.plain, progress)
+    fit = estimate(experiment.base, log.observations, experiment.estimation.plain, progress)
     stage(f"looking for slips in {path.name}")
     return log, fit, fitted_doubts(log, fit)
 
@@ -285,12 +285,11 @@ def identify(
         through = stage.through(max(o.samples for o in [*fitted, *checked]))
         found = validate(fit, [*fitted, *checked], progress=through)
         beside = None
-        doubtful = loaded.regularised or loaded.single_axes is not None or fit.undetermined
+        doubtful = loaded.estimation.regularised or fit.undetermined
         if doubtful and not reports:
             same = rows if fit.base is base else Rows.of(fit.base, fitted)
             other = fit_rows(same, loaded.other_estimator)
-            ways = None if loaded.single_axes is None else ("axis by axis", "at once")
-            beside = Beside.of(other, [*fitted, *checked], ways)
+            beside = Beside.of(other, [*fitted, *checked], None)
         suspected = slips_of(read[: len(logs)], fit)
         if fit.residual > BAD and not suspected:
             said.append(DELAYS)
@@ -311,7 +310,7 @@ def identify(
                 "split": split,
                 "filter": str(loaded.filter),
                 "decimation": str(loaded.decimation),
-                "slow": loaded.slow,
+                "slow": loaded.min_speed,
             },
             (*loaded.notes, *dict.fromkeys(logs_said), *doubts),
             beside,
@@ -327,7 +326,7 @@ def identify(
     terminal.show_fit(console, fit)
     console.print()
     terminal.show_rows(console, fitted, fit)
-    terminal.show_undetermined(console, fit, loaded.regularised)
+    terminal.show_undetermined(console, fit, loaded.estimation.regularised)
     terminal.show_residuals(console, loaded.robot, fit)
     terminal.sentences(console, suspected, terminal.DOUBTFUL, "!")
     terminal.show_consistency(console, loaded.robot, fit)
@@ -340,7 +339,8 @@ def identify(
 def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -> tuple[Fit, Run]:
     """A run with what earlier reports know, as if all logs had been fitted at once."""
     if not run.tells(fit):
-        kind = fit.estimator if experiment.essential is None else "for essential parameters"
+        essential = experiment.estimation.essential is not None
+        kind = "for essential parameters" if essential else fit.estimator
         raise InputError(
             f"{experiment.path.name}: earlier reports can be added to plain least squares only, "
             f"but the estimator is {kind}: leave `[estimator]` out, or give the logs "

@@ -10,7 +10,7 @@ from rich.text import Text
 from jaxid.cli.options import ExperimentFile, open_console
 from jaxid.errors import InputError
 from jaxid.experiment import terminal
-from jaxid.experiment.excite import design, side_by_side, write
+from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.folder import refuse_foreign_table
 from jaxid.experiment.progress import designing
@@ -52,11 +52,11 @@ def excite(
         terminal.sentences(console, [text], terminal.DOUBTFUL, "!")
     try:
         with designing(console) as tell:
-            excited = design(loaded, tell, state, resume)
+            excited = design_motion(loaded, tell, state, resume)
     except KeyboardInterrupt:
         open_console(stderr=True).print(Text(f"jaxid: {_nothing(state)}"), soft_wrap=True)
         raise typer.Exit(STOPPED) from None
-    written = write(excited, output, _command_line(experiment, output, all_criteria))
+    written = write_design(excited, output, _command_line(experiment, output, all_criteria))
     if not excited.plan.interrupted:
         state.unlink(missing_ok=True)
     show_excited(console, excited)
@@ -69,7 +69,7 @@ def excite(
         terminal.sentences(console, [stopped], terminal.DOUBTFUL, "!")
         return
     with designing(console) as tell:
-        plans = side_by_side(loaded, tell)
+        plans = compare_criteria(loaded, tell)
     show_side_by_side(console, plans)
 
 

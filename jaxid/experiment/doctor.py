@@ -24,7 +24,7 @@ def examine(experiment: Experiment, recording: Recording) -> tuple[str, ...]:
     """
     observations = experiment.observe(recording)
     check = check_log(experiment.robot, recording, observations)
-    fit = identify(experiment.base, observations, experiment.plain)
+    fit = identify(experiment.base, observations, experiment.estimation.plain)
     log = Loaded(recording, observations, check, observations)
     return (*fitted_doubts(log, fit), *check.warnings)
 

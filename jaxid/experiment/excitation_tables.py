@@ -1,15 +1,13 @@
-"""The table `[excitation]` becomes constraints, what earlier motions told, and trajectories."""
+"""The tables `[collision]` and `[excitation]` of an experiment file."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.errors import InputError
-from jaxid.excitation.constraints.clearance import Clearance
-from jaxid.excitation.constraints.constraint import AbstractConstraint
-from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace
 from jaxid.excitation.criteria import (
     AbstractCriterion,
     AOptimal,
@@ -19,13 +17,20 @@ from jaxid.excitation.criteria import (
     ScaledConditionNumber,
     WeightedConditionNumber,
 )
-from jaxid.excitation.information import information
-from jaxid.experiment.excited_forces import force_limits
-from jaxid.experiment.experiment import Experiment
-from jaxid.experiment.nominal import Nominal
-from jaxid.experiment.tables import ExcitationTable
+from jaxid.experiment.decoder import Bounds, Count, Positive, Vector
+from jaxid.experiment.robot_tables import RobotSource, joint_list
+from jaxid.robot import library
+from jaxid.robot.collision import (
+    GROUND,
+    AbstractObstacle,
+    Box,
+    Capsule,
+    CollisionModel,
+    HalfSpace,
+)
+from jaxid.robot.kinematics import rpy_rotation
+from jaxid.robot.robot import Robot
 from jaxid.trajectory.basis import AbstractBasis
-from jaxid.trajectory.files import load_trajectory
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
@@ -39,127 +44,268 @@ CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
     "weighted_condition_number": WeightedConditionNumber,
     "scaled_condition_number": ScaledConditionNumber,
 }
-"""What `excitation.criterion` may be."""
-LEAD = 0.5
-"""Time of leads that are designed together with the motion where the file does not say [s]."""
 
 
-def build_basis(table: ExcitationTable, constrained: bool) -> AbstractBasis:
-    """The trajectories to choose from.
+def capsule(
+    *, name: str, body: str, start: Vector, radius: Positive, end: Vector | None = None
+) -> tuple[str, Capsule]:
+    """Return a capsule and the name of its body; a sphere without `end`.
 
     Args:
-        table: Of the experiment file.
-        constrained: Whether there is more to keep than limits of joints: then leads are designed
-            together with the motion, so that they keep it too.
-
-    Raises:
-        InputError: If two kinds are asked for, or one whose end no sample would meet.
+        name: Name of the capsule.
+        body: Name of the joint that moves the capsule's body, or "ground".
+        start: One end of the axis, in the frame of the body [m].
+        radius: Radius [m].
+        end: Other end of the axis [m].
     """
-    if table.spline is not None:
-        if table.rest:
+    return body, Capsule(name, GROUND, start=start, end=end, radius=radius)
+
+
+def box(*, name: str, centre: Vector, size: Vector, rotation: Vector | None = None) -> Box:
+    """Return a box in the world.
+
+    Args:
+        name: Name of the box.
+        centre: Centre [m].
+        size: Lengths of the edges [m].
+        rotation: Roll, pitch, yaw [deg].
+    """
+    R = None if rotation is None else rpy_rotation(np.deg2rad(rotation))
+    return Box(name, centre=centre, size=size, rotation=R)
+
+
+@dataclasses.dataclass(frozen=True)
+class Collision:
+    """Shapes that must keep a distance while a designed motion runs.
+
+    Attributes:
+        distance: Distance that must remain [m].
+        fit: Whether to fit capsules around the geometry of the URDF's links.
+        packages: Folder of what the URDF file calls `package://`, like `"."`.
+        ground: Height of the floor [m], like `0.0`.
+        capsules: Capsules on bodies or on the ground, like
+            `[{ name = "gun", body = "ground", start = [0, 0, 0], end = [0, 0, 1], radius = 0.1 }]`.
+        boxes: Boxes in the world, with angles in degrees, like
+            `[{ name = "table", centre = [0.8, 0, 0.2], size = [1, 1, 1], rotation = [0, 0, 45] }]`.
+        pairs: Pairs of shapes to watch, like `[["gun", "table"]]`; by default all that the joints
+            can bring together.
+    """
+
+    distance: Positive = 0.03
+    fit: bool = False
+    packages: str | None = None
+    ground: float | None = None
+    capsules: list[Annotated[tuple[str, Capsule], capsule]] = dataclasses.field(
+        default_factory=list
+    )
+    boxes: list[Annotated[Box, box]] = dataclasses.field(default_factory=list)
+    pairs: list[tuple[str, str]] | None = None
+
+    def build(self, robot: Robot, source: RobotSource, folder: Path) -> CollisionModel:
+        """Return the collision model.
+
+        Args:
+            robot: Robot with its joints.
+            source: Source of the robot, which may know shapes.
+            folder: Folder of the experiment file.
+
+        Raises:
+            InputError: If shapes cannot be made, or a name is unknown.
+        """
+        capsules, obstacles, pairs = self._fitted(source, folder) if self.fit else ([], [], None)
+        numbers = {"ground": GROUND, **{name: j for j, name in enumerate(robot.joint_names)}}
+        for body, shape in self.capsules:
+            if body not in numbers:
+                raise InputError(
+                    f"`body` of capsule `{shape.name}` must be `ground` or the name of the joint "
+                    f'that moves it ({joint_list(robot)}), but is "{body}".'
+                )
+            capsules.append(dataclasses.replace(shape, body=numbers[body]))
+        obstacles += self.boxes
+        if self.ground is not None:
+            obstacles.append(HalfSpace("ground", height=self.ground))
+        return CollisionModel(robot, capsules, obstacles, self.pairs or pairs)
+
+    def _fitted(
+        self, source: RobotSource, folder: Path
+    ) -> tuple[list[Capsule], list[AbstractObstacle], list[tuple[str, str]] | None]:
+        """Return shapes that the robot's source knows, and their pairs if it knows those too."""
+        if source.urdf is not None:
+            return list(source.capsules(folder, self.packages)), [], None
+        make = getattr(library, f"{source.builtin}_collision", None)
+        if make is None:
             raise InputError(
-                "`rest` is for Fourier series, and a `spline` rests at its ends: leave one out."
+                "`fit` needs `robot.urdf`, or the built-in robot tx90l_on_rail, whose shapes are "
+                "known: give `capsules` instead."
             )
-        return RestToRestSplineBasis(table.spline.points, table.spline.duration)
-    if table.rest:
-        return RestToRestBasis(*table.series)
-    series = FourierBasis(*table.series)
-    if table.led is None:
-        _require_division(table.sample_time, float(series.duration))
-        return series
-    if not constrained and table.led.time is None:
-        return series
-    lead = LEAD if table.led.time is None else table.led.time
-    return LeadsBasis(*table.series, lead=lead, periods=table.led.periods)
+        if source.base_rotation is not None or source.base_position is not None:
+            raise InputError(
+                "`fit` knows the built-in robot only where it stands by itself: leave out "
+                "`robot.base_rotation` and `robot.base_position`, or give `capsules`."
+            )
+        model = make()
+        names = [s.name for s in (*model.capsules, *model.obstacles)]
+        contacts = [(i, len(model.capsules) + k) for i, k in model.contacts]
+        pairs = [(names[i], names[k]) for i, k in (*model.pairs, *contacts)]
+        # New shapes are to be watched too: then all pairs are found anew.
+        alone = not self.capsules and not self.boxes and self.ground is None
+        obstacles = [o for o in model.obstacles if self.ground is None or o.name != "ground"]
+        return list(model.capsules), obstacles, pairs if alone else None
 
 
-def _require_division(sample_time: float | None, period: float) -> None:
-    """Refuses samples of a motion at full speed that would end before it or go on after it."""
-    if sample_time is None:
-        return
-    count = count_cycles(period, sample_time)
-    if abs(count * sample_time - period) > 1e-6 * sample_time:
-        raise InputError(
-            f"`sample_time` must divide the period of {period:.9g} s where there are no `leads`, "
-            f"for the motion repeats at full speed, but is {sample_time:g} s: choose `omega` = "
-            f"{2 * np.pi / (count * sample_time):.9g}, or leave `leads` as they are."
-        )
-
-
-def build_constraints(
-    experiment: Experiment, nominal: Nominal | None
-) -> tuple[AbstractConstraint, ...]:
-    """What the motion must keep beside the limits of the joints.
+def spline(
+    *,
+    points: Annotated[int, Bounds(least=4, most=100)] = 12,
+    duration: Annotated[float, Bounds(above=0.0, most=10_000.0)] = 8.0,
+) -> RestToRestSplineBasis:
+    """Return a spline from standstill to standstill.
 
     Args:
-        experiment: With its tables `[collision]` and `[excitation]`.
-        nominal: What is known of the parameters.
-
-    Raises:
-        InputError: If forces are limited, but no parameters or no largest forces are known.
+        points: Number of coefficients of a joint.
+        duration: Duration [s].
     """
-    table = experiment.excitation
-    found: list[AbstractConstraint] = []
-    if experiment.collision is not None:
-        found.append(Clearance(experiment.collision, experiment.clearance))
-    if table.tip_speed is not None:
-        found.append(TipSpeed(table.tip_speed))
-    if table.tip_acceleration is not None:
-        found.append(TipAcceleration(table.tip_acceleration))
-    if table.workspace is not None:
-        found.append(Workspace.of(*table.workspace))
-    if table.force_margin is None:
-        return tuple(found)
-    if nominal is None:
-        raise InputError(
-            "`force_margin` needs parameters to compute forces with: say in `nominal` where an "
-            "earlier result of `jaxid identify` is."
-        )
-    forces = force_limits(experiment, nominal, table.force_margin)
-    if not forces:
-        raise InputError(
-            "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
-        )
-    return (*found, *forces)
+    return RestToRestSplineBasis(points, duration)
 
 
-def build_prior(
-    experiment: Experiment, noise: Float[np.ndarray, " joints"]
-) -> Float[np.ndarray, "base base"] | None:
-    """What earlier motions will have told; None if there are none.
+@dataclasses.dataclass(frozen=True)
+class Leads:
+    """Ways from standstill into a periodic motion, and out of it.
 
-    Args:
-        experiment: With its table `[excitation]`.
-        noise: Standard deviations of the forces' noise.
-
-    Raises:
-        InputError: If the criterion knows no noise, or a file holds no motion of this robot.
+    Attributes:
+        time: Duration of each, if they are designed together with the motion [s].
+        periods: Number of periods between them.
     """
-    table, folder = experiment.excitation, experiment.path.parent
-    if not table.earlier:
-        return None
-    if not CRITERIA[table.criterion]().weighted:
-        raise InputError(
-            f'`earlier` and `criterion = "{table.criterion}"` do not go together: what motions '
-            "tell adds up in units of the noise, which this criterion does not know; leave out "
-            '`earlier`, or choose a criterion like "d_optimal".'
-        )
-    return np.sum([_told(experiment, folder / p, noise) for p in table.earlier], axis=0)
+
+    time: Positive | None = None
+    periods: Annotated[int, Bounds(least=1, most=1000)] = 1
 
 
-def _told(
-    experiment: Experiment, path: Path, noise: Float[np.ndarray, " joints"]
-) -> Float[np.ndarray, "base base"]:
-    trajectory, samples = load_trajectory(path), experiment.excitation.samples
-    if trajectory.joints != experiment.robot.joints:
-        raise InputError(
-            f"`earlier`: the motion of `{path}` moves {_joints(trajectory.joints)}, but the robot "
-            f"`{experiment.robot.name}` has {experiment.robot.joints}: name motions of this robot."
-        )
-    times = np.arange(samples) * (float(trajectory.duration) / samples)
-    motion = trajectory.motion(times)
-    return np.asarray(information(experiment.base, motion, 1.0 / noise).weighted)
+@dataclasses.dataclass(frozen=True)
+class Excitation:
+    """Motion that `jaxid excite` designs, within the limits above.
 
+    Attributes:
+        criterion: Objective: "d_optimal" for the smallest standard deviations on the whole,
+            a_optimal, e_optimal, condition_number (the paper's, Eq. 36), weighted_condition_number
+            or scaled_condition_number.
+        harmonics: Number of harmonics of the Fourier series, like `5`, the default.
+        omega: Ground frequency of the series [rad/s], like `0.8`, the default.
+        rest: Whether the motion starts and stops at rest.
+        spline: Spline from rest to rest in place of a series, like
+            `{ points = 12, duration = 8.0 }`.
+        leads: Way from standstill into the periodic motion, and out; or a table, like
+            `{ time = 0.5, periods = 2 }`: of so many seconds, designed together with the motion,
+            and two periods between them.
+        samples: Number of samples that one run will measure.
+        noise: Standard deviation of the forces' noise for each joint [N m or N]; by default 1 % of
+            the largest forces.
+        starts: Number of random motions to start from.
+        generations: Number of times that the motions found have children.
+        polish: Number of the best motions that are polished.
+        seed: Seed of the random motions.
+        sample_time: Time between two rows of the written table, the controller's cycle [s], like
+            `0.004`; by default that of the samples.
+        ros: Language of the file for ROS: "yaml" or "json".
+        nominal: Folder of an earlier result of `jaxid identify`, to compare with, like `"report"`.
+        earlier: Motions whose logs will be used together with this one's, like
+            `["trajectory.json"]`.
+        force_margin: Fraction of the largest forces to keep free, by nominal parameters, like
+            `0.1`.
+        tip_speed: Largest speed of the end-effector [m/s], like `1.5`.
+        tip_acceleration: Largest acceleration of the end-effector [m/s²], like `10.0`.
+        workspace: Box for the end-effector: two corners [m], like
+            `[[-1.0, -1.0, 0.1], [1.0, 1.0, 1.5]]`.
+    """
 
-def _joints(count: int) -> str:
-    return f"{count} joint{'' if count == 1 else 's'}"
+    criterion: Literal[
+        "d_optimal",
+        "a_optimal",
+        "e_optimal",
+        "condition_number",
+        "weighted_condition_number",
+        "scaled_condition_number",
+    ] = "d_optimal"
+    harmonics: Annotated[int, Bounds(least=1, most=50)] | None = None
+    omega: Annotated[float, Bounds(above=0.0, most=1000.0)] | None = None
+    rest: bool = False
+    spline: Annotated[RestToRestSplineBasis, spline] | None = None
+    leads: bool | Leads = True
+    samples: Annotated[int, Bounds(least=2, most=10_000_000)] = 800
+    noise: list[Annotated[float, Bounds(above=0.0, below=1e9)]] | None = None
+    starts: Count = 32
+    generations: Annotated[int, Bounds(least=0, most=10_000)] = 12
+    polish: Annotated[int, Bounds(least=0, most=10_000)] = 4
+    seed: Annotated[int, Bounds(least=0, most=2**32 - 1)] = 0
+    sample_time: Annotated[float, Bounds(least=1e-5)] | None = None
+    ros: Literal["yaml", "json"] = "yaml"
+    nominal: str | None = None
+    earlier: tuple[str, ...] = ()
+    force_margin: Annotated[float, Bounds(least=0.0, below=1.0)] | None = None
+    tip_speed: Positive | None = None
+    tip_acceleration: Positive | None = None
+    workspace: tuple[Vector, Vector] | None = None
+
+    @property
+    def series(self) -> tuple[int, float]:
+        """Number of harmonics, and ground frequency [rad/s]."""
+        harmonics = 5 if self.harmonics is None else self.harmonics
+        return harmonics, 0.8 if self.omega is None else self.omega
+
+    @property
+    def chosen_leads(self) -> Leads | None:
+        """Ways into and out of the motion; None if it starts as it is."""
+        if not self.leads or self.rest or self.spline is not None:
+            return None
+        return self.leads if isinstance(self.leads, Leads) else Leads()
+
+    @property
+    def unused(self) -> list[str]:
+        """Sentences about keys that others leave without effect."""
+        notes = []
+        if self.spline is not None:
+            given = [f"`{k}`" for k in ("harmonics", "omega") if getattr(self, k) is not None]
+            if given:
+                verb = "do" if len(given) > 1 else "does"
+                notes.append(f"{' and '.join(given)} {verb} nothing for a `spline`")
+        if isinstance(self.leads, Leads) and self.chosen_leads is None:
+            notes.append("`leads` do nothing for a motion that rests at its ends")
+        return notes
+
+    def basis(self, constrained: bool) -> AbstractBasis:
+        """Return the basis of the trajectories.
+
+        Args:
+            constrained: Whether there are constraints beside limits of joints: then leads are
+                designed together with the motion, so that they keep them too.
+
+        Raises:
+            InputError: If two kinds are asked for, or one whose end no sample would meet.
+        """
+        if self.spline is not None:
+            if self.rest:
+                raise InputError(
+                    "`rest` is for Fourier series, and a `spline` rests at its ends: leave one out."
+                )
+            return self.spline
+        if self.rest:
+            return RestToRestBasis(*self.series)
+        series, leads = FourierBasis(*self.series), self.chosen_leads
+        if leads is None:
+            self._check_sample_time(float(series.duration))
+            return series
+        if not constrained and leads.time is None:
+            return series
+        return LeadsBasis(*self.series, lead=leads.time or 0.5, periods=leads.periods)
+
+    def _check_sample_time(self, period: float) -> None:
+        """Reject samples of a motion at full speed that end before it or go on after it."""
+        step = self.sample_time
+        if step is None:
+            return
+        count = count_cycles(period, step)
+        if abs(count * step - period) > 1e-6 * step:
+            raise InputError(
+                f"`sample_time` must divide the period of {period:.9g} s where there are no "
+                f"`leads`, for the motion repeats at full speed, but is {step:g} s: choose `omega` "
+                f"= {2 * np.pi / (count * step):.9g}, or leave `leads` as they are."
+            )

@@ -1,8 +1,10 @@
-"""An experiment: the objects that the user's file describes."""
+"""Experiment: the objects that the user's TOML file describes."""
 
 import dataclasses
 import functools
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,26 +13,20 @@ from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
-from jaxid.experiment.collision_tables import build_collision
-from jaxid.experiment.estimator_tables import build_estimator, build_single_axes
+from jaxid.experiment.decoder import call, check_tables, within
+from jaxid.experiment.estimator_table import Estimation, build_estimation
+from jaxid.experiment.excitation_tables import Collision, Excitation
 from jaxid.experiment.method_tables import (
-    build_candidates,
+    Effects,
+    Logs,
     build_columns,
-    build_decimation,
-    build_filter,
-    build_linear_terms,
-    build_slow,
-    build_terms,
+    build_filters,
+    build_rows,
+    filter_candidates,
 )
-from jaxid.experiment.reading import read_tables
-from jaxid.experiment.robot_tables import build_load, build_robot, within
-from jaxid.experiment.tables import ExcitationTable, RecordingTable, RobotTable
+from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
 from jaxid.identification.essential import essential_parameters
-from jaxid.identification.estimators import (
-    AbstractEstimator,
-    LeastSquares,
-    WeightedLeastSquares,
-)
+from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.filter_choice import FilterCandidate
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_rows
@@ -38,10 +34,7 @@ from jaxid.identification.nonlinear.estimator import NonlinearFriction
 from jaxid.identification.nonlinear.verdict import identify_nonlinear
 from jaxid.identification.rows import Rows
 from jaxid.identification.solutions import Complete, CrossValidated
-from jaxid.identification.stepwise import Stepwise
 from jaxid.identification.streaming import Progress
-from jaxid.identification.uncertainty.methods import AbstractUncertainty
-from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.chunked_files import estimated_rows
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
@@ -53,112 +46,98 @@ from jaxid.measurement.timestamps import NeedsMemory
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot, Tool
 
-SHORTEST = 1e-6
-"""Time between two samples that no robot's log goes below [s]."""
+TABLES = (
+    *("robot", "limits", "drives", "collision", "model", "recording", "load"),
+    *("filter", "rows", "estimator", "excitation"),
+)
+"""Tables of an experiment file."""
 LONG = 500_000
 """Samples from which a log is read part by part."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """What an experiment file describes.
+    """Content of an experiment file.
 
     Attributes:
-        path: Of the file.
-        text: Of the file, as it was read.
-        source: The table of the robot.
-        robot: What is known.
-        model: The effects whose parameters are wanted.
-        collision: What may not touch what; None if the file does not say.
-        clearance: Least distance between what may not touch [m].
-        recording: The table of the log's columns; None if the file has none.
-        columns: The same as the reader needs them; None if the file has none.
-        load: What is on the robot in some logs only, and known; None if the file does not say.
-        filter: For motion, forces and columns.
-        decimation: For forces and columns.
-        slow: Speeds below which rows do not count [rad/s or m/s]; None if all count.
-        estimator: How rows become parameters.
-        plain: Least squares with the same weights and solution: to look at logs, one by one.
-        uncertainty: How standard deviations are found.
-        regularised: Whether the estimator keeps small what the logs do not decide.
-        single_axes: Logs of single axes if axes are identified one by one; None if at once.
-        essential: Held-out error that leaving parameters out may cost, of 1; None to keep all.
-        linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
+        path: Path of the file.
+        text: Text of the file.
+        source: Source of the robot.
+        robot: Robot with its limits, drives and known tool.
+        model: Effects whose parameters are wanted.
+        collision: Shapes that must keep a distance; None if the file has none.
+        clearance: Least distance between them [m].
+        columns: Columns of the logs; None if the file does not say.
+        logs: Sides, files and parts of the logs.
+        load: Known load that is on the robot in some logs only; None if the file does not say.
+        filter: Filter of motion, forces and columns.
         candidates: Filters to choose from; none if the file names one.
-        excitation: The table of the motion to design.
-        notes: What was assumed where the file says nothing, in sentences.
+        decimation: Decimation of forces and columns.
+        min_speed: Speeds below which rows do not count [rad/s or m/s]; None if all count.
+        estimation: Estimator and uncertainty.
+        linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
+        excitation: Settings of the motion to design.
+        notes: Assumptions where the file says nothing, in sentences.
     """
 
     path: Path
     text: str
-    source: RobotTable
+    source: RobotSource
     robot: Robot
     model: Model
     collision: CollisionModel | None
     clearance: float
-    recording: RecordingTable | None
     columns: Columns | None
+    logs: Logs
     load: Tool | None
     filter: AbstractFilter
-    decimation: AbstractDecimation
-    slow: Float[np.ndarray, " joints"] | None
-    estimator: AbstractEstimator
-    plain: LeastSquares | WeightedLeastSquares
-    uncertainty: AbstractUncertainty
-    regularised: bool
-    single_axes: tuple[Path, ...] | None
-    essential: float | None
-    linear: tuple[AbstractTerm, ...] | None
     candidates: tuple[FilterCandidate, ...]
-    excitation: ExcitationTable
+    decimation: AbstractDecimation
+    min_speed: Float[np.ndarray, " joints"] | None
+    estimation: Estimation
+    linear: tuple[AbstractTerm, ...] | None
+    excitation: Excitation
     notes: tuple[str, ...]
 
     @functools.cached_property
     def base(self) -> BaseParameters:
-        """The base parameters of the model, found when they are first asked for."""
+        """Base parameters of the model, found when they are first asked for."""
         return base_parameters(self.model)
 
     @property
     def other_estimator(self) -> LeastSquares | WeightedLeastSquares:
-        """What the estimator is compared with where logs do not determine everything.
+        """Estimator to compare with where logs do not determine everything.
 
-        Plain least squares beside an estimator that keeps undecided parameters small, and the
-        other way round; identification at once beside axis by axis.
+        Plain least squares beside an estimator that keeps undetermined parameters small, and the
+        other way round.
         """
-        if self.single_axes is not None:
-            return self.plain
-        other = Complete() if self.regularised else CrossValidated()
-        return dataclasses.replace(self.plain, solution=other)
+        other = Complete() if self.estimation.regularised else CrossValidated()
+        return dataclasses.replace(self.estimation.plain, solution=other)
 
     def fit(self, rows: Rows, progress: Progress | None = None) -> Fit:
-        """Estimates as the table `[estimator]` says.
+        """Estimate parameters as the table `[estimator]` says.
 
         Args:
-            rows: To identify with.
-            progress: Is told which share of a search is done, of 1.
+            rows: Rows to identify with.
+            progress: Callback, called with the completed fraction of a search (0 to 1).
         """
-        if self.single_axes is not None:
-            alone = tuple(self.observe(self.read(log)) for log in self.single_axes)
-            weights = np.asarray(self.plain(rows).weights)
-            stepwise = Stepwise(alone, GivenWeights(weights))
-            return fit_rows(rows, stepwise, uncertainty=self.uncertainty)
-        if self.linear is None:
-            fit = fit_rows(rows, self.estimator, uncertainty=self.uncertainty)
-            if self.essential is None:
-                return fit
-            found = essential_parameters(
-                fit, rows.recordings, cost=self.essential, uncertainty=self.uncertainty
-            )
-            return dataclasses.replace(found.fit, notes=(*found.fit.notes, *found.notes))
-        linear = base_parameters(Model(self.robot, self.linear))
-        estimator = NonlinearFriction(self.plain)
-        found = identify_nonlinear(
-            self.base, rows.recordings, estimator, linear=linear, progress=progress
+        uncertainty = self.estimation.uncertainty
+        if self.linear is not None:
+            linear = base_parameters(Model(self.robot, self.linear))
+            estimator = NonlinearFriction(self.estimation.plain)
+            return identify_nonlinear(
+                self.base, rows.recordings, estimator, linear=linear, progress=progress
+            ).better
+        fit = fit_rows(rows, self.estimation.estimator, uncertainty=uncertainty)
+        if self.estimation.essential is None:
+            return fit
+        choice = essential_parameters(
+            fit, rows.recordings, cost=self.estimation.essential, uncertainty=uncertainty
         )
-        return found.better
+        return dataclasses.replace(choice.fit, notes=(*choice.fit.notes, *choice.notes))
 
     def read(self, log: str | Path) -> Recording:
-        """Reads a log as the file's table `[recording]` says.
+        """Read a log as the table `[recording]` says.
 
         Args:
             log: Path of the log; the files of forces and velocities lie beside it.
@@ -167,14 +146,8 @@ class Experiment:
             InputError: If the file has no table `[recording]`, or the log is not as it says.
         """
         log = Path(log)
-        table, columns = self._columns_of(log)
-        recording = read_recording(
-            log,
-            columns,
-            forces_path=_beside(log, table.forces_file),
-            velocities_path=_beside(log, table.velocities_file),
-            largest_gap=table.largest_gap,
-        )
+        columns, logs = self._columns_of(log), self.logs
+        recording = read_recording(log, columns, largest_gap=logs.largest_gap, **logs.files(log))
         if recording.joints != self.robot.joints:
             raise InputError(
                 f"{self.path.name}: `recording.angles` names {recording.joints} of the "
@@ -182,48 +155,52 @@ class Experiment:
                 f"{self.robot.joints} joints: "
                 "name one column for each joint, or choose another robot (`robot.tip`)."
             )
-        with within(self.path.name, "recording"):
-            if recording.sample_time < SHORTEST:
+        with self._within("recording"):
+            if recording.sample_time < 1e-6:
                 raise InputError(
                     f"`{log.name}` has {1 / recording.sample_time:.3g} samples in a second: check "
                     "`time_unit` or `sample_time`."
                 )
-            if table.start is not None or table.stop is not None:
-                recording = recording.crop(
-                    -np.inf if table.start is None else table.start,
-                    np.inf if table.stop is None else table.stop,
-                )
-            if table.force_delay:
-                recording = remove_delay(recording, table.force_delay)
+            if np.isfinite((logs.start, logs.stop)).any():
+                recording = recording.crop(logs.start, logs.stop)
+            if logs.force_delay:
+                recording = remove_delay(recording, logs.force_delay)
         return recording
 
     def observe(self, recording: Recording) -> Observations:
-        """Filters a recording and makes rows of it, as the tables `[filter]` and `[rows]` say.
+        """Filter a recording and make rows of it, as the tables `[filter]` and `[rows]` say.
+
+        Args:
+            recording: Recording of a log.
 
         Raises:
             InputError: If filter and recording do not go together.
         """
-        with within(self.path.name, "filter` and `rows"):
-            return observe(recording, self.robot, self.filter, self.decimation, self.slow)
+        with self._within("filter` and `rows"):
+            return observe(recording, self.robot, self.filter, self.decimation, self.min_speed)
 
     def is_long(self, log: str | Path) -> bool:
-        """Whether a log is better read part by part than as a whole."""
-        return estimated_rows(Path(log)) >= LONG
-
-    def open(self, log: str | Path, progress: Progress | None = None) -> Observations:
-        """Opens a log that need not fit into memory: like `read` and `observe`, part by part.
+        """Return whether a log is better read part by part than as a whole.
 
         Args:
             log: Path of the log.
-            progress: Is told which share of the log was gone through for `rows.slow`, of 1.
+        """
+        return estimated_rows(Path(log)) >= LONG
+
+    def open(self, log: str | Path, progress: Progress | None = None) -> Observations:
+        """Open a log that need not fit into memory: like `read` and `observe`, part by part.
+
+        Args:
+            log: Path of the log.
+            progress: Callback, called with the completed fraction (0 to 1) for `rows.min_speed`.
 
         Raises:
             NeedsMemory: If it can be read only as a whole.
-            InputError: Like `read` and `observe`.
+            InputError: If the log is not as the file says.
         """
         log = Path(log)
-        table, columns = self._columns_of(log)
-        if table.force_delay:
+        columns, logs = self._columns_of(log), self.logs
+        if logs.force_delay:
             raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
         return scan_log(
             log,
@@ -231,49 +208,31 @@ class Experiment:
             self.robot,
             self.filter,
             self.decimation,
-            self.slow,
-            forces_path=_beside(log, table.forces_file),
-            velocities_path=_beside(log, table.velocities_file),
-            largest_gap=table.largest_gap,
-            start=-np.inf if table.start is None else table.start,
-            stop=np.inf if table.stop is None else table.stop,
+            self.min_speed,
+            largest_gap=logs.largest_gap,
+            start=logs.start,
+            stop=logs.stop,
             progress=progress,
+            **logs.files(log),
         )
 
-    def _columns_of(self, log: Path) -> tuple[RecordingTable, Columns]:
-        if self.recording is None or self.columns is None:
+    def _columns_of(self, log: Path) -> Columns:
+        if self.columns is None:
             raise InputError(
                 f"{self.path.name}: the table `[recording]` is missing: it says which columns of "
                 f"`{log.name}` hold angles and forces."
             )
-        return self.recording, self.columns
+        return self.columns
 
-
-def _beside(log: Path, name: str | None) -> Path | None:
-    return None if name is None else log.parent / name.replace("{}", log.stem)
-
-
-def _two_forces(robot: Robot) -> list[str]:
-    """Says which of two known largest forces decides."""
-    own, motors = np.asarray(robot.limits.force), np.asarray(robot.drives.max_forces)
-    both = np.isfinite(own) & np.isfinite(motors) & ~np.isclose(own, motors, rtol=1e-6)
-    if not both.any():
-        return []
-    shown = (
-        f"{robot.joint_names[j]} {own[j]:.4g}, not {motors[j]:.4g} {robot.force_unit(j)}"
-        for j in np.flatnonzero(both).tolist()
-    )
-    return [
-        "the largest forces are those of the joints (`limits.force`), which decide before what the "
-        f"motors give through the gears (`drives.max_torques`): {'; '.join(shown)}."
-    ]
+    def _within(self, table: str) -> Any:
+        return within(table, self.path.name)
 
 
 def load_experiment(path: str | Path) -> Experiment:
-    """Loads an experiment file.
+    """Load an experiment file.
 
     Args:
-        path: Of a TOML file; paths in it are relative to its folder.
+        path: Path of a TOML file; paths in it are relative to its folder.
 
     Raises:
         OSError: If the file cannot be read.
@@ -281,53 +240,98 @@ def load_experiment(path: str | Path) -> Experiment:
             names of file and key.
     """
     path = Path(path)
-    tables, text = read_tables(path)
-    robot = build_robot(tables, path)
-    notes = _two_forces(robot)
-    with within(path.name, "model"):
-        model = Model(robot, build_terms(tables.model, robot))
-    collision = build_collision(tables, robot, path)
-    with within(path.name, "recording"):
-        columns = build_columns(tables.recording, robot)
-    load = None
-    if tables.load is not None:
-        with within(path.name, "load"):
-            load = build_load(robot, tables.load)
-    with within(path.name, "filter"):
-        filtering, said = build_filter(tables.filter)
-        notes += said
-        candidates = build_candidates(tables.filter, tables.rows)
-    nonlinear = tables.estimator.nonlinear_friction
-    linear = build_linear_terms(tables.model, robot) if nonlinear else None
-    with within(path.name, "rows"):
-        decimation = build_decimation(tables.rows)
-        slow = build_slow(tables.rows, robot)
-    with within(path.name, "estimator"):
-        chosen = build_estimator(tables.estimator, robot, model, tables.robot, path)
-        notes += chosen.notes
-        single_axes = build_single_axes(tables.estimator, path)
-    return Experiment(
-        path=path,
-        text=text,
-        source=tables.robot,
-        robot=robot,
-        model=model,
-        collision=collision,
-        clearance=0.0 if tables.collision is None else tables.collision.distance,
-        recording=tables.recording,
-        columns=columns,
-        load=load,
-        filter=filtering,
-        decimation=decimation,
-        slow=slow,
-        estimator=chosen.estimator,
-        plain=chosen.plain,
-        uncertainty=chosen.uncertainty,
-        regularised=tables.estimator.ridge is not None or tables.estimator.truncate is not None,
-        single_axes=single_axes,
-        essential=tables.estimator.essential,
-        linear=linear,
-        candidates=candidates,
-        excitation=tables.excitation,
-        notes=tuple(notes),
+    try:
+        text, content = _read(path)
+        return Experiment(path=path, text=text, **_build(content, path.parent))
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from error
+
+
+def _read(path: Path) -> tuple[str, dict[str, Any]]:
+    if not path.is_file():
+        raise InputError(
+            f"`{path}` is no file: check its path, or write one with `jaxid init arm.urdf`."
+        )
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+        return text, tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise InputError(f"is no text in UTF-8 (byte {error.start}).") from error
+    except RecursionError as error:
+        raise InputError("is no TOML: brackets are nested too deeply.") from error
+    except ValueError as error:  # also a number of thousands of digits
+        raise InputError(f"is no TOML: {str(error).rstrip('.')}.") from error
+
+
+def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the fields of an experiment from the tables of its file."""
+    check_tables(content, list(TABLES))
+    if "robot" not in content:
+        raise InputError("the table `[robot]` is missing: give it `urdf`, `builtin` or `dh`.")
+    source = call(RobotSource, content["robot"], "robot")
+    with within("robot"):
+        robot = source.build(folder)
+    for name, replace in (("limits", replace_limits), ("drives", replace_drives)):
+        if name in content:
+            robot = call(replace, content[name], name, robot)
+    effects = call(Effects, content.get("model", {}), "model")
+    with within("model"):
+        model = Model(robot, effects.terms(robot))
+    fields: dict[str, Any] = {"source": source, "robot": robot, "model": model}
+    fields |= _collision(content, robot, source, folder)
+    fields |= _load(content, robot)
+    columns, logs = None, Logs()
+    if "recording" in content:
+        columns, logs = build_columns(content["recording"], robot)
+    filters, filter_notes = build_filters(content.get("filter"))
+    decimation, min_speed = call(build_rows, content.get("rows", {}), "rows", robot)
+    estimation = build_estimation(content.get("estimator", {}), robot, model, source, folder)
+    return fields | {
+        "columns": columns,
+        "logs": logs,
+        "filter": filters[0],
+        "candidates": filter_candidates(filters, decimation),
+        "decimation": decimation,
+        "min_speed": min_speed,
+        "estimation": estimation,
+        "linear": effects.linear_terms(robot) if estimation.nonlinear else None,
+        "excitation": call(Excitation, content.get("excitation", {}), "excitation"),
+        "notes": (*_two_forces(robot), *filter_notes, *estimation.notes),
+    }
+
+
+def _collision(
+    content: dict[str, Any], robot: Robot, source: RobotSource, folder: Path
+) -> dict[str, Any]:
+    if "collision" not in content:
+        return {"collision": None, "clearance": 0.0}
+    shapes = call(Collision, content["collision"], "collision")
+    with within("collision"):
+        return {
+            "collision": shapes.build(robot, source, folder),
+            "clearance": shapes.distance,
+        }
+
+
+def _load(content: dict[str, Any], robot: Robot) -> dict[str, Any]:
+    if "load" not in content:
+        return {"load": None}
+    load = call(Load, content["load"], "load")
+    with within("load"):
+        return {"load": load.on(robot)}
+
+
+def _two_forces(robot: Robot) -> list[str]:
+    """Say which of two known largest forces decides."""
+    joints, motors = np.asarray(robot.limits.force), np.asarray(robot.drives.max_forces)
+    both = np.isfinite(joints) & np.isfinite(motors) & ~np.isclose(joints, motors, rtol=1e-6)
+    if not both.any():
+        return []
+    shown = (
+        f"{robot.joint_names[j]} {joints[j]:.4g}, not {motors[j]:.4g} {robot.force_unit(j)}"
+        for j in np.flatnonzero(both).tolist()
     )
+    return [
+        "the largest forces are those of the joints (`limits.force`), which decide before what the "
+        f"motors give through the gears (`drives.max_torques`): {'; '.join(shown)}."
+    ]

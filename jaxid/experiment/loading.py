@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxid.errors import InputError
+from jaxid.experiment.decoder import within
 from jaxid.experiment.excerpt import excerpt
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.progress import Stages
-from jaxid.experiment.robot_tables import within
 from jaxid.experiment.sanity import LogCheck, check_log, check_long_log
 from jaxid.identification.filter_choice import FilterChoice, choose_filter
 from jaxid.measurement.observations import Observations
@@ -120,13 +120,13 @@ def choose(
         whole = experiment.read(log)
         recordings.append(whole if split is None else whole.split(split)[0])
     stage("choosing the filter")
-    with within(experiment.path.name, "filter` and `rows"):
+    with within("filter` and `rows", experiment.path.name):
         choice = choose_filter(
             experiment.base,
             recordings,
             experiment.candidates,
-            estimator=experiment.estimator,
-            slow=experiment.slow,
+            estimator=experiment.estimation.estimator,
+            slow=experiment.min_speed,
             progress=stage.through(len(experiment.candidates) * sum(r.samples for r in recordings)),
         )
     notes = (*experiment.notes, str(choice))

@@ -1,6 +1,9 @@
-"""The tables `[model]`, `[recording]`, `[filter]` and `[rows]` become objects."""
+"""The tables `[model]`, `[recording]`, `[filter]` and `[rows]` of an experiment file."""
 
-import msgspec
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
 import numpy as np
 
 from jaxid.arrays import Float
@@ -18,18 +21,10 @@ from jaxid.dynamics.terms import (
 )
 from jaxid.dynamics.transitions import AbstractTransition, HardSign, Tanh
 from jaxid.errors import InputError
-from jaxid.experiment.robot_tables import each
-from jaxid.experiment.tables import (
-    ButterworthTable,
-    CoulombTable,
-    ModelTable,
-    PaperTable,
-    PeriodicTable,
-    RecordingTable,
-    RowsTable,
-)
+from jaxid.experiment.decoder import Bounds, Count, Magnitude, Positive, decode, quoted, within
+from jaxid.experiment.robot_tables import one_per_joint
 from jaxid.identification.filter_choice import FilterCandidate
-from jaxid.measurement.columns import Columns, Selection
+from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
 from jaxid.measurement.filters import (
     AbstractFilter,
@@ -37,229 +32,319 @@ from jaxid.measurement.filters import (
     PeriodicFourier,
     ZeroPhaseButterworth,
 )
-from jaxid.measurement.units import NM, Unit, unit
+from jaxid.measurement.units import Unit
 from jaxid.robot.robot import Robot
 
-TURNS = ("deg", "rev", "deg/s", "rpm", "N m")
-SLIDES = ("mm", "mm/s", "N")
+FILTERS: dict[str, type[AbstractFilter]] = {
+    "butterworth": ZeroPhaseButterworth,
+    "paper": PaperFilter,
+    "periodic": PeriodicFourier,
+}
 CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
 
+Side = Literal["joint", "motor"]
+Speed = float | Float[np.ndarray, " joints"]
 
-def build_terms(table: ModelTable, robot: Robot) -> tuple[AbstractTerm, ...]:
-    """The terms of the model, in the paper's order: bodies, friction, rotors, and the rest.
+
+@dataclasses.dataclass(frozen=True)
+class DryFriction:
+    """Dry friction, and its transition from one direction of motion to the other.
+
+    Attributes:
+        epsilon: Speed of the smooth transition [rad/s or m/s]; or a list.
+        dead_zone: Speed below which there is no dry friction [rad/s or m/s]; or a list.
+        hard: Whether to take a sign instead of tanh(speed / epsilon).
+        asymmetric: Whether each direction has a level of its own (then there is no `offset`).
+        stribeck: Speed about which friction falls from a static level [rad/s or m/s], like `0.1`;
+            or a list.
+    """
+
+    epsilon: Positive | list[Positive] = 0.01
+    dead_zone: Magnitude | list[Magnitude] = 0.0
+    hard: bool = False
+    asymmetric: bool = False
+    stribeck: Positive | list[Positive] | None = None
+
+    def transition(self, robot: Robot) -> AbstractTransition:
+        """Return the transition between the directions.
+
+        Args:
+            robot: Robot with the joints.
+        """
+        dead_zone = _speed(robot, "coulomb.dead_zone", self.dead_zone)
+        if self.hard:
+            return HardSign(dead_zone)
+        return Tanh(_speed(robot, "coulomb.epsilon", self.epsilon), dead_zone)
+
+    def term(self, robot: Robot) -> AbstractTerm:
+        """Return the term of the model.
+
+        Args:
+            robot: Robot with the joints.
+        """
+        transition = self.transition(robot)
+        if self.stribeck is None:
+            kind = AsymmetricCoulombFriction if self.asymmetric else CoulombFriction
+            return kind(transition)
+        if self.asymmetric:
+            raise InputError(
+                "give `coulomb.stribeck` or `coulomb.asymmetric`, but not both: one level for each "
+                "direction has no Stribeck effect here."
+            )
+        speed = _speed(robot, "coulomb.stribeck", self.stribeck)
+        return StribeckFriction(speed, transition=transition)
+
+
+def _speed(robot: Robot, name: str, value: float | list[float]) -> Speed:
+    if not isinstance(value, list):
+        return float(value)
+    one_per_joint(robot, name, value)
+    return np.array(value, np.float64)
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects:
+    """Effects that the model has beside the rigid bodies.
+
+    Attributes:
+        principal_axes: Whether to leave out products of inertia (seven per body, Eq. 12).
+        viscous: Whether friction grows with speed.
+        rotor_inertia: Whether the motors' rotors are felt through the gears.
+        offset: Whether there is a constant force at each joint (sensor offsets); by default unless
+            dry friction is asymmetric.
+        springs: Whether there is a linear spring at each joint (counterbalances).
+        coupled_drives: Whether motors turn several axes; by default where the matrix of `[drives]`
+            has entries beside its diagonal.
+        coulomb: Dry friction, as a table; or none, like `false`.
+    """
+
+    principal_axes: bool = False
+    viscous: bool = True
+    rotor_inertia: bool = True
+    offset: bool | None = None
+    springs: bool = False
+    coupled_drives: bool | None = None
+    coulomb: bool | DryFriction = True
+
+    def terms(self, robot: Robot) -> tuple[AbstractTerm, ...]:
+        """Return the terms of the model, in the paper's order.
+
+        Args:
+            robot: Robot with the joints.
+
+        Raises:
+            InputError: If a list does not hold one number for each joint.
+        """
+        dry = DryFriction() if isinstance(self.coulomb, bool) else self.coulomb
+        # An offset is half of what two levels of dry friction can express already.
+        offset = not dry.asymmetric if self.offset is None else self.offset
+        coupled = self.coupled_drives
+        if coupled is None:
+            coupled = bool(CoupledDrives().couplings(robot))
+        terms: list[AbstractTerm] = [RigidBodies(principal_axes=self.principal_axes)]
+        if self.viscous:
+            terms.append(ViscousFriction())
+        if self.coulomb is not False:
+            terms.append(dry.term(robot))
+        if self.rotor_inertia:
+            terms.append(RotorInertia())
+        if offset:
+            terms.append(ConstantOffset())
+        if coupled:
+            terms.append(CoupledDrives(dry.transition(robot)))
+        if self.springs:
+            terms.append(LinearSpring())
+        return tuple(terms)
+
+    def linear_terms(self, robot: Robot) -> tuple[AbstractTerm, ...]:
+        """Return the terms with Coulomb's law in place of Stribeck's.
+
+        Args:
+            robot: Robot with the joints.
+        """
+        if not isinstance(self.coulomb, DryFriction):
+            return self.terms(robot)
+        coulomb = dataclasses.replace(self.coulomb, stribeck=None)
+        return dataclasses.replace(self, coulomb=coulomb).terms(robot)
+
+
+@dataclasses.dataclass(frozen=True)
+class Logs:
+    """Sides, files and parts of the logs.
+
+    Attributes:
+        side: Side of the gears on which the log is: "joint" or "motor".
+        forces_side: Side of the forces, if it is another one, like `"motor"`.
+        forces_file: File of the forces, if they lie in another file beside the log, like
+            `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
+        velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
+        force_delay: Time by which forces stand later in the log than angles [s].
+        largest_gap: Longest pause that is bridged, in sample times.
+        start: Start of the part of every log that is used [s], like `0.0`.
+        stop: End of that part [s], like `10.0`.
+    """
+
+    side: Side = "joint"
+    forces_side: Side | None = None
+    forces_file: str | None = None
+    velocities_file: str | None = None
+    force_delay: float = 0.0
+    largest_gap: Annotated[float, Bounds(above=1.0)] = 1.75
+    start: float = -np.inf
+    stop: float = np.inf
+
+    def files(self, log: Path) -> dict[str, Path | None]:
+        """Return the paths of the files beside a log, as the readers take them.
+
+        Args:
+            log: Path of the log.
+        """
+        names = {"forces_path": self.forces_file, "velocities_path": self.velocities_file}
+        return {
+            key: None if name is None else log.parent / name.replace("{}", log.stem)
+            for key, name in names.items()
+        }
+
+
+SIDES = ("angles_on_motor_side", "forces_on_motor_side")
+"""Arguments of `Columns` for which the file has `side` and `forces_side`."""
+
+
+def build_columns(table: Any, robot: Robot) -> tuple[Columns, Logs]:
+    """Return the columns of the logs, and how logs are read.
+
+    Args:
+        table: The table `[recording]`.
+        robot: Robot that was recorded.
 
     Raises:
-        InputError: If a list does not hold one number for each joint.
+        InputError: If a key or value does not fit.
     """
-    coulomb = CoulombTable() if isinstance(table.coulomb, bool) else table.coulomb
-    transition = _transition(coulomb, robot)
-    terms: list[AbstractTerm] = [RigidBodies(principal_axes=table.principal_axes)]
-    if table.viscous:
-        terms.append(ViscousFriction())
-    if table.coulomb is not False:
-        terms.append(_dry(coulomb, transition, robot))
-    if table.rotor_inertia:
-        terms.append(RotorInertia())
-    # An offset is half of what two levels of dry friction can say already.
-    if table.offset or (table.offset is None and not coulomb.asymmetric):
-        terms.append(ConstantOffset())
-    if table.coupled_drives or (table.coupled_drives is None and coupled(robot)):
-        terms.append(CoupledDrives(transition))
-    if table.springs:
-        terms.append(LinearSpring())
-    return tuple(terms)
+    given, reading = decode([Columns, Logs], table, "recording", skip=SIDES)
+    with within("recording"):
+        for name, value in given.items():
+            if isinstance(value, list | tuple):
+                one_per_joint(robot, name, value)
+        logs = Logs(**reading)
+        on_motor_side = (logs.side == "motor", (logs.forces_side or logs.side) == "motor")
+        columns = Columns(**given, **dict(zip(SIDES, on_motor_side, strict=True)))
+        if logs.side == "joint":
+            _refuse_mixed(robot, "angle_unit", given.get("angle_unit"))
+            _refuse_mixed(robot, "velocity_unit", given.get("velocity_unit"))
+        if not on_motor_side[1]:
+            _refuse_mixed(robot, "force_unit", given.get("force_unit"))
+    return columns, logs
 
 
-def build_linear_terms(table: ModelTable, robot: Robot) -> tuple[AbstractTerm, ...]:
-    """The terms of the same model with Coulomb's law in place of Stribeck's."""
-    if isinstance(table.coulomb, CoulombTable):
-        coulomb = msgspec.structs.replace(table.coulomb, stribeck=None)
-        table = msgspec.structs.replace(table, coulomb=coulomb)
-    return build_terms(table, robot)
-
-
-def _dry(table: CoulombTable, transition: AbstractTransition, robot: Robot) -> AbstractTerm:
-    if table.stribeck is None:
-        dry = AsymmetricCoulombFriction if table.asymmetric else CoulombFriction
-        return dry(transition)
-    if table.asymmetric:
-        raise InputError(
-            "give `coulomb.stribeck` or `coulomb.asymmetric`, but not both: one level for each "
-            "direction has no Stribeck effect here."
-        )
-    speed = _number_or_each(robot, "coulomb.stribeck", table.stribeck)
-    return StribeckFriction(speed, transition=transition)
-
-
-def coupled(robot: Robot) -> bool:
-    """Whether some motor turns more than one axis."""
-    return bool(CoupledDrives().couplings(robot))
-
-
-def _transition(table: CoulombTable, robot: Robot) -> AbstractTransition:
-    dead_zone = _number_or_each(robot, "coulomb.dead_zone", table.dead_zone)
-    if table.hard:
-        return HardSign(dead_zone)
-    return Tanh(_number_or_each(robot, "coulomb.epsilon", table.epsilon), dead_zone)
-
-
-def _number_or_each(
-    robot: Robot, name: str, value: float | int | list
-) -> float | Float[np.ndarray, " joints"]:
-    if isinstance(value, list):
-        return np.array(each(robot, name, value), np.float64)
-    return float(value)
-
-
-def build_columns(table: RecordingTable | None, robot: Robot) -> Columns | None:
-    """What the columns of the logs hold.
-
-    Raises:
-        InputError: If a unit is unknown or does not fit its joint, a list has a wrong length, or
-            the time is not given.
-    """
-    if table is None:
-        return None
-    if (table.time is None) == (table.sample_time is None):
-        came = "it has neither" if table.time is None else "not both"
-        raise InputError(
-            "give `time` (the column of the time stamps) or `sample_time` [s] (rows equally far "
-            f"apart): {came}."
-        )
-    for name in (
-        "torque_constants",
-        "angle_signs",
-        "force_signs",
-        "angle_offsets",
-        "force_gains",
-    ):
-        each(robot, name, getattr(table, name))
-    forces_side = table.side if table.forces_side is None else table.forces_side
-    if table.side == "joint":
-        _refuse_mixed(robot, "angle_unit", table.angle_unit)
-        _refuse_mixed(robot, "velocity_unit", table.velocity_unit)
-    if forces_side == "joint":
-        _refuse_mixed(robot, "force_unit", table.force_unit)
-    return Columns(
-        _selection(robot, "angles", table.angles),
-        _selection(robot, "forces", table.forces),
-        None if table.velocities is None else _selection(robot, "velocities", table.velocities),
-        time=table.time,
-        sample_time=table.sample_time,
-        time_unit=unit(table.time_unit),
-        angle_unit=_units(robot, "angle_unit", table.angle_unit),
-        velocity_unit=(
-            None
-            if table.velocity_unit is None
-            else _units(robot, "velocity_unit", table.velocity_unit)
-        ),
-        force_unit=_units(robot, "force_unit", _force_unit(robot, table)),
-        torque_constants=table.torque_constants,
-        angle_signs=table.angle_signs,
-        force_signs=table.force_signs,
-        angle_offsets=table.angle_offsets,
-        force_gains=table.force_gains,
-        angles_on_motor_side=table.side == "motor",
-        forces_on_motor_side=forces_side == "motor",
-    )
-
-
-def _selection(robot: Robot, name: str, value: str | int | list) -> Selection:
-    return tuple(each(robot, name, value) or ()) if isinstance(value, list) else value
-
-
-def _units(robot: Robot, name: str, value: str | list[str]) -> Unit | list[Unit]:
-    if isinstance(value, str):
-        return unit(value)
-    return [unit(one) for one in each(robot, name, value) or []]
-
-
-def _force_unit(robot: Robot, table: RecordingTable) -> str | list[str]:
-    """As the file says; otherwise SI units, which are the same number for both kinds of joint."""
-    return NM.symbol if table.force_unit is None else table.force_unit
-
-
-def _refuse_mixed(robot: Robot, name: str, value: str | list[str] | None) -> None:
-    """Refuses degrees or N m for a joint that slides, and millimetres or N for one that turns.
-
-    Raises:
-        InputError: If there is such a joint.
-    """
+def _refuse_mixed(robot: Robot, name: str, value: Unit | tuple[Unit, ...] | None) -> None:
+    """Reject degrees or N m for a joint that slides, and millimetres or N for one that turns."""
     if value is None:
         return
-    symbols = [value] * robot.joints if isinstance(value, str) else each(robot, name, value) or []
-    for label, turns, symbol in zip(robot.joint_names, robot.revolute, symbols, strict=True):
-        if symbol in (SLIDES if turns else TURNS):
-            kinds = ("a torque", "a force") if "force" in name else ("an angle", "a length")
+    units = (value,) * robot.joints if isinstance(value, Unit) else value
+    for label, turns, one in zip(robot.joint_names, robot.revolute, units, strict=True):
+        foreign = ("mm", "mm/s", "N") if turns else ("deg", "rev", "deg/s", "rpm", "N m")
+        if one.symbol in foreign:
             raise InputError(
-                f'`{name}` of joint `{label}` is "{symbol}", but the joint '
-                f"{'turns' if turns else 'slides'}: give a list with one unit for each joint, of "
-                f"{kinds[not turns]} for this one."
+                f'`{name}` of joint `{label}` is "{one.symbol}", but the joint '
+                f"{'turns' if turns else 'slides'}: give a list with one unit for each joint."
             )
 
 
-def build_filter(
-    table: ButterworthTable | PaperTable | PeriodicTable | None,
-) -> tuple[AbstractFilter, list[str]]:
-    """The filter, and what is assumed."""
-    match table:
-        case None:
-            said = (
-                f"no table `[filter]`: a Butterworth low-pass at {CUTOFF:g} Hz is assumed; choose "
-                "about five times the highest frequency of the motion."
-            )
-            return ZeroPhaseButterworth(CUTOFF), [said]
-        case ButterworthTable():
-            return _butterworth(table)[0], []
-        case PaperTable():
-            return PaperFilter(table.velocity, table.acceleration, table.margin), []
-        case PeriodicTable():
-            return PeriodicFourier(
-                table.period, table.harmonics, table.force_harmonics, table.order, table.margin
-            ), []
+def build_filters(table: Any) -> tuple[list[AbstractFilter], list[str]]:
+    """Return the filter, or several to choose from, and what is assumed.
+
+    Args:
+        table: The table `[filter]`; None if the file has none.
+
+    Raises:
+        InputError: If a key or value does not fit.
+    """
+    if table is None:
+        note = (
+            f"no table `[filter]`: a Butterworth low-pass at {CUTOFF:g} Hz is assumed; choose "
+            "about five times the highest frequency of the motion."
+        )
+        return [ZeroPhaseButterworth(CUTOFF)], [note]
+    kind, rest = pop_kind(table, "filter", list(FILTERS))
+    cutoffs = rest.get("cutoff")
+    if kind == "butterworth" and isinstance(cutoffs, list):
+        if not cutoffs:
+            raise InputError("`filter.cutoff` must be a number, or a list to choose from.")
+        tables = [{**rest, "cutoff": cutoff} for cutoff in cutoffs]
+    else:
+        tables = [rest]
+    filters = []
+    for one in tables:
+        (arguments,) = decode([FILTERS[kind]], one, "filter")
+        with within("filter"):
+            filters.append(FILTERS[kind](**arguments))
+    return filters, []
 
 
-def _butterworth(table: ButterworthTable) -> list[ZeroPhaseButterworth]:
-    """One filter, or one for each cut-off of a list."""
-    cutoffs = table.cutoff if isinstance(table.cutoff, list) else [table.cutoff]
-    if not cutoffs:
-        raise InputError("`cutoff` must be a number, or a list to choose from, but is empty.")
-    return [ZeroPhaseButterworth(f, table.order, table.force_cutoff, table.margin) for f in cutoffs]
+def pop_kind(
+    table: Any, place: str, kinds: list[str], default: str | None = None
+) -> tuple[str, dict[str, Any]]:
+    """Return the `kind` of a table, and its other keys.
+
+    Args:
+        table: The table.
+        place: Path of the table in the file.
+        kinds: Kinds that there are.
+        default: Kind of a table that names none; None if it must.
+
+    Raises:
+        InputError: If there is no such kind.
+    """
+    if not isinstance(table, dict):
+        raise InputError(f"`{place}` must be a table, but is {table}.")
+    kind = table.get("kind", default)
+    if kind is None:
+        raise InputError(f"`{place}.kind` is missing: `[{place}]` needs it ({quoted(kinds)}).")
+    if kind not in kinds:
+        raise InputError(f'`{place}.kind` must be {quoted(kinds)}, but is "{kind}".')
+    return kind, {k: v for k, v in table.items() if k != "kind"}
 
 
-def build_candidates(
-    table: ButterworthTable | PaperTable | PeriodicTable | None, rows: RowsTable
-) -> tuple[FilterCandidate, ...]:
-    """The filters to choose from, where the file lists cut-offs; none where it names one."""
-    if not isinstance(table, ButterworthTable) or not isinstance(table.cutoff, list):
-        return ()
-    decimation = build_decimation(rows)
-    return tuple(FilterCandidate(filter, decimation) for filter in _butterworth(table))
+def build_rows(
+    robot: Robot,
+    *,
+    step: Count | None = None,
+    factors: list[Count] | None = None,
+    min_speed: Magnitude | list[Magnitude] | None = None,
+) -> tuple[AbstractDecimation, Float[np.ndarray, " joints"] | None]:
+    """Samples that become rows of the least-squares problem.
 
-
-def build_decimation(table: RowsTable) -> AbstractDecimation:
-    """Which samples become rows.
+    Args:
+        robot: Robot with the joints.
+        step: Number of samples from one row to the next, of signals below half of that rate.
+        factors: Factors of stages that low-pass and decimate, instead of `step`, like `[10, 10]`:
+            13 at most.
+        min_speed: Speed below which rows do not count [rad/s or m/s], like `0.05`; or a list.
 
     Raises:
         InputError: If two ways are asked for, or a factor is too large.
     """
-    if table.every is not None and table.factors is not None:
+    if step is not None and factors is not None:
         raise InputError(
-            "give `every` (takes every n-th sample) or `factors` (low-pass filters before every "
+            "give `step` (takes every n-th sample) or `factors` (low-pass filters before every "
             "stage), but not both."
         )
-    if table.factors is not None:
-        return Decimation(tuple(table.factors))
-    return Subsample(1 if table.every is None else table.every)
+    speed = None
+    if min_speed is not None:
+        speed = np.broadcast_to(_speed(robot, "min_speed", min_speed), (robot.joints,)) + 0.0
+    return Subsample(step or 1) if factors is None else Decimation(tuple(factors)), speed
 
 
-def build_slow(table: RowsTable, robot: Robot) -> Float[np.ndarray, " joints"] | None:
-    """Speeds below which rows do not count [rad/s or m/s].
+def filter_candidates(
+    filters: list[AbstractFilter], decimation: AbstractDecimation
+) -> tuple[FilterCandidate, ...]:
+    """Return the filters to choose from; none where there is one only.
 
-    Raises:
-        InputError: If there is not one number for each joint.
+    Args:
+        filters: Filters of the file.
+        decimation: Decimation after each of them.
     """
-    if table.slow is None:
-        return None
-    return np.broadcast_to(_number_or_each(robot, "slow", table.slow), (robot.joints,)) + 0.0
+    if len(filters) == 1:
+        return ()
+    return tuple(FilterCandidate(one, decimation) for one in filters)

@@ -47,7 +47,7 @@ def require_plain(experiment: Experiment) -> tuple[str, ...]:
         experiment: Whose runs are looked at together.
 
     Raises:
-        InputError: If friction's shapes are to be found, or axes are identified one by one.
+        InputError: If friction's shapes are to be found.
     """
     if experiment.linear is not None:
         raise InputError(
@@ -55,13 +55,9 @@ def require_plain(experiment: Experiment) -> tuple[str, ...]:
             "friction in each run: leave it out, and give both runs the shapes that `jaxid "
             "identify` finds, as `epsilon` and `stribeck` of `model.coulomb`."
         )
-    if experiment.single_axes is not None:
-        raise InputError(
-            f'{experiment.path.name}: `estimator.kind = "stepwise"` does not tell how the errors '
-            "of two runs belong together: leave it out here."
-        )
-    plain = experiment.estimator is experiment.plain and not experiment.regularised
-    if plain and experiment.essential is None:
+    chosen = experiment.estimation
+    plain = chosen.estimator is chosen.plain and not chosen.regularised
+    if plain and chosen.essential is None:
         return ()
     return ("all runs are weighted least squares here: the rest of `[estimator]` does not count",)
 
@@ -88,7 +84,7 @@ def read_run(
         stage(f"factorising the rows, {name}")
         through = stage.through(sum(o.samples for o in observed))
         rows = Rows.of(experiment.base, observed, through)
-        fit = fit_rows(rows, experiment.plain)
+        fit = fit_rows(rows, experiment.estimation.plain)
         doubts += slips_of(logs, fit)
         earlier.append(Run.of_rows(rows, fit))
     return functools.reduce(update, earlier), doubts

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from jaxid.excitation.plan import CRITERIA, ExcitationPlan
-from jaxid.experiment.excite import Excited
+from jaxid.experiment.excitation import Design
 from jaxid.experiment.terminal import BAD, DOUBTFUL, GOOD, sentences, show_table
 from jaxid.report.blocks import Tone
 from jaxid.report.excitation import (
@@ -21,7 +21,7 @@ STYLES = {Tone.PLAIN: "", Tone.GOOD: GOOD, Tone.DOUBTFUL: DOUBTFUL, Tone.BAD: BA
 """How remarks look in the terminal."""
 
 
-def show_excited(console: Console, excited: Excited) -> None:
+def show_excited(console: Console, excited: Design) -> None:
     """A designed motion and how a robot gets into it."""
     plan = excited.plan
     tables = [criteria_table(plan), deviation_table(plan), use_table(plan)]

@@ -62,7 +62,7 @@ kind = "butterworth"                  # a low-pass, forward and backward, then d
 cutoff = 10.0                         # the motion has nothing above 0.625 Hz [Hz]
 
 [rows]                                # which samples become rows of the least-squares problem
-every = 20                            # 25 rows in a second
+step = 20                             # 25 rows in a second
 
 [estimator]
 kind = "weighted"                     # joints count by their largest torques (Eq. 30)

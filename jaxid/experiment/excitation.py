@@ -1,0 +1,467 @@
+"""Design of the motion that an experiment file asks for, and the files that a robot can play."""
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxid.arrays import Float, double_precision
+from jaxid.errors import InputError
+from jaxid.excitation.constraints.clearance import Clearance
+from jaxid.excitation.constraints.constraint import AbstractConstraint, Finding
+from jaxid.excitation.constraints.forces import (
+    AbstractForceLimits,
+    JointForces,
+    MotorTorques,
+    NominalForces,
+)
+from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace
+from jaxid.excitation.design import DesignProgress, assumed_noise, design_excitation
+from jaxid.excitation.information import information
+from jaxid.excitation.plan import CRITERIA as ALL_CRITERIA
+from jaxid.excitation.plan import ExcitationPlan
+from jaxid.experiment.decoder import within
+from jaxid.experiment.excitation_tables import CRITERIA
+from jaxid.experiment.experiment import Experiment
+from jaxid.identification.runs.estimates import groups
+from jaxid.io import atomic_folder
+from jaxid.report.blocks import Remark, Tone
+from jaxid.report.compared_files import read_estimates
+from jaxid.report.excitation_words import named
+from jaxid.report.excited import Aside, write_pictures
+from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.trajectory.files import (
+    load_trajectory,
+    save_trajectory,
+    write_csv,
+    write_ros_json,
+    write_ros_yaml,
+)
+from jaxid.trajectory.leads import with_leads
+from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
+
+
+class Nominal(NamedTuple):
+    """Base parameters as far as they are known before the experiment.
+
+    Attributes:
+        names: Names of the base parameters.
+        parameters: Values; NaN where nothing is known.
+        covariance: Covariance of an earlier fit; None if the parameters are only claimed. Zero for
+            what the fit does not determine.
+        undetermined: Names of parameters that an earlier fit does not determine.
+    """
+
+    names: tuple[str, ...]
+    parameters: Float[np.ndarray, " base"]
+    covariance: Float[np.ndarray, "base base"] | None
+    undetermined: tuple[str, ...] = ()
+
+    @property
+    def sizes(self) -> Float[np.ndarray, " base"]:
+        """Parameters; NaN also for what is not determined, whose estimate alone means nothing."""
+        return np.where(np.isin(self.names, self.undetermined), np.nan, self.parameters)
+
+
+class Design(NamedTuple):
+    """Designed motion as a robot can play it.
+
+    Attributes:
+        plan: Result of the optimisation.
+        played: Motion from standstill to standstill where that is possible.
+        window: Times of it between which lies the designed motion [s].
+        aside: Remarks, and how the motion came about.
+        sampled: Motion as it is written in samples: until a sample meets its end.
+        sample_time: Time between those samples [s].
+        ros: Language of the file for ROS: yaml or json.
+    """
+
+    plan: ExcitationPlan
+    played: AbstractTrajectory
+    window: tuple[float, float]
+    aside: Aside
+    sampled: AbstractTrajectory
+    sample_time: float
+    ros: str
+
+
+def design_motion(
+    experiment: Experiment,
+    progress: Callable[[DesignProgress], None],
+    state: Path,
+    resume: bool,
+) -> Design:
+    """Design the motion that the experiment file asks for.
+
+    Args:
+        experiment: Experiment with its table `[excitation]`, or the defaults.
+        progress: Callback for the progress of the design.
+        state: File that keeps the state of the design.
+        resume: Whether to go on from that file if it is there.
+
+    Raises:
+        InputError: If the table does not fit the robot, or no motion keeps all limits.
+    """
+    table = experiment.excitation
+    with within("excitation", experiment.path.name):
+        nominal = find_nominal(experiment)
+        plan = design_excitation(
+            experiment.base,
+            criterion=CRITERIA[table.criterion](),
+            starts=table.starts,
+            generations=table.generations,
+            polish=min(table.polish, table.starts),
+            progress=progress,
+            state=state,
+            resume=resume,
+            **_settings(experiment, nominal),
+        )
+        return _add_leads(experiment, plan, nominal)
+
+
+def compare_criteria(
+    experiment: Experiment, progress: Callable[[DesignProgress], None]
+) -> list[ExcitationPlan]:
+    """Design by every criterion, from few starts and without polishing, until Ctrl-C.
+
+    Args:
+        experiment: Experiment with its table `[excitation]`, or the defaults.
+        progress: Callback for the progress of the designs.
+    """
+    plans, table = [], experiment.excitation
+    for number, criterion in enumerate(ALL_CRITERIA):
+
+        def tell(now: DesignProgress, number: int = number) -> None:
+            share = (number + now.share) / len(ALL_CRITERIA)
+            doing = f"criterion {number + 1} of {len(ALL_CRITERIA)}, {now.doing}"
+            progress(now._replace(share=share, doing=doing))
+
+        try:
+            with within("excitation", experiment.path.name):
+                nominal = find_nominal(experiment)
+                plan = design_excitation(
+                    experiment.base,
+                    criterion=criterion,
+                    starts=min(8, table.starts),
+                    generations=min(4, table.generations),
+                    polish=0,
+                    progress=tell,
+                    throw=False,
+                    **_settings(experiment, nominal, bool(criterion.weighted)),
+                )
+        except KeyboardInterrupt:
+            break
+        plans.append(plan)
+        if plan.interrupted:
+            break
+    return plans
+
+
+def write_design(design: Design, output: Path, command: str = "") -> list[Path]:
+    """Write table, trajectory, ROS message and pictures; return the files.
+
+    Args:
+        design: The motion.
+        output: Path of the table; the others lie beside it.
+        command: Command line that makes it again, for the page.
+    """
+    plan, step = design.plan, design.sample_time
+    aside = design.aside._replace(settings={**design.aside.settings, "command": command})
+    robot = plan.base.model.robot
+    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{design.ros}"]
+    write_ros = write_ros_json if design.ros == "json" else write_ros_yaml
+    with double_precision(), atomic_folder(output.parent) as folder:
+        write_csv(design.sampled, robot, folder / names[0], sample_time=step)
+        save_trajectory(jax.tree.map(np.asarray, design.played), folder / names[1])
+        write_ros(design.sampled, robot, folder / names[2], sample_time=step)
+        # Before the others take their places: where there is no room for pictures, nothing changes.
+        pictures = write_pictures(output.with_suffix(""), plan, design.played, aside)
+    return [output.parent / n for n in names] + pictures
+
+
+def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = True) -> dict:
+    """Return what all designs of one experiment have in common."""
+    table = experiment.excitation
+    noise = assumed_noise(experiment.robot) if table.noise is None else np.array(table.noise)
+    constraints = find_constraints(experiment, nominal)
+    return {
+        "basis": table.basis(bool(constraints)),
+        "constraints": constraints,
+        "key": jax.random.key(table.seed),
+        "noise": noise,
+        "nominal": None if nominal is None else nominal.sizes,
+        "prior": _earlier_information(experiment, noise) if weighted else None,
+        "samples": table.samples,
+    }
+
+
+def find_constraints(
+    experiment: Experiment, nominal: Nominal | None
+) -> tuple[AbstractConstraint, ...]:
+    """Return the constraints of the motion beside the limits of the joints.
+
+    Args:
+        experiment: Experiment with its tables `[collision]` and `[excitation]`.
+        nominal: Nominal parameters; None if nothing is known.
+
+    Raises:
+        InputError: If forces are limited, but no parameters or no largest forces are known.
+    """
+    table = experiment.excitation
+    constraints: list[AbstractConstraint] = []
+    if experiment.collision is not None:
+        constraints.append(Clearance(experiment.collision, experiment.clearance))
+    if table.tip_speed is not None:
+        constraints.append(TipSpeed(table.tip_speed))
+    if table.tip_acceleration is not None:
+        constraints.append(TipAcceleration(table.tip_acceleration))
+    if table.workspace is not None:
+        constraints.append(Workspace.of(*table.workspace))
+    if table.force_margin is None:
+        return tuple(constraints)
+    if nominal is None:
+        raise InputError(
+            "`force_margin` needs parameters to compute forces with: say in `nominal` where an "
+            "earlier result of `jaxid identify` is."
+        )
+    forces = _force_limits(experiment, nominal, table.force_margin)
+    if not forces:
+        raise InputError(
+            "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
+        )
+    return (*constraints, *forces)
+
+
+def _force_limits(
+    experiment: Experiment, nominal: Nominal, margin: float
+) -> tuple[AbstractForceLimits, ...]:
+    """Return limits of joints' forces and motors' torques, as far as the robot has them."""
+    robot = experiment.robot
+    parameters = np.nan_to_num(nominal.parameters)
+    forces = NominalForces.of(experiment.base, parameters, nominal.covariance)
+    limits: list[AbstractForceLimits] = []
+    if np.isfinite(robot.limits.force).any():
+        limits.append(JointForces(forces, margin))
+    if np.isfinite(robot.drives.max_torques).any():
+        limits.append(MotorTorques(forces, margin))
+    return tuple(limits)
+
+
+def _earlier_information(
+    experiment: Experiment, noise: Float[np.ndarray, " joints"]
+) -> Float[np.ndarray, "base base"] | None:
+    """Return the information of earlier motions; None if there are none."""
+    table, folder = experiment.excitation, experiment.path.parent
+    if not table.earlier:
+        return None
+    if not CRITERIA[table.criterion]().weighted:
+        raise InputError(
+            f'`earlier` and `criterion = "{table.criterion}"` do not go together: what motions '
+            "tell adds up in units of the noise, which this criterion does not know; leave out "
+            '`earlier`, or choose a criterion like "d_optimal".'
+        )
+    total = 0.0
+    for name in table.earlier:
+        trajectory = load_trajectory(folder / name)
+        if trajectory.joints != experiment.robot.joints:
+            raise InputError(
+                f"`earlier`: the motion of `{name}` moves {trajectory.joints} joint(s), but the "
+                f"robot `{experiment.robot.name}` has {experiment.robot.joints}: name motions of "
+                "this robot."
+            )
+        times = np.arange(table.samples) * (float(trajectory.duration) / table.samples)
+        weighted = information(experiment.base, trajectory.motion(times), 1.0 / noise).weighted
+        total = total + np.asarray(weighted)
+    return np.asarray(total)
+
+
+def find_nominal(experiment: Experiment) -> Nominal | None:
+    """Return nominal parameters of an earlier result, or those that the URDF file claims.
+
+    Args:
+        experiment: Experiment with its table `[excitation]`.
+
+    Raises:
+        InputError: If the earlier result is of other parameters.
+    """
+    if experiment.excitation.nominal is not None:
+        return _earlier_result(experiment, experiment.excitation.nominal)
+    try:
+        bodies = experiment.source.parameters(experiment.path.parent)
+    except InputError:
+        if experiment.excitation.force_margin is not None:
+            raise
+        return None  # nothing depends on it, and the robot's notes name the body that cannot exist
+    if bodies is None or not np.any(bodies):
+        return None
+    base, standard = experiment.base, experiment.model.parameter_names
+    names = [f"{n}{i + 1}" for i in range(experiment.robot.joints) for n in INERTIAL_NAMES]
+    known = dict(zip(names, bodies.ravel().tolist(), strict=True))
+    values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
+    leads = [standard[k] in known for k in base.indices]
+    return Nominal(base.names, np.where(leads, values, np.nan), None)
+
+
+def _earlier_result(experiment: Experiment, report: str) -> Nominal:
+    base, fit = experiment.base, read_estimates(experiment.path.parent / report)
+    if fit.names != base.names:
+        raise InputError(
+            f"`nominal`: the {len(fit.names)} base parameters of `{report}` are not the "
+            f"{base.size} of this experiment: identify with the same robot and model."
+        )
+    covariance = np.array(fit.covariance)
+    undetermined = ~np.isfinite(np.diag(covariance))
+    covariance[undetermined | undetermined[:, None]] = 0.0
+    names = tuple(n for n, u in zip(fit.names, undetermined, strict=True) if u)
+    return Nominal(base.names, np.asarray(fit.parameters), covariance, names)
+
+
+def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None) -> Design:
+    """Return the motion from standstill to standstill, in samples of the controller."""
+    motion, table = plan.trajectory, experiment.excitation
+    leads = table.chosen_leads
+    begin, last, end = _sample_times(plan)[[0, 1, -1]].tolist()
+    step, refusal = last - begin, ""
+    # Where there are constraints, leads were designed together with the motion.
+    if leads is not None and leads.time is None and not plan.findings:
+        robot = experiment.robot.replace(limits=plan.limits.limits)
+        try:
+            motion = with_leads(motion, robot, periods=leads.periods)
+        except InputError as error:
+            refusal = str(error)
+        else:
+            begin, end = (float(t) for t in motion.window)
+    elif leads is not None:
+        end = begin + leads.periods * (end - begin)
+    remarks = (
+        *_remarks(experiment, plan, float(motion.duration), (begin, end), refusal),
+        *force_remarks(experiment, nominal, motion),
+    )
+    settings = {"facts": (("seed", str(table.seed)),), "experiment_text": experiment.text}
+    step = step if table.sample_time is None else table.sample_time
+    rests = leads is not None or table.rest or table.spline is not None
+    whole_cycles = table.sample_time is not None and rests and not refusal
+    sampled = PaddedToCycle(motion, step) if whole_cycles else motion
+    return Design(plan, motion, (begin, end), Aside(remarks, settings), sampled, step, table.ros)
+
+
+def _sample_times(plan: ExcitationPlan) -> Float[np.ndarray, " times"]:
+    """Return the times of the samples of one run, and its end [s]."""
+    times = plan.limits.basis.times(plan.samples)
+    return np.append(times, times[-1] + times[1] - times[0])
+
+
+def _remarks(
+    experiment: Experiment,
+    plan: ExcitationPlan,
+    duration: float,
+    window: tuple[float, float],
+    refusal: str,
+) -> Iterator[Remark]:
+    table, leads, (begin, end) = experiment.excitation, experiment.excitation.chosen_leads, window
+    notes = []
+    if begin > 0:
+        notes.append(
+            f"the robot starts at rest and is in the designed motion from {begin:.3f} to "
+            f"{end:.3f} s of {duration:.3f} s"
+        )
+    if table.noise is None:
+        notes.append(
+            "the noise is assumed as 1 % of the largest forces: give `noise` if it is known"
+        )
+    if table.earlier:
+        notes.append(f"deviations are those together with {', '.join(table.earlier)}")
+    if leads is not None and leads.periods > 1:
+        notes.append(f"the motion runs through {leads.periods} periods; the deviations are of one")
+    notes += table.unused
+    if plan.nominal is None:
+        notes.append(
+            "for relative deviations, say in `excitation.nominal` where an earlier result is"
+        )
+    for text in notes:
+        yield Remark(Tone.PLAIN, text)
+    if refusal:
+        yield Remark(
+            Tone.BAD,
+            f"the motion is without leads, and starts and ends at full speed: {refusal} "
+            "`rest = true` designs one that is at rest there.",
+        )
+
+
+def force_remarks(
+    experiment: Experiment, nominal: Nominal | None, played: AbstractTrajectory
+) -> Iterator[Remark]:
+    """Yield remarks about the forces of a motion, where any are limited.
+
+    Args:
+        experiment: Experiment with its table `[excitation]`.
+        nominal: Nominal parameters; None if nothing is known.
+        played: Motion with its leads.
+    """
+    if not np.isfinite(experiment.robot.known_max_forces).any():
+        return
+    if nominal is None:
+        yield Remark(
+            Tone.DOUBTFUL,
+            "forces were not checked, although they have limits, for no parameters are known: "
+            "say in `excitation.nominal` where an earlier result is, and give `force_margin` to "
+            "keep the limits",
+        )
+        return
+    if experiment.excitation.force_margin is None:
+        yield _force_use(experiment, nominal, played)
+    unknown = _unknown_parameters(experiment, nominal)
+    if unknown:
+        text = f"not known, and counted as zero in the forces: {unknown}"
+        yield Remark(Tone.DOUBTFUL, text)
+    if nominal.undetermined:
+        yield Remark(
+            Tone.DOUBTFUL,
+            f"`{experiment.excitation.nominal}` does not determine "
+            f"{', '.join(nominal.undetermined)}: the forces are computed with its estimates of "
+            "them, whose uncertainty counts as zero",
+        )
+
+
+def _force_use(experiment: Experiment, nominal: Nominal, played: AbstractTrajectory) -> Remark:
+    robot = experiment.robot
+    findings: list[Finding] = []
+    with double_precision():
+        motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
+        for limit in _force_limits(experiment, nominal, 0.0):
+            findings += limit.describe(robot, np.asarray(limit(robot, motion)))
+    exceeded = [_describe_use(one) for one in findings if one.value > 0]
+    if exceeded:
+        return Remark(
+            Tone.BAD,
+            "by the nominal parameters this motion needs more than robot and motors can give: "
+            f"{'; '.join(exceeded)}; give `force_margin`, and the design keeps these limits",
+        )
+    nearest = max(findings, key=lambda one: one.value)
+    return Remark(
+        Tone.PLAIN,
+        "forces were not part of the design; by the nominal parameters they stay within their "
+        f"limits, the nearest being {_describe_use(nearest)} (`force_margin` keeps them with room)",
+    )
+
+
+def _describe_use(finding: Finding) -> str:
+    return f"{finding.name} with {100 * finding.used:.1f} % of {finding.limit:.4g} {finding.unit}"
+
+
+def _unknown_parameters(experiment: Experiment, nominal: Nominal) -> str:
+    """Name the unknown parameters by effect and joint; empty if all are known."""
+    base, kinds = experiment.base, groups(experiment.base)
+    joints: dict[str, list[int]] = {}
+    for k in np.flatnonzero(np.isnan(nominal.parameters)):
+        number = re.search(r"\d+$", base.model.parameter_names[base.indices[k]])
+        if number is not None:
+            joints.setdefault(kinds[k], []).append(int(number[0]) - 1)
+    effects: dict[str, list[str]] = {}
+    for effect, indices in joints.items():
+        where = named(experiment.robot, sorted(set(indices)))
+        effects.setdefault(where, []).append(effect)
+    return "; ".join(f"{', '.join(words)} of {where}" for where, words in effects.items())
