@@ -18,6 +18,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from jaxid import cli
+from jaxid.errors import InputError
 from jaxid.excitation.limits import JointLimits
 from jaxid.excitation.plan import CRITERIA
 from jaxid.experiment.decoder import keys_of
@@ -29,7 +30,7 @@ from jaxid.experiment.excitation import (
     force_remarks,
     write_design,
 )
-from jaxid.experiment.excitation_tables import Excitation, Leads, spline
+from jaxid.experiment.excitation_tables import Excitation, Leads, spline_basis
 from jaxid.experiment.experiment import load_experiment
 from jaxid.report.blocks import Tone
 from jaxid.report.excitation_words import remarks
@@ -37,6 +38,7 @@ from jaxid.report.excited import excitation_page
 from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.fourier import fourier_series
 
+HOME = "jaxid.experiment.excitation"
 PENDULUM = """\
 <robot name="pendulum">
   <link name="stand"/>
@@ -231,11 +233,11 @@ def test_a_spline_in_place_of_a_series(written, run, no_pictures):
 
 
 def test_keys_that_others_leave_nothing_to_do_are_named():
-    table = Excitation(spline=spline(), harmonics=3, omega=1.0)
+    table = Excitation(spline=spline_basis(), harmonics=3, omega=1.0)
     assert table.unused == [
         "`harmonics` and `omega` do nothing for a `spline`",
     ]
-    assert Excitation(spline=spline()).unused == []
+    assert Excitation(spline=spline_basis()).unused == []
 
 
 def test_an_impossible_motion_is_diagnosed(written, run):
@@ -340,7 +342,7 @@ def test_leads_may_be_given_their_time():
 def test_the_guide_shows_every_key():
     guide = Path(__file__).parent.parent / "docs" / "excitation.md"
     shown = guide.read_text(encoding="utf-8").partition("```toml")[2].partition("```")[0]
-    for kind in (Excitation, Leads, spline):
+    for kind in (Excitation, Leads, spline_basis):
         for key in keys_of(kind):
             assert re.search(rf"\b{key} = ", shown), key
 
@@ -357,7 +359,7 @@ def test_limits_that_nobody_gave_are_named(written, excited):
 
 def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excited, monkeypatch):
     def refuse(series, robot, periods):
-        raise ValueError("no lead is short enough.")
+        raise InputError("no lead is short enough.")
 
     monkeypatch.setattr("jaxid.experiment.excitation.with_leads", refuse)
     monkeypatch.setattr(

@@ -518,7 +518,7 @@ REFUSALS = [
     (ARM + "[filter]\nkind = 'paper'\ncutoff = 3", "`filter.cutoff`.*velocity"),
     (ARM + "[filter]\nkind = 'periodic'\nperiod = 1\nharmonics = 1.5", "`filter.harmonics`"),
     (ARM + "[rows]\nevery = 2", "`rows.every` was renamed to `step`"),
-    (ARM + "[rows]\nmin_speed = 2", "`rows.slow` was renamed to `min_speed`"),
+    (ARM + "[rows]\nslow = 2", "`rows.slow` was renamed to `min_speed`"),
     (ARM + "[rows]\nstep = 0", "`rows.step`"),
     (ARM + "[rows]\nstep = 2\nfactors = [2]", "`step`.*`factors`"),
     (ARM + "[rows]\nfactors = [50]", "`factors`"),
@@ -585,13 +585,12 @@ def test_mistakes_are_one_sentence_with_file_and_key(load, text, expected):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(ValueError, match="is no file: check its path, or write one with `jaxid in"):
-        load_experiment(tmp_path / "none.toml")
-    with pytest.raises(ValueError, match="is a folder"):
-        load_experiment(tmp_path)
+    for path in (tmp_path / "none.toml", tmp_path):
+        with pytest.raises(InputError, match="is no file"):
+            load_experiment(path)
     path = tmp_path / "latin.toml"
     path.write_bytes("# Stäubli\n".encode("latin-1"))
-    with pytest.raises(ValueError, match=r"latin.toml: is no text in UTF-8 \(byte 4\)"):
+    with pytest.raises(InputError, match=r"latin.toml: .* \(byte 4\)"):
         load_experiment(path)
 
 
@@ -645,7 +644,7 @@ def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
         said = _refusal(path)
         # The keys of other kinds follow their kind, which stands twice then.
         foreign = re.search(r"`filter.\w+` is no known key", said)
-        wrong = re.search(r"no known key|must be (a|true)|is missing", said)
+        wrong = re.search(r"no known key|must be (a num|a list|a text|true)|is missing", said)
         assert not wrong or foreign, said
 
 

@@ -41,7 +41,7 @@ class Bounds(NamedTuple):
     most: float = math.inf
     below: float = math.inf
 
-    def broken_by(self, value: float) -> str:
+    def broken_by(self, value: float | int) -> str:
         """Return the rule that a number breaks, and nothing if it breaks none."""
         if not value > self.above and self.above > -math.inf:
             return "positive" if self.above == 0 else f"above {self.above:g}"

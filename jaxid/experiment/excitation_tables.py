@@ -153,7 +153,7 @@ class Collision:
         return list(model.capsules), obstacles, pairs if alone else None
 
 
-def spline(
+def spline_basis(
     *,
     points: Annotated[int, Bounds(least=4, most=100)] = 12,
     duration: Annotated[float, Bounds(above=0.0, most=10_000.0)] = 8.0,
@@ -228,7 +228,7 @@ class Excitation:
     harmonics: Annotated[int, Bounds(least=1, most=50)] | None = None
     omega: Annotated[float, Bounds(above=0.0, most=1000.0)] | None = None
     rest: bool = False
-    spline: Annotated[RestToRestSplineBasis, spline] | None = None
+    spline: Annotated[RestToRestSplineBasis, spline_basis] | None = None
     leads: bool | Leads = True
     samples: Annotated[int, Bounds(least=2, most=10_000_000)] = 800
     noise: list[Annotated[float, Bounds(above=0.0, below=1e9)]] | None = None

@@ -188,11 +188,12 @@ def _other_kinds(
 
 def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
     text, example = _split_example(key.text)
-    if value is None and not key.needed and not key.tables:
+    example = example or EXAMPLES.get(key.name, "")
+    if value is None and not (key.needed or key.tables or (example and not active)):
         value = key.default
     shown = _toml(value)
     if shown is None:
-        active, shown = False, _example(key, joints, example or EXAMPLES.get(key.name, ""))
+        active, shown = False, _example(key, joints, example)
     yield from _entry(key.name, shown, text, active)
 
 
@@ -236,7 +237,7 @@ def _toml(value: Any) -> str | None:
     return None
 
 
-def _number(value: float) -> str:
+def _number(value: float | int) -> str:
     return repr(value)
 
 

@@ -66,7 +66,7 @@ def test_the_truth_is_found_again(example):
         experiment.observe(experiment.read(example / f"{name}.csv"))
         for name in ("identification", "verification")
     ]
-    fit = identify(base, observations[0], experiment.estimator)
+    fit = identify(base, observations[0], experiment.estimation.estimator)
     truth = json.loads((example / "truth.json").read_text("utf-8"))
     rows = truth["base_parameters"]
     assert [r["name"] for r in rows] == list(base.names)
