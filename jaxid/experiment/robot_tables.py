@@ -13,8 +13,8 @@ from jaxid.experiment.decoder import Magnitude, PerJoint, Positive, Vector, quot
 from jaxid.robot import library
 from jaxid.robot.collision import Capsule, fit_capsules
 from jaxid.robot.dh import from_dh
-from jaxid.robot.limits import Limits
 from jaxid.robot.kinematics import rpy_rotation
+from jaxid.robot.limits import Limits
 from jaxid.robot.plausibility import SNAP_TOLERANCE, far_notes, fast_notes, range_fault
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.urdf import load_urdf, urdf_parameters
@@ -111,9 +111,7 @@ class Load:
             )
             return cast(Tool, loaded.tool)
         body = joint_number(robot, self.body)
-        return Tool(
-            body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia
-        )
+        return Tool(body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia)
 
 
 def joint_number(robot: Robot, name: str, key: str = "body") -> int:
