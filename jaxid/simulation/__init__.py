@@ -1,1 +1,28 @@
-"""A virtual robot to experiment on."""
+"""Virtual robots: experiments whose truth is known, on our own physics or on MuJoCo."""
+
+from jaxid.simulation.example import virtual_panda as virtual_panda
+from jaxid.simulation.example import write_example as write_example
+from jaxid.simulation.experiment import AbstractExperiment as AbstractExperiment
+from jaxid.simulation.experiment import AbstractPlant as AbstractPlant
+from jaxid.simulation.experiment import Sensors as Sensors
+from jaxid.simulation.experiment import Servo as Servo
+from jaxid.simulation.experiment import Tracking as Tracking
+from jaxid.simulation.friction import AbstractDisturbance as AbstractDisturbance
+from jaxid.simulation.friction import AbstractGearFriction as AbstractGearFriction
+from jaxid.simulation.friction import CableForce as CableForce
+from jaxid.simulation.friction import FrictionTemperature as FrictionTemperature
+from jaxid.simulation.friction import LuGreFriction as LuGreFriction
+from jaxid.simulation.friction import SmoothFriction as SmoothFriction
+from jaxid.simulation.friction import StepFriction as StepFriction
+from jaxid.simulation.friction import TorqueRipple as TorqueRipple
+from jaxid.simulation.mechanics import AbstractGear as AbstractGear
+from jaxid.simulation.mechanics import BacklashGear as BacklashGear
+from jaxid.simulation.mechanics import FlexibleGear as FlexibleGear
+from jaxid.simulation.mechanics import GearForce as GearForce
+from jaxid.simulation.mechanics import MotorMomentum as MotorMomentum
+from jaxid.simulation.mechanics import RigidGear as RigidGear
+from jaxid.simulation.mujoco import MujocoRobot as MujocoRobot
+from jaxid.simulation.tx90l import cad_tx90l_on_rail as cad_tx90l_on_rail
+from jaxid.simulation.tx90l import virtual_tx90l_on_rail as virtual_tx90l_on_rail
+from jaxid.simulation.virtual import VirtualRobot as VirtualRobot
+from jaxid.simulation.virtual import random_bodies as random_bodies

@@ -1,8 +1,9 @@
-"""An example to begin with: the files of an experiment on a virtual robot whose truth is known."""
+"""An example: the files of an experiment on a virtual robot whose truth is known."""
 
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,20 +13,11 @@ from jaxid.errors import InputError
 from jaxid.io import atomic_folder
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
-from jaxid.simulation.gear_friction import SmoothFriction
-from jaxid.simulation.sensors import Sensors
+from jaxid.simulation.experiment import Sensors
+from jaxid.simulation.friction import SmoothFriction
 from jaxid.simulation.virtual import VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 
-SAMPLE_TIME = 0.002
-PERIOD = 8.0
-IDENTIFICATION_PERIODS, VERIFICATION_PERIODS = 2, 1
-MASSES = (3.4, 2.2, 2.6, 2.4, 1.6, 1.3, 0.6)
-"""About what the bodies weigh [kg]."""
-ROTORS = (0.6, 0.6, 0.45, 0.45, 0.2, 0.2, 0.15)
-"""About what the motors add to the joints' inertia [kg m²]."""
-STRIBECK, STRIBECK_SPEED = 0.005, 0.05
-"""Friction near standstill that no model has, of the largest torques, and its speed [rad/s]."""
 FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")
 
 _EXPERIMENT = """\
@@ -70,29 +62,31 @@ kind = "weighted"                     # joints count by their largest torques (E
 
 
 def virtual_panda(seed: int = 0) -> VirtualRobot:
-    """A robot with the geometry of a Panda and parameters that are drawn.
+    """Return a robot with the geometry of a Panda and random parameters.
 
-    Masses, rotors and friction vary by some 20 percent about plausible values; the bodies could
+    Masses, rotors and friction vary by some 20 percent about plausible values; the bodies can
     exist. Noise is 1 percent of the largest torques.
 
     Args:
-        seed: Of the parameters.
+        seed: Seed of the parameters.
     """
     robot = library.panda()
     random = np.random.default_rng([seed, 0])
     n, largest = robot.joints, np.asarray(robot.max_forces)
 
-    def about(values: np.ndarray) -> np.ndarray:
+    def vary(values: np.ndarray) -> np.ndarray:
         return values * random.uniform(0.8, 1.2, n)
 
-    bodies = random_bodies(robot, about(np.array(MASSES)), random)
+    masses = vary(np.array([3.4, 2.2, 2.6, 2.4, 1.6, 1.3, 0.6]))  # [kg]
+    bodies = random_bodies(robot, masses, random)
     friction = SmoothFriction(
-        viscous=about(0.02 * largest),
-        coulomb=about(0.03 * largest),
-        stribeck=STRIBECK * largest,
-        stribeck_speed=STRIBECK_SPEED,
+        viscous=vary(0.02 * largest),
+        coulomb=vary(0.03 * largest),
+        stribeck=0.005 * largest,  # friction near standstill that no model has
+        stribeck_speed=0.05,
     )
-    rotors, offsets = about(np.array(ROTORS)), 0.01 * largest * random.uniform(-1.0, 1.0, n)
+    rotors = vary(np.array([0.6, 0.6, 0.45, 0.45, 0.2, 0.2, 0.15]))  # [kg m²]
+    offsets = 0.01 * largest * random.uniform(-1.0, 1.0, n)
     return VirtualRobot(
         robot=robot,
         terms=(RigidBodies(), RotorInertia(), ConstantOffset()),
@@ -108,64 +102,59 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
 
 
 def virtual_log(robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]) -> Recording:
-    """A log of a random motion within the limits.
+    """Return a log of a random motion within the limits, with a period of 8 s, at 500 Hz.
 
     Args:
-        robot: That moves.
-        name: Of the log.
-        periods: How often the motion is repeated.
-        seed: Of motion and noise.
+        robot: Virtual robot.
+        name: Name of the log.
+        periods: Number of periods.
+        seed: Seed of motion and noise.
     """
     motion_seed, noise_seed = (
         int(s) for s in np.random.SeedSequence(seed).generate_state(2, np.uint32)
     )
     trajectory = random_fourier_series(
-        robot.model.robot, omega=2 * math.pi / PERIOD, reach=0.9, seed=motion_seed
+        robot.model.robot, omega=2 * math.pi / 8.0, reach=0.9, seed=motion_seed
     )
     return robot.measure(
         trajectory,
-        duration=periods * PERIOD,
-        sample_time=SAMPLE_TIME,
+        duration=periods * 8.0,
+        sample_time=0.002,
         seed=noise_seed,
         name=name,
     )
 
 
 def write_example(folder: Path, seed: int = 0) -> list[Path]:
-    """Writes an experiment to try: its file, two logs and the truth; all of them or nothing.
+    """Write an experiment to try: its file, two logs and the truth, all of them or nothing.
 
     Args:
-        folder: Of the files; made with its parents.
-        seed: Of the parameters, the motions and the noise.
+        folder: Folder of the files; made with its parents.
+        seed: Seed of the parameters, the motions and the noise.
 
     Returns:
-        The files.
+        Paths of the files.
 
     Raises:
-        InputError: If `folder` is a file, or holds one of the files with another content.
+        InputError: If `folder` is a file, or contains one of the files with other content.
         RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
     with atomic_folder(folder) as staging:
         (staging / FILES[0]).write_text(_EXPERIMENT, encoding="utf-8")
-        for k, (file, periods) in enumerate(
-            zip(FILES[1:3], (IDENTIFICATION_PERIODS, VERIFICATION_PERIODS), strict=True)
-        ):
+        for k, (file, periods) in enumerate(zip(FILES[1:3], (2, 1), strict=True)):
             path = staging / file
             _write_csv(path, virtual_log(robot, path.stem, periods, (seed, k + 1)))
         text = json.dumps(_truth(robot, seed), indent=1, ensure_ascii=False, allow_nan=False)
         (staging / FILES[3]).write_text(f"{text}\n", encoding="utf-8")
         for file in FILES:
-            _refuse_other(folder / file, staging / file)
+            present, content = folder / file, (staging / file).read_bytes()
+            if present.exists() and (not present.is_file() or present.read_bytes() != content):
+                raise InputError(
+                    f"`{present}` exists already with other content: choose another folder for "
+                    "the example, or remove it."
+                )
     return [folder / file for file in FILES]
-
-
-def _refuse_other(present: Path, new: Path) -> None:
-    if present.exists() and (not present.is_file() or present.read_bytes() != new.read_bytes()):
-        raise InputError(
-            f"`{present}` is there already with another content: choose another folder for the "
-            "example, or remove it."
-        )
 
 
 def _write_csv(path: Path, recording: Recording) -> None:
@@ -177,6 +166,7 @@ def _write_csv(path: Path, recording: Recording) -> None:
 
 
 def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
+    friction: Any = robot.friction
     model, p = robot.model, np.asarray(robot.parameters)
     base = base_parameters(model)
     first, second = list(base.indices), list(base.dependent)
@@ -191,8 +181,8 @@ def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
         "base_parameters": [dict(zip(keys, row, strict=True)) for row in regrouped],
         "standard_parameters": [dict(zip(keys, row, strict=True)) for row in standard],
         "beyond_the_model": {
-            "stribeck_friction": (STRIBECK * np.asarray(model.robot.max_forces)).tolist(),
-            "stribeck_speed": STRIBECK_SPEED,
+            "stribeck_friction": np.asarray(friction.stribeck).tolist(),
+            "stribeck_speed": friction.stribeck_speed,
             "encoder_step": robot.sensors.encoder_step,
             "white_noise": np.asarray(robot.sensors.white_noise).tolist(),
             "coloured_noise": np.asarray(robot.sensors.coloured_noise).tolist(),

@@ -1,13 +1,20 @@
-"""What every friction, gear and disturbance must hold to, whoever wrote it."""
+"""Laws of every friction, gear and disturbance."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxid.robot import library
-from jaxid.simulation.disturbances import CableForce, TorqueRipple
-from jaxid.simulation.gear_friction import LuGreFriction, SmoothFriction
-from jaxid.simulation.gears import BacklashGear, Balance, FlexibleGear, RigidGear, Shafts
+from jaxid.simulation import (
+    BacklashGear,
+    CableForce,
+    FlexibleGear,
+    LuGreFriction,
+    MotorMomentum,
+    RigidGear,
+    SmoothFriction,
+    TorqueRipple,
+)
 
 VISCOUS, COULOMB = np.array([3.0, 0.2, 1.0]), np.array([5.0, 0.4, 2.0])
 FRICTIONS = [
@@ -58,23 +65,22 @@ def test_temperature_scales_viscous_and_dry_friction_apart(friction):
 @pytest.mark.parametrize("twist", [0.0, 0.03, -0.03])
 def test_what_the_motor_loses_the_joint_gets(gear, twist):
     random = np.random.default_rng(0)
-    motors = Balance(random.uniform(50.0, 200.0, 3), random.normal(size=3))
-    shafts = Shafts(np.full(3, twist), 0.1 * random.normal(size=3))
-    felt = gear.transmit(shafts, motors, STEP)
+    motors = MotorMomentum(random.uniform(50.0, 200.0, 3), random.normal(size=3))
+    felt = gear.transmit(np.full(3, twist), 0.1 * random.normal(size=3), motors, STEP)
     assert (np.asarray(felt.slope) >= 0).all()
-    assert (np.asarray(felt.share) >= 0).all()
-    assert (np.asarray(felt.share) <= 1).all()
+    assert (np.asarray(felt.ratio) >= 0).all()
+    assert (np.asarray(felt.ratio) <= 1).all()
     for qd in random.normal(size=(3, 3)):
-        w, torque = felt.speed + felt.share * qd, felt.force - felt.slope * qd
+        w, torque = felt.speed + felt.ratio * qd, felt.force - felt.slope * qd
         np.testing.assert_allclose(motors.inertia * w, motors.drive - torque, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("gear", GEARS, ids=lambda g: type(g).__name__)
 def test_a_gear_that_is_wound_up_holds_its_load(gear):
     load = np.array([2.0, -0.3, 1.0])
-    held = Balance(np.full(3, 1e12), np.zeros(3))
+    held = MotorMomentum(np.full(3, 1e12), np.zeros(3))
     if gear.twist(load).any():
-        felt = gear.transmit(Shafts(gear.twist(load), jnp.zeros(3)), held, STEP)
+        felt = gear.transmit(gear.twist(load), jnp.zeros(3), held, STEP)
         np.testing.assert_allclose(felt.force, load, rtol=1e-6)
 
 

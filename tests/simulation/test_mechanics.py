@@ -9,10 +9,14 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.robot import Robot
-from jaxid.simulation.disturbances import CableForce
-from jaxid.simulation.gear_friction import LuGreFriction, SmoothFriction
-from jaxid.simulation.gears import BacklashGear, FlexibleGear, RigidGear
-from jaxid.simulation.mechanics import DriveTrain, SimulatedPlant
+from jaxid.simulation.friction import CableForce, LuGreFriction, SmoothFriction
+from jaxid.simulation.mechanics import (
+    BacklashGear,
+    DriveTrain,
+    FlexibleGear,
+    RigidGear,
+    SimulatedPlant,
+)
 from jaxid.simulation.virtual import random_bodies
 
 ZERO = np.zeros(2)
@@ -42,8 +46,8 @@ PARAMETERS = np.concatenate([BODIES.ravel(), [1.5, 0.05]])
 
 def plant(friction=FREE, gear=None, disturbances=(), step=1e-3):
     gear = RigidGear() if gear is None else gear
-    drives = DriveTrain(MODEL.robot, PARAMETERS[-2:], friction, gear, disturbances, step)
-    return SimulatedPlant(MODEL, PARAMETERS, drives)
+    drives = DriveTrain(MODEL, PARAMETERS[-2:], friction, gear, disturbances, step)
+    return SimulatedPlant(drives, PARAMETERS)
 
 
 def moved(machine, u, steps, ramp=1):

@@ -11,8 +11,8 @@ from jaxid.measurement.decimation import Subsample
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
 from jaxid.robot import library
-from jaxid.simulation.gear_friction import SmoothFriction
-from jaxid.simulation.sensors import Sensors
+from jaxid.simulation.experiment import Sensors
+from jaxid.simulation.friction import SmoothFriction
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
 from jaxid.simulation.virtual import VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
@@ -42,12 +42,12 @@ def ur10(tool=False):
 def test_forces_of_a_motion_are_mujocos(virtual):
     virtual = virtual.replace(
         friction=SmoothFriction(virtual.present_friction.viscous, 0.0 * virtual.friction.coulomb),
-        lubricant=None,
+        heating=None,
         temperature=None,
     )
     n = virtual.robot.joints
     motion = Motion(*np.random.default_rng(1).normal(size=(3, 50, n)))
-    ours, theirs = virtual.forces(motion), MujocoRobot.of(virtual).forces(motion)
+    ours, theirs = virtual.forces(motion), MujocoRobot(virtual).forces(motion)
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * np.abs(theirs).max())
 
 
@@ -64,7 +64,7 @@ def test_the_same_experiment_gives_the_same_torques(dry, tolerance):
 
     ours, theirs = (
         machine.track(trajectory, feed_forward=known, duration=1.5, substeps=4, seed=1)
-        for machine in (virtual, MujocoRobot.of(virtual))
+        for machine in (virtual, MujocoRobot(virtual))
     )
     most = np.asarray(virtual.robot.max_forces)
     difference = np.sqrt(np.mean((ours.forces - theirs.forces) ** 2, axis=0)) / most
@@ -76,7 +76,7 @@ def test_the_same_experiment_gives_the_same_torques(dry, tolerance):
 def test_mujocos_data_lead_to_the_true_parameters():
     virtual = ur10()
     trajectory = random_fourier_series(virtual.robot, omega=1.0, reach=0.8, seed=3)
-    run = MujocoRobot.of(virtual).track(
+    run = MujocoRobot(virtual).track(
         trajectory, feed_forward=virtual.forces, duration=6.0, substeps=2, seed=0
     )
     base = base_parameters(virtual.model)
@@ -99,5 +99,5 @@ def test_what_mujoco_does_not_know_is_refused():
         terms=(*virtual.terms, ConstantOffset()),
         values=np.concatenate([virtual.values, np.ones(6)]),
     )
-    with pytest.raises(ValueError, match="beside them it knows rotors"):
-        MujocoRobot.of(other).plant(1e-3)
+    with pytest.raises(ValueError, match="`terms`"):
+        MujocoRobot(other).plant(1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit import Fit
 from jaxid.robot.kinematics import tip_jacobian
-from jaxid.simulation.tracking import Tracking
+from jaxid.simulation.experiment import Tracking
 from jaxid.simulation.tx90l import cad_tx90l_on_rail
 from jaxid.simulation.virtual import VirtualRobot
 from jaxid.trajectory.tip_path import TipPath

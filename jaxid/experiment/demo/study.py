@@ -29,7 +29,7 @@ from jaxid.measurement.recording import Recording
 from jaxid.robot.library import tx90l_on_rail_collision
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
-from jaxid.simulation.tracking import Tracking
+from jaxid.simulation.experiment import Tracking
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
 from jaxid.simulation.virtual import VirtualRobot
 from jaxid.trajectory.basis import LinearTrajectory
