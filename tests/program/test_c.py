@@ -1,4 +1,7 @@
+"""C code against NumPy and extended precision; no branches but those of the loops."""
+
 import ctypes
+import re
 import shutil
 import subprocess
 
@@ -9,28 +12,30 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from sample_functions import SIZE, chain, random_functions, samples
 
-from jaxid.program import evaluate, to_c, trace
+from jaxid.errors import InputError
+from jaxid.program import CWriter, evaluate, to_c, trace
 
-STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror", "-O1", "-fPIC", "-shared"]
+pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
+HEAD = "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"
+WARNINGS = ("-Wall", "-Wextra", "-pedantic", "-Werror", "-O1")
 
 
-@pytest.fixture(scope="module")
+def compile_c(folder, text, *flags, language="c"):
+    source, target = folder / "program.c", folder / "program.so"
+    source.write_text(text)
+    flags = ["-x", language, *flags, "-fPIC", "-shared"]
+    subprocess.run(["gcc", *flags, str(source), "-o", str(target), "-lm"], check=True)
+    return target
+
+
+@pytest.fixture
 def compiled(tmp_path_factory):
-    """Compiles a program and returns it as a Python function of one sample."""
-    if shutil.which("gcc") is None:
-        pytest.skip("no C compiler (gcc) on this machine")
-    folder, count = tmp_path_factory.mktemp("c"), iter(range(10**6))
+    """Compile a program and return it as a Python function of one sample."""
 
     def compile_(program, double=True, language="c"):
-        stem = folder / f"program{next(count)}"
-        source, library = stem.with_suffix(".c"), stem.with_suffix(".so")
-        source.write_text(to_c(program, "run", double=double))
         standard = {"c": "-std=c99", "c++": "-std=c++11"}[language]
-        subprocess.run(
-            ["gcc", "-x", language, standard, *STRICT, str(source), "-o", str(library), "-lm"],
-            check=True,
-        )
-        run = ctypes.CDLL(str(library)).run
+        folder, text = tmp_path_factory.mktemp("c"), to_c(program, "run", double=double)
+        run = ctypes.CDLL(str(compile_c(folder, text, standard, *WARNINGS, language=language))).run
         dtype = np.float64 if double else np.float32
 
         def call(*inputs):
@@ -45,22 +50,21 @@ def compiled(tmp_path_factory):
     return compile_
 
 
-def flat(program, *x):
-    return [np.ravel(v) for v in jax.tree.leaves(evaluate(program, *x))]
+def assert_equal_to_numpy(call, program, *x, tolerance):
+    for got, want in zip(call(*x), jax.tree.leaves(evaluate(program, *x)), strict=True):
+        np.testing.assert_allclose(got, np.ravel(want), rtol=tolerance, atol=tolerance)
 
 
 @given(function=random_functions())
 @settings(
-    max_examples=8,
+    max_examples=4,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_c_equals_numpy(compiled, function):
     program = trace(function, (SIZE,), (SIZE,))
-    x = samples(0, ())
-    for got, want in zip(compiled(program)(*x), flat(program, *x), strict=True):
-        np.testing.assert_allclose(got, want, rtol=1e-15, atol=1e-15)
+    assert_equal_to_numpy(compiled(program), program, *samples(0, ()), tolerance=1e-15)
 
 
 @pytest.mark.parametrize("language", ["c", "c++"])
@@ -84,16 +88,12 @@ def test_every_operation_in_both_precisions_and_languages(compiled, double, lang
         )  # fmt: skip
 
     program = trace(function, (2,), (3,))
-    run = compiled(program, double, language)
-    tolerance = 4e-16 if double else 1e-6
+    run, tolerance = compiled(program, double, language), 4e-16 if double else 1e-6
     for x in ([0.3, -0.4], [-1.2, 2.0], [0.7, 0.5]):
-        for got, want in zip(
-            run(x, np.zeros(3)), flat(program, np.array(x), np.zeros(3)), strict=True
-        ):
-            np.testing.assert_allclose(got, want, rtol=tolerance, atol=tolerance)
+        assert_equal_to_numpy(run, program, np.array(x), np.zeros(3), tolerance=tolerance)
 
 
-def test_nan_comes_through_choices(compiled):
+def test_nan_is_kept_by_choices(compiled):
     program = trace(lambda x, y: (jnp.maximum(x, y), jnp.minimum(x, y), jnp.sign(x + y)), (), ())
     run = compiled(program)
     for x, y in ((np.nan, 1.0), (1.0, np.nan)):
@@ -101,18 +101,9 @@ def test_nan_comes_through_choices(compiled):
 
 
 def test_inputs_are_read_before_an_output_is_written():
-    program = trace(lambda x: x[::-1] * 2.0, (3,))
-    text = to_c(program, "swap")
+    text = to_c(trace(lambda x: x[::-1] * 2.0, (3,)), "swap")
     body = text[text.rindex("{") :]
     assert body.rindex("input0[") < body.index("output0[")
-
-
-def test_names_and_documentation_in_the_source():
-    text = to_c(trace(chain, (3,), (3,)), "arm", ["q", "qd"], ["v"])
-    assert "void arm(const double *q, const double *qd, double *v)" in text
-    assert "multiplications" in text
-    assert "static" not in text
-    assert text.count("v[") == 9
 
 
 @pytest.mark.parametrize(
@@ -121,10 +112,74 @@ def test_names_and_documentation_in_the_source():
         (("2arm",), "names in C code"),
         (("for",), "names in C code"),
         (("t3",), "names in C code"),
-        (("arm", ["q"]), "`inputs`"),
         (("arm", ["q", "q"]), "names in C code"),
+        (("arm", ["q"]), "`inputs`"),
     ],
 )
-def test_bad_names_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
+def test_invalid_names_are_rejected(arguments, message):
+    with pytest.raises(InputError, match=message):
         to_c(trace(chain, (3,), (3,)), *arguments)
+
+
+# As accurate as without fused multiplications and additions, which some flags allow.
+FLAGS = {"plain": ["-std=c99"], "fused": ["-march=native", "-ffp-contract=fast"]}
+
+
+@pytest.fixture(scope="module", params=[(d, f) for d in (True, False) for f in FLAGS])
+def library(request, tmp_path_factory):
+    """Return the precision, the writer, the file and the function of sines, cosines and tanh."""
+    double, flags = request.param
+    program = trace(lambda x: (jnp.sin(x), jnp.cos(x), jnp.tanh(x)), (5,))
+    writer = CWriter(double, "arm", [program])
+    text = HEAD + writer.library() + writer.definition(program, "run", ["x"], ["s", "c", "h"])
+    target = compile_c(tmp_path_factory.mktemp("library"), text, "-O2", *FLAGS[flags])
+    opened, dtype = ctypes.CDLL(str(target)), np.float64 if double else np.float32
+
+    def call(x):
+        x = np.ascontiguousarray(x, dtype)
+        found = [np.zeros_like(x) for _ in range(3)]
+        for k in range(len(x)):
+            opened.run(*(ctypes.c_void_p(a[k].ctypes.data) for a in (x, *found)))
+        return x.astype(np.longdouble), found
+
+    return double, writer, target, call
+
+
+def test_the_library_has_only_what_is_needed_for_an_even_number(library):
+    assert library[1].widths == {"sine_cosine": 6, "tanh": 6}
+    assert "tanh" not in CWriter(True, "arm", [trace(jnp.sin, (2,))]).library()
+    assert CWriter(True, "arm", [trace(jnp.exp, (2,))]).library() == ""
+
+
+def test_accuracy_of_the_library(library):
+    double, writer, _, run = library
+    allowed, random = (2e-16, 1.2e-7)[not double], np.random.default_rng(0)
+    for size in (0.8, 3.0, 50.0, 6.28 * writer.turns):
+        x, found = run(random.uniform(-size, size, (400, 5)))
+        for got, function in zip(found, (np.sin, np.cos, np.tanh), strict=True):
+            assert np.abs(got - function(x)).max() < allowed
+    x, (_, _, h) = run(10.0 ** random.uniform(-6, 0, (400, 5)))
+    assert np.abs(h / np.tanh(x) - 1).max() < 4 * allowed
+
+
+def test_angles_without_a_known_sine_give_nan(library):
+    _, writer, _, run = library
+    far = 6.29 * writer.turns
+    for bad in (np.nan, np.inf, -np.inf, far, -far, 1e18, -1e30, 2.0**63):
+        x = np.full((1, 5), 0.3)
+        x[0, 2] = bad
+        _, (s, c, h) = run(x)
+        assert np.isnan([s[0, 2], c[0, 2]]).all()
+        assert np.isnan(h[0, 2]) if np.isnan(bad) else h[0, 2] == np.sign(bad)
+        assert np.isfinite(np.delete([s, c, h], 2, axis=2)).all()
+
+
+def test_no_branch_but_those_of_the_loops(library):
+    if shutil.which("objdump") is None:
+        pytest.skip("no objdump on this machine")
+    command = ["objdump", "-d", "--no-show-raw-insn", str(library[2])]
+    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    blocks = [b for b in text.split("\n\n") if re.search("<(run|arm_)", b.split("\n")[0])]
+    jumps = re.findall(r"\sj(?!mp)[a-z]+\s", "".join(blocks))
+    assert blocks
+    assert len(jumps) <= 2, jumps
