@@ -27,11 +27,11 @@ AnyArray = jax.Array | np.ndarray
 
 # NumPy's own `ArrayLike` turns tuples away when types are checked at run time.
 Numbers = AnyArray | Sequence[Any] | float | int
-"""What users may pass where an array is meant: an array, nested lists or tuples, one number."""
+"""Array argument of a user: an array, nested lists or tuples, or one number."""
 
 
 def require_float64(what: str) -> None:
-    """Refuses to go on in single precision.
+    """Reject single precision.
 
     Args:
         what: The task that needs double precision, as it reads in a sentence.
@@ -48,7 +48,7 @@ def require_float64(what: str) -> None:
 
 
 def double_precision() -> AbstractContextManager:
-    """Lets JAX compute in float64 within a `with`, whatever its setting is outside."""
+    """Return a context in which JAX computes in float64, whatever its setting outside."""
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(True)
     from jax.experimental import enable_x64  # pyright: ignore[reportAttributeAccessIssue]
@@ -57,7 +57,7 @@ def double_precision() -> AbstractContextManager:
 
 
 def as_array(name: str, value: Numbers) -> AnyArray:
-    """An array as it is, and everything else as a NumPy array of float64.
+    """Return an array as it is, and anything else as a NumPy array of float64.
 
     Raises:
         InputError: If it does not consist of numbers, or its rows are not equally long.
@@ -71,12 +71,12 @@ def as_array(name: str, value: Numbers) -> AnyArray:
 
 
 def one_or_each(value: Any) -> Any:
-    """A converter of fields that hold one number for all joints, or a list of one for each."""
+    """Convert a field that holds one number for all joints, or a list with one for each."""
     return as_array("value", value) if isinstance(value, list | tuple) else value
 
 
 def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | float:
-    """A number for all joints, or one for each of those that move with `qd`.
+    """Check one number for all joints, or one for each of those that move with `qd`.
 
     Raises:
         InputError: If there are more or fewer than joints.
@@ -91,24 +91,24 @@ def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | flo
 
 
 def is_traced(*trees: Any) -> bool:
-    """Whether JAX is tracing some number of these, so that nothing can be asked of its value."""
+    """Return whether JAX is tracing a leaf of these trees, so that its value is not known."""
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
 def namespace(*arrays: AnyArray) -> ModuleType:
-    """`jax.numpy` if one of the arrays is JAX's; else NumPy, whose results stay constants."""
+    """Return `jax.numpy` if one of the arrays is JAX's, else NumPy (results stay constants)."""
     return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
 
 
 def content(tree: Any) -> tuple:
-    """What a tree of known numbers is, by value: structure, shapes, types and bytes."""
+    """Return a hashable key of a concrete PyTree: structure, shapes, types and bytes."""
     leaves, structure = jax.tree.flatten(tree)
     arrays = [np.asarray(x) for x in leaves]
     return structure, tuple((x.shape, x.dtype.str, x.tobytes()) for x in arrays)
 
 
 class Hashable(eqx.Module):
-    """A module with NumPy arrays in it whose methods `jax.jit` takes as they are.
+    """Module with NumPy arrays whose methods `jax.jit` takes as they are.
 
     JAX looks functions up by their hash, also a bound method such as `model.regressor`, and arrays
     have none. Here the hash is of the numbers.

@@ -142,13 +142,6 @@ def test_numbers_that_nothing_measures(folder, run):  # noqa: F811
     assert refused(run("inspect", "experiment.toml", "x.csv"), said)
 
 
-def test_an_option_that_needs_a_log(folder, run):  # noqa: F811
-    for end in ((), ("-o", "report")):
-        result = run("identify", "experiment.toml", "a.csv", "--verify", *end)
-        assert refused(result, "`--verify` needs at least one log behind it, but has none")
-    assert not (folder / "report").exists()
-
-
 def test_rates_that_cannot_be(folder, run):  # noqa: F811
     (folder / "e.toml").write_text(EXPERIMENT.replace('"t"', '"t"\ntime_unit = "s"'))
     lines = (folder / "a.csv").read_text().splitlines()

@@ -18,16 +18,16 @@ from jaxid.cli.export import export
 from jaxid.cli.options import (
     ExperimentFile,
     Force,
-    SpreadLogs,
     command_line,
+    describe_error,
     open_console,
     open_stages,
+    require_one_log_per_option,
 )
 from jaxid.errors import InputError
 from jaxid.experiment import terminal
 from jaxid.experiment.doctor import fitted_doubts, slips_of
 from jaxid.experiment.experiment import Experiment, load_experiment
-from jaxid.experiment.failures import is_for_the_user, sentence
 from jaxid.experiment.folder import (
     output_folder,
     refuse_foreign_folder,
@@ -72,17 +72,16 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Runs a command; what a user can mend is one sentence on stderr and exit code 2."""
+    """Run a command; an error of a user is one sentence on stderr, with exit code 2."""
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
     if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals know few characters
         sys.stdout.reconfigure(errors="replace")
     try:
+        require_one_log_per_option()
         app()
-    except (ValueError, OSError, RuntimeError) as error:
-        if not is_for_the_user(error):
-            raise
-        open_console(stderr=True).print(Text(f"jaxid: {sentence(error)}"), soft_wrap=True)
+    except (InputError, OSError) as error:
+        open_console(stderr=True).print(Text(f"jaxid: {describe_error(error)}"), soft_wrap=True)
         raise SystemExit(2) from None
 
 
@@ -193,7 +192,7 @@ def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fi
 app.command()(excite)
 
 
-@app.command(cls=SpreadLogs)
+@app.command()
 def identify(
     experiment: ExperimentFile,
     logs: Annotated[
@@ -207,7 +206,9 @@ def identify(
     verify: Annotated[
         list[Path] | None,
         typer.Option(
-            "--verify", metavar="LOG...", help="Logs to verify with, which the fit does not see."
+            "--verify",
+            metavar="LOG",
+            help="A log to verify with, which the fit does not see; may be repeated.",
         ),
     ] = None,
     split: Annotated[
@@ -215,7 +216,8 @@ def identify(
         typer.Option(
             "--split",
             metavar="F",
-            help="Identify with the first part F of every log, of 1; verify with the rest.",
+            help="Use the first fraction F (0-1) of each log for identification, the rest for "
+            "validation.",
         ),
     ] = None,
     output: Annotated[
@@ -352,7 +354,7 @@ def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -
 
 app.command()(demo)
 app.command()(runs.compare)
-app.command(cls=SpreadLogs)(runs.payload)
-app.command(cls=SpreadLogs)(runs.gains)
+app.command()(runs.payload)
+app.command()(runs.gains)
 app.command()(runs.states)
 app.command()(export)

@@ -33,7 +33,11 @@ Unloaded = Annotated[
 ]
 Loaded = Annotated[
     list[Path],
-    typer.Option("--loaded", metavar="LOG...", help="Logs with the load, or folders of reports."),
+    typer.Option(
+        "--loaded",
+        metavar="LOG",
+        help="A log with the load, or the folder of a report; may be repeated.",
+    ),
 ]
 UNLIKELY = 0.01
 """Chance that states share what they should, of 1, below which that needs a word."""

@@ -1,4 +1,4 @@
-"""How far a command is: its stages, and the samples of a long log with their speed."""
+"""Progress bars of commands: stages, and samples of a long log with their speed."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,14 +8,14 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 from rich.text import Text
 
 from jaxid.excitation.design import DesignProgress
-from jaxid.identification.streaming import Progress as Told
+from jaxid.identification.streaming import Progress as Callback
 
 
 class _Speed(ProgressColumn):
-    """How fast samples go through, and how long it will still take."""
+    """Column with the speed and the remaining time."""
 
     def render(self, task):
-        """Nothing before the speed is known."""
+        """Return the text of the column; empty before the speed is known."""
         if not task.fields.get("samples") or not task.speed:
             return Text("")
         done = 100 * task.completed / (task.total or 1.0)
@@ -33,7 +33,7 @@ def _large(count: float) -> str:
 
 
 class Stages:
-    """A progress bar: call it with the name of each stage as it begins."""
+    """Progress bar of a command, called with the name of each stage as it begins."""
 
     def __init__(self, bar: Progress, total: int):
         self._bar = bar
@@ -41,33 +41,41 @@ class Stages:
         self._samples = bar.add_task("", total=1, samples=True, visible=False)
 
     def __call__(self, name: str) -> None:
-        """A stage begins."""
+        """Begin a stage.
+
+        Args:
+            name: Name of the stage.
+        """
         self._bar.update(self._task, description=name, advance=1)
         self._bar.update(self._samples, visible=False)
 
-    def through(self, samples: int) -> Told:
-        """Who is told which share of so many samples is done; a second bar shows it."""
+    def through(self, samples: int) -> Callback:
+        """Return a callback for the completed fraction of so many samples (a second bar).
+
+        Args:
+            samples: Number of samples.
+        """
         return self._counting(samples, rows=True)
 
-    def part(self) -> Told:
-        """Who is told which share of a stage is done; a second bar shows it."""
+    def part(self) -> Callback:
+        """Return a callback for the completed fraction of a stage (a second bar)."""
         return self._counting(1, rows=False)
 
-    def _counting(self, total: int, rows: bool) -> Told:
+    def _counting(self, total: int, rows: bool) -> Callback:
         self._bar.reset(self._samples, total=total, visible=False, samples=True, rows=rows)
 
-        def progress(share: float) -> None:
-            self._bar.update(self._samples, completed=share * total, visible=True)
+        def progress(fraction: float) -> None:
+            self._bar.update(self._samples, completed=fraction * total, visible=True)
 
         return progress
 
 
 @contextmanager
 def stages(console: Console, total: int) -> Iterator[Stages]:
-    """A progress bar in a terminal; nothing elsewhere.
+    """Show a progress bar in a terminal, and nothing elsewhere.
 
     Args:
-        console: Where it stands.
+        console: Terminal.
         total: Number of stages.
     """
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), _Speed())
@@ -78,10 +86,10 @@ def stages(console: Console, total: int) -> Iterator[Stages]:
 
 @contextmanager
 def designing(console: Console) -> Iterator[Callable[[DesignProgress], None]]:
-    """A progress bar of a design with the best value so far; nothing elsewhere than in a terminal.
+    """Show a progress bar of a design with the best value so far, in a terminal only.
 
     Args:
-        console: Where it stands.
+        console: Terminal.
     """
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     quiet = not console.is_terminal

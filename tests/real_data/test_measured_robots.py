@@ -75,7 +75,8 @@ def test_ur10_split_in_time(identify):
 
 
 def test_kr300_is_said_to_be_undetermined_and_a_ridge_transfers(identify):
-    logs = ("kr300/traj_A.csv", "--verify", "kr300/traj_B.csv", "kr300/traj_C.csv")
+    verify = ("--verify", "kr300/traj_B.csv", "--verify", "kr300/traj_C.csv")
+    logs = ("kr300/traj_A.csv", *verify)
     found, printed = identify("kr300.toml", *logs)
     assert len(found["base_parameters"]) == 58
     assert len(found["fit"]["undetermined"]) >= 5
