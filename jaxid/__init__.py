@@ -1,5 +1,7 @@
 """jaxid: identifies the dynamic parameters of robots, from a log to a model (the public API)."""
 
+from typing import TYPE_CHECKING, Any
+
 from jaxid.dynamics.base import BaseParameters as BaseParameters
 from jaxid.dynamics.base import Identifiability as Identifiability
 from jaxid.dynamics.base import base_parameters as base_parameters
@@ -147,7 +149,6 @@ from jaxid.measurement.recording import Recording as Recording
 from jaxid.measurement.recording import read_recording as read_recording
 from jaxid.measurement.recording import remove_delay as remove_delay
 from jaxid.program.cache import keep_compiled as keep_compiled
-from jaxid.report import plot as plot
 from jaxid.robot import library as robots  # noqa: F401
 from jaxid.robot.collision import AbstractObstacle as AbstractObstacle
 from jaxid.robot.collision import Box as Box
@@ -206,3 +207,15 @@ from jaxid.trajectory import write_csv as write_csv
 from jaxid.trajectory import write_ros_json as write_ros_json
 from jaxid.trajectory import write_ros_yaml as write_ros_yaml
 from jaxid.validation import validate as validate
+
+if TYPE_CHECKING:
+    from jaxid.report import plot as plot
+
+
+def __getattr__(name: str) -> Any:
+    """Load the figures, and matplotlib, when `jid.plot` is first used."""
+    if name == "plot":
+        import jaxid.report.plot
+
+        return jaxid.report.plot
+    raise AttributeError(f"module `jaxid` has no attribute `{name}`.")

@@ -434,7 +434,7 @@ def test_after_a_failure_nothing_is_half_written(folder, run, monkeypatch):
     def full_disk(*args, **kwargs):
         raise OSError(28, "No space left on device", "torque_b.png")
 
-    monkeypatch.setattr("jaxid.report.write.torque_figure", full_disk)
+    monkeypatch.setattr("jaxid.report.result_files.torque_figure", full_disk)
     for output in ("report", "new"):
         assert refused(
             run("identify", "experiment.toml", "b.csv", "-o", output),

@@ -178,12 +178,12 @@ def test_a_disk_without_room(folder, run, monkeypatch):  # noqa: F811
     import errno
     import os
 
-    from jaxid.report import write
+    from jaxid.report import result_files
 
     def full(path, content):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(write, "write_json", full)
+    monkeypatch.setattr(result_files, "write_json", full)
     result = run("identify", "experiment.toml", "a.csv")
     assert refused(result, "No space left on device: nothing was written; make room")
     assert not (folder / "report").exists()

@@ -26,15 +26,7 @@ from jaxid.experiment.sanity import SURE
 from jaxid.identification.excited import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
 from jaxid.measurement.columns import Columns
-from jaxid.report.verdict import (
-    ACCURATE,
-    ACCURATE_SHARE,
-    ALIKE,
-    LARGE_CONDITION,
-    TOLERABLE,
-    TOLERABLE_SHARE,
-    UNLIKE,
-)
+from jaxid.report.verdict import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation import POSES
 
@@ -226,10 +218,10 @@ def test_other_packages_bodies_become_ours(given):
 THRESHOLDS = {
     "3.": (f"{LARGEST_UNCERTAINTY:.0%}",),
     "4.": (f"below {LARGE_CONDITION:.0f}",),
-    "5.": (f"up to {ACCURATE_SHARE:.0%} of the forces, tolerable to {TOLERABLE_SHARE:.0%}",),
+    "5.": (f"up to {RMS_ERROR[0]:.0%} of the forces, tolerable to {RMS_ERROR[1]:.0%}",),
     "6.": (
-        f"up to {ACCURATE / 100:.0%} of the largest force, tolerable to {TOLERABLE / 100:.0%}",
-        f"up to {ALIKE} times those of the fit, tolerable to {UNLIKE:.0f} times",
+        f"up to {MEAN_ERROR[0]:.0f}% of the largest force, tolerable to {MEAN_ERROR[1]:.0f}%",
+        f"up to {UNSEEN_RATIO[0]} times those of the fit, tolerable to {UNSEEN_RATIO[1]:.0f} times",
     ),
     "7.": (f"up to {TRUSTED:.0%}", f"up to {DOUBTFUL:.0%} doubtful"),
     "10.": (f"all of {POSES} poses",),

@@ -32,9 +32,8 @@ from jaxid.experiment.excitation import (
 )
 from jaxid.experiment.excitation_tables import Excitation, Leads, spline_basis
 from jaxid.experiment.experiment import load_experiment
-from jaxid.report.blocks import Tone
-from jaxid.report.excitation_words import remarks
-from jaxid.report.excited import excitation_page
+from jaxid.report.excitation import excitation_page, plan_remarks
+from jaxid.table import Status
 from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.fourier import fourier_series
 
@@ -108,7 +107,7 @@ def excited(written):
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing takes longer than all else where a motion is there already."""
-    monkeypatch.setattr("jaxid.experiment.excitation.write_pictures", lambda *_: [])
+    monkeypatch.setattr("jaxid.experiment.excitation.write_excitation", lambda *_: [])
 
 
 def listing(folder):
@@ -228,7 +227,7 @@ def test_a_spline_in_place_of_a_series(written, run, no_pictures):
     assert q.max() <= 1.5 * rounding
     assert 1.0 < np.abs(qd).max() <= 2
     assert np.abs(qdd).max() <= 4
-    assert "use of the limits [%]" in out
+    assert "use of the limits" in out
     assert "`harmonics` does nothing for a `spline`" in out
 
 
@@ -250,29 +249,25 @@ def test_an_impossible_motion_is_diagnosed(written, run):
     assert not (written / "far").exists() or listing(written / "far") == []
 
 
-def test_earlier_results_are_nominal(written, excited):
+def test_earlier_results_are_nominal(written, excited, monkeypatch):
     experiment = load_experiment(with_keys(written, "after.toml", 'nominal = "report"'))
     path = with_keys(written, "kept.toml", 'nominal = "report"', "force_margin = 0.1")
     base = experiment.base
-    rows = [
-        {"name": n, "expression": n, "unit": u, "estimate": 1.0 + k}
-        for k, (n, u) in enumerate(zip(base.names, base.units, strict=True))
-    ]
-    covariance = (0.01 * np.eye(base.size)).tolist()
-    content = {
-        "schema": "jaxid-result/1",
-        "base_parameters": rows,
-        "fit": {"covariance": covariance},
-    }
-    (written / "report").mkdir()
-    result = written / "report" / "result.json"
-    result.write_text(json.dumps(content))
+    covariance, names = 0.01 * np.eye(base.size), [*base.names]
+
+    class Earlier:
+        parameters = 1.0 + np.arange(base.size)
+
+        def __init__(self, folder):
+            self.names, self.covariance = tuple(names), covariance
+
+    monkeypatch.setattr("jaxid.experiment.excitation.read_estimates", Earlier)
     found = find_nominal(experiment)
     np.testing.assert_array_equal(found.parameters, 1.0 + np.arange(base.size))
     np.testing.assert_array_equal(found.covariance, covariance)
     assert found.undetermined == ()
-    covariance[1][0] = covariance[0][1] = covariance[0][0] = None
-    result.write_text(json.dumps(content))
+    covariance = covariance.copy()
+    covariance[1, 0] = covariance[0, 1] = covariance[0, 0] = np.inf
     found = find_nominal(experiment)
     assert found.undetermined == base.names[:1]
     np.testing.assert_array_equal(np.isnan(found.sizes), np.arange(base.size) == 0)
@@ -280,8 +275,7 @@ def test_earlier_results_are_nominal(written, excited):
     find_constraints(load_experiment(path), found)  # refuses a covariance that is not finite
     (_, said) = force_remarks(experiment, found, excited.played)
     assert said.text.startswith(f"`report` does not determine {base.names[0]}: the forces are")
-    rows[0]["name"] = "other"
-    result.write_text(json.dumps(content))
+    names[0] = "other"
     with pytest.raises(ValueError, match="are not the"):
         find_nominal(experiment)
 
@@ -296,12 +290,12 @@ def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
 
     # Holding the rod where it points ahead takes 7.8 N m.
     within, zero = remarks(50.0)
-    assert within.tone is Tone.PLAIN
+    assert within.status is Status.NEUTRAL
     assert re.search(r"hinge` with (1[4-9]|2\d)(\.\d)? % of 50 N m", within.text)
     unknown = "viscous friction, coulomb friction, constant offset of `hinge`"
-    assert zero.text == f"not known, and counted as zero in the forces: {unknown}"
+    assert zero.text == f"not known, and counted as zero in the forces: {unknown}."
     beyond, _ = remarks(5.0)
-    assert beyond.tone is Tone.BAD
+    assert beyond.status is Status.BAD
     assert re.search(
         r"joint `hinge` with 1[4-9]\d\.\d % of 5 N m; give `force_margin`", beyond.text
     )
@@ -328,7 +322,7 @@ def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pict
     assert files[2].name == "motion.ros.json"
     assert len(message["points"]) == len(t)
     said = [remark.text for remark in found.aside.remarks]
-    assert "the motion runs through 2 periods; the deviations are of one" in said
+    assert "the motion runs through 2 periods; the deviations are of one." in said
 
 
 def test_leads_may_be_given_their_time():
@@ -352,9 +346,9 @@ def test_limits_that_nobody_gave_are_named(written, excited):
     robot = load_experiment(written / "open.toml").robot
     limits = JointLimits.of(robot, excited.plan.limits.basis)
     plan = dataclasses.replace(excited.plan, limits=limits)
-    said = [remark.text for remark in remarks(plan)]
-    assert "assumed, because it is not given: acceleration of `hinge` (8 rad/s²)" in said
-    assert not any("assumed" in remark.text for remark in remarks(excited.plan))
+    said = [remark.text for remark in plan_remarks(plan)]
+    assert "Assumed, because not given: acceleration of `hinge` (8 rad/s²)." in said
+    assert not any("ssumed" in remark.text for remark in plan_remarks(excited.plan))
 
 
 def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excited, monkeypatch):
@@ -369,9 +363,9 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excit
         load_experiment(written / "fast.toml"), lambda _: None, written / "no.npz", False
     )
     assert led.window[0] == 0.0
-    page = html.unescape(excitation_page(led.plan, {}, led.aside).html())
-    assert "The motion is without leads, and starts and ends at full speed: no lead is" in page
-    assert "read what stands below before it is recorded" in page
+    page = html.unescape(excitation_page(led.plan, {}, *led.aside))
+    assert "the motion is without leads, and starts and ends at full speed: no lead is" in page
+    assert "read the remarks below before it is recorded" in page
 
 
 def test_a_urdf_claims_inertias_and_knows_no_friction(written):
@@ -482,7 +476,7 @@ def test_where_pictures_find_no_room_nothing_is_written(excited, tmp_path, monke
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("jaxid.experiment.excitation.write_pictures", full)
+    monkeypatch.setattr("jaxid.experiment.excitation.write_excitation", full)
     with pytest.raises(OSError, match="No space left"):
         write_design(excited, tmp_path / "motion.csv")
     assert list(tmp_path.iterdir()) == []

@@ -25,7 +25,6 @@ from jaxid.cli.options import (
     require_one_log_per_option,
 )
 from jaxid.errors import InputError
-from jaxid.experiment import terminal
 from jaxid.experiment.doctor import fitted_doubts, slips_of
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import (
@@ -45,9 +44,23 @@ from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.twice import share_data
 from jaxid.identification.runs.update import update
 from jaxid.program.cache import keep_compiled
-from jaxid.report.content import Beside
-from jaxid.report.write import write_report
-from jaxid.validation import validate
+from jaxid.report.result_files import write_report
+from jaxid.report.result_json import Alternative
+from jaxid.report.tables import (
+    alternative_table,
+    base_table,
+    body_table,
+    determination_remarks,
+    fit_facts,
+    log_table,
+    parameter_table,
+    residual_table,
+    robot_tables,
+    solution_name,
+)
+from jaxid.report.terminal import show, show_files, show_remarks
+from jaxid.table import Remark, Status, Table
+from jaxid.validation import torque_errors, validate
 
 DISTRIBUTION = "jaxid-robotics"
 
@@ -169,15 +182,11 @@ def inspect(
         _ = loaded.base.expressions
         loaded, _ = choose(loaded, paths, stage)
         seen = [_look(loaded, path, stage) for path in paths]
-    terminal.show_robot(console, loaded)
-    terminal.show_base(console, loaded.base)
-    terminal.sentences(console, loaded.notes)
+    show(console, *robot_tables(loaded.robot), base_table(loaded.base))
+    show_remarks(console, loaded.notes)
     for log, fit, doubts in seen:
-        terminal.show_recording(console, log.recording)
-        terminal.show_check(console, loaded.robot, log.check, doubts)
-        console.print()
-        terminal.show_rows(console, (log.observations,), fit)
-        terminal.show_undetermined(console, fit, loaded.estimation.regularised)
+        show(console, log_table(log.recording, loaded.robot, log.check, doubts))
+        show(console, Table("", facts=fit_facts(fit), remarks=determination_remarks(fit)))
 
 
 def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fit, tuple[str, ...]]:
@@ -286,12 +295,13 @@ def identify(
         stage("predicting torques")
         through = stage.through(max(o.samples for o in [*fitted, *checked]))
         found = validate(fit, [*fitted, *checked], progress=through)
-        beside = None
-        doubtful = loaded.estimation.regularised or fit.undetermined
-        if doubtful and not reports:
+        alternative = None
+        if (loaded.estimation.regularised or fit.undetermined) and not reports:
             same = rows if fit.base is base else Rows.of(fit.base, fitted)
             other = fit_rows(same, loaded.other_estimator)
-            beside = Beside.of(other, [*fitted, *checked], None)
+            names = (solution_name(fit.solution), solution_name(other.solution))
+            errors = [torque_errors(other, o) for o in (*fitted, *checked)]
+            alternative = Alternative(other, errors, names)
         suspected = slips_of(read[: len(logs)], fit)
         if fit.residual > BAD and not suspected:
             said.append(DELAYS)
@@ -315,27 +325,26 @@ def identify(
                 "slow": loaded.min_speed,
             },
             (*loaded.notes, *dict.fromkeys(logs_said), *doubts),
-            beside,
+            alternative,
             choice,
             run,
             (*doubts, *suspected),
             pdf,
         )
-    terminal.show_robot(console, loaded)
-    console.print()
-    terminal.show_notes(console, [*loaded.notes, *logs_said], fit)
-    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
-    terminal.show_fit(console, fit)
-    console.print()
-    terminal.show_rows(console, fitted, fit)
-    terminal.show_undetermined(console, fit, loaded.estimation.regularised)
-    terminal.show_residuals(console, loaded.robot, fit)
-    terminal.sentences(console, suspected, terminal.DOUBTFUL, "!")
-    terminal.show_consistency(console, loaded.robot, fit)
-    terminal.show_validation(console, loaded.robot, found, len(fitted))
-    if beside is not None:
-        terminal.show_beside(console, fit, found.errors, beside)
-    terminal.show_files(console, output, [p.name for p in files])
+    tabulated = () if fit.consistency is None else fit.consistency.findings
+    noted = [*loaded.notes, *logs_said, *(note for note in fit.notes if note not in tabulated)]
+    show(console, *robot_tables(loaded.robot))
+    show_remarks(console, [*noted, *(Remark(text, Status.DOUBTFUL) for text in doubts)])
+    show(console, parameter_table(fit))
+    if fit.residual_spectra is not None:
+        show(console, residual_table(fit.residual_spectra, loaded.robot))
+    show_remarks(console, [Remark(text, Status.DOUBTFUL) for text in suspected])
+    if fit.consistency is not None:
+        show(console, body_table(fit.consistency, loaded.robot.joint_names))
+    show(console, found.summary())
+    if alternative is not None:
+        show(console, alternative_table(found.errors, alternative.errors, alternative.names))
+    show_files(console, output, [p.name for p in files])
 
 
 def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -> tuple[Fit, Run]:

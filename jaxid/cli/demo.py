@@ -24,16 +24,28 @@ def demo(
     Base parameters, optimal excitation, measurement cold and warm, identification, verification on
     the path of ISO 9283, and how well the path is followed with and without the model.
     """
-    from jaxid.experiment.demo.show import show_study
-    from jaxid.experiment.demo.study import STAGES, study
-    from jaxid.experiment.demo.write import write_study
+    from jaxid.demo.page import write_study
+    from jaxid.demo.study import run_study
+    from jaxid.demo.tables import remarks, tables
+    from jaxid.report.terminal import show, show_remarks
 
     console = open_console()
     refuse_foreign_folder(output, force)
-    with open_stages(STAGES + 1) as stage:
-        found = study(seed, stage)
+    with open_stages(15) as stage:
+        part = stage.part()
+
+        def progress(name: str, fraction: float) -> None:
+            nonlocal part
+            if fraction == 0.0:
+                stage(name)
+                part = stage.part()
+            else:
+                part(fraction)
+
+        study = run_study(seed, progress)
         stage("writing the report")
-        files = write_study(output, found)
-    show_study(console, found)
+        files = write_study(output, study)
+    show(console, *tables(study))
+    show_remarks(console, remarks(study))
     console.print()
     console.print(Text(f"the report: {files[0]}"), soft_wrap=True)

@@ -9,12 +9,14 @@ from rich.text import Text
 
 from jaxid.cli.options import ExperimentFile, open_console
 from jaxid.errors import InputError
-from jaxid.experiment import terminal
+from jaxid.excitation.plan import CRITERIA
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.folder import refuse_foreign_table
 from jaxid.experiment.progress import designing
-from jaxid.experiment.show_excited import show_excited, show_side_by_side
+from jaxid.report.excitation import ordered, plan_remarks, plan_tables, side_by_side_table
+from jaxid.report.terminal import show, show_files, show_remarks
+from jaxid.table import Remark, Status
 
 STOPPED = 130
 """Exit code of a command that Ctrl-C has ended, as shells expect it."""
@@ -49,7 +51,7 @@ def excite(
     loaded = load_experiment(experiment)
     if resume and not state.exists():
         text = f"`{state}` is not there to go on with: the design begins anew"
-        terminal.sentences(console, [text], terminal.DOUBTFUL, "!")
+        show_remarks(console, [Remark(text, Status.DOUBTFUL)])
     try:
         with designing(console) as tell:
             excited = design_motion(loaded, tell, state, resume)
@@ -59,18 +61,24 @@ def excite(
     written = write_design(excited, output, _command_line(experiment, output, all_criteria))
     if not excited.plan.interrupted:
         state.unlink(missing_ok=True)
-    show_excited(console, excited)
+    show(console, *plan_tables(excited.plan))
+    show_remarks(console, ordered((*plan_remarks(excited.plan), *excited.aside.remarks)))
     names = [str(path.relative_to(output.parent)) for path in written]
-    terminal.show_files(console, output.parent, names)
+    show_files(console, output.parent, names)
     if not all_criteria:
         return
     if excited.plan.interrupted:
         stopped = "the design was stopped, and no other criterion was tried"
-        terminal.sentences(console, [stopped], terminal.DOUBTFUL, "!")
+        show_remarks(console, [Remark(stopped, Status.DOUBTFUL)])
         return
     with designing(console) as tell:
         plans = compare_criteria(loaded, tell)
-    show_side_by_side(console, plans)
+    if plans:
+        show(console, side_by_side_table(plans))
+    if len(plans) < len(CRITERIA) or plans[-1].interrupted:
+        done = sum(not plan.interrupted for plan in plans)
+        text = f"stopped after {done} of {len(CRITERIA)} criteria"
+        show_remarks(console, [Remark(text, Status.DOUBTFUL)])
 
 
 def _nothing(state: Path) -> str:

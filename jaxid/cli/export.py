@@ -8,7 +8,6 @@ import typer
 
 from jaxid.cli.options import open_console
 from jaxid.errors import InputError
-from jaxid.experiment import terminal
 from jaxid.export.c_code import export_c
 from jaxid.export.feed_forward import export_jax
 from jaxid.export.inertials import export_pinocchio
@@ -16,7 +15,8 @@ from jaxid.export.mjcf import export_mjcf
 from jaxid.export.urdf import export_urdf
 from jaxid.identification.fit import Fit, load
 from jaxid.io import require_writable
-from jaxid.report.write import MODEL
+from jaxid.report.result_files import MODEL
+from jaxid.report.terminal import show_files
 
 
 class Target(enum.StrEnum):
@@ -99,7 +99,7 @@ def export(
             export_pinocchio(fit, path)
         case Target.JAX:
             export_jax(fit, path)
-    terminal.show_files(open_console(), path.parent, [x.name for x in made])
+    show_files(open_console(), path.parent, [x.name for x in made])
 
 
 def _model_file(report: Path) -> Path:

@@ -11,7 +11,6 @@ from rich.text import Text
 
 from jaxid.cli.options import ExperimentFile, Force, open_console, open_stages
 from jaxid.errors import InputError
-from jaxid.experiment import terminal
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
 from jaxid.experiment.loading import choose
@@ -21,9 +20,10 @@ from jaxid.identification.runs.drive_gains import identify_drive_gains
 from jaxid.identification.runs.payload import Payload, identify_payload
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.states import identify_states
-from jaxid.report.compared_files import read_estimates, write_comparison
-from jaxid.report.found import GAINS, PAYLOAD, STATES, estimate_table, write_found
-from jaxid.report.numbers import significant
+from jaxid.report.result_files import read_estimates, write_comparison, write_estimates
+from jaxid.report.tables import comparison_table, estimate_table, group_table
+from jaxid.report.terminal import show, show_files
+from jaxid.table import Remark, Status, significant
 
 Unloaded = Annotated[
     list[Path],
@@ -74,8 +74,8 @@ def compare(
     with open_stages(1) as stage:
         stage("drawing")
         files = write_comparison(output, found, (first, second))
-    terminal.show_comparison(console, found)
-    terminal.show_files(console, output, [p.name for p in files])
+    show(console, comparison_table(found), group_table(found))
+    show_files(console, output, [p.name for p in files])
 
 
 def payload(
@@ -112,18 +112,15 @@ def payload(
         "distance": found.distance,
     }
     sources = {"unloaded": logs, "loaded": loaded}
-    files = write_found(output, PAYLOAD, [found.estimates, found.central], content, sources)
+    files = write_estimates(output, "payload", [found.estimates, found.central], content, sources)
     console = open_console()
     said = f"payload on the body of `{name}`, in its frame; moments about the centre of mass"
-    terminal.heading(console, said)
-    console.print(estimate_table(found.central))
-    console.print()
-    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
-    _show_possible(console, found)
+    remarks = [*(Remark(text, Status.DOUBTFUL) for text in doubts), _consistency_remark(found)]
+    show(console, estimate_table(found.central, said, remarks=remarks))
     _show_lines(
         console, "to subtract it from other logs, in the experiment file:", _tool(found, name)
     )
-    terminal.show_files(console, output, [p.name for p in files])
+    show_files(console, output, [p.name for p in files])
 
 
 def gains(
@@ -150,16 +147,15 @@ def gains(
     found = identify_drive_gains(*pair, described.load)
     key, values = _corrected(described, np.asarray(found.gains))
     sources = {"unloaded": logs, "loaded": loaded}
-    files = write_found(output, GAINS, [found.estimates], {key: values}, sources)
+    files = write_estimates(output, "gains", [found.estimates], {key: values}, sources)
     console = open_console()
-    terminal.heading(console, "true forces over those of the logs")
-    console.print(estimate_table(found.estimates))
-    console.print()
-    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
+    remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
+    title = "true forces over those of the logs"
+    show(console, estimate_table(found.estimates, title, remarks=remarks))
     shown = ", ".join(significant(v, 5) for v in values)
     lines = ["[recording]", f"{key} = [{shown}]"]
     _show_lines(console, "to use them, in the experiment file:", lines)
-    terminal.show_files(console, output, [p.name for p in files])
+    show_files(console, output, [p.name for p in files])
 
 
 def states(
@@ -197,20 +193,20 @@ def states(
         "varying": [found.base.names[k] for k in found.varying],
         "sharing_chance": chance,
     }
-    files = write_found(output, STATES, [found.estimates], content, {"states": logs})
+    files = write_estimates(output, "states", [found.estimates], content, {"states": logs})
     console = open_console()
-    terminal.heading(console, "what all states share, then what each has for itself")
-    console.print(estimate_table(found.estimates))
-    for other in names[1:]:
-        terminal.show_comparison(console, found.compare(names[0], other))
-    console.print()
     if chance < UNLIKELY:
         doubts.append(
             "the states do not agree on what they share (chance "
             f"{100 * chance:.2g} %): something else than friction and offsets differs"
         )
-    terminal.sentences(console, doubts, terminal.DOUBTFUL, "!")
-    terminal.show_files(console, output, [p.name for p in files])
+    title = "parameters that all states share, then those of each state"
+    remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
+    show(console, estimate_table(found.estimates, title, remarks=remarks))
+    for other in names[1:]:
+        comparison = found.compare(names[0], other)
+        show(console, comparison_table(comparison), group_table(comparison))
+    show_files(console, output, [p.name for p in files])
 
 
 def _pair(
@@ -253,25 +249,20 @@ def _body(experiment: Experiment, joint: str | None) -> int | None:
     return names.index(joint)
 
 
-def _show_possible(console: Console, found: Payload) -> None:
+def _consistency_remark(found: Payload) -> Remark:
     if not np.isfinite(found.distance):
         text = (
             "the logs do not determine all ten parameters of the payload: move the joints that "
             "carry it in more poses, faster, and alike in both runs."
         )
-        terminal.sentences(console, [text], terminal.BAD, "✗")
-    elif found.distance == 0:
-        text = "such a body could exist."
-        terminal.sentences(console, [text], terminal.GOOD, "✓")
-    else:
-        text = (
-            "the estimate itself belongs to no body: these are the parameters of the nearest one "
-            f"that could exist, {found.distance:.2g} standard deviations away."
-        )
-        usual = found.distance < UNUSUAL
-        terminal.sentences(
-            console, [text], "" if usual else terminal.DOUBTFUL, "·" if usual else "!"
-        )
+        return Remark(text, Status.BAD)
+    if found.distance == 0:
+        return Remark("the payload is physically consistent.", Status.GOOD)
+    text = (
+        "the estimate itself is not physically consistent: these are the parameters of the nearest "
+        f"body that is, {found.distance:.2g} standard deviations away."
+    )
+    return Remark(text, Status.NEUTRAL if found.distance < UNUSUAL else Status.DOUBTFUL)
 
 
 def _tool(found: Payload, joint: str) -> list[str]:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -28,11 +28,10 @@ from jaxid.experiment.excitation_tables import CRITERIA
 from jaxid.experiment.experiment import Experiment
 from jaxid.identification.runs.estimates import groups
 from jaxid.io import atomic_folder
-from jaxid.report.blocks import Remark, Tone
-from jaxid.report.compared_files import read_estimates
-from jaxid.report.excitation_words import named
-from jaxid.report.excited import Aside, write_pictures
+from jaxid.report.excitation import list_joints, write_excitation
+from jaxid.report.result_files import read_estimates
 from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.table import Remark, Status
 from jaxid.trajectory.files import (
     load_trajectory,
     save_trajectory,
@@ -64,6 +63,18 @@ class Nominal(NamedTuple):
     def sizes(self) -> Float[np.ndarray, " base"]:
         """Parameters; NaN also for what is not determined, whose estimate alone means nothing."""
         return np.where(np.isin(self.names, self.undetermined), np.nan, self.parameters)
+
+
+class Aside(NamedTuple):
+    """Remarks on a design beside those of its plan, and its origin.
+
+    Attributes:
+        remarks: Remarks.
+        settings: Origin of the design: `facts`, `command` and `experiment_text`.
+    """
+
+    remarks: tuple[Remark, ...]
+    settings: dict[str, Any]
 
 
 class Design(NamedTuple):
@@ -178,7 +189,7 @@ def write_design(design: Design, output: Path, command: str = "") -> list[Path]:
         save_trajectory(jax.tree.map(np.asarray, design.played), folder / names[1])
         write_ros(design.sampled, robot, folder / names[2], sample_time=step)
         # Before the others take their places: where there is no room for pictures, nothing changes.
-        pictures = write_pictures(output.with_suffix(""), plan, design.played, aside)
+        pictures = write_excitation(output.with_suffix(""), plan, design.played, *aside)
     return [output.parent / n for n in names] + pictures
 
 
@@ -382,12 +393,12 @@ def _remarks(
             "for relative deviations, say in `excitation.nominal` where an earlier result is"
         )
     for text in notes:
-        yield Remark(Tone.PLAIN, text)
+        yield Remark(text)
     if refusal:
         yield Remark(
-            Tone.BAD,
             f"the motion is without leads, and starts and ends at full speed: {refusal} "
             "`rest = true` designs one that is at rest there.",
+            Status.BAD,
         )
 
 
@@ -405,10 +416,10 @@ def force_remarks(
         return
     if nominal is None:
         yield Remark(
-            Tone.DOUBTFUL,
             "forces were not checked, although they have limits, for no parameters are known: "
             "say in `excitation.nominal` where an earlier result is, and give `force_margin` to "
             "keep the limits",
+            Status.DOUBTFUL,
         )
         return
     if experiment.excitation.force_margin is None:
@@ -416,13 +427,13 @@ def force_remarks(
     unknown = _unknown_parameters(experiment, nominal)
     if unknown:
         text = f"not known, and counted as zero in the forces: {unknown}"
-        yield Remark(Tone.DOUBTFUL, text)
+        yield Remark(text, Status.DOUBTFUL)
     if nominal.undetermined:
         yield Remark(
-            Tone.DOUBTFUL,
             f"`{experiment.excitation.nominal}` does not determine "
             f"{', '.join(nominal.undetermined)}: the forces are computed with its estimates of "
             "them, whose uncertainty counts as zero",
+            Status.DOUBTFUL,
         )
 
 
@@ -436,15 +447,15 @@ def _force_use(experiment: Experiment, nominal: Nominal, played: AbstractTraject
     exceeded = [_describe_use(one) for one in findings if one.value > 0]
     if exceeded:
         return Remark(
-            Tone.BAD,
             "by the nominal parameters this motion needs more than robot and motors can give: "
             f"{'; '.join(exceeded)}; give `force_margin`, and the design keeps these limits",
+            Status.BAD,
         )
     nearest = max(findings, key=lambda one: one.value)
     return Remark(
-        Tone.PLAIN,
         "forces were not part of the design; by the nominal parameters they stay within their "
         f"limits, the nearest being {_describe_use(nearest)} (`force_margin` keeps them with room)",
+        Status.NEUTRAL,
     )
 
 
@@ -462,6 +473,6 @@ def _unknown_parameters(experiment: Experiment, nominal: Nominal) -> str:
             joints.setdefault(kinds[k], []).append(int(number[0]) - 1)
     effects: dict[str, list[str]] = {}
     for effect, indices in joints.items():
-        where = named(experiment.robot, sorted(set(indices)))
+        where = list_joints(experiment.robot, sorted(set(indices)))
         effects.setdefault(where, []).append(effect)
     return "; ".join(f"{', '.join(words)} of {where}" for where, words in effects.items())

@@ -6,20 +6,9 @@ import sys
 from pathlib import Path
 
 from jaxid.errors import InputError
-from jaxid.experiment.demo import DEMO
 from jaxid.io import read_json, require_writable
-from jaxid.report import compared_files, content, found
+from jaxid.report.result_json import SCHEMAS
 from jaxid.trajectory.files import load_trajectory
-
-WRITTEN = (
-    ("result.json", content.SCHEMA),
-    ("comparison.json", compared_files.SCHEMA),
-    ("payload.json", found.PAYLOAD),
-    ("gains.json", found.GAINS),
-    ("states.json", found.STATES),
-    ("demo.json", DEMO),
-)
-"""Files by which earlier results are known, and their schemas."""
 
 
 def refuse_foreign_folder(target: Path, force: bool) -> None:
@@ -79,7 +68,7 @@ def _is_trajectory(path: Path) -> bool:
 
 
 def _is_report(folder: Path) -> bool:
-    return any(_has(folder / file, schema) for file, schema in WRITTEN)
+    return any(_has(folder / file, schema) for file, schema in SCHEMAS.items())
 
 
 def _has(path: Path, schema: str) -> bool:

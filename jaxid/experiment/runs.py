@@ -13,7 +13,7 @@ from jaxid.identification.identify import fit_rows
 from jaxid.identification.rows import Rows
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.update import load_run, update
-from jaxid.report.write import RUN
+from jaxid.report.result_files import RUN
 
 
 def is_report(path: Path) -> bool:

@@ -10,10 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from jaxid.arrays import AnyArray
+from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.report.lines import thinned
-from jaxid.report.numbers import percent, shortened, significant
 from jaxid.report.style import (
     ERROR,
     GREEN,
@@ -22,7 +20,6 @@ from jaxid.report.style import (
     ORANGE,
     PREDICTED,
     PURPLE,
-    WIDE,
     WIDTH,
     caption,
     heading,
@@ -30,14 +27,8 @@ from jaxid.report.style import (
     new_figure,
 )
 from jaxid.robot.robot import Robot
+from jaxid.table import percent, shortened, significant
 from jaxid.validation import TorqueErrors
-
-OTHERS = (GREEN, ORANGE, PURPLE)
-"""Colours of predictions beside the first."""
-ROW = 2.15
-HEADER = 0.95
-BINS = 700
-"""Bins of a line: about one for each pixel of a panel."""
 
 
 def torque_figure(
@@ -47,99 +38,86 @@ def torque_figure(
     joints: Sequence[int] | None = None,
     beside: Sequence[tuple[str, TorqueErrors]] = (),
 ) -> Figure:
-    """Draws measured and predicted forces of every joint, and their difference below.
+    """Draw measured and predicted forces of every joint, and their difference below.
 
     Rows at both ends that count for no joint are left out; where a row within does not count for
     a joint, the difference is left blank.
 
     Args:
-        errors: Of one recording.
-        robot: Whose joints they are.
-        title: Of the figure; the recording's name if None.
-        joints: Which ones to show, 0 is the first; all if None.
+        errors: Errors on one recording.
+        robot: Robot of the recording.
+        title: Title of the figure; the recording's name if None.
+        joints: Indices of the joints to show, from 0; all if None.
         beside: Other predictions of the same recording, with their names.
 
     Raises:
         InputError: If the numbers of joints differ, there is no such joint, or no row counts.
     """
+    colours = dict(zip((GREEN, ORANGE, PURPLE), beside, strict=False))
+    if len(colours) < len(beside):
+        raise InputError(f"`beside` must hold 3 predictions at most, but holds {len(beside)}.")
     for one in (errors, *(other for _, other in beside)):
         require_joints(one, robot)
-    if len(beside) > len(OTHERS):
-        raise InputError(f"`beside` must hold {len(OTHERS)} at most, but holds {len(beside)}.")
     shown = range(robot.joints) if joints is None else tuple(joints)
-    n = len(shown)
-    if not n or not set(shown) <= set(range(robot.joints)):
+    if not shown or not set(shown) <= set(range(robot.joints)):
         raise InputError(
             f"`joints` must hold numbers from 0 to {robot.joints - 1}, but is {joints}."
         )
-    counts = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
-    if not len(counts):
+    counted = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
+    if not len(counted):
         raise InputError(
             f"no row of `{errors.name}` counts for any joint: there is nothing to draw."
         )
-    window = slice(counts[0], counts[-1] + 1)
-    columns = 1 if n <= 2 else 2 if n <= 16 else 3
-    rows = math.ceil(n / columns)
+    window = slice(counted[0], counted[-1] + 1)
+    columns = 1 if len(shown) <= 2 else 2 if len(shown) <= 16 else 3
+    rows = math.ceil(len(shown) / columns)
     with house_style():
-        figure = new_figure(WIDTH if columns < 3 else WIDE, HEADER + ROW * rows, gap=0.02)
+        figure = new_figure(WIDTH if columns < 3 else 15.0, 0.95 + 2.15 * rows, gap=0.045)
         grid = figure.add_gridspec(rows, columns)
         panels = []
         for place, j in enumerate(shown):
-            # The third part is empty: it keeps the next joint off.
+            # The third part is empty: it separates the joints.
             cell = grid[divmod(place, columns)].subgridspec(3, 1, height_ratios=(3, 1, 0.22))
             upper = figure.add_subplot(cell[0])
             lower = figure.add_subplot(cell[1], sharex=upper)
-            for axes in (upper, lower):
-                axes.set_gid(f"joint-{j}")
             panels.append((upper, lower))
-            for colour, (_, other) in zip(OTHERS, beside, strict=False):
-                _line(upper, other, other.predicted, j, window, color=colour, lw=0.8)
-                _line(lower, other, other.errors, j, window, color=colour, lw=0.6)
-            _joint(upper, lower, errors, robot, j, window)
+            for colour, (_, other) in colours.items():
+                _draw_line(upper, other, other.predicted, j, window, color=colour, lw=0.8)
+                _draw_line(lower, other, other.errors, j, window, color=colour, lw=0.6)
+            _draw_joint(upper, lower, errors, robot, j, window)
             _scale(lower, [one.errors[window, j] for one in (errors, *(e for _, e in beside))])
-            if place + columns >= n:
+            if place + columns >= len(shown):
                 lower.set_xlabel("time [s]")
         for column in range(columns):
             figure.align_ylabels([axes for pair in panels[column::columns] for axes in pair])
         name = shortened(errors.name if title is None else title, 40)
         heading(figure, f"{name}: relative error {percent(errors.relative)} %")
-        figure.legend(
-            handles=[
-                Line2D([], [], color=MEASURED, lw=2.4, label="measured"),
-                Line2D([], [], color=PREDICTED, lw=1.2, label="predicted"),
-                *(
-                    Line2D([], [], color=colour, lw=1.2, label=name)
-                    for colour, (name, _) in zip(OTHERS, beside, strict=False)
-                ),
-                Line2D(
-                    [], [], color=ERROR, lw=1.2, label="predicted - measured, on a scale of its own"
-                ),
-            ],
-            loc="outside lower left",
-            ncols=3 + len(beside),
-        )
+        entries = [
+            (MEASURED, "measured"),
+            (PREDICTED, "predicted"),
+            *((colour, name) for colour, (name, _) in colours.items()),
+            (ERROR, "predicted - measured, on a scale of its own"),
+        ]
+        handles = [Line2D([], [], color=colour, lw=1.6, label=name) for colour, name in entries]
+        figure.legend(handles=handles, loc="outside lower left", ncols=len(handles))
     return figure
 
 
-def _line(
-    axes: Axes, errors: TorqueErrors, values: AnyArray, j: int, window: slice, **looks: Any
+def _draw_line(
+    axes: Axes, errors: TorqueErrors, values: AnyArray, j: int, window: slice, **style: Any
 ) -> None:
-    """A column of a recording, thinned out."""
     time, column = np.asarray(errors.time)[window], np.asarray(values)[window, j]
-    axes.plot(*thinned(time, column, BINS), **looks)
+    axes.plot(*decimate(time, column, bins=700), **style)
 
 
-def _joint(
+def _draw_joint(
     upper: Axes, lower: Axes, errors: TorqueErrors, robot: Robot, j: int, window: slice
 ) -> None:
     unit = robot.force_unit(j)
     time = np.asarray(errors.time)[window]
-    for values, colour, width in (
-        (errors.measured, MEASURED, 1.9),
-        (errors.predicted, PREDICTED, 0.8),
-    ):
-        _line(upper, errors, values, j, window, color=colour, lw=width)
-    _line(lower, errors, errors.errors, j, window, color=ERROR, lw=0.6)
+    _draw_line(upper, errors, errors.measured, j, window, color=MEASURED, lw=1.9)
+    _draw_line(upper, errors, errors.predicted, j, window, color=PREDICTED, lw=0.8)
+    _draw_line(lower, errors, errors.errors, j, window, color=ERROR, lw=0.6)
     caption(upper, shortened(robot.joint_names[j], 26), _mean_error(errors, j, unit))
     upper.set_ylabel(f"{'torque' if robot.revolute[j] else 'force'} [{unit}]")
     lower.set_ylabel(f"[{unit}]")
@@ -151,7 +129,7 @@ def _joint(
 
 
 def _scale(axes: Axes, differences: Sequence[np.ndarray]) -> None:
-    """Zero in the middle, and room for all differences."""
+    """Centre a panel at zero, with room for all differences."""
     sizes = np.abs(np.concatenate(differences))
     largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
     axes.set_ylim(*np.array([-1.1, 1.1]) * (largest if largest > 0 else 1.0))
@@ -160,13 +138,13 @@ def _scale(axes: Axes, differences: Sequence[np.ndarray]) -> None:
 def _mean_error(errors: TorqueErrors, j: int, unit: str) -> str:
     if not np.asarray(errors.counted)[:, j].any():
         return "no row counts"
-    mean, share = errors.mean[j], errors.mean_percent[j] / 100.0
+    mean, fraction = errors.mean[j], errors.mean_percent[j] / 100.0
     text = f"mean |e| {significant(mean, 2)} {unit}"
-    return f"{text} = {percent(share)} % of max" if np.isfinite(share) else text
+    return f"{text} = {percent(fraction)} % of max" if np.isfinite(fraction) else text
 
 
 def require_joints(errors: TorqueErrors, robot: Robot) -> None:
-    """Refuses errors of another robot.
+    """Reject errors of another robot.
 
     Raises:
         InputError: If the numbers of joints differ.
@@ -176,3 +154,33 @@ def require_joints(errors: TorqueErrors, robot: Robot) -> None:
             f"`errors` of `{errors.name}` belong to {errors.measured.shape[1]} joints, but the "
             f"robot `{robot.name}` has {robot.joints}."
         )
+
+
+def decimate(
+    time: Float[AnyArray, " rows"], values: Float[AnyArray, " rows"], bins: int
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Return points of a line: all if they are few, else the least and largest of each bin.
+
+    A peak of one sample stays visible however long the log is. Gaps in time become NaN, at which
+    a line breaks; values that are NaN stay out of their bin.
+
+    Args:
+        time: Rising instants of the values [s].
+        values: Values, NaN where there is none.
+        bins: Number of intervals of equal duration, about one for each pixel.
+    """
+    t, y = np.asarray(time), np.asarray(values)
+    if len(t) <= 2 * bins:
+        steps = np.diff(t)
+        gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) + 1 if len(steps) else []
+        return np.insert(t, gaps, np.nan), np.insert(y, gaps, np.nan)
+    place = np.minimum((bins * ((t - t[0]) / (t[-1] - t[0]))).astype(int), bins - 1)
+    first = np.flatnonzero(np.diff(place, prepend=-1))
+    last = np.append(first[1:], len(t)) - 1
+    least, largest = np.fmin.reduceat(y, first), np.fmax.reduceat(y, first)
+    rising = ~(y[last] < y[first])
+    points = np.stack([np.where(rising, least, largest), np.where(rising, largest, least)], axis=1)
+    times = np.stack([t[first], t[last]], axis=1)
+    gaps = np.flatnonzero(np.diff(place[first]) > 1) + 1
+    times, points = (np.insert(x, gaps, np.nan, axis=0) for x in (times, points))
+    return times.ravel(), points.ravel()

@@ -21,9 +21,7 @@ import pytest
 
 import jaxid as jid
 from jaxid import cli
-from jaxid.experiment.demo.study import Effort, study
-from jaxid.experiment.demo.tables import errors
-from jaxid.experiment.progress import Stages
+from jaxid.demo.study import run_study
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -214,29 +212,16 @@ def test_design():
     assert designed.after <= golden("design")["value"] * 1.02
 
 
-class Silent(Stages):
-    """A progress bar that shows nothing."""
-
-    def __init__(self):
-        pass
-
-    def __call__(self, name):
-        pass
-
-    def part(self):
-        return lambda share: None
-
-
 def test_identification_of_the_demo():
     robot = jid.robots.tx90l_on_rail()
     motion = jid.random_fourier_series(robot, omega=0.8, reach=0.7, seed=1)
-    found = study(0, Silent(), Effort(draws=1, periods=1), motion)
-    fit = found.weighted.fit
+    study = run_study(0, lambda name, fraction: None, draws=1, periods=1, motion=motion)
+    fit = study.weighted.fit
     compare(
         "demo",
         {
             "parameters": dict(zip(fit.base.names, map(float, fit.parameters), strict=True)),
             "deviations": list(map(float, fit.standard_deviations)),
-            "errors": [list(map(float, errors(found.weighted, k))) for k in (0, 1)],
+            "errors": [study.weighted.mean_errors(k) for k in (0, 1)],
         },
     )

@@ -1,8 +1,11 @@
 """A small robot with a rail and a pendulum, fitted to a noisy virtual log."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+import jaxid as jid
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.identification.estimators import LeastSquares
@@ -75,3 +78,29 @@ def fit(validated):
 @pytest.fixture
 def validation(validated) -> Validation:
     return validated[1]
+
+
+@pytest.fixture
+def warm(fit):
+    """Return the same robot with a third of the rail's friction."""
+    p = np.array(fit.parameters)
+    p[fit.base.names.index("fv1")] /= 3.0
+    return dataclasses.replace(fit, parameters=p, recordings=("warm",))
+
+
+@pytest.fixture(scope="session")
+def consistent():
+    """Return a fit of possible bodies with friction that drives: the bound at zero decides."""
+    robot = jid.robots.planar_arm(2, 0.4)
+    model = jid.Model(robot, (jid.RigidBodies(), jid.ViscousFriction()))
+    t = np.arange(0.0, 6.0, 0.01)
+    motion = jid.random_fourier_series(robot, omega=1.5, seed=0).motion(t)
+    p = np.zeros(model.size)
+    p[[0, 1, 6, 5, 10, 11, 16, 15]] = [2.0, 0.4, 0.11, 0.11, 1.0, 0.2, 0.06, 0.06]
+    p[-2:] = [0.3, -0.3]
+    forces = np.array(model.inverse_dynamics(p, motion))
+    forces += np.random.default_rng(0).normal(0.0, 0.05, forces.shape)
+    log = jid.Recording.of(np.asarray(motion.q), forces, time=t)
+    o = jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0))
+    estimator = jid.PhysicallyConsistent(jid.MeasuredForces())
+    return jid.identify(jid.base_parameters(model), o, estimator)

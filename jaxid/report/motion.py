@@ -1,4 +1,4 @@
-"""Figures of a motion: its joints against their limits, and its end-effector (Figs. 4, 5)."""
+"""Figures of a motion: joints and their limits, end-effector, filtered signals (Figs. 4, 5)."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +12,6 @@ from jaxid.excitation.constraints.tip import tip_motion
 from jaxid.report.style import (
     BLUE,
     GREY,
-    HEADING,
     MEASURED,
     PREDICTED,
     VERMILION,
@@ -25,29 +24,26 @@ from jaxid.report.style import (
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 
-ROW = 1.25
-"""Height of a row of panels [inch]."""
-
 
 def joint_figure(
     robot: Robot, limits: Limits, time: Float[AnyArray, " samples"], motion: Motion
 ) -> Figure:
-    """Position, velocity and acceleration of every joint between their limits (Fig. 4).
+    """Draw position, velocity and acceleration of every joint between their limits (Fig. 4).
 
     Args:
-        robot: Whose joints they are.
-        limits: Drawn as lines where they are finite.
-        time: Of the samples [s].
-        motion: At the samples.
+        robot: Robot that moves.
+        limits: Limits, drawn as lines where they are finite.
+        time: Instants of the samples [s].
+        motion: Motion at the samples.
     """
+    bounds = (
+        (limits.position_min, limits.position_max),
+        *((-np.asarray(x), np.asarray(x)) for x in (limits.velocity, limits.acceleration)),
+    )
     with house_style():
-        figure = new_figure(WIDTH, ROW * robot.joints + HEADING)
+        figure = new_figure(WIDTH, 1.25 * robot.joints + 0.36)
         heading(figure, f"{robot.name}: motion of the joints (dashed: limits)")
         panels = figure.subplots(robot.joints, 3, sharex=True, squeeze=False)
-        bounds = (
-            (limits.position_min, limits.position_max),
-            *((-np.asarray(x), np.asarray(x)) for x in (limits.velocity, limits.acceleration)),
-        )
         for j, row in enumerate(panels):
             unit = robot.joint_unit(j)
             kinds = (("", motion.q), ("/s", motion.qd), ("/s²", motion.qdd))
@@ -57,36 +53,34 @@ def joint_figure(
                     if np.isfinite(limit):
                         axes.axhline(limit, color=VERMILION, linewidth=0.7, linestyle="--")
                 caption(axes, robot.joint_names[j] if axes is row[0] else "", f"[{unit}{rate}]")
-        _time_axis(panels[-1], time)
+        _label_time(panels[-1], time)
     return figure
 
 
 def tip_figure(robot: Robot, time: Float[AnyArray, " samples"], motion: Motion) -> Figure:
-    """Position, speed and acceleration of the end-effector (Sec. 4).
+    """Draw position, speed and acceleration of the end-effector (Sec. 4).
 
     Args:
-        robot: Whose end-effector moves.
-        time: Of the samples [s].
-        motion: At the samples.
+        robot: Robot that moves.
+        time: Instants of the samples [s].
+        motion: Motion of the joints at the samples.
     """
     with double_precision():
         position, *rates = (np.asarray(x) for x in tip_motion(robot, motion))
-    speed, rate = (np.linalg.norm(x, axis=1) for x in rates)
     with house_style():
-        figure = new_figure(WIDTH, 3 * 1.6 + HEADING)
+        figure = new_figure(WIDTH, 5.2)
         heading(figure, f"{robot.name}: motion of the end-effector")
         panels = figure.subplots(3, 1, sharex=True)
         for k, (name, color) in enumerate(zip("xyz", (BLUE, VERMILION, GREY), strict=True)):
             panels[0].plot(time, position[:, k], color=color, linewidth=1.0, label=name)
         panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3)
-        caption(panels[0], "position [m]", "")
-        for axes, values, name, unit in (
-            (panels[1], speed, "speed", "m/s"),
-            (panels[2], rate, "acceleration", "m/s²"),
-        ):
+        caption(panels[0], "position [m]")
+        quantities = (("speed", "m/s"), ("acceleration", "m/s²"))
+        for axes, vectors, (name, unit) in zip(panels[1:], rates, quantities, strict=True):
+            values = np.linalg.norm(vectors, axis=1)
             axes.plot(time, values, color=BLUE, linewidth=1.0)
             caption(axes, name, f"up to {values.max():.3g} {unit}")
-        _time_axis(panels[-1:], time)
+        _label_time(panels[-1:], time)
     return figure
 
 
@@ -97,14 +91,14 @@ def filtered_figure(
     filtered: Motion,
     joint: int,
 ) -> Figure:
-    """Velocity and acceleration of a joint: as desired, and out of a filter (Fig. 5).
+    """Draw velocity and acceleration of a joint: as desired, and behind a filter (Fig. 5).
 
     Args:
-        robot: Whose joint it is.
-        time: Of the samples [s].
-        desired: At the samples.
-        filtered: At the samples, from measured positions.
-        joint: Its index; 0 is the first.
+        robot: Robot that moves.
+        time: Instants of the samples [s].
+        desired: Desired motion at the samples.
+        filtered: Motion that the filter makes of measured positions.
+        joint: Index of the joint, from 0.
 
     Raises:
         InputError: If there is no such joint.
@@ -113,19 +107,19 @@ def filtered_figure(
         raise InputError(f"`joint` must lie between 0 and {robot.joints - 1}, but is {joint}.")
     unit = robot.joint_unit(joint)
     with house_style():
-        figure = new_figure(WIDTH, 2 * 1.9 + HEADING + 0.3)
+        figure = new_figure(WIDTH, 4.5)
         heading(figure, f"{robot.name}: {robot.joint_names[joint]}, desired and filtered")
         panels = figure.subplots(2, 1, sharex=True)
-        for axes, name, rate, wanted, found in (
+        for axes, name, rate, *pair in (
             (panels[0], "velocity", "/s", desired.qd, filtered.qd),
             (panels[1], "acceleration", "/s²", desired.qdd, filtered.qdd),
         ):
-            pair = [np.asarray(x)[:, joint] for x in (wanted, found)]
-            axes.plot(time, pair[0], color=MEASURED, linewidth=2.4)
-            axes.plot(time, pair[1], color=PREDICTED, linewidth=1.0)
-            apart = float(np.sqrt(np.mean((pair[1] - pair[0]) ** 2)))
-            caption(axes, f"{name} [{unit}{rate}]", f"RMS difference {apart:.3g} {unit}{rate}")
-        _time_axis(panels[-1:], time)
+            wanted, measured = (np.asarray(x)[:, joint] for x in pair)
+            axes.plot(time, wanted, color=MEASURED, linewidth=2.4)
+            axes.plot(time, measured, color=PREDICTED, linewidth=1.0)
+            rms = float(np.sqrt(np.mean((measured - wanted) ** 2)))
+            caption(axes, f"{name} [{unit}{rate}]", f"RMS difference {rms:.3g} {unit}{rate}")
+        _label_time(panels[-1:], time)
         handles = [
             Line2D([], [], color=MEASURED, lw=2.4, label="desired"),
             Line2D([], [], color=PREDICTED, lw=1.2, label="filtered"),
@@ -134,7 +128,7 @@ def filtered_figure(
     return figure
 
 
-def _time_axis(panels: np.ndarray, time: Float[AnyArray, " samples"]) -> None:
+def _label_time(panels: np.ndarray, time: Float[AnyArray, " samples"]) -> None:
     axes: Axes
     for axes in panels:
         axes.set_xlabel("time [s]")

@@ -1,0 +1,344 @@
+"""The paper's experiments, one after the other, on the virtual TX90L on its rail."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import jaxid as jid
+from jaxid.arrays import Float
+from jaxid.demo.feed_forward import Timing, time_feed_forward
+from jaxid.simulation.experiment import Tracking
+from jaxid.validation import Validation
+
+HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800
+"""Fourier series of the paper: order, fundamental frequency [rad/s], samples of a period."""
+SAMPLE_TIME, STEP = 1e-3, 20
+"""Sample time of servo and log [s] (not published), and samples for each row."""
+CUBE, EDGE = (0.3, 0.5, 0.8), 0.6
+"""Centre and edge of the cube of the verification path [m]."""
+SPEED, ACCELERATION = 1.05, 4.0
+"""Limits of the end-effector along that path [m/s, m/s²]: nearly all that the joints can do."""
+AT_REST = 0.02
+"""Speed below which a joint counts as resting, twice the width of the model's dry friction
+[rad/s or m/s]."""
+
+
+class Model(NamedTuple):
+    """A set of parameters and its errors on identification and verification.
+
+    Attributes:
+        name: Name of the estimator.
+        fit: Parameters.
+        validation: Torque errors on both recordings, and definiteness of the mass matrix.
+    """
+
+    name: str
+    fit: jid.Fit
+    validation: Validation
+
+    def mean_errors(self, recording: int) -> list[float]:
+        """Return the mean errors of all axes [% of the largest torque] (Eq. 37).
+
+        Args:
+            recording: 0 for identification, 1 for verification.
+        """
+        return [float(x) for x in self.validation.errors[recording].mean_percent]
+
+
+class PathRun(NamedTuple):
+    """Run along the verification path with a feed-forward.
+
+    Attributes:
+        name: Model that is fed forward.
+        run: Measured motion and torques.
+        distance: Distance of the end-effector from its path, at the samples [m].
+    """
+
+    name: str
+    run: Tracking
+    distance: Float[np.ndarray, " samples"]
+
+    @property
+    def rms(self) -> float:
+        """RMS distance of the end-effector [m]."""
+        return float(np.sqrt(np.mean(self.distance**2)))
+
+    @property
+    def joint_rms(self) -> Float[np.ndarray, " joints"]:
+        """RMS of the joints' tracking errors [rad or m]."""
+        return np.sqrt(np.mean(np.asarray(self.run.tracking_error) ** 2, axis=0))
+
+
+class Coverage(NamedTuple):
+    """Number of 95 % intervals that hold the true parameter.
+
+    Attributes:
+        filter: Filter of the recordings, in words.
+        inside: Number of intervals that hold the truth.
+        total: Number of intervals.
+    """
+
+    filter: str
+    inside: int
+    total: int
+
+
+class Study(NamedTuple):
+    """Results of the demo.
+
+    Attributes:
+        seed: Seed of all random numbers.
+        base: Base parameters of the robot.
+        truth: Base parameters of the cold robot.
+        plans: Motions with the least condition number (Eq. 36), and D-optimal; none if a motion
+            was given.
+        played: Motion of the identification, from standstill to standstill.
+        path: Path of the end-effector for verification.
+        joint_path: The same path in joint coordinates.
+        runs: Measurements: identification cold, identification warm, verification.
+        observations: Filtered recordings of the three runs.
+        unweighted: Least squares without weights.
+        weighted: Least squares with the weights of Eq. 30.
+        consistent: Estimate of physically consistent bodies.
+        true: Parameters of the robot itself: their errors are all due to disturbances.
+        warm: Fit of the warm robot.
+        temperature: Comparison of the cold with the warm robot.
+        coverage: Coverage of intervals where nothing but noise disturbs, for two filters.
+        followed: Runs along the path with no model, CAD values, and the identified model.
+        timing: Cost of feed-forward torques; a sentence where it was not measured.
+    """
+
+    seed: int
+    base: jid.BaseParameters
+    truth: Float[np.ndarray, " base"]
+    plans: tuple[jid.ExcitationPlan, ...]
+    played: jid.WithLeads
+    path: jid.TipPath
+    joint_path: jid.AbstractTrajectory
+    runs: tuple[Tracking, ...]
+    observations: tuple[jid.Observations, ...]
+    unweighted: Model
+    weighted: Model
+    consistent: Model
+    true: Model
+    warm: jid.Fit
+    temperature: jid.Comparison
+    coverage: tuple[Coverage, ...]
+    followed: tuple[PathRun, ...]
+    timing: Timing | str
+
+    @property
+    def models(self) -> tuple[Model, ...]:
+        """All sets of parameters whose errors are compared."""
+        return self.unweighted, self.weighted, self.consistent, self.true
+
+    def moving(self, recording: int) -> np.ndarray:
+        """Return which rows count where joints at rest are left out [rows, joints].
+
+        Args:
+            recording: 0 for identification, 1 for verification.
+        """
+        motion = self.observations[2 * recording].reduced_motion
+        return np.abs(np.asarray(motion.qd)) > AT_REST
+
+    def moving_errors(self, model: Model, recording: int) -> list[float]:
+        """Return the mean errors of all axes while they move [% of the largest torque].
+
+        Args:
+            model: Set of parameters.
+            recording: 0 for identification, 1 for verification.
+        """
+        errors, moving = model.validation.errors[recording], self.moving(recording)
+        sums = np.where(moving, np.abs(np.asarray(errors.errors)), 0.0).sum(axis=0)
+        mean = sums / np.maximum(moving.sum(axis=0), 1)
+        return [float(x) for x in 100.0 * mean / np.asarray(errors.max_forces)]
+
+    @property
+    def tip_maxima(self) -> tuple[float, float]:
+        """Largest speed [m/s] and acceleration [m/s²] of the end-effector in the identification."""
+        series = self.played.inner
+        times = np.linspace(0.0, float(series.duration), 4000, endpoint=False)
+        tip = jid.tip_motion(self.base.model.robot, series.motion(times))
+        rates = (tip.velocity, tip.acceleration)
+        speed, acceleration = (float(np.linalg.norm(x, axis=1).max()) for x in rates)
+        return speed, acceleration
+
+
+def run_study(
+    seed: int,
+    progress: Callable[[str, float], None],
+    *,
+    starts: int = 2,
+    draws: int = 4,
+    periods: int = 2,
+    motion: jid.AbstractTrajectory | None = None,
+) -> Study:
+    """Repeat the experiments of the paper.
+
+    Args:
+        seed: Seed of all random numbers.
+        progress: Callback, called with the name of a stage and its completed fraction (0 to 1).
+        starts: Number of random motions from which a design starts.
+        draws: Number of recordings with which intervals are checked.
+        periods: Number of periods of the excitation that are measured.
+        motion: Motion to identify with; designed if None.
+    """
+    progress("finding base parameters", 0.0)
+    cold, hot = jid.virtual_tx90l_on_rail(), jid.virtual_tx90l_on_rail(warm=True)
+    robot, base = cold.robot, jid.base_parameters(cold.model)
+    _ = base.expressions
+    plans = () if motion is not None else _design(base, seed, starts, progress)
+    if motion is None:
+        motion = jid.FourierBasis(HARMONICS, OMEGA).trajectory(plans[0].numbers)
+    progress("adding the leads", 0.0)
+    played = jid.with_leads(motion, robot, periods=periods)
+    progress("inverse kinematics of the verification path", 0.0)
+    path = verification_path()
+    joints = jid.joint_path(robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0))
+    runs = []
+    for k, (name, virtual, trajectory) in enumerate(
+        (
+            ("identification, cold", cold, played),
+            ("identification, warm", hot, played),
+            ("verification", cold, joints),
+        )
+    ):
+        progress(f"measuring: {name}", 0.0)
+        options = {"sample_time": SAMPLE_TIME, "seed": 10 * seed + k, "name": name}
+        runs.append(virtual.track(trajectory, **options))
+    observations = [_observe(run.recording, robot, jid.PaperFilter()) for run in runs]
+    progress("identifying", 0.0)
+    rows = jid.Rows.of(base, [observations[0]])
+    fits = {
+        "without weights": jid.fit_rows(rows, jid.LeastSquares()),
+        "weighted": jid.fit_rows(rows, jid.WeightedLeastSquares()),
+        "consistent": jid.fit_rows(rows, jid.PhysicallyConsistent()),
+    }
+    truth = np.asarray(base.from_standard(cold.parameters))
+    fits["true parameters"] = eqx.tree_at(lambda f: f.parameters, fits["weighted"], truth)
+    progress("predicting torques", 0.0)
+    recordings = [observations[0], observations[2]]
+    models = [Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()]
+    progress("comparing cold and warm", 0.0)
+    warm = jid.fit_rows(jid.Rows.of(base, [observations[1]]), jid.WeightedLeastSquares())
+    progress("checking intervals", 0.0)
+    coverage = _check_coverage(base, played, seed, draws)
+    progress("following the path with three controllers", 0.0)
+    followed = _follow(cold, path, joints, fits["consistent"], seed)
+    progress("timing the feed-forward", 0.0)
+    return Study(
+        seed,
+        base,
+        truth,
+        plans,
+        played,
+        path,
+        joints,
+        tuple(runs),
+        tuple(observations),
+        *models,
+        warm=warm,
+        temperature=jid.compare(fits["weighted"], warm),
+        coverage=coverage,
+        followed=followed,
+        timing=time_feed_forward(fits["consistent"], joints),
+    )
+
+
+def verification_path() -> jid.TipPath:
+    """Return the path of ISO 9283 of the demo; the tool points along the rail (Fig. 8)."""
+    forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    limits = {"speed": SPEED, "acceleration": ACCELERATION}
+    return jid.iso9283_path(CUBE, EDGE, forward, leans_along=1, **limits)
+
+
+def _observe(log: jid.Recording, robot: jid.Robot, filter: jid.AbstractFilter) -> jid.Observations:
+    return jid.observe(log, robot, filter, jid.Subsample(STEP))
+
+
+def _design(
+    base: jid.BaseParameters, seed: int, starts: int, progress: Callable[[str, float], None]
+) -> tuple[jid.ExcitationPlan, ...]:
+    """Return a motion with the least condition number, and a D-optimal one."""
+    limits = base.model.robot.limits
+    low, high, most = (
+        np.array(x) for x in (limits.position_min, limits.position_max, limits.acceleration)
+    )
+    # The drive of the shoulder could not hold and move the arm in all that its limits allow.
+    low[2], high[2], most[2] = -0.4, 0.4, 3.0
+    limits = dataclasses.replace(limits, position_min=low, position_max=high, acceleration=most)
+
+    def design(criterion: jid.AbstractCriterion) -> jid.ExcitationPlan:
+        name = f"designing the motion: {criterion.name}"
+        progress(name, 0.0)
+        return jid.design_excitation(
+            base,
+            criterion=criterion,
+            basis=jid.FourierBasis(HARMONICS, OMEGA),
+            limits=limits,
+            constraints=(jid.Clearance(jid.robots.tx90l_on_rail_collision()),),
+            starts=starts,
+            generations=0,
+            polish=0,
+            samples=SAMPLES,
+            key=jax.random.key(seed),
+            progress=lambda now: progress(name, now.share),
+            throw=False,
+        )
+
+    return design(jid.ConditionNumber()), design(jid.DOptimal())
+
+
+def _check_coverage(
+    base: jid.BaseParameters, excitation: jid.WithLeads, seed: int, draws: int
+) -> tuple[Coverage, ...]:
+    """Count the intervals that hold the truth, for a robot with noise and encoders only."""
+    quiet = jid.virtual_tx90l_on_rail(disturbed=False)
+    truth = np.asarray(base.from_standard(quiet.parameters))
+    duration = float(excitation.duration)
+    seeds = range(1000 * (seed + 1), 1000 * (seed + 1) + draws)
+    logs = [
+        quiet.measure(excitation, duration=duration, sample_time=SAMPLE_TIME, seed=k) for k in seeds
+    ]
+
+    def count(filter: jid.AbstractFilter) -> int:
+        inside = 0
+        for log in logs:
+            rows = jid.Rows.of(base, [_observe(log, quiet.robot, filter)])
+            low, high = jid.fit_rows(rows, jid.WeightedLeastSquares()).intervals(0.95).T
+            inside += int(np.count_nonzero((low <= truth) & (truth <= high)))
+        return inside
+
+    filters = {
+        "the paper's filter, which lags and smooths accelerations twice": jid.PaperFilter(),
+        "a zero-phase Butterworth filter of 15 Hz": jid.ZeroPhaseButterworth(15.0),
+    }
+    return tuple(Coverage(name, count(f), draws * base.size) for name, f in filters.items())
+
+
+def _follow(
+    virtual: jid.VirtualRobot,
+    path: jid.TipPath,
+    joints: jid.AbstractTrajectory,
+    fit: jid.Fit,
+    seed: int,
+) -> tuple[PathRun, ...]:
+    """Run the path by the servo alone, and with two models fed forward."""
+    cad = jid.cad_tx90l_on_rail()
+    controllers = {
+        "no model": None,
+        "CAD values": lambda motion: np.asarray(virtual.model.inverse_dynamics(cad, motion)),
+        "identified model": fit.predict,
+    }
+    runs = []
+    for k, (name, feed_forward) in enumerate(controllers.items()):
+        number = 100 + 10 * seed + k
+        run = virtual.track(joints, feed_forward=feed_forward, seed=number, name=name)
+        tip = np.asarray(jid.tip_motion(virtual.robot, run.actual).position)
+        distance = np.linalg.norm(tip - path.positions(np.asarray(run.time)), axis=1)
+        runs.append(PathRun(name, run, distance))
+    return tuple(runs)

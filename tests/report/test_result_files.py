@@ -1,0 +1,217 @@
+"""Reports on disk: exact numbers, valid JSON, whole or not at all."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from report_samples import errors_of
+
+from jaxid.identification.runs.comparison import Comparison, Verdict, compare
+from jaxid.report import result_files
+from jaxid.report.result_files import read_estimates, safe_name, write_comparison, write_report
+from jaxid.report.result_json import consistency_record, plain
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Figures and pages are tested elsewhere."""
+    monkeypatch.setattr(result_files, "save", lambda figure, path: path.write_bytes(b"figure"))
+    monkeypatch.setattr(result_files, "identification_page", lambda *_: "page")
+
+
+def report(folder, fit, validation, **changes):
+    arguments = {
+        "identification": validation.errors[:1],
+        "verification": validation.errors[1:],
+        "definiteness": validation.definiteness,
+        "settings": {"split": 0.6, "min_speed": np.array([0.1, np.inf])},
+        "notes": ("a note",),
+    }
+    return write_report(folder, fit, **{**arguments, **changes})
+
+
+def load(folder):
+    def refuse(token):
+        raise AssertionError(f"{token} is no JSON")
+
+    return json.loads((folder / "result.json").read_text("utf-8"), parse_constant=refuse)
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_writes_all_files_with_their_parents(tmp_path, fit, validation):
+    folder = tmp_path / "a" / "b" / "report"
+    files = report(folder, fit, validation, pdf=True)
+    assert sorted(p.name for p in files) == names(folder)
+    figures = ("autocorrelation", "errors", "parameters", "residuals")
+    figures += ("torque_first-run", "torque_second")
+    assert set(names(folder)) == {
+        *(f"{name}{suffix}" for name in figures for suffix in (".png", ".pdf")),
+        *("model.json", "parameters.csv", "report.html", "result.json"),
+    }
+    for path in files:
+        if path.suffix in (".png", ".pdf"):
+            assert path.read_bytes()[:4] in (b"\x89PNG", b"%PDF")
+    assert names(tmp_path) == ["a"]
+
+
+def test_numbers_come_back_exactly(tmp_path, fit, validation, quick):
+    report(tmp_path, fit, validation)
+    found = load(tmp_path)
+    assert found["schema"] == "jaxid-result/1"
+    rows = found["base_parameters"]
+    for key, values in {
+        "estimate": np.asarray(fit.parameters).tolist(),
+        "standard_deviation": fit.standard_deviations.tolist(),
+        "naive_standard_deviation": fit.naive_standard_deviations.tolist(),
+        "ratio_to_naive": fit.uncertainty.ratios.tolist(),
+        "degrees_of_freedom": fit.uncertainty.freedom.tolist(),
+        "name": list(fit.base.names),
+        "expression": list(fit.base.expressions),
+        "unit": list(fit.base.units),
+    }.items():
+        assert [r[key] for r in rows] == values, key
+    assert [[r["low_95"], r["high_95"]] for r in rows] == fit.intervals(0.95).tolist()
+    residuals = found["fit"]["residuals"]
+    assert residuals["white"] == list(fit.residual_spectra.white)
+    assert np.shape(residuals["density"]) == (2, len(residuals["frequency"]))
+    assert found["fit"]["covariance"] == np.asarray(fit.covariance).tolist()
+    assert found["fit"]["condition_numbers"]["scaled"] == fit.condition_numbers.scaled
+    assert found["mass_matrix"]["positive_definite"] is True
+    joints = found["errors"]["verification"][0]["joints"]
+    assert [j["mean"] for j in joints] == validation.errors[1].mean.tolist()
+    assert [j["unit"] for j in joints] == ["N", "N m"]
+    assert found["notes"][-1] == "a note"
+    assert set(found["made"]["versions"]) == {"jaxid", "jax", "numpy", "python"}
+    with (tmp_path / "parameters.csv").open(encoding="utf-8", newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(r["estimate"]) for r in table] == np.asarray(fit.parameters).tolist()
+
+
+def test_the_result_file_holds_complete_bodies(consistent, fit):
+    assert consistency_record(fit) is None
+    text = json.dumps(plain(consistency_record(consistent)), allow_nan=False)
+    found = json.loads(text)
+    values = [p["estimate"] for p in found["standard_parameters"]]
+    np.testing.assert_array_equal(values, consistent.full_parameters)
+    assert found["standard_parameters"][1]["unit"] == "kg m"
+    assert found["proved"]
+    assert found["price"] > 0.1
+    assert found["masses_from_bounds"] == ["m1", "m2"]
+    assert "fv2 at 0" in " ".join(found["active_bounds"])
+
+
+def test_values_that_are_not_finite_are_null(tmp_path, fit, validation, quick):
+    covariance = np.array(fit.covariance)
+    covariance[0, 0] = np.inf
+    unknown = dataclasses.replace(fit.uncertainty, covariance=covariance)
+    fit = dataclasses.replace(fit, uncertainty=unknown)
+    report(tmp_path, fit, validation)
+    found = load(tmp_path)
+    assert found["base_parameters"][0]["standard_deviation"] is None
+    assert found["settings"]["min_speed"] == [0.1, None]
+    assert found["robot"]["joints"][0]["position_max"] is None
+    mixed = (float("nan"), np.float64(np.inf), np.int64(3), None, True)
+    assert plain({"a": mixed}) == {"a": [None, None, 3, None, True]}
+    # The model file knows better: a comparison reads that.
+    again = read_estimates(tmp_path, "again")
+    np.testing.assert_array_equal(again.covariance, covariance)
+    same = Comparison.of(read_estimates(tmp_path), again)
+    assert set(same.verdicts) == {Verdict.UNKNOWN, Verdict.UNCHANGED}
+
+
+def test_the_model_can_be_used_again(tmp_path, fit, validation, quick):
+    report(tmp_path, fit, validation)
+    model = load(tmp_path)["model"]
+    p = np.random.default_rng(0).standard_normal(fit.base.model.size)
+    again = p[model["independent"]] + np.array(model["kappa"]) @ p[model["dependent"]]
+    np.testing.assert_allclose(again, fit.base.from_standard(p), rtol=1e-14)
+    estimates = read_estimates(tmp_path)
+    assert estimates.label == tmp_path.name
+    assert estimates.expressions == fit.base.expressions
+    np.testing.assert_array_equal(estimates.parameters, fit.parameters)
+
+
+@pytest.mark.parametrize("present", [False, True])
+def test_a_failure_in_the_middle_leaves_nothing(
+    tmp_path, fit, validation, monkeypatch, quick, present
+):
+    folder = tmp_path / "new" / "report"
+    if present:
+        folder.mkdir(parents=True)
+        (folder / "result.json").write_text("old")
+
+    def fail(figure, path):
+        path.write_bytes(b"half")
+        raise RuntimeError("no ink")
+
+    monkeypatch.setattr(result_files, "save", fail)
+    with pytest.raises(RuntimeError, match="no ink"):
+        report(folder, fit, validation)
+    if present:
+        assert names(folder) == ["result.json"]
+        assert (folder / "result.json").read_text() == "old"
+    else:
+        assert not folder.exists()
+
+
+def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, quick):
+    for name in ("log.csv", "torque_mine.png"):
+        (tmp_path / name).write_text("mine")
+    report(tmp_path, fit, validation, pdf=True)
+    report(tmp_path, fit, validation, verification=())
+    assert "torque_second.png" not in names(tmp_path)
+    assert "torque_first-run.png" in names(tmp_path)
+    assert not [name for name in names(tmp_path) if name.endswith(".pdf")]
+    for name in ("log.csv", "torque_mine.png"):
+        assert (tmp_path / name).read_text() == "mine"
+
+
+def test_recordings_of_one_name_keep_their_figures_apart(tmp_path, fit, validation, quick):
+    same = tuple(dataclasses.replace(errors_of(2), name=name) for name in ("Run", "run", "run"))
+    report(tmp_path, fit, validation, identification=same[:1], verification=same[1:])
+    figures = [n for n in names(tmp_path) if n.startswith("torque")]
+    assert len({n.lower() for n in figures}) == 3
+    assert "torque_run_verification.png" in figures
+
+
+def test_comparisons_hold_the_numbers_exactly(tmp_path, fit, warm):
+    found = compare(fit, warm)
+    files = write_comparison(tmp_path / "out", found)
+    assert [p.name for p in files] == ["comparison.json", "comparison.csv", "comparison.png"]
+    content = json.loads(files[0].read_text(encoding="utf-8"))
+    assert content["schema"] == "jaxid-comparison/1"
+    assert [r["difference"] for r in content["parameters"]] == found.difference.tolist()
+    assert content["groups"][1]["changed"] is True
+    with files[1].open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(r["half_width"]) for r in rows] == found.half_widths.tolist()
+    assert files[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_folders_that_are_no_reports_are_refused(tmp_path, fit, validation, quick):
+    with pytest.raises(ValueError, match=r"`model.json`"):
+        read_estimates(tmp_path)
+    (tmp_path / "report").write_text("a file")
+    with pytest.raises(ValueError, match="must be a folder"):
+        report(tmp_path / "report", fit, validation)
+    assert names(tmp_path) == ["report"]
+
+
+@pytest.mark.parametrize(
+    ("name", "safe"),
+    [
+        ("log_1", "log_1"),
+        ("../../etc/passwd", "etc-passwd"),
+        ("Prüfstand 3: kalt", "Prufstand-3-kalt"),
+        ("日本", "recording"),
+        ("..", "recording"),
+        ("a" * 300, "a" * 80),
+    ],
+)
+def test_names_become_safe(name, safe):
+    assert safe_name(name) == safe

@@ -1,0 +1,192 @@
+"""Tables: numbers as text, alignment, units, widths, CSV; and what stands in those of results."""
+
+import csv
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+from report_samples import arm_of, errors_of
+from rich.console import Console
+
+from jaxid.identification.runs.comparison import compare
+from jaxid.report.tables import (
+    body_table,
+    comparison_table,
+    error_table,
+    group_table,
+    parameter_table,
+    residual_table,
+    robot_table,
+)
+from jaxid.report.terminal import show
+from jaxid.table import (
+    MISSING,
+    Column,
+    Remark,
+    Status,
+    Table,
+    percent,
+    shortened,
+    significant,
+    with_deviation,
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1.2345, "1.23"),
+        (-0.012345, "-0.0123"),
+        (123.456, "123"),
+        (9.999, "10.0"),
+        (0.9951, "0.995"),
+        (1.5e-12, "1.50e-12"),
+        (0.0, "0"),
+        (float("inf"), "∞"),
+        (float("nan"), MISSING),
+    ],
+)
+def test_significant_digits(value, text):
+    assert significant(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "deviation", "texts"),
+    [
+        (1.23456, 0.0123, ("1.235", "0.012")),
+        (1.23456, 0.00996, ("1.235", "0.010")),
+        (1234.56, 12.3, ("1235", "12")),
+        (0.5, float("inf"), ("0.5000", "∞")),
+    ],
+)
+def test_estimates_have_the_digits_of_their_deviation(value, deviation, texts):
+    assert with_deviation(value, deviation) == texts
+
+
+def test_percent_and_names():
+    assert percent(0.01234) == "1.2"
+    assert percent(1.57) == "157"
+    assert shortened("short", 8) == "short"
+    assert shortened("a_very_long_joint_name", 10) == "a_very…ame"
+
+
+def table():
+    return Table(
+        "errors",
+        Column("joint", ["rail", "a joint with a name that goes on and on"]),
+        Column("RMS", np.array([1.25, 100.0]), "N m"),
+        Column("fraction", [0.5, np.nan], "%", percent),
+        facts=[("rows", 799)],
+        remarks=[Remark("a sentence " * 12, Status.BAD), "another"],
+        status=[Status.GOOD, Status.DOUBTFUL],
+        rules=[1],
+    )
+
+
+def test_text_is_aligned_marked_and_no_wider_than_asked():
+    text = table().text(60).splitlines()
+    assert text[:2] == ["errors", "rows  799"]
+    header, units, first, rule, second = text[3:8]
+    assert header.split() == ["RMS", "fraction"]
+    assert units.split() == ["joint", "[N", "m]", "[%]"]
+    assert first.startswith("✓  rail")
+    assert second.startswith("!  a joint with")
+    assert set(rule) == {"─"}
+    assert first.index(".") == second.index("100") + 3, "points stand below each other"
+    assert second.endswith(MISSING)
+    assert text[9].startswith("✗  a sentence")
+    assert text[-1] == "·  another."
+    assert max(map(len, text)) <= 60
+    narrow = table().text(40)
+    assert "a joint with…" in narrow or "…" in narrow
+    assert max(map(len, narrow.splitlines())) <= 40
+
+
+def test_csv_has_all_digits_and_units():
+    rows = list(csv.reader(io.StringIO(table().csv())))
+    assert rows[0] == ["joint", "RMS [N m]", "fraction [%]"]
+    assert [float(row[1]) for row in rows[1:]] == [1.25, 100.0]
+
+
+def test_the_terminal_shows_the_same_letters_in_colour():
+    plain, coloured = io.StringIO(), io.StringIO()
+    show(Console(file=plain, width=60), table())
+    show(Console(file=coloured, width=60, force_terminal=True), table())
+    lines = [line.rstrip() for line in plain.getvalue().splitlines()]
+    assert lines == ["", *table().text(60).splitlines()]
+    assert "\x1b[32m✓" in coloured.getvalue()
+
+
+def test_columns_of_different_lengths_are_refused():
+    with pytest.raises(ValueError, match="`columns`"):
+        Table("", Column("a", [1]), Column("b", [1, 2]))
+
+
+def test_parameters_have_estimate_deviation_unit_and_naive_deviation(fit):
+    lines = parameter_table(fit).text(140).splitlines()
+    start = next(k for k, line in enumerate(lines) if line.split()[:2] == ["#", "parameter"]) + 1
+    for k, expression in enumerate(fit.base.expressions):
+        row = lines[start + k]
+        assert expression in row
+        assert fit.base.units[k] in row
+        numbers = [float(x) for x in row.split() if x.replace(".", "").lstrip("-").isdigit()]
+        assert numbers[0] == k + 1
+        assert any(
+            abs(x - fit.parameters[k]) <= 0.5 * fit.standard_deviations[k] for x in numbers[1:]
+        )
+        naive = float(f"{fit.naive_standard_deviations[k]:.1e}")
+        ratio = pytest.approx(fit.uncertainty.ratios[k], rel=0.06)
+        assert numbers[-2:] == [pytest.approx(naive), ratio]
+    alone = dataclasses.replace(fit, uncertainty=type(fit.uncertainty).given(fit.covariance))
+    assert "naive" not in parameter_table(alone).text()
+
+
+def test_residuals_are_white_or_not(fit):
+    spectra = fit.residual_spectra
+    rows = residual_table(spectra, fit.base.model.robot).rows
+    for row, white, slow in zip(rows, spectra.white, spectra.slow, strict=True):
+        assert row[1] == ("yes" if white else "no")
+        assert float(row[-1]) == pytest.approx(100 * slow, rel=0.06)
+
+
+def test_errors_have_joints_and_units(fit, validation):
+    errors, robot = validation.errors[1], fit.base.model.robot
+    text = str(error_table(errors, robot))
+    for word in ("second", "rail", "swing_$1_$", " N ", " N m ", "[% of max]", "average"):
+        assert word in text
+    assert f"{errors.mean_percent[0]:.3g}" in text
+    unknown = dataclasses.replace(errors_of(2), max_forces=np.full(2, np.nan))
+    text = str(error_table(unknown, arm_of(2)))
+    assert "average" not in text
+    assert sum(MISSING in row for row in text.splitlines()) == 2
+    with pytest.raises(ValueError, match="`errors`"):
+        error_table(errors_of(3), arm_of(2))
+
+
+def test_joints_have_limits_and_units(fit):
+    rail, swing = (
+        line.split() for line in str(robot_table(fit.base.model.robot)).splitlines()[3:5]
+    )
+    assert rail == ["rail", "slides", MISSING, MISSING, "1.00", MISSING, "200", "m", "N"]
+    assert swing[1] == "turns"
+    assert swing[-2:] == ["N", "m"]
+
+
+def test_bodies_show_their_margins_and_the_active_bounds(consistent):
+    robot = consistent.base.model.robot
+    table = body_table(consistent.consistency, robot.joint_names)
+    assert [row[0] for row in table.rows] == list(robot.joint_names)
+    assert table.status == (Status.DOUBTFUL, Status.DOUBTFUL)
+    assert "fv2 at 0" in str(table)
+
+
+def test_the_comparison_names_what_has_changed(fit, warm):
+    found = compare(fit, warm)
+    lines = comparison_table(found).text(100).splitlines()
+    (line,) = [x for x in lines if " fv1 " in x]
+    assert "N s/m" in line
+    assert line.endswith("changed")
+    assert "\n".join(lines).count(" no change seen") == fit.base.size - 1
+    kinds = group_table(found).text().splitlines()
+    assert [x.endswith(" changed") for x in kinds[-3:]] == [0, 1, 0]
