@@ -67,7 +67,6 @@ from jaxid.identification.consistency import consistent_body as consistent_body
 from jaxid.identification.consistency import pseudo_inertia as pseudo_inertia
 from jaxid.identification.correlated import GeneralisedLeastSquares as GeneralisedLeastSquares
 from jaxid.identification.devices import factorise_across_processes as factorise_across_processes
-from jaxid.identification.devices import factorise_on_devices as factorise_on_devices
 from jaxid.identification.devices import shards as shards
 from jaxid.identification.essential import EssentialParameters as EssentialParameters
 from jaxid.identification.essential import essential_parameters as essential_parameters
@@ -75,7 +74,6 @@ from jaxid.identification.estimators import AbstractEstimator as AbstractEstimat
 from jaxid.identification.estimators import Estimate as Estimate
 from jaxid.identification.estimators import LeastSquares as LeastSquares
 from jaxid.identification.estimators import WeightedLeastSquares as WeightedLeastSquares
-from jaxid.identification.factors import factorise as factorise
 from jaxid.identification.filter_choice import AbstractFilterCriterion as AbstractFilterCriterion
 from jaxid.identification.filter_choice import FilterCandidate as FilterCandidate
 from jaxid.identification.filter_choice import FilterChoice as FilterChoice
@@ -86,8 +84,7 @@ from jaxid.identification.filter_choice import choose_filter as choose_filter
 from jaxid.identification.fit import Fit as Fit
 from jaxid.identification.fit import Trust as Trust
 from jaxid.identification.fit import load as load
-from jaxid.identification.identify import fit_blocks as fit_blocks
-from jaxid.identification.identify import fit_rows as fit_rows
+from jaxid.identification.identify import fit_problem as fit_problem
 from jaxid.identification.identify import identify as identify
 from jaxid.identification.instruments import InstrumentalVariables as InstrumentalVariables
 from jaxid.identification.nonlinear.estimator import NonlinearFriction as NonlinearFriction
@@ -96,11 +93,11 @@ from jaxid.identification.nonlinear.temperature import temperature_law as temper
 from jaxid.identification.nonlinear.verdict import NonlinearFit as NonlinearFit
 from jaxid.identification.nonlinear.verdict import identify_nonlinear as identify_nonlinear
 from jaxid.identification.prior import RelativeTo as RelativeTo
+from jaxid.identification.problem import RegressionProblem as RegressionProblem
 from jaxid.identification.robust import AbstractLoss as AbstractLoss
 from jaxid.identification.robust import Huber as Huber
 from jaxid.identification.robust import IterativelyReweighted as IterativelyReweighted
 from jaxid.identification.robust import Tukey as Tukey
-from jaxid.identification.rows import Rows as Rows
 from jaxid.identification.runs.comparison import Comparison as Comparison
 from jaxid.identification.runs.comparison import Verdict as Verdict
 from jaxid.identification.runs.comparison import compare as compare

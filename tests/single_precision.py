@@ -111,16 +111,11 @@ CASES = {
     ),
     "PhysicallyConsistent": lambda: consistent().parameters,
     "identify_batch": batch,
-    "bootstrap": lambda: jid.bootstrap(jid.factorise(base, [cold]), np.ones(2), 20, key),
-    "factorise_on_devices": lambda: (
-        jid.fit_blocks(
-            base, jid.factorise_on_devices(base, cold.motion, cold.forces), jid.LeastSquares()
-        ).parameters
+    "bootstrap": lambda: jid.bootstrap(
+        jid.RegressionProblem(base, [cold]).blocks, np.ones(2), 20, key
     ),
     "factorise_across_processes": lambda: (
-        jid.fit_blocks(
-            base, jid.factorise_across_processes(base, [cold]), jid.LeastSquares()
-        ).parameters
+        jid.fit_problem(jid.factorise_across_processes(base, [cold]), jid.LeastSquares()).parameters
     ),
     "essential_parameters": lambda: jid.essential_parameters(plain(), cold).fit.parameters,
     "identify_stepwise": lambda: jid.identify_stepwise(base, [cold]).stepwise.parameters,

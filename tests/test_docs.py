@@ -23,7 +23,6 @@ from jaxid.experiment.method_tables import FILTERS, SIDES, Effects, Logs, build_
 from jaxid.experiment.mistakes import BAD
 from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
 from jaxid.experiment.sanity import SURE
-from jaxid.identification.excited import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
 from jaxid.measurement.columns import Columns
 from jaxid.report.verdict import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO

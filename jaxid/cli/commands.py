@@ -37,9 +37,9 @@ from jaxid.experiment.progress import Stages
 from jaxid.experiment.runs import earlier_run, is_report
 from jaxid.experiment.template import write_template
 from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_rows
+from jaxid.identification.identify import fit_problem
 from jaxid.identification.identify import identify as estimate
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.twice import share_data
 from jaxid.identification.runs.update import update
@@ -279,7 +279,7 @@ def identify(
         stage("finding base parameters")
         base = loaded.base
         stage("factorising the rows")
-        rows = Rows.of(base, fitted, stage.through(sum(o.samples for o in fitted)))
+        rows = RegressionProblem(base, fitted, stage.through(sum(o.samples for o in fitted)))
         fit = loaded.fit(rows, stage.through(sum(o.samples for o in fitted)))
         run = Run.of_rows(rows, fit)
         if not run.tells(fit):
@@ -287,7 +287,7 @@ def identify(
         if reports:
             fit, run = _together(loaded, reports, fit, run)
             for o in checked:
-                if share_data(run.blocks, Rows.of(base, [o]).blocks):
+                if share_data(run.blocks, RegressionProblem(base, [o]).blocks):
                     raise InputError(
                         f"a report that was given has seen the data of `{o.name}`: a model that "
                         "has seen a log is not verified by it; verify with another."
@@ -297,8 +297,8 @@ def identify(
         found = validate(fit, [*fitted, *checked], progress=through)
         alternative = None
         if (loaded.estimation.regularised or fit.undetermined) and not reports:
-            same = rows if fit.base is base else Rows.of(fit.base, fitted)
-            other = fit_rows(same, loaded.other_estimator)
+            same = rows if fit.base is base else RegressionProblem(fit.base, fitted)
+            other = fit_problem(same, loaded.other_estimator)
             names = (solution_name(fit.solution), solution_name(other.solution))
             errors = [torque_errors(other, o) for o in (*fitted, *checked)]
             alternative = Alternative(other, errors, names)

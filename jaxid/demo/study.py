@@ -212,11 +212,11 @@ def run_study(
         runs.append(virtual.track(trajectory, **options))
     observations = [_observe(run.recording, robot, jid.PaperFilter()) for run in runs]
     progress("identifying", 0.0)
-    rows = jid.Rows.of(base, [observations[0]])
+    rows = jid.RegressionProblem(base, [observations[0]])
     fits = {
-        "without weights": jid.fit_rows(rows, jid.LeastSquares()),
-        "weighted": jid.fit_rows(rows, jid.WeightedLeastSquares()),
-        "consistent": jid.fit_rows(rows, jid.PhysicallyConsistent()),
+        "without weights": jid.fit_problem(rows, jid.LeastSquares()),
+        "weighted": jid.fit_problem(rows, jid.WeightedLeastSquares()),
+        "consistent": jid.fit_problem(rows, jid.PhysicallyConsistent()),
     }
     truth = np.asarray(base.from_standard(cold.parameters))
     fits["true parameters"] = eqx.tree_at(lambda f: f.parameters, fits["weighted"], truth)
@@ -224,7 +224,9 @@ def run_study(
     recordings = [observations[0], observations[2]]
     models = [Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()]
     progress("comparing cold and warm", 0.0)
-    warm = jid.fit_rows(jid.Rows.of(base, [observations[1]]), jid.WeightedLeastSquares())
+    warm = jid.fit_problem(
+        jid.RegressionProblem(base, [observations[1]]), jid.WeightedLeastSquares()
+    )
     progress("checking intervals", 0.0)
     coverage = _check_coverage(base, played, seed, draws)
     progress("following the path with three controllers", 0.0)
@@ -308,8 +310,8 @@ def _check_coverage(
     def count(filter: jid.AbstractFilter) -> int:
         inside = 0
         for log in logs:
-            rows = jid.Rows.of(base, [_observe(log, quiet.robot, filter)])
-            low, high = jid.fit_rows(rows, jid.WeightedLeastSquares()).intervals(0.95).T
+            rows = jid.RegressionProblem(base, [_observe(log, quiet.robot, filter)])
+            low, high = jid.fit_problem(rows, jid.WeightedLeastSquares()).intervals(0.95).T
             inside += int(np.count_nonzero((low <= truth) & (truth <= high)))
         return inside
 

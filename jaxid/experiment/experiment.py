@@ -29,18 +29,17 @@ from jaxid.identification.essential import essential_parameters
 from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
 from jaxid.identification.filter_choice import FilterCandidate
 from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_rows
+from jaxid.identification.identify import fit_problem
 from jaxid.identification.nonlinear.estimator import NonlinearFriction
 from jaxid.identification.nonlinear.verdict import identify_nonlinear
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.solutions import Complete, CrossValidated
-from jaxid.identification.streaming import Progress
 from jaxid.measurement.chunked_files import estimated_rows
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation
 from jaxid.measurement.filters import AbstractFilter
 from jaxid.measurement.log_on_disk import scan_log
-from jaxid.measurement.observations import Observations, observe
+from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.recording import Recording, read_recording, remove_delay
 from jaxid.measurement.timestamps import NeedsMemory
 from jaxid.robot.collision import CollisionModel
@@ -114,7 +113,7 @@ class Experiment:
         other = Complete() if self.estimation.regularised else CrossValidated()
         return dataclasses.replace(self.estimation.plain, solution=other)
 
-    def fit(self, rows: Rows, progress: Progress | None = None) -> Fit:
+    def fit(self, rows: RegressionProblem, progress: Progress | None = None) -> Fit:
         """Estimate parameters as the table `[estimator]` says.
 
         Args:
@@ -128,7 +127,7 @@ class Experiment:
             return identify_nonlinear(
                 self.base, rows.recordings, estimator, linear=linear, progress=progress
             ).better
-        fit = fit_rows(rows, self.estimation.estimator, uncertainty=uncertainty)
+        fit = fit_problem(rows, self.estimation.estimator, uncertainty=uncertainty)
         if self.estimation.essential is None:
             return fit
         choice = essential_parameters(

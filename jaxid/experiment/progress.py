@@ -8,7 +8,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 from rich.text import Text
 
 from jaxid.excitation.design import DesignProgress
-from jaxid.identification.streaming import Progress as Callback
+from jaxid.measurement.observations import Progress as Callback
 
 
 class _Speed(ProgressColumn):

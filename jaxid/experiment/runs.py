@@ -9,8 +9,8 @@ from jaxid.experiment.doctor import slips_of
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.loading import doubts_of, load_log
 from jaxid.experiment.progress import Stages
-from jaxid.identification.identify import fit_rows
-from jaxid.identification.rows import Rows
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.update import load_run, update
 from jaxid.report.result_files import RUN
@@ -83,8 +83,8 @@ def read_run(
         observed = [log.observations for log in logs]
         stage(f"factorising the rows, {name}")
         through = stage.through(sum(o.samples for o in observed))
-        rows = Rows.of(experiment.base, observed, through)
-        fit = fit_rows(rows, experiment.estimation.plain)
+        rows = RegressionProblem(experiment.base, observed, through)
+        fit = fit_problem(rows, experiment.estimation.plain)
         doubts += slips_of(logs, fit)
         earlier.append(Run.of_rows(rows, fit))
     return functools.reduce(update, earlier), doubts

@@ -17,8 +17,7 @@ from jaxid.experiment.channels import (
 from jaxid.experiment.faults import channel_faults
 from jaxid.experiment.mistakes import FRICTION
 from jaxid.identification.fit import Fit
-from jaxid.identification.streaming import Progress
-from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Observations, Progress
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
 

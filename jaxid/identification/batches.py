@@ -22,10 +22,11 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.batch_estimators import estimate_each
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
-from jaxid.identification.factors import CHUNK, Blocks, Factors, JointFactor
-from jaxid.identification.geometries import geometries
-from jaxid.identification.identify import fit_blocks
+from jaxid.identification.factors import Blocks, Factors, JointFactor
+from jaxid.identification.identify import fit_problem
 from jaxid.identification.normal_equations import BatchFit, DataSets, solve
+from jaxid.identification.problem import RegressionProblem
+from jaxid.identification.robot_family import geometries
 from jaxid.identification.weights import GivenWeights
 from jaxid.robot.robot import Robot
 
@@ -202,7 +203,7 @@ def _solved_again(
                 deviations[k, draw] = naive[k, draw] = np.inf
                 continue
             estimator = WeightedLeastSquares(GivenWeights(one.weights))
-            again = fit_blocks(base, blocks, estimator)
+            again = fit_problem(RegressionProblem(base, blocks=blocks), estimator)
             found = again.naive_standard_deviations
             known = np.isfinite(found).all()
             p[k, draw], naive[k, draw] = again.parameters, found
@@ -221,14 +222,14 @@ def _blocks(rows: JointRows, one: DataSets, forces: np.ndarray) -> Blocks:
     parts = []
     for begin, end in itertools.pairwise(edges):
         joints = [JointFactor(c, np.zeros((0, len(c) + 1)), 0) for c in rows.columns]
-        for start in range(begin, end, CHUNK):
-            part = slice(start, min(start + CHUNK, end))
+        for start in range(begin, end, 65536):
+            part = slice(start, min(start + 65536, end))
             arrays = [x[part].T for x in jax.tree.leaves(one.motion)]
             if one.numbers is not None:
                 shape = (len(one.numbers), arrays[0].shape[-1])
                 arrays.append(np.broadcast_to(one.numbers[:, None], shape))
             for j, columns in enumerate(rows.in_numpy(*arrays)):
                 kept = slice(None) if one.mask is None else one.mask[part, j] > 0
-                joints[j] = joints[j].joined(np.column_stack([columns.T, forces[part, j]])[kept])
+                joints[j] = joints[j].append(np.column_stack([columns.T, forces[part, j]])[kept])
         parts.append(Factors(tuple(joints), rows.size))
     return Blocks(tuple(parts))

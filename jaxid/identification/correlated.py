@@ -5,9 +5,9 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.identification.estimators import AbstractEstimator, Estimate
-from jaxid.identification.factors import Blocks, Factors, JointFactor
+from jaxid.identification.factors import Blocks, RowChunk
 from jaxid.identification.influence import AbstractInfluence, Channel
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem, chunk_residuals
 from jaxid.identification.solutions import AbstractSolution, Complete, Decomposition
 from jaxid.identification.weights import ResidualVariances
 
@@ -26,16 +26,16 @@ class WhitenedRows(AbstractInfluence):
 
     def channels(self, chunk, residuals):
         """Combinations of joints whose residuals are not correlated."""
-        size = 1 + max((max(own) for own in chunk.acting if own), default=0)
+        size = 1 + max((max(own) for own in chunk.indices if own), default=0)
         whole = np.zeros((*residuals.shape, size + 1))
-        for j, own in enumerate(chunk.acting):
+        for j, own in enumerate(chunk.indices):
             whole[:, j, list(own)] = chunk.columns[j]
         whole[..., -1] = residuals
-        mixed = self._mixed(whole, chunk.counted)
+        mixed = self._mixed(whole, chunk.mask)
         found = []
         for c in range(residuals.shape[1]):
             Z = mixed[:, c, :-1]
-            counted = int(chunk.counted[:, c].sum())
+            counted = int(chunk.mask[:, c].sum())
             found.append(Channel(tuple(range(size)), Z, Z, mixed[:, c, -1], counted))
         return found
 
@@ -72,7 +72,7 @@ class GeneralisedLeastSquares(AbstractEstimator):
         Raises:
             InputError: If only factors of the rows are known.
         """
-        rows.require_seen("least squares with the full covariance of the joints")
+        rows.require_samples("least squares with the full covariance of the joints")
         weights = ResidualVariances()(rows.robot, rows.factors)
         estimate = Estimate.solved(rows, weights, self.solution.choose(rows.blocks, weights))
         for _ in range(self.iterations):
@@ -95,13 +95,13 @@ class GeneralisedLeastSquares(AbstractEstimator):
 
 
 def residual_covariance(
-    rows: Rows, p: Float[AnyArray, " base"]
+    rows: RegressionProblem, p: Float[AnyArray, " base"]
 ) -> Float[np.ndarray, "joints joints"]:
     """Covariance of the joints' residuals at the same instants [N² m², N m N or N²]."""
     n = rows.robot.joints
     products, counts = np.zeros((n, n)), np.zeros((n, n))
     for chunk, residuals in rows.residuals(np.asarray(p)):
-        r, c = np.where(chunk.counted, residuals, 0.0), chunk.counted.astype(float)
+        r, c = np.where(chunk.mask, residuals, 0.0), chunk.mask.astype(float)
         products += r.T @ r
         counts += c.T @ c
     S = products / np.maximum(counts, 1.0)
@@ -112,17 +112,19 @@ def residual_covariance(
     return whole * size * size[:, None]
 
 
-def _whitened(rows: Rows, influence: WhitenedRows, p: np.ndarray, weights: np.ndarray) -> Blocks:
+def _whitened(
+    rows: RegressionProblem, influence: WhitenedRows, p: np.ndarray, weights: np.ndarray
+) -> Blocks:
     """The factors of combinations of joints, as if they were the joints' own."""
-    size, everything = rows.base.size, tuple(range(rows.base.size))
-    none = JointFactor(everything, np.zeros((0, size + 1)), 0)
-    parts = [Factors((none,) * len(weights), size) for _ in rows.blocks.parts]
-    for chunk, residuals in rows.residuals(p):
-        joints = []
-        for c, channel in enumerate(influence.channels(chunk, residuals)):
-            Z = np.zeros((len(residuals), size))
+    size = rows.base.size
+
+    def equations(chunk: RowChunk) -> list[np.ndarray]:
+        found = []
+        for c, channel in enumerate(influence.channels(chunk, chunk_residuals(chunk, p))):
+            Z = np.zeros((len(chunk.mask), size))
             Z[:, list(channel.columns)] = channel.equations
-            both = np.column_stack([Z, channel.disturbance + Z @ p])[chunk.counted[:, c]]
-            joints.append(parts[chunk.block].joints[c].joined(both / weights[c]))
-        parts[chunk.block] = Factors(tuple(joints), size)
-    return Blocks(tuple(parts))
+            both = np.column_stack([Z, channel.disturbance + Z @ p])[chunk.mask[:, c]]
+            found.append(both / weights[c])
+        return found
+
+    return rows.fold(equations, [tuple(range(size))] * len(weights))

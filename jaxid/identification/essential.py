@@ -11,9 +11,8 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import Fit
-from jaxid.identification.held_out import folds
-from jaxid.identification.identify import fit_rows
-from jaxid.identification.rows import Rows
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem, cross_validation_folds
 from jaxid.identification.solutions import NUMERICAL
 from jaxid.identification.uncertainty.methods import AbstractUncertainty
 from jaxid.measurement.observations import Observations
@@ -105,7 +104,7 @@ def essential_parameters(
         raise InputError(f"`cost` must be a share of zero or more, but is {cost:g}.")
     single = isinstance(observations, Observations)
     recordings = (observations,) if single else tuple(observations)
-    rows = Rows.of(fit.base, recordings)
+    rows = RegressionProblem(fit.base, recordings)
     if [int(n) for n in rows.factors.rows] != list(fit.rows):
         raise InputError(
             "`observations` must be those that the fit was made of, but they have other rows."
@@ -114,7 +113,7 @@ def essential_parameters(
     smallest = min(step.held_out for step in path)
     within = [k for k, step in enumerate(path) if step.held_out <= (1 + cost) * smallest]
     base = restricted(fit.base, kept[within[-1]])
-    left = fit_rows(Rows.of(base, recordings), fit.estimator, uncertainty=uncertainty)
+    left = fit_problem(RegressionProblem(base, recordings), fit.estimator, uncertainty=uncertainty)
     return EssentialParameters(left, fit, tuple(path))
 
 
@@ -132,13 +131,16 @@ def restricted(base: BaseParameters, kept: Sequence[int]) -> BaseParameters:
     )
 
 
-def _eliminated(fit: Fit, rows: Rows) -> tuple[list[Elimination], list[list[int]]]:
+def _eliminated(fit: Fit, rows: RegressionProblem) -> tuple[list[Elimination], list[list[int]]]:
     """The path to a single parameter, and which are left at each step."""
     weights, names = np.asarray(fit.weights), fit.base.names
     squares = weights**2
     whole = float(squares @ rows.factors.force_squares)
     R, z = rows.factors.weighted(weights)
-    parts = [(rest.total.weighted(weights), part.total) for rest, part in folds(rows.blocks, 10)]
+    parts = [
+        (rest.total.weighted(weights), part.total)
+        for rest, part in cross_validation_folds(rows.blocks, 10)
+    ]
     kept = list(range(fit.base.size))
     deviations = _deviations(rows.factors, R, z, weights, kept)[1]
     honest = np.asarray(fit.standard_deviations)

@@ -11,7 +11,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks
 from jaxid.identification.influence import AbstractInfluence, ByJoint
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.solutions import (
     AbstractSolution,
     AbstractSpectralSolution,
@@ -59,7 +59,10 @@ class Estimate(eqx.Module):
 
     @classmethod
     def solved(
-        cls, rows: Rows, weights: Float[AnyArray, " joints"], solution: AbstractSpectralSolution
+        cls,
+        rows: RegressionProblem,
+        weights: Float[AnyArray, " joints"],
+        solution: AbstractSpectralSolution,
     ) -> "Estimate":
         """Least squares of rows that are weighted by joint (Eqs. 28, 33)."""
         decomposition = Decomposition.of(*rows.factors.weighted(weights))
@@ -79,7 +82,7 @@ class Estimate(eqx.Module):
 class AbstractEstimator(eqx.Module):
     """A way to estimate parameters from rows.
 
-    An estimator gets `Rows` and returns an `Estimate`. What it can ask the rows for:
+    An estimator gets `RegressionProblem` and returns an `Estimate`. What it can ask the rows for:
 
     * `rows.base`, `rows.robot`: the base parameters, with the model and the robot behind them;
     * `rows.factors`: for each joint the R factor of its columns and forces, all that least squares
@@ -90,7 +93,7 @@ class AbstractEstimator(eqx.Module):
     * `rows.with_base(base)`: the same recordings with other columns, where constants of the model's
       terms are looked for; `rows.recordings`: motions and filters.
 
-    Rows of factors only (`rows.seen` is False: from other processes, by `fit_blocks`) serve
+    Rows of factors only (`rows.has_samples` is False: from other processes, by `fit_blocks`) serve
     estimators that need no pass; the others refuse them in one sentence.
 
     What it returns: `Estimate.solved` makes the estimate of weighted least squares; start from it
@@ -100,7 +103,7 @@ class AbstractEstimator(eqx.Module):
     """
 
     @abstractmethod
-    def __call__(self, rows: Rows) -> Estimate:
+    def __call__(self, rows: RegressionProblem) -> Estimate:
         """The estimate from some rows.
 
         Raises:

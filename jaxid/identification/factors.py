@@ -1,37 +1,102 @@
-"""What least squares need of the observations: one triangular factor for each joint.
+"""Rows of the regression and the triangular factors to which they are reduced.
 
-The rows of a joint see only the bodies beyond it. Their columns and forces are reduced, chunk by
-chunk, to the R factor of a QR decomposition; weights of the joints are applied afterwards, for
-free, and recordings are added by stacking factors. The observation matrix is never held.
+The rows of a joint depend only on the bodies beyond it. Columns and forces of a chunk of samples
+are filtered and decimated alike, and reduced to the R factor of a QR decomposition for each joint.
+Weights of the joints are applied to the factors afterwards, and recordings are added by stacking
+factors. The observation matrix is never held in memory.
 """
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import acting_columns
-from jaxid.identification.kernel import CHUNK as SAMPLES
-from jaxid.identification.reduction import reduced
-from jaxid.identification.sharded import StreamOnDevices, devices
-from jaxid.identification.streaming import Progress, Stream, suits
-from jaxid.measurement.observations import Observations
+from jaxid.dynamics.compiled import regressor_rows, tool_forces
+from jaxid.dynamics.motion import Motion
+from jaxid.measurement.observations import Chunk
 
-CHUNK = 65536
-"""Samples whose columns are held at once."""
-BLOCKS = 10
-"""Blocks of time into which a recording is divided, for cross-validation."""
+Columns = Sequence[tuple[int, ...]]
+"""Indices of the base parameters that can act on each joint."""
+
+
+class RowChunk(NamedTuple):
+    """Consecutive rows of one block of time, filtered and decimated.
+
+    Attributes:
+        recording: Index of the recording.
+        block: Index of the block of time, counted over all recordings.
+        rows: Range of the recording's rows.
+        indices: Base parameters that can act on each joint.
+        columns: Columns of each joint [rows, indices of the joint].
+        forces: Measured forces less those of a known tool [rows, joints], in [N m] or [N].
+        mask: Rows that count for each joint [rows, joints].
+    """
+
+    recording: int
+    block: int
+    rows: slice
+    indices: Columns
+    columns: list[np.ndarray]
+    forces: np.ndarray
+    mask: np.ndarray
+
+    def part(self, selection: slice) -> "RowChunk":
+        """Return some of the rows, counted from the first of the chunk."""
+        start = self.rows.start
+        return self._replace(
+            rows=slice(start + selection.start, start + selection.stop),
+            columns=[x[selection] for x in self.columns],
+            forces=self.forces[selection],
+            mask=self.mask[selection],
+        )
+
+    def equations(self) -> list[np.ndarray]:
+        """Return the masked rows `[columns, force]` of each joint."""
+        joints = zip(self.columns, self.forces.T, self.mask.T, strict=True)
+        return [np.column_stack([theta, force])[kept] for theta, force, kept in joints]
+
+
+def reduce_chunk(
+    base: BaseParameters, motion: Motion, forces: Float[AnyArray, "samples joints"], chunk: Chunk
+) -> tuple[list[Float[np.ndarray, "rows columns"]], Float[np.ndarray, "rows joints"]]:
+    """Return the columns of each joint and the forces of a chunk, filtered and decimated (Eq. 26).
+
+    Args:
+        base: The base parameters.
+        motion: Motion at the samples of the chunk.
+        forces: Measured forces at the samples of the chunk [N m or N].
+        chunk: Filter and decimation, which make rows of samples.
+    """
+    forces = np.asarray(forces)
+    if base.model.robot.tool is not None:
+        forces = forces - tool_forces(base, motion)
+    columns = [chunk.reduce(theta) for theta in regressor_rows(base, motion)]
+    return columns, chunk.reduce(forces)
+
+
+def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]]:
+    """Yield each block of time that some rows reach into, with its part of the rows.
+
+    Args:
+        edges: First row of each block, and the end of the last one.
+        rows: Consecutive rows.
+    """
+    for block, (low, high) in enumerate(itertools.pairwise(edges)):
+        a, b = max(low, rows.start), min(high, rows.stop)
+        if a < b:
+            yield block, slice(a, b)
 
 
 class JointFactor(eqx.Module):
     r"""The R factor of $[\Theta_j \; Q_j]$, the rows of one joint and their forces.
 
     Attributes:
-        columns: The base parameters that can act on this joint.
+        columns: Base parameters that can act on the joint.
         R: Upper triangle, or fewer rows; its last column belongs to the forces.
         rows: Number of rows that it stands for.
     """
@@ -40,42 +105,40 @@ class JointFactor(eqx.Module):
     R: Float[AnyArray, "height width"]
     rows: int = eqx.field(static=True)
 
-    def joined(self, rows: Float[AnyArray, "height width"]) -> "JointFactor":
-        """The factor after more rows `[columns, forces]`."""
+    def append(self, rows: Float[AnyArray, "height width"]) -> "JointFactor":
+        """Return the factor after more rows `[columns, force]`."""
         R = np.asarray(np.linalg.qr(np.vstack([self.R, rows]), mode="r"))
         return JointFactor(self.columns, R, self.rows + len(rows))
-
-    def residual_square(self, p: Float[AnyArray, " base"]) -> float:
-        """Sum of the squared residuals of this joint's rows [N² m² or N²]."""
-        x = np.append(np.asarray(p)[list(self.columns)], -1.0)
-        return float(np.sum((np.asarray(self.R) @ x) ** 2))
-
-    @property
-    def force_square(self) -> float:
-        """Sum of the squared forces of this joint's rows [N² m² or N²]."""
-        return float(np.sum(np.asarray(self.R)[:, -1] ** 2))
 
 
 class Factors(eqx.Module):
     """The factors of all joints.
 
     Attributes:
-        joints: One for each joint.
+        joints: Factor of each joint.
         size: Number of base parameters.
     """
 
     joints: tuple[JointFactor, ...]
     size: int = eqx.field(static=True)
 
+    def append(self, rows: Sequence[np.ndarray]) -> "Factors":
+        """Return the factors after more rows `[columns, force]` of each joint."""
+        pairs = zip(self.joints, rows, strict=True)
+        return Factors(tuple(joint.append(x) for joint, x in pairs), self.size)
+
     def __add__(self, other: "Factors") -> "Factors":
-        """The factors of both sets of rows together."""
-        pairs = zip(self.joints, other.joints, strict=True)
-        joined = [a.joined(b.R) for a, b in pairs]
-        rows = [a.rows + b.rows for a, b in zip(self.joints, other.joints, strict=True)]
-        return Factors(
-            tuple(JointFactor(j.columns, j.R, n) for j, n in zip(joined, rows, strict=True)),
-            self.size,
-        )
+        """Return the factors of both sets of rows together."""
+        joints = []
+        for a, b in zip(self.joints, other.joints, strict=True):
+            joints.append(JointFactor(a.columns, a.append(b.R).R, a.rows + b.rows))
+        return Factors(tuple(joints), self.size)
+
+    def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Factors":
+        """Return the factors of rows that are multiplied by one factor for each joint."""
+        pairs = zip(self.joints, np.asarray(factors), strict=True)
+        joints = [JointFactor(j.columns, x * np.asarray(j.R), j.rows) for j, x in pairs]
+        return Factors(tuple(joints), self.size)
 
     @property
     def rows(self) -> np.ndarray:
@@ -85,7 +148,7 @@ class Factors(eqx.Module):
     def weighted(
         self, weights: Float[AnyArray, " joints"]
     ) -> tuple[Float[np.ndarray, "height base"], Float[np.ndarray, " height"]]:
-        r"""Matrix and right-hand side with the norms of $W \Theta_B p$ and $W Q$ (Eq. 29)."""
+        r"""Return matrix and right-hand side with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
         blocks, forces = [], []
         for joint, w in zip(self.joints, np.asarray(weights), strict=True):
             R = w * np.asarray(joint.R)
@@ -98,29 +161,34 @@ class Factors(eqx.Module):
         return R[:, :-1], R[:, -1]
 
     def residual_squares(self, p: Float[AnyArray, " base"]) -> Float[np.ndarray, " joints"]:
-        """Sum of the squared residuals of each joint [N² m² or N²]."""
-        return np.array([j.residual_square(p) for j in self.joints])
+        """Return the sum of the squared residuals of each joint [N² m² or N²]."""
+        p = np.asarray(p)
+        vectors = [np.append(p[list(joint.columns)], -1.0) for joint in self.joints]
+        pairs = zip(self.joints, vectors, strict=True)
+        return np.array([np.sum((np.asarray(joint.R) @ x) ** 2) for joint, x in pairs])
 
     @property
     def force_squares(self) -> Float[np.ndarray, " joints"]:
         """Sum of the squared forces of each joint [N² m² or N²]."""
-        return np.array([j.force_square for j in self.joints])
+        return np.array([np.sum(np.asarray(joint.R)[:, -1] ** 2) for joint in self.joints])
 
 
-def condensed(parts: Sequence[Factors], most: int) -> list[Factors]:
-    """At most so many factors that stand for the same rows: neighbours are joined in pairs."""
-    parts = list(parts)
-    while len(parts) > most:
-        pairs = (parts[k : k + 2] for k in range(0, len(parts), 2))
-        parts = [functools.reduce(lambda x, y: x + y, pair) for pair in pairs]
-    return parts
+def empty_factors(columns: Columns, size: int) -> Factors:
+    """Return the factors of no rows.
+
+    Args:
+        columns: Parameters that can act on each joint.
+        size: Number of all parameters.
+    """
+    joints = (JointFactor(tuple(own), np.zeros((0, len(own) + 1)), 0) for own in columns)
+    return Factors(tuple(joints), size)
 
 
 class Blocks(eqx.Module):
-    """Factors of contiguous blocks of time, which together are all observations.
+    """Factors of contiguous blocks of time, which together hold all rows.
 
     Attributes:
-        parts: One for each block.
+        parts: Factors of each block.
     """
 
     parts: tuple[Factors, ...]
@@ -131,141 +199,18 @@ class Blocks(eqx.Module):
         return functools.reduce(lambda x, y: x + y, self.parts)
 
     def without(self, block: int) -> Factors:
-        """The factors of all rows but those of one block."""
+        """Return the factors of all rows but those of one block."""
         others = (*self.parts[:block], *self.parts[block + 1 :])
         return functools.reduce(lambda x, y: x + y, others)
 
+    def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Blocks":
+        """Return the factors of rows that are multiplied by one factor for each joint."""
+        return Blocks(tuple(part.scale_joints(factors) for part in self.parts))
 
-def empty(base: BaseParameters) -> Factors:
-    """Factors of no rows at all."""
-    return Factors(
-        tuple(
-            JointFactor(columns, np.zeros((0, len(columns) + 1)), 0)
-            for columns in acting_columns(base)
-        ),
-        base.size,
-    )
-
-
-def factorise(
-    base: BaseParameters,
-    recordings: Sequence[Observations],
-    blocks: int = BLOCKS,
-    progress: Progress | None = None,
-) -> Blocks:
-    """Reduces observations to the factors of their joints, by blocks of time (Eq. 26).
-
-    Columns are evaluated at the full rate and filtered like the forces, chunk by chunk: in NumPy,
-    or for long logs by a compiled loop, with the same result up to rounding.
-
-    Args:
-        base: The base parameters.
-        recordings: Observations of the same robot.
-        blocks: Number of blocks into which the counted rows of each recording are divided.
-        progress: Is told now and then which share of a long log is done, of 1.
-    """
-    parts, done = [], 0
-    whole = sum(observations.samples for observations in recordings)
-    for observations in recordings:
-        edges, samples = block_edges(observations, blocks), observations.samples
-        told = None if progress is None else _share_of(progress, done / whole, samples / whole)
-        if suits(observations):
-            parts += streamed(base, observations, edges, progress=told)
-        else:
-            parts += _in_numpy(base, observations, edges)
-        done += samples
-    return Blocks(tuple(parts))
-
-
-def _share_of(progress: Progress, done: float, share: float) -> Progress:
-    """The progress of one recording among several."""
-    return lambda own: progress(min(1.0, done + share * own))
-
-
-def block_edges(observations: Observations, blocks: int = BLOCKS) -> list[int]:
-    """Rows at which blocks of time with equally many counted rows begin, and the last one ends."""
-    counted = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
-    edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
-    return [0, *edges[1:], observations.rows]
-
-
-def _in_numpy(
-    base: BaseParameters, observations: Observations, edges: Sequence[int]
-) -> list[Factors]:
-    """The factors of blocks of time, without compiling."""
-    mask = np.asarray(observations.mask)
-    factors = [empty(base) for _ in edges[1:]]
-    for rows, columns, forces in reduced_rows(base, observations):
-        for k, (first, last) in enumerate(itertools.pairwise(edges)):
-            low, high = max(first, rows.start), min(last, rows.stop)
-            if low < high:
-                part = slice(low - rows.start, high - rows.start)
-                factors[k] = _joined(factors[k], columns, forces, mask[rows], part)
-    return factors
-
-
-def streamed(
-    base: BaseParameters,
-    observations: Observations,
-    edges: Sequence[int],
-    chunk: int = SAMPLES,
-    progress: Progress | None = None,
-) -> list[Factors]:
-    """The factors of blocks of time by the compiled loop, for logs of any length.
-
-    All devices of this process share the log; with one, nothing is shared.
-
-    Args:
-        base: The base parameters.
-        observations: What was measured.
-        edges: Rows at which the blocks begin, and the last one ends.
-        chunk: Samples of an iteration of the loop.
-        progress: Is told now and then which share of the log is done, of 1.
-    """
-    mask = np.asarray(observations.mask)
-    acting = acting_columns(base)
-    kind = StreamOnDevices if len(devices()) > 1 else Stream
-    triangles = kind(base, observations, edges, chunk, progress).triangles()
-    found = []
-    for R, (first, last) in zip(triangles, itertools.pairwise(edges), strict=True):
-        rows = mask[first:last].sum(axis=0)
-        joints = zip(acting, R, rows, strict=True)
-        found.append(Factors(tuple(JointFactor(c, r, int(n)) for c, r, n in joints), base.size))
-    return found
-
-
-def _joined(
-    factors: Factors, columns: list[np.ndarray], forces: np.ndarray, mask: np.ndarray, part: slice
-) -> Factors:
-    joints = []
-    for j, (joint, theta) in enumerate(zip(factors.joints, columns, strict=True)):
-        kept = mask[part, j]
-        joints.append(joint.joined(np.column_stack([theta[part], forces[part, j]])[kept]))
-    return Factors(tuple(joints), factors.size)
-
-
-def reduced_rows(
-    base: BaseParameters,
-    observations: Observations,
-    samples: int = CHUNK,
-    wanted: Sequence[tuple[int, int]] | None = None,
-):
-    """Goes through observations by chunks: row range, columns of each joint, and forces.
-
-    A known tool's forces are taken off the measured ones.
-
-    Args:
-        base: The base parameters.
-        observations: What was measured.
-        samples: Size of a chunk.
-        wanted: Ranges of rows; chunks without any of them are left out. All if None.
-
-    Yields:
-        Slice of the rows; for each joint its columns [rows, columns of the joint]; forces
-        [rows, joints] in [N m] or [N].
-    """
-    for chunk in observations.chunks(samples):
-        first, last = chunk.rows
-        if wanted is not None and not any(a < last and first < b for a, b in wanted):
-            continue
-        yield slice(*chunk.rows), *reduced(base, *observations.read(slice(*chunk.samples)), chunk)
+    def condense(self, most: int) -> "Blocks":
+        """Return the same rows in at most so many blocks; neighbours are joined in pairs."""
+        parts = list(self.parts)
+        while len(parts) > most:
+            pairs = (parts[k : k + 2] for k in range(0, len(parts), 2))
+            parts = [functools.reduce(lambda x, y: x + y, pair) for pair in pairs]
+        return Blocks(tuple(parts))

@@ -10,12 +10,10 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
-from jaxid.identification.held_out import FOLDS, folds
-from jaxid.identification.rows import Rows
-from jaxid.identification.streaming import Progress
+from jaxid.identification.problem import RegressionProblem, cross_validation_folds
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
 from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth
-from jaxid.measurement.observations import Observations, observe
+from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
 
@@ -181,12 +179,14 @@ def choose_filter(
     edge = max(c.filter.edge(dt) for c in candidates)
     widest = candidates[int(np.argmax(cutoffs))]
     judges = [_inner(_observed(x, robot, widest, slow), edge) for x in logs]
-    weights = np.asarray(estimator(Rows.of(base, judges)).weights)
+    weights = np.asarray(estimator(RegressionProblem(base, judges)).weights)
     errors, correlations = [], []
     for number, candidate in enumerate(candidates):
         seen = [_inner(_observed(x, robot, candidate, slow), edge) for x in logs]
-        rows = Rows.of(base, seen)
-        judge = Rows.of(base, [_with_motion(*pair) for pair in zip(judges, seen, strict=True)])
+        rows = RegressionProblem(base, seen)
+        judge = RegressionProblem(
+            base, [_with_motion(*pair) for pair in zip(judges, seen, strict=True)]
+        )
         errors.append(_errors(rows, judge, estimator, weights**2))
         correlations.append(_correlation(rows, estimator))
         if progress is not None:
@@ -222,16 +222,23 @@ def _with_motion(judge: Observations, observations: Observations) -> Observation
 
 
 def _errors(
-    rows: Rows, judge: Rows, estimator: AbstractEstimator, squares: Float[np.ndarray, " joints"]
+    rows: RegressionProblem,
+    judge: RegressionProblem,
+    estimator: AbstractEstimator,
+    squares: Float[np.ndarray, " joints"],
 ) -> Float[np.ndarray, " folds"]:
     """Errors on parts not seen, relative to the forces of all parts."""
-    whole = squares @ judge.factors.force_squares / FOLDS
-    pairs = zip(folds(rows.blocks), folds(judge.blocks), strict=True)
+    whole = squares @ judge.factors.force_squares / 5
+    pairs = zip(
+        cross_validation_folds(rows.blocks), cross_validation_folds(judge.blocks), strict=True
+    )
     return np.array(
         [
             np.sqrt(
                 squares
-                @ part.total.residual_squares(estimator(Rows(rows.base, rest)).parameters)
+                @ part.total.residual_squares(
+                    estimator(RegressionProblem(rows.base, blocks=rest)).parameters
+                )
                 / whole
             )
             for (rest, _), (_, part) in pairs
@@ -239,11 +246,11 @@ def _errors(
     )
 
 
-def _correlation(rows: Rows, estimator: AbstractEstimator) -> float:
+def _correlation(rows: RegressionProblem, estimator: AbstractEstimator) -> float:
     """How alike neighbouring rows of the residuals are: the mean of the joints."""
     power, alike = np.zeros(rows.robot.joints), np.zeros(rows.robot.joints)
     for chunk, residuals in rows.residuals(np.asarray(estimator(rows).parameters)):
-        e = np.where(chunk.counted, residuals, 0.0)
+        e = np.where(chunk.mask, residuals, 0.0)
         power += np.sum(e**2, axis=0)
         alike += np.sum(e[1:] * e[:-1], axis=0)
     return float(np.mean(alike / np.where(power > 0, power, 1.0)))

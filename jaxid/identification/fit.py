@@ -14,7 +14,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators import AbstractEstimator, EstimatorInWords
-from jaxid.identification.excited import UndeterminedDirection
+from jaxid.identification.identifiability import UndeterminedDirection
 from jaxid.identification.model_file import checksum_of, read_model, write_model
 from jaxid.identification.solutions import AbstractSpectralSolution
 from jaxid.identification.uncertainty.residuals import ResidualSpectra

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.identification.rows import RowChunk
+from jaxid.identification.factors import RowChunk
 
 
 class Channel(NamedTuple):
@@ -57,8 +57,8 @@ class ByJoint(AbstractInfluence):
     def channels(self, chunk, residuals):
         """One channel for each joint."""
         found = []
-        for j, (theta, own) in enumerate(zip(chunk.columns, chunk.acting, strict=True)):
-            counted = chunk.counted[:, j]
+        for j, (theta, own) in enumerate(zip(chunk.columns, chunk.indices, strict=True)):
+            counted = chunk.mask[:, j]
             rows = np.where(counted, np.asarray(self.weights)[j], 0.0)
             weighted = rows[:, None] * theta
             disturbance = rows * residuals[:, j]

@@ -8,9 +8,8 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, Estimate
-from jaxid.identification.factors import reduced_rows
 from jaxid.identification.influence import AbstractInfluence, Channel
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem, reduced_rows
 from jaxid.identification.solutions import NUMERICAL, Complete
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations
@@ -32,8 +31,8 @@ class InstrumentRows(AbstractInfluence):
     def channels(self, chunk, residuals):
         """One channel for each joint: its own equations, and the other motion's columns."""
         found = []
-        for j, (theta, own) in enumerate(zip(chunk.columns, chunk.acting, strict=True)):
-            counted = chunk.counted[:, j]
+        for j, (theta, own) in enumerate(zip(chunk.columns, chunk.indices, strict=True)):
+            counted = chunk.mask[:, j]
             rows = np.where(counted, np.asarray(self.weights)[j], 0.0)
             Z = rows[:, None] * np.asarray(self.instruments[chunk.recording][j])[chunk.rows]
             equations, disturbance = rows[:, None] * theta, rows * residuals[:, j]
@@ -68,7 +67,7 @@ class InstrumentalVariables(AbstractEstimator):
         Raises:
             InputError: If only factors of the rows are known, or the number of references is wrong.
         """
-        rows.require_seen("an estimate with instrumental variables")
+        rows.require_samples("an estimate with instrumental variables")
         weights = self.weights(rows.robot, rows.factors)
         count = len(rows.recordings)
         references, starts = (
@@ -128,7 +127,7 @@ def _columns(
     return tuple(np.concatenate(joint) for joint in zip(*parts, strict=True))
 
 
-def _inverse(information: np.ndarray, rows: Rows, weights: np.ndarray) -> np.ndarray:
+def _inverse(information: np.ndarray, rows: RegressionProblem, weights: np.ndarray) -> np.ndarray:
     R, _ = rows.factors.weighted(weights)
     norms = np.linalg.norm(R, axis=0)
     scale = np.where(norms > NUMERICAL * norms.max(initial=0.0), norms, np.inf)

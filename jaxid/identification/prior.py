@@ -11,7 +11,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.factors import Blocks, Factors
-from jaxid.identification.rows import Rows, Span
+from jaxid.identification.problem import RegressionProblem, Span
 from jaxid.identification.solutions import CrossValidated
 
 
@@ -58,16 +58,16 @@ class RelativeTo(AbstractEstimator):
         )
 
 
-class _Relative(Rows):
+class _Relative(RegressionProblem):
     """Rows whose forces are those that a prior does not explain."""
 
-    def __init__(self, whole: Rows, prior: np.ndarray):
+    def __init__(self, whole: RegressionProblem, prior: np.ndarray):
         self._whole, self._prior = whole, prior
         self._origin = np.asarray(whole.base.from_standard(prior))
         blocks = moved(whole.blocks, self._origin)
-        super().__init__(whole.base, blocks, whole.recordings, whole.progress)
+        super().__init__(whole.base, whole.recordings, whole.progress, blocks=blocks)
 
-    def with_base(self, base: BaseParameters) -> Rows:
+    def with_base(self, base: BaseParameters) -> RegressionProblem:
         return _Relative(self._whole.with_base(base), self._prior)
 
     def chunks(self, spans: Sequence[Span] | None = None):

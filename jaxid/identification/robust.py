@@ -9,7 +9,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, Estimate
 from jaxid.identification.influence import AbstractInfluence, Channel
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.solutions import AbstractSolution, Complete, Decomposition
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 
@@ -105,8 +105,8 @@ class RobustRows(AbstractInfluence):
         """Residuals enter as the loss lets them; a change of parameters by the mean slope."""
         found = []
         felt = self.loss.share(residuals / self.scale) * residuals
-        for j, (theta, own) in enumerate(zip(chunk.columns, chunk.acting, strict=True)):
-            counted = chunk.counted[:, j]
+        for j, (theta, own) in enumerate(zip(chunk.columns, chunk.indices, strict=True)):
+            counted = chunk.mask[:, j]
             rows = np.where(counted, np.asarray(self.weights)[j], 0.0)
             Z = rows[:, None] * theta
             slope = np.asarray(self.slope)[j]
@@ -143,7 +143,7 @@ class IterativelyReweighted(AbstractEstimator):
         Raises:
             InputError: If only factors of the rows are known.
         """
-        rows.require_seen("an iteratively reweighted estimate")
+        rows.require_samples("an iteratively reweighted estimate")
         weights = self.weights(rows.robot, rows.factors)
         start = Estimate.solved(rows, weights, self.solution.choose(rows.blocks, weights))
         p, _ = self._settled(rows, weights, np.asarray(start.parameters), Huber())
@@ -171,7 +171,7 @@ class IterativelyReweighted(AbstractEstimator):
         )
 
     def _settled(
-        self, rows: Rows, weights: np.ndarray, p: np.ndarray, loss: AbstractLoss
+        self, rows: RegressionProblem, weights: np.ndarray, p: np.ndarray, loss: AbstractLoss
     ) -> tuple[np.ndarray, float]:
         """Parameters that reweighting no longer changes, and the last change."""
         change = np.inf
@@ -191,13 +191,13 @@ class IterativelyReweighted(AbstractEstimator):
         return p, change
 
 
-def spread(rows: Rows, p: Float[np.ndarray, " base"]) -> Float[np.ndarray, " joints"]:
+def spread(rows: RegressionProblem, p: Float[np.ndarray, " base"]) -> Float[np.ndarray, " joints"]:
     """Standard deviation of each joint's ordinary residuals, from their median size [N m or N]."""
     step = max(1, -(-int(rows.factors.rows.max()) // MANY))
     found = [[] for _ in range(rows.robot.joints)]
     for chunk, residuals in rows.residuals(p):
         for j, own in enumerate(found):
-            own.append(np.abs(residuals[chunk.counted[:, j], j])[::step])
+            own.append(np.abs(residuals[chunk.mask[:, j], j])[::step])
     medians = np.array([np.median(np.concatenate(own)) for own in found])
     # Residuals of zero are of rows without noise: all count.
     floor = max(1e-12 * float(np.sqrt(rows.factors.force_squares.max())), np.finfo(float).tiny)
@@ -209,9 +209,9 @@ def _share(loss: AbstractLoss, scale: np.ndarray):
 
 
 def _mean_slope(
-    rows: Rows, p: np.ndarray, scale: np.ndarray, loss: AbstractLoss
+    rows: RegressionProblem, p: np.ndarray, scale: np.ndarray, loss: AbstractLoss
 ) -> Float[np.ndarray, " joints"]:
     total = np.zeros(len(scale))
     for chunk, residuals in rows.residuals(p):
-        total += np.sum(np.where(chunk.counted, loss.slope(residuals / scale), 0.0), axis=0)
+        total += np.sum(np.where(chunk.mask, loss.slope(residuals / scale), 0.0), axis=0)
     return total / np.maximum(rows.factors.rows, 1)

@@ -20,12 +20,10 @@ from jaxid.identification.estimators import (
     Estimate,
     WeightedLeastSquares,
 )
-from jaxid.identification.factors import factorise
 from jaxid.identification.fit import Fit
-from jaxid.identification.held_out import held_out_squares, weighted_error
-from jaxid.identification.identify import fit_rows
+from jaxid.identification.identify import fit_problem
 from jaxid.identification.influence import AbstractInfluence, Channel
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations
 
@@ -49,12 +47,12 @@ class ByAxis(AbstractInfluence):
     def channels(self, chunk, residuals):
         """One channel for each joint."""
         found = []
-        for j, (theta, acting) in enumerate(zip(chunk.columns, chunk.acting, strict=True)):
-            rows = np.asarray(self.weights)[j] * np.where(chunk.counted[:, j], 1.0, 0.0)
+        for j, (theta, acting) in enumerate(zip(chunk.columns, chunk.indices, strict=True)):
+            rows = np.asarray(self.weights)[j] * np.where(chunk.mask[:, j], 1.0, 0.0)
             weighted = rows[:, None] * theta
             own = np.array([k in self.decided[j] for k in acting], bool)
             instruments = np.where(own, weighted, 0.0)
-            counted = int(np.count_nonzero(chunk.counted[:, j]))
+            counted = int(np.count_nonzero(chunk.mask[:, j]))
             found.append(Channel(acting, instruments, weighted, rows * residuals[:, j], counted))
         return found
 
@@ -118,7 +116,7 @@ class Stepwise(AbstractEstimator):
         friction = friction_parameters(base)
         for observations in self.single_axes:
             j = _moving(base, observations)
-            joint = factorise(base, [observations], blocks=1).total.joints[j]
+            joint = RegressionProblem(base, [observations], divisions=1).factors.joints[j]
             R = np.asarray(joint.R)
             own = [c for c, k in enumerate(joint.columns) if k in friction]
             others = [c for c, k in enumerate(joint.columns) if k not in friction]
@@ -262,11 +260,24 @@ def identify_stepwise(
     recordings = (observations,) if single else tuple(observations)
     stepwise = Stepwise() if stepwise is None else stepwise
     at_once = WeightedLeastSquares(stepwise.weights) if at_once is None else at_once
-    rows = Rows.of(base, recordings)
-    whole, single_steps = (fit_rows(rows, estimator) for estimator in (at_once, stepwise))
+    rows = RegressionProblem(base, recordings)
+    whole, single_steps = (fit_problem(rows, estimator) for estimator in (at_once, stepwise))
     weights = np.asarray(single_steps.weights)
-    errors = [
-        weighted_error(held_out_squares(rows, estimator), rows, weights)
-        for estimator in (at_once, stepwise)
-    ]
+    errors = [_held_out_error(rows, estimator, weights) for estimator in (at_once, stepwise)]
     return StepwiseComparison(whole, single_steps, errors[0], errors[1])
+
+
+def _held_out_error(
+    problem: RegressionProblem, estimator: AbstractEstimator, weights: Float[np.ndarray, " joints"]
+) -> float:
+    """Return the weighted error on folds that the estimate has not seen, relative to the forces."""
+    w = np.asarray(weights) ** 2
+    squares = np.array(
+        [
+            part.total.residual_squares(
+                estimator(RegressionProblem(problem.base, blocks=rest)).parameters
+            )
+            for rest, part in cross_validation_folds(problem.blocks)
+        ]
+    )
+    return float(np.sqrt(np.sum(squares @ w) / (problem.factors.force_squares @ w)))

@@ -7,8 +7,8 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.identification.consistency.estimator import Consistency
-from jaxid.identification.excited import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
+from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
 from jaxid.identification.runs.comparison import LEVEL, Comparison, Verdict
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.solutions import AbstractSpectralSolution

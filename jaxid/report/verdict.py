@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxid.identification.excited import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
 from jaxid.table import Remark, Status, percent, significant
 from jaxid.validation import Definiteness, TorqueErrors

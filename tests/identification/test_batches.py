@@ -13,8 +13,6 @@ from jaxid.dynamics.machine import in_numpy
 from jaxid.identification import normal_equations
 from jaxid.identification.batches import identify_batch
 from jaxid.identification.bootstrap import bootstrap
-from jaxid.identification.factors import factorise
-from jaxid.identification.identify import fit_blocks
 
 SAMPLES = 150
 WEIGHTS = np.array([0.3, 2.0])
@@ -258,8 +256,8 @@ def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
     o = observations(base.model, standard_parameters(base.model), samples=12000, noise=2.0)
     order = np.random.default_rng(0).permutation(12000)
     o = o.replace(motion=o.motion[order], forces=o.forces[order])
-    blocks = factorise(base, [o], blocks=60)
-    fit = fit_blocks(base, blocks, jid.LeastSquares())
+    blocks = jid.RegressionProblem(base, [o], divisions=60).blocks
+    fit = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), jid.LeastSquares())
     draws = bootstrap(blocks, fit.weights, 4000, jax.random.key(0))
     np.testing.assert_allclose(
         np.mean(draws, axis=0), fit.parameters, atol=0.2 * fit.standard_deviations.max()
@@ -276,12 +274,16 @@ def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
 
 def test_bootstrap_refuses_what_it_cannot_answer(base):
     p = standard_parameters(base.model)
-    blocks = factorise(base, [observations(base.model, p, noise=1.0)], blocks=1)
+    blocks = jid.RegressionProblem(
+        base, [observations(base.model, p, noise=1.0)], divisions=1
+    ).blocks
     with pytest.raises(ValueError, match="at least two blocks"):
         bootstrap(blocks, WEIGHTS, 3, jax.random.key(0))
     still = [observations(base.model, p, still=(1,), noise=1.0), observations(base.model, p)]
     with pytest.raises(ValueError, match="do not determine all parameters"):
-        bootstrap(factorise(base, still, blocks=1), WEIGHTS, 50, jax.random.key(0))
+        bootstrap(
+            jid.RegressionProblem(base, still, divisions=1).blocks, WEIGHTS, 50, jax.random.key(0)
+        )
 
 
 def test_what_was_compiled_for_shapes_that_are_forgotten_is_given_back(base):

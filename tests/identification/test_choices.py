@@ -115,10 +115,12 @@ def test_axis_by_axis_is_what_it_says():
 def test_errors_are_handed_on_as_the_estimate_says():
     """The matrix of the estimate moves it by a disturbance as identifying again does."""
     o = virtual.observations(MODEL, P, noise=0.5)
-    rows = jid.Rows.of(BASE, [o])
+    rows = jid.RegressionProblem(BASE, [o])
     estimate = STEPWISE(rows)
     disturbance = 1e-3 * np.random.default_rng(7).normal(size=np.shape(o.forces))
-    moved = STEPWISE(jid.Rows.of(BASE, [o.replace(forces=np.asarray(o.forces) + disturbance)]))
+    moved = STEPWISE(
+        jid.RegressionProblem(BASE, [o.replace(forces=np.asarray(o.forces) + disturbance)])
+    )
     g = np.zeros(BASE.size)
     for chunk in rows.chunks():
         for channel in estimate.influence.channels(chunk, o.reduce(disturbance)[chunk.rows]):

@@ -14,9 +14,8 @@ import pytest
 from virtual import observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.devices import factorise_across_processes, factorise_on_devices
-from jaxid.identification.factors import Blocks, condensed, factorise
-from jaxid.identification.identify import fit_blocks
+from jaxid.identification.devices import factorise_across_processes
+from jaxid.identification.factors import Blocks
 
 HERE = Path(__file__).resolve().parent
 COMMON = """
@@ -25,8 +24,7 @@ import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 import jaxid as jid
 from virtual import observations, standard_parameters
-from jaxid.identification.devices import factorise_across_processes, factorise_on_devices
-from jaxid.identification.identify import fit_blocks
+from jaxid.identification.devices import factorise_across_processes
 
 if len(sys.argv) > 3:
     # Before anything else: making a robot may already start JAX.
@@ -45,21 +43,14 @@ def recording(seed):
 def say(*words):
     # In one piece: an unbuffered print writes word by word, and JAX's own log comes between.
     os.write(1, (" ".join(map(str, words)) + "\\n").encode())
-def write(blocks):
-    fit = fit_blocks(base, blocks, jid.LeastSquares())
+def write(problem):
+    fit = jid.fit_problem(problem, jid.LeastSquares())
     np.savez(sys.argv[1], p=fit.parameters, s=fit.naive_standard_deviations, rows=fit.rows)
-"""
-DEVICES = """
-assert len(jax.devices()) == 8
-o = recording(0)
-blocks = factorise_on_devices(base, o.motion, o.forces)
-assert len(blocks.parts) == 8
-write(blocks)
 """
 LONG = """
 assert len(jax.devices()) == int(sys.argv[2])
-from jaxid.identification import kernel, streaming
-streaming.LONG, kernel.PIECE = 1000, 2048
+from jaxid.identification import compiled, streaming
+streaming.LONG, compiled.PIECE = 1000, 2048
 o = observations(base.model, standard_parameters(base.model), samples=20011, noise=0.3,
                  filter=jid.ZeroPhaseButterworth(30.0), every=15)
 shares = []
@@ -81,7 +72,7 @@ from jaxid.identification import devices
 if number == 1:
     def killed(*_):
         os.kill(os.getpid(), signal.SIGKILL)
-    devices._sent = killed
+    devices._exchange = killed
 start = time.monotonic()
 try:
     factorise_across_processes(base, [recording(number)], patience=30.0)
@@ -169,14 +160,6 @@ def assert_same(path, fit):
     np.testing.assert_array_equal(found["rows"], fit.rows)
 
 
-def test_eight_devices(base, tmp_path):
-    process = start(DEVICES, tmp_path / "fit.npz", flags="--xla_force_host_platform_device_count=8")
-    (output,) = finish(process)
-    assert process.returncode == 0, output
-    fit = fit_blocks(base, factorise(base, [recording(base, 0)], 8), jid.LeastSquares())
-    assert_same(tmp_path / "fit.npz", fit)
-
-
 def test_a_long_log_on_three_devices_without_asking(tmp_path):
     flags = "--xla_force_host_platform_device_count={}"
     processes = [start(LONG, tmp_path / f"{n}.npz", n, flags=flags.format(n)) for n in (1, 3)]
@@ -189,18 +172,6 @@ def test_a_long_log_on_three_devices_without_asking(tmp_path):
     np.testing.assert_array_equal(one["rows"], three["rows"])
 
 
-def test_one_device_by_chunks(base, monkeypatch):
-    from jaxid.identification import devices
-
-    monkeypatch.setattr(devices, "AT_ONCE", 100)
-    o = recording(base, 0)
-    found = factorise_on_devices(base, o.motion, o.forces).total
-    expected = factorise(base, [o]).total
-    for a, b in zip(found.joints, expected.joints, strict=True):
-        assert a.rows == b.rows == 1003
-        np.testing.assert_allclose(a.R.T @ a.R, b.R.T @ b.R, rtol=1e-12, atol=1e-9)
-
-
 def test_two_processes(base, tmp_path):
     port = free_port()
     paths = [tmp_path / f"{k}.npz" for k in range(2)]
@@ -208,7 +179,7 @@ def test_two_processes(base, tmp_path):
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0, 0], "\n\n".join(outputs)
     recordings = [recording(base, k) for k in range(3)]
-    fit = fit_blocks(base, factorise(base, recordings), jid.LeastSquares())
+    fit = jid.fit_problem(jid.RegressionProblem(base, recordings), jid.LeastSquares())
     for path in paths:
         assert_same(path, fit)
     a, b = (np.load(path)["p"] for path in paths)
@@ -241,8 +212,8 @@ def test_three_processes_read_their_own_shards(base, tmp_path):
 
 
 def test_many_blocks_are_joined_in_pairs(base):
-    parts = factorise(base, [recording(base, 0)], 11).parts
-    few = condensed(parts, 4)
+    parts = jid.RegressionProblem(base, [recording(base, 0)], divisions=11).blocks.parts
+    few = Blocks(parts).condense(4).parts
     assert len(few) == 3
     total, expected = Blocks(tuple(few)).total, Blocks(parts).total
     np.testing.assert_array_equal(total.rows, expected.rows)
@@ -294,14 +265,11 @@ def test_a_first_process_that_is_killed_ends_the_others(tmp_path):
 
 def test_a_program_of_one_process_needs_no_coordinator(base):
     o = recording(base, 0)
-    a = factorise_across_processes(base, [o]).total.weighted(np.ones(2))
-    b = factorise(base, [o]).total.weighted(np.ones(2))
+    a = factorise_across_processes(base, [o]).factors.weighted(np.ones(2))
+    b = jid.RegressionProblem(base, [o]).blocks.total.weighted(np.ones(2))
     np.testing.assert_array_equal(a[0], b[0])
 
 
-def test_refusals(base):
-    o = recording(base, 0)
-    with pytest.raises(ValueError, match=r"must have the shape \[samples, 2\]"):
-        factorise_on_devices(base, o.motion, o.forces[1:])
+def test_refusals():
     with pytest.raises(ValueError, match="holds no file"):
         jid.shards(HERE)

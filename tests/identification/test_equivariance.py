@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.factors import Factors, factorise
+from jaxid.identification.factors import Factors
 from jaxid.identification.solutions import Complete, Decomposition
 
 TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
@@ -111,9 +111,9 @@ def test_the_order_of_rows_is_rounding(seed, order):
 @given(seed=seeds, added=st.integers(1, 50), blocks=st.integers(1, 10))
 def test_rows_of_zeros_and_the_number_of_blocks_change_nothing(seed, added, blocks):
     o = observed(seed)
-    total = factorise(BASE, [o]).total
+    total = jid.RegressionProblem(BASE, [o]).blocks.total
     padded = [j.joined(np.zeros((added, len(j.columns) + 1))) for j in total.joints]
-    divided = factorise(BASE, [o], blocks=blocks).total
+    divided = jid.RegressionProblem(BASE, [o], divisions=blocks).blocks.total
     expected, *others = (
         solved(factors) for factors in (total, Factors(tuple(padded), BASE.size), divided)
     )

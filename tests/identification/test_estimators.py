@@ -8,7 +8,6 @@ from scipy import optimize
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification import rows as rows_module
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 MEASURED = jid.MeasuredForces()
@@ -91,13 +90,8 @@ def test_every_estimator_follows_its_forces_and_judges_itself(base, noisy, k):
 @pytest.mark.parametrize("k", range(9))
 def test_every_estimator_goes_through_logs_that_are_not_held(base, noisy, k, monkeypatch):
     whole = jid.identify(base, noisy, members(noisy)[k])
-    monkeypatch.setattr(rows_module, "HELD", 0)
-    short = rows_module.reduced_rows
-
-    def in_parts(base, o, **options):
-        return short(base, o, samples=70, **options)
-
-    monkeypatch.setattr(rows_module, "reduced_rows", in_parts)
+    monkeypatch.setattr(jid.RegressionProblem, "cached_numbers", 0)
+    monkeypatch.setattr(jid.RegressionProblem, "samples_per_chunk", 70)
     parts = jid.identify(base, noisy, members(noisy)[k])
     np.testing.assert_allclose(parts.parameters, whole.parameters, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(parts.standard_deviations, whole.standard_deviations, rtol=1e-6)
@@ -105,9 +99,9 @@ def test_every_estimator_goes_through_logs_that_are_not_held(base, noisy, k, mon
 
 @pytest.mark.parametrize("k", range(3, 8))
 def test_what_needs_rows_refuses_factors(base, noisy, k):
-    blocks = jid.factorise(base, [noisy])
+    blocks = jid.RegressionProblem(base, [noisy]).blocks
     with pytest.raises(ValueError, match="needs the rows themselves, but only their factors"):
-        jid.fit_blocks(base, blocks, members(noisy)[k])
+        jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), members(noisy)[k])
 
 
 @pytest.mark.parametrize("loss", [jid.Huber(), jid.Tukey()])

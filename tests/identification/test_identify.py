@@ -5,7 +5,6 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.factors import factorise
 from jaxid.identification.fit import Trust
 from jaxid.identification.solutions import Decomposition
 
@@ -183,7 +182,7 @@ def test_well_excited_data_leave_nothing_open(base, noisy):
 
 def test_truncated_solution_leaves_weak_directions_at_zero(base, noisy):
     weights = np.ones(2)
-    blocks = factorise(base, [noisy])
+    blocks = jid.RegressionProblem(base, [noisy]).blocks
     d = Decomposition.of(*blocks.total.weighted(weights))
     share = float(d.values[4] / d.values[0]) * 0.999
     fit = jid.identify(base, noisy, jid.LeastSquares(jid.Truncated(share)))

@@ -7,12 +7,10 @@ import pytest
 import virtual
 
 import jaxid as jid
-from jaxid.identification.factors import factorise
 from jaxid.identification.nonlinear.estimator import NonlinearFriction
 from jaxid.identification.nonlinear.projection import Search, project
 from jaxid.identification.nonlinear.separable import SeparableRows
 from jaxid.identification.nonlinear.shapes import Shapes
-from jaxid.identification.rows import Rows
 
 ROBOT = jid.robots.planar_arm(3)
 TRUE_EPSILON, TRUE_SPEED = np.array([0.02, 0.05, 0.03]), np.array([0.2, 0.3, 0.15])
@@ -39,7 +37,7 @@ def observations(**changed):
 
 
 def separable(base, o, free=None):
-    rows = Rows.of(base, [o])
+    rows = jid.RegressionProblem(base, [o])
     return SeparableRows(rows, Shapes.of(base, free))
 
 
@@ -62,7 +60,7 @@ def test_factors_are_those_of_the_model_with_these_shapes():
     rows = separable(START, o)
     x = np.array([0.01, 0.02, 0.03, 0.5, 0.2, 0.1])
     found = rows.blocks(x)
-    other = factorise(rows.shapes.set(START, x), [o])
+    other = jid.RegressionProblem(rows.shapes.set(START, x), [o]).blocks
     for a, b in zip(found.parts, other.parts, strict=True):
         R, z = a.weighted(np.array([1.0, 2.0, 3.0]))
         S, y = b.weighted(np.array([1.0, 2.0, 3.0]))
@@ -169,9 +167,9 @@ def test_what_cannot_be_searched_is_refused():
     zero = dataclasses.replace(START, model=model(0.04, np.array([0.1, 0.0, 0.1])))
     with pytest.raises(ValueError, match="`vs2` must begin at a positive number"):
         Shapes.of(zero).values(zero)
-    blocks = factorise(START, [observations(samples=300)])
+    blocks = jid.RegressionProblem(START, [observations(samples=300)]).blocks
     with pytest.raises(ValueError, match="needs the rows themselves"):
-        jid.fit_blocks(START, blocks, NonlinearFriction(WLS))
+        jid.fit_problem(jid.RegressionProblem(START, blocks=blocks), NonlinearFriction(WLS))
 
 
 def test_friction_falls_with_temperature_as_fits_at_several_tell():

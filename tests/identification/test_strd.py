@@ -28,7 +28,7 @@ def solved(X, y):
     size = X.shape[1]
     joint = JointFactor(tuple(range(size)), np.zeros((0, size + 1)), 0)
     for part in np.array_split(np.column_stack([X, y]), 2):
-        joint = joint.joined(part)
+        joint = joint.append(part)
     found = Decomposition.of(*Factors((joint,), size).weighted(np.ones(1)))
     inverse = Complete().inverse(found.values)
     return found.solve(inverse), found, inverse

@@ -10,9 +10,9 @@ from virtual import dense, motion, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification import streaming
-from jaxid.identification.factors import Blocks, factorise, streamed
-from jaxid.identification.identify import fit_blocks
-from jaxid.identification.response import response
+from jaxid.identification.compiled import impulse_response
+from jaxid.identification.factors import Blocks
+from jaxid.identification.streaming import stream_blocks
 from jaxid.robot.robot import Robot
 
 WEIGHTS = np.array([0.3, 2.0])
@@ -49,7 +49,7 @@ def changed(o: jid.Observations, **fields) -> jid.Observations:
 def fast(base, o, blocks=4, chunk=2048) -> Blocks:
     counted = np.flatnonzero(np.asarray(o.mask).any(axis=1))
     edges = [int(part[0]) for part in np.array_split(counted, blocks)]
-    return Blocks(tuple(streamed(base, o, [0, *edges[1:], o.rows], chunk)))
+    return Blocks(tuple(stream_blocks(base, o, [0, *edges[1:], o.rows], chunk=chunk)))
 
 
 def scaled_gram(factors, weights) -> tuple[np.ndarray, np.ndarray]:
@@ -65,12 +65,18 @@ def distance(a, b, weights=WEIGHTS) -> float:
 
 
 def agree(base, o, **options) -> None:
-    got, expected = fast(base, o, **options), factorise(base, [o], options.get("blocks", 4))
+    got, expected = (
+        fast(base, o, **options),
+        jid.RegressionProblem(base, [o], divisions=options.get("blocks", 4)).blocks,
+    )
     np.testing.assert_array_equal(got.total.rows, expected.total.rows)
     assert distance(got.total, expected.total) < 1e-12
     for a, b in zip(got.parts, expected.parts, strict=True):
         assert distance(a, b) < 1e-12
-    p, q = (fit_blocks(base, x, jid.LeastSquares()).parameters for x in (got, expected))
+    p, q = (
+        jid.fit_problem(jid.RegressionProblem(base, blocks=x), jid.LeastSquares()).parameters
+        for x in (got, expected)
+    )
     norms = np.linalg.norm(expected.total.weighted(np.ones(2))[0], axis=0)
     assert np.linalg.norm(norms * (p - q)) <= 1e-12 * np.linalg.norm(norms * q)
 
@@ -112,7 +118,7 @@ def test_a_known_tool():
 
 def test_forces_without_noise_are_explained_to_rounding(base):
     o = observed(base, noise=0.0)
-    fit = fit_blocks(base, fast(base, o), jid.LeastSquares())
+    fit = jid.fit_problem(jid.RegressionProblem(base, blocks=fast(base, o)), jid.LeastSquares())
     assert fit.residual < 1e-13
 
 
@@ -135,7 +141,7 @@ def test_nothing_depends_on_the_length_of_chunks(base):
 
 def test_a_response_is_what_filtering_an_impulse_gives():
     low_pass = jid.ZeroPhaseButterworth(30.0).low_pass(1e-3)
-    h = response(low_pass)
+    h = impulse_response(low_pass)
     half = len(h) // 2
     impulse = np.zeros(6 * half + 1)
     impulse[3 * half] = 1.0
@@ -161,9 +167,9 @@ def test_seven_joints_against_a_dense_matrix():
 
 def test_long_logs_take_the_compiled_pass_by_themselves(base, monkeypatch):
     o = observed(base, mask=np.random.default_rng(3).random((6000, 2)) < 0.7)
-    slow = factorise(base, [o, o], 5)
+    slow = jid.RegressionProblem(base, [o, o], divisions=5).blocks
     monkeypatch.setattr(streaming, "LONG", 5000)
-    quick = factorise(base, [o, o], 5)
+    quick = jid.RegressionProblem(base, [o, o], divisions=5).blocks
     assert len(quick.parts) == 10
     assert distance(slow.total, quick.total) < 1e-12
     assert [len(j.columns) for j in quick.total.joints] == [

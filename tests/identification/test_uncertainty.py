@@ -29,7 +29,7 @@ def base():
 
 
 def seen(base, recordings):
-    rows = jid.Rows.of(base, recordings)
+    rows = jid.RegressionProblem(base, recordings)
     e = ESTIMATOR(rows)
     return lines_of(rows, e.influence, e.inverse, e.parameters), e
 
@@ -96,13 +96,13 @@ def coverage(base, recordings, memory, draws, seed=0):
     lines, e = found_lines(base, recordings)
     table = SpectralTable(lines)
     w = np.asarray(e.weights)
-    rows = jid.Rows.of(base, recordings)
+    rows = jid.RegressionProblem(base, recordings)
     error, parts = np.zeros((draws, base.size)), []
     for o, chunks in zip(recordings, by_recording(rows), strict=True):
         A = np.zeros((o.rows, len(w), base.size))
         for chunk in chunks:
-            for j, own in enumerate(chunk.acting):
-                A[chunk.rows, j, list(own)] = w[j] * chunk.counted[:, j, None] * chunk.columns[j]
+            for j, own in enumerate(chunk.indices):
+                A[chunk.rows, j, list(own)] = w[j] * chunk.mask[:, j, None] * chunk.columns[j]
         noise = w * coloured(random, (draws, o.rows, len(w)), memory, o.row_time)
         noise = noise * np.asarray(o.mask)
         error += np.einsum("dtj,tjk->dk", noise, A) @ np.asarray(e.inverse)
@@ -235,8 +235,8 @@ def test_every_way_gives_a_whole_uncertainty(base, method):
 
 def test_factors_alone_are_judged_by_blocks(base):
     o = observations(base.model, standard_parameters(base.model), noise=0.3)
-    blocks = jid.factorise(base, [o], 12)
-    fit = jid.fit_blocks(base, blocks, ESTIMATOR)
+    blocks = jid.RegressionProblem(base, [o], divisions=12).blocks
+    fit = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), ESTIMATOR)
     left_out = np.array(
         [
             np.linalg.lstsq(*blocks.without(k).weighted(fit.weights), rcond=None)[0]
@@ -247,7 +247,8 @@ def test_factors_alone_are_judged_by_blocks(base):
     np.testing.assert_allclose(fit.standard_deviations, expected, rtol=1e-7)
     assert (fit.uncertainty.freedom == 11).all()
     assert any("blocks of time that were left out in turn" in note for note in fit.notes)
-    one = jid.fit_blocks(base, jid.factorise(base, [o], 1), ESTIMATOR)
+    blocks = jid.RegressionProblem(base, [o], divisions=1).blocks
+    one = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), ESTIMATOR)
     np.testing.assert_array_equal(one.standard_deviations, one.naive_standard_deviations)
     assert any("only one block of time" in note for note in one.notes)
 

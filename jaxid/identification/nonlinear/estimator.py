@@ -12,7 +12,7 @@ from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSqua
 from jaxid.identification.nonlinear.projection import Found, Search
 from jaxid.identification.nonlinear.separable import SeparableRows
 from jaxid.identification.nonlinear.shapes import Free, Shapes
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 
 STARTS = (0.2, 1.0, 5.0)
 """Multiples of the shapes among which the search chooses its beginning, joint by joint."""
@@ -48,7 +48,7 @@ class NonlinearFriction(AbstractEstimator):
         return dataclasses.replace(estimate, notes=(*estimate.notes, *not_converged(found)))
 
     def search(
-        self, rows: Rows, weights: Float[np.ndarray, " joints"]
+        self, rows: RegressionProblem, weights: Float[np.ndarray, " joints"]
     ) -> tuple[Shapes, SeparableRows, Found]:
         """What was looked for, in which rows, and where the search has ended.
 

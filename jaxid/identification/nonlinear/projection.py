@@ -17,8 +17,8 @@ import numpy as np
 import optimistix as optx
 
 from jaxid.arrays import AnyArray, Float
+from jaxid.identification.compiled import on_cpu
 from jaxid.identification.factors import Factors
-from jaxid.identification.kernel import on_cpu
 from jaxid.identification.nonlinear.separable import SeparableRows, joined
 from jaxid.identification.solutions import Complete, Decomposition
 

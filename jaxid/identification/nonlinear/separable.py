@@ -13,9 +13,9 @@ from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.machine import program_of
 from jaxid.errors import InputError
-from jaxid.identification.factors import CHUNK, Blocks, Factors, JointFactor
+from jaxid.identification.factors import Blocks, Factors, JointFactor, RowChunk
 from jaxid.identification.nonlinear.shapes import Shapes
-from jaxid.identification.rows import RowChunk, Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.program import evaluate_packed
 
 MOST = 2**28
@@ -97,8 +97,8 @@ class SeparableRows:
         InputError: If only factors are known, or the rows are too many to be held.
     """
 
-    def __init__(self, rows: Rows, shapes: Shapes):
-        rows.require_seen("nonlinear friction")
+    def __init__(self, rows: RegressionProblem, shapes: Shapes):
+        rows.require_samples("nonlinear friction")
         base = rows.base
         self._rows, self.base, self.shapes = rows, base, shapes
         self._owner = ShapedColumns.of(base, shapes)
@@ -126,12 +126,12 @@ class SeparableRows:
         """Number of columns of the factors."""
         return self.base.size + len(self.pairs)
 
-    def _held(self, rows: Rows) -> list[Piece]:
+    def _held(self, rows: RegressionProblem) -> list[Piece]:
         varying, pieces, size = set(self.varying), [], 0
         self._fixed = []
         for chunk in rows.chunks():
             if not pieces:
-                self._fixed = [[k for k in own if k not in varying] for own in chunk.acting]
+                self._fixed = [[k for k in own if k not in varying] for own in chunk.indices]
             pieces.append(self._factored(chunk))
             size += sum(Q.size for Q in pieces[-1].Q)
             if size > MOST:
@@ -144,17 +144,15 @@ class SeparableRows:
     def _factored(self, chunk: RowChunk) -> Piece:
         bases, triangles, rests = [], [], []
         for j, fixed in enumerate(self._fixed):
-            counted = chunk.counted[:, j]
-            kept = [chunk.acting[j].index(k) for k in fixed]
+            counted = chunk.mask[:, j]
+            kept = [chunk.indices[j].index(k) for k in fixed]
             Q, R = np.linalg.qr(chunk.columns[j][counted][:, kept])
             forces = chunk.forces[counted, j]
             along = Q.T @ forces
             bases.append(Q)
             triangles.append(np.column_stack([R, along]))
             rests.append(forces - Q @ along)
-        return Piece(
-            chunk.recording, chunk.block, chunk.rows, chunk.counted, bases, triangles, rests
-        )
+        return Piece(chunk.recording, chunk.block, chunk.rows, chunk.mask, bases, triangles, rests)
 
     def blocks(self, x: Float[np.ndarray, " shapes"]) -> Blocks:
         """The factors by blocks of time for some shapes."""

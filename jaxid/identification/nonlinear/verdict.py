@@ -10,16 +10,15 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.factors import Blocks
 from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_rows
+from jaxid.identification.identify import fit_problem
 from jaxid.identification.nonlinear.estimator import NonlinearFriction, not_converged
 from jaxid.identification.nonlinear.projection import Found, Search, project
 from jaxid.identification.nonlinear.separable import SeparableRows, joined
 from jaxid.identification.nonlinear.shapes import Shapes
 from jaxid.identification.nonlinear.slopes import with_slopes
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.solutions import Complete, Decomposition
-from jaxid.identification.streaming import Progress
-from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Observations, Progress
 
 FOLDS = 5
 WORTH = 0.01
@@ -147,14 +146,14 @@ def identify_nonlinear(
     single = isinstance(observations, Observations)
     recordings = (observations,) if single else tuple(observations)
     estimator = NonlinearFriction() if estimator is None else estimator
-    beside = Rows.of(base if linear is None else linear, recordings)
-    before = fit_rows(beside, estimator.linear)
+    beside = RegressionProblem(base if linear is None else linear, recordings)
+    before = fit_problem(beside, estimator.linear)
     weights = np.asarray(before.weights)
-    shapes, separable, found = estimator.search(Rows.of(base, recordings), weights)
+    shapes, separable, found = estimator.search(RegressionProblem(base, recordings), weights)
     chosen = shapes.set(base, found.x)
-    fit = fit_rows(Rows.of(chosen, recordings), estimator.linear)
-    whole = fit_rows(
-        Rows.of(with_slopes(chosen, shapes, fit.parameters), recordings), estimator.linear
+    fit = fit_problem(RegressionProblem(chosen, recordings), estimator.linear)
+    whole = fit_problem(
+        RegressionProblem(with_slopes(chosen, shapes, fit.parameters), recordings), estimator.linear
     )
     covariance, size = np.asarray(whole.covariance), base.size
     own = whole.uncertainty.of_first(size)

@@ -1,6 +1,5 @@
 """How late a log's forces are against its angles, found from the model itself."""
 
-import itertools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -11,14 +10,8 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.factors import (
-    Blocks,
-    Factors,
-    JointFactor,
-    block_edges,
-    empty,
-    reduced_rows,
-)
+from jaxid.identification.factors import Blocks, RowChunk
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.comparison import joint_test
 from jaxid.identification.runs.left_out import block_covariance
 from jaxid.identification.solutions import Complete, Decomposition
@@ -101,12 +94,12 @@ def estimate_delay(
     common[:size, :size] = np.eye(size)
     common[size:, size] = 1.0
     each = -(-BLOCKS // len(recordings))
-    whole = _together(base, recordings, np.zeros(size), each)
+    whole = _with_delays(base, recordings, np.zeros(size), each)
     w = (MaximumForces() if weights is None else weights)(base.model.robot, whole.total)
     p, seconds = _solved(*whole.total.weighted(w))[0][:size], 0.0
     step = np.inf
     for _ in range(PASSES):
-        blocks = _together(base, [without_delay(o, seconds) for o in recordings], p, each)
+        blocks = _with_delays(base, [without_delay(o, seconds) for o in recordings], p, each)
         R, z = blocks.total.weighted(w)
         x, B = _solved(R @ common, z)
         p, step = x[:size], float(x[size])
@@ -134,46 +127,29 @@ def estimate_delay(
     )
 
 
-def _together(
+def _with_delays(
     base: BaseParameters,
     recordings: Sequence[Observations],
     p: Float[np.ndarray, " base"],
-    blocks: int,
+    divisions: int,
 ) -> Blocks:
-    return Blocks(tuple(part for o in recordings for part in _factors(base, o, p, blocks)))
+    """Return factors with a column for the delay of each joint behind the others."""
+    late = []
+    for o in recordings:
+        forces = compiled.forces(base, p, o.motion)
+        dt = o.sample_time
+        rates = np.concatenate([np.gradient(forces[a:b], dt, axis=0) for a, b in o.segments])
+        late.append(-o.reduce(rates))
 
+    def equations(chunk: RowChunk) -> list[np.ndarray]:
+        delays = late[chunk.recording][chunk.rows]
+        rows = zip(chunk.columns, delays.T, chunk.forces.T, chunk.mask.T, strict=True)
+        return [np.column_stack([theta, d, force])[kept] for theta, d, force, kept in rows]
 
-def _factors(
-    base: BaseParameters, observations: Observations, p: Float[np.ndarray, " base"], blocks: int
-) -> list[Factors]:
-    """Factors of blocks of time, with a column for the delay of each joint behind the others."""
-    o, n = observations, base.model.robot.joints
-    forces = compiled.forces(base, p, o.motion)
-    rates = np.concatenate([np.gradient(forces[a:b], o.sample_time, axis=0) for a, b in o.segments])
-    late = -o.reduce(rates)
-    mask, edges = np.asarray(o.mask), block_edges(o, blocks)
-    found = [_widened(part, base.size) for part in [empty(base)] * (len(edges) - 1)]
-    for rows, columns, measured in reduced_rows(base, o):
-        for k, (low, high) in enumerate(itertools.pairwise(edges)):
-            a, b = max(low, rows.start), min(high, rows.stop)
-            if a >= b:
-                continue
-            own, joints = slice(a - rows.start, b - rows.start), []
-            for j in range(n):
-                kept = mask[a:b, j]
-                parts = [columns[j][own], late[a:b, j], measured[own, j]]
-                joints.append(found[k].joints[j].joined(np.column_stack(parts)[kept]))
-            found[k] = Factors(tuple(joints), base.size + n)
-    return found
-
-
-def _widened(factors: Factors, size: int) -> Factors:
-    """Room for one more column of each joint."""
-    joints = tuple(
-        JointFactor((*joint.columns, size + j), np.zeros((0, len(joint.columns) + 2)), 0)
-        for j, joint in enumerate(factors.joints)
-    )
-    return Factors(joints, size + len(joints))
+    acting = enumerate(compiled.acting_columns(base))
+    columns = [(*own, base.size + j) for j, own in acting]
+    problem = RegressionProblem(base, recordings, divisions=divisions)
+    return problem.fold(equations, columns, base.size + len(columns))
 
 
 def _solved(

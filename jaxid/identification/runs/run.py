@@ -12,13 +12,12 @@ from jaxid.errors import InputError
 from jaxid.identification.estimators import WeightedLeastSquares
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_blocks, fit_rows
-from jaxid.identification.rows import Rows
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.estimates import freedom_of, with_covariance
 from jaxid.identification.solutions import Complete, Decomposition
-from jaxid.identification.streaming import Progress
 from jaxid.identification.weights import AbstractWeights, GivenWeights, MaximumForces
-from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Observations, Progress
 
 ROUNDING = 1e-7
 """Difference of predicted forces, relative to the forces, up to which estimates are the same."""
@@ -76,12 +75,12 @@ class Run(eqx.Module):
         """
         single = isinstance(observations, Observations)
         recordings = (observations,) if single else tuple(observations)
-        rows = Rows.of(base, recordings, progress)
+        rows = RegressionProblem(base, recordings, progress)
         chosen = MaximumForces() if weights is None else weights
-        return cls._fitted(rows, fit_rows(rows, WeightedLeastSquares(chosen)), name)
+        return cls._fitted(rows, fit_problem(rows, WeightedLeastSquares(chosen)), name)
 
     @classmethod
-    def of_rows(cls, rows: Rows, fit: Fit, name: str | None = None) -> "Run":
+    def of_rows(cls, rows: RegressionProblem, fit: Fit, name: str | None = None) -> "Run":
         """What rows tell that a fit has seen.
 
         Where the fit's estimates are not weighted least squares, as those of robust, regularised or
@@ -97,11 +96,11 @@ class Run(eqx.Module):
         plain = decomposition.solve(Complete().inverse(decomposition.values))
         same = fit.base.names == rows.base.names and is_same(R, z, plain, fit.parameters)
         if not same:
-            fit = fit_rows(rows, WeightedLeastSquares(GivenWeights(np.asarray(fit.weights))))
+            fit = fit_problem(rows, WeightedLeastSquares(GivenWeights(np.asarray(fit.weights))))
         return cls._fitted(rows, fit, name)
 
     @classmethod
-    def _fitted(cls, rows: Rows, fit: Fit, name: str | None) -> "Run":
+    def _fitted(cls, rows: RegressionProblem, fit: Fit, name: str | None) -> "Run":
         return cls(
             base=rows.base,
             blocks=rows.blocks,
@@ -133,7 +132,8 @@ class Run(eqx.Module):
     def fit(self) -> Fit:
         """The estimates as a fit: to validate, compare and report."""
         estimator = WeightedLeastSquares(GivenWeights(self.weights))
-        fit = fit_blocks(self.base, self.blocks, estimator, self.recordings)
+        problem = RegressionProblem(self.base, blocks=self.blocks, names=self.recordings)
+        fit = fit_problem(problem, estimator)
         return with_covariance(fit, self.parameters, self.covariance, self.freedom)
 
     def weighted_like(self, weights: Float[AnyArray, " joints"]) -> "Run":

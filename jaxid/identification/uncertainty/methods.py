@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.identification.estimators import Estimate
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.uncertainty.jackknife import jackknife
 from jaxid.identification.uncertainty.residuals import ResidualSpectra, residual_spectra
 from jaxid.identification.uncertainty.sandwich import sandwich
@@ -21,7 +21,7 @@ class AbstractUncertainty(eqx.Module):
 
     @abstractmethod
     def __call__(
-        self, rows: Rows, estimate: Estimate, naive: Float[np.ndarray, "base base"]
+        self, rows: RegressionProblem, estimate: Estimate, naive: Float[np.ndarray, "base base"]
     ) -> tuple[Uncertainty, ResidualSpectra | None]:
         """The uncertainty, and spectra of the residuals where it has looked at the rows.
 
@@ -43,7 +43,7 @@ class SpectralSandwich(AbstractUncertainty):
 
     def __call__(self, rows, estimate, naive):
         """The sandwich, with the jackknife beside it."""
-        if not rows.seen:
+        if not rows.has_samples:
             found, _ = BlockJackknife()(rows, estimate, naive)
             said = (
                 "standard deviations come from blocks of time that were left out in turn: only "

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.identification.influence import AbstractInfluence, Channel
-from jaxid.identification.rows import Rows
+from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.uncertainty.stretches import (
     FAINT,
     filled,
@@ -75,7 +75,7 @@ class Seen(NamedTuple):
 
 
 def lines_of(
-    rows: Rows,
+    rows: RegressionProblem,
     influence: AbstractInfluence,
     inverse: Float[AnyArray, "base base"],
     p: Float[AnyArray, " base"],
@@ -98,7 +98,7 @@ def lines_of(
         pieces = [influence.channels(chunk, residuals) for chunk, residuals in parts]
         if not len(correlated):
             correlated = np.zeros((len(BINS) + 1, len(pieces[0]), *B.shape))
-        r = np.concatenate([np.where(chunk.counted, r, 0.0) for chunk, r in parts])
+        r = np.concatenate([np.where(chunk.mask, r, 0.0) for chunk, r in parts])
         n = lengths[stretch.length, stretch.row_time]
         lines = _transformed(n, stretch.row_time, pieces, r, B, o, correlated)
         key = (n, stretch.row_time, len(lines.frequency))

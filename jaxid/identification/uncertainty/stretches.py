@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.identification.rows import RowChunk, Rows
+from jaxid.identification.factors import RowChunk
+from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
 
 LONGEST_ROWS = 2**15
@@ -41,7 +42,7 @@ class Stretch(NamedTuple):
         return self.rows[1] - self.rows[0]
 
 
-def stretches(rows: Rows) -> tuple[list[Stretch], bool]:
+def stretches(rows: RegressionProblem) -> tuple[list[Stretch], bool]:
     """Divides recordings into stretches.
 
     Rows of different stretches count as independent: the error is of the size of the noise's memory
@@ -93,7 +94,7 @@ def passes(observations: Observations, frequency: Float[np.ndarray, " lines"]) -
 
 
 def gathered(
-    rows: Rows, wanted: list[Stretch], p: np.ndarray
+    rows: RegressionProblem, wanted: list[Stretch], p: np.ndarray
 ) -> Iterator[tuple[Stretch, list[tuple[RowChunk, np.ndarray]]]]:
     """Goes through rows once and hands out the chunks, with residuals, of each stretch."""
     coming = iter(wanted)

@@ -67,7 +67,7 @@ def test_factors_of_a_log_in_parts_are_enough(panda):
     base, _, o = panda
     estimator = jid.PhysicallyConsistent(WEIGHTS)
     whole = jid.identify(base, o, estimator)
-    parts = jid.fit_blocks(base, jid.factorise(base, o.split(0.5)), estimator)
+    parts = jid.fit_problem(jid.RegressionProblem(base, o.split(0.5)), estimator)
     np.testing.assert_allclose(parts.parameters, whole.parameters, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(
         parts.consistency.residual_increase, whole.consistency.residual_increase, atol=1e-6

@@ -1,4 +1,4 @@
-"""Which combinations of parameters a recording does not determine."""
+"""Combinations of parameters that a recording does not determine."""
 
 import equinox as eqx
 import numpy as np
@@ -9,23 +9,18 @@ from jaxid.identification.factors import Blocks
 from jaxid.identification.solutions import NUMERICAL, Decomposition
 
 LARGEST_UNCERTAINTY = 0.1
-"""Share of the whole forces by which an undetermined combination may be wrong."""
-SHOWN = 0.3
-"""Parameters below this share of a direction's largest one are left out of its sentence."""
-
-NAMED = 5
-"""Most parameters that a sentence names."""
+"""Fraction of the forces by which an undetermined combination may be wrong."""
 
 
 class UndeterminedDirection(eqx.Module):
-    """A combination of base parameters that the forces hardly depend on.
+    """A combination of base parameters on which the forces hardly depend.
 
     Attributes:
         parts: Indices of the base parameters in it, the largest first.
-        shares: Their shares, as they count in the forces; the largest is 1.
-        singular_value: Of the scaled observation matrix, relative to the largest.
-        uncertainty: Standard deviation of the forces that this combination's parameters make one by
-            one, relative to the recording's whole forces, of 1; infinite if it was not moved.
+        shares: Their fractions, as they count in the forces; the largest is 1.
+        singular_value: Singular value of the scaled observation matrix, relative to the largest.
+        uncertainty: Standard deviation of the forces that the parameters of this combination make
+            one by one, relative to all forces; infinite if the combination was not moved.
     """
 
     parts: tuple[int, ...] = eqx.field(static=True)
@@ -34,19 +29,19 @@ class UndeterminedDirection(eqx.Module):
     uncertainty: float
 
     def sentence(self, base: BaseParameters) -> str:
-        """The combination in words, with the names of the base parameters."""
+        """Return the combination in words, with the names of five base parameters at most."""
         names = [base.names[k] for k in self.parts]
         if len(names) == 1:
             return f"{names[0]} is not determined"
-        if len(names) > NAMED:
-            names = [*names[: NAMED - 1], f"{len(names) - NAMED + 1} others"]
+        if len(names) > 5:
+            names = [*names[:4], f"{len(names) - 4} others"]
         return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
 
 
-def undetermined_directions(
+def undetermined(
     blocks: Blocks, weights: Float[AnyArray, " joints"], decomposition: Decomposition
 ) -> tuple[UndeterminedDirection, ...]:
-    r"""Finds directions in which the data leave more open than they tell.
+    r"""Return the directions in which the data leave more open than they tell.
 
     Scale the parameters so that each of them alone makes forces of its own column's length. A step
     along a singular direction changes the forces by the singular value $s$ only. The noise along it
@@ -57,8 +52,8 @@ def undetermined_directions(
 
     Args:
         blocks: Factors of contiguous blocks of time.
-        weights: Of the joints.
-        decomposition: Of the weighted observation matrix.
+        weights: Weights of the joints.
+        decomposition: Decomposition of the weighted observation matrix.
     """
     s, V = np.asarray(decomposition.values), np.asarray(decomposition.directions)
     size = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
@@ -68,13 +63,12 @@ def undetermined_directions(
     sums = np.zeros(len(s))
     for part in blocks.parts:
         R, z = part.weighted(weights)
-        g = V @ ((R.T @ (R @ p - z)) / np.asarray(decomposition.scale))
-        sums += g**2
+        sums += (V @ ((R.T @ (R @ p - z)) / np.asarray(decomposition.scale))) ** 2
     count = len(blocks.parts)
     deviations = np.sqrt(sums * count / max(count - 1, 1)) * inverse
     floor = np.finfo(float).eps * size
-    whole = max(size, np.finfo(float).tiny)
-    uncertainty = np.where(live, np.maximum(deviations, floor) / whole, np.inf)
+    forces = max(size, np.finfo(float).tiny)
+    uncertainty = np.where(live, np.maximum(deviations, floor) / forces, np.inf)
     return tuple(
         _direction(V[k], float(s[k] / s[0]), float(uncertainty[k]))
         for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]
@@ -85,7 +79,8 @@ def _direction(
     direction: Float[AnyArray, " base"], value: float, uncertainty: float
 ) -> UndeterminedDirection:
     size = np.abs(direction) / np.abs(direction).max()
-    order = [int(k) for k in np.argsort(-size, kind="stable") if size[k] >= SHOWN]
+    # Parameters below 0.3 of the largest one are left out.
+    order = [int(k) for k in np.argsort(-size, kind="stable") if size[k] >= 0.3]
     signs = np.sign(direction[order]) * np.sign(direction[order[0]])
     shares = tuple(float(x) for x in signs * size[order])
     return UndeterminedDirection(tuple(order), shares, value, uncertainty)

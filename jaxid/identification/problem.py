@@ -1,0 +1,310 @@
+"""The regression problem of identification: one pass over the rows makes all its factors."""
+
+import functools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+import numpy as np
+
+from jaxid.arrays import Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.compiled import acting_columns
+from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
+from jaxid.identification.factors import (
+    Blocks,
+    Columns,
+    Factors,
+    RowChunk,
+    divide_rows,
+    empty_factors,
+    reduce_chunk,
+)
+from jaxid.identification.streaming import stream_blocks, suits
+from jaxid.measurement.observations import Observations, Progress
+from jaxid.robot.robot import Robot
+
+Span = tuple[int, int, int]
+"""Index of a recording, and the half-open range of some of its rows."""
+
+
+class RegressionProblem:
+    r"""Linear equations $\Theta p = Q$ of some recordings, and the factors of their rows (Eq. 26).
+
+    Most estimators need only `blocks` or `factors`: one triangle for each joint. Estimators that
+    need the rows themselves, or residuals, iterate over `chunks`, in memory or from files alike.
+    Columns are kept between passes as long as they are few (`cached_numbers`).
+
+    Args:
+        base: Base parameters, which are the unknowns.
+        recordings: Observations of the robot; empty where only factors are known.
+        progress: Callback, called with the completed fraction (0 to 1) of a pass over long logs.
+        divisions: Number of blocks of time into which the rows of each recording are divided.
+        blocks: Factors by blocks of time, if they were made before.
+        names: Names of the recordings; by default their own.
+    """
+
+    samples_per_chunk = 65536
+    """Samples whose columns are evaluated at once."""
+    cached_numbers = 2**26
+    """Numbers (half a gigabyte) up to which columns are kept for the next pass."""
+
+    def __init__(
+        self,
+        base: BaseParameters,
+        recordings: Sequence[Observations] = (),
+        progress: Progress | None = None,
+        *,
+        divisions: int = 10,
+        blocks: Blocks | None = None,
+        names: Sequence[str] | None = None,
+    ):
+        self.base, self.progress = base, progress
+        self.recordings = tuple(recordings)
+        self.names = tuple(o.name for o in recordings) if names is None else tuple(names)
+        self._given = blocks
+        self._edges = [block_edges(o, divisions) for o in recordings]
+        self._cache: dict[int, list[RowChunk]] = {}
+
+    @property
+    def robot(self) -> Robot:
+        """Robot of the base parameters."""
+        return self.base.model.robot
+
+    @functools.cached_property
+    def blocks(self) -> Blocks:
+        """The factors by contiguous blocks of time, made by the first pass over the rows."""
+        if self._given is not None:
+            return self._given
+        self.require_samples("a pass over the rows")
+        parts = self._empty(acting_columns(self.base), self.base.size)
+        done, samples = 0, [o.samples for o in self.recordings]
+        for number, recording in enumerate(self.recordings):
+            if suits(recording):
+                edges, first = self._edges[number], self._first_block(number)
+                report = self._part_of_progress(done / sum(samples), samples[number] / sum(samples))
+                own = stream_blocks(self.base, recording, edges, report)
+                parts[first : first + len(own)] = own
+            else:
+                _append(parts, self._chunks(number), RowChunk.equations)
+            done += samples[number]
+        return Blocks(tuple(parts))
+
+    @functools.cached_property
+    def factors(self) -> Factors:
+        """The factors of all rows together."""
+        return self.blocks.total
+
+    @property
+    def has_samples(self) -> bool:
+        """Whether the rows themselves are known, and not only their factors."""
+        return bool(self.recordings)
+
+    def require_samples(self, task: str) -> None:
+        """Check that the rows themselves are known.
+
+        Args:
+            task: Task that needs rows, as it reads at the beginning of a sentence.
+
+        Raises:
+            InputError: If only factors are known.
+        """
+        if not self.has_samples:
+            raise InputError(
+                f"{task} needs the rows themselves, but only their factors are known: use "
+                "`identify` with the recordings."
+            )
+
+    def with_base(self, base: BaseParameters) -> "RegressionProblem":
+        """Return the problem of the same recordings with other base parameters.
+
+        For estimators that search for constants of the model's terms.
+
+        Raises:
+            InputError: If only factors are known.
+        """
+        self.require_samples("another model")
+        return RegressionProblem(base, self.recordings, self.progress)
+
+    def fold(
+        self,
+        equations: Callable[[RowChunk], Sequence[np.ndarray]],
+        columns: Columns | None = None,
+        size: int | None = None,
+    ) -> Blocks:
+        """Return the factors of transformed rows, by blocks of time.
+
+        Args:
+            equations: Function from a chunk to the rows `[columns, force]` of each joint.
+            columns: Parameters to which these columns belong; by default those of the rows.
+            size: Number of all parameters; by default that of the base parameters.
+
+        Raises:
+            InputError: If only factors are known.
+        """
+        columns = acting_columns(self.base) if columns is None else columns
+        parts = self._empty(columns, self.base.size if size is None else size)
+        _append(parts, self.chunks(), equations)
+        return Blocks(tuple(parts))
+
+    def _empty(self, columns: Columns, size: int) -> list[Factors]:
+        return [empty_factors(columns, size)] * self._first_block(len(self.recordings))
+
+    def chunks(self, spans: Sequence[Span] | None = None) -> Iterator[RowChunk]:
+        """Yield the rows, recording by recording, in their order.
+
+        Args:
+            spans: Rows that are needed; chunks without any of them may be left out. By default all.
+
+        Raises:
+            InputError: If only factors are known.
+        """
+        self.require_samples("a pass over the rows")
+        for number in range(len(self.recordings)):
+            wanted = None if spans is None else [(a, b) for k, a, b in spans if k == number]
+            yield from self._chunks(number, wanted)
+
+    def _chunks(
+        self, number: int, wanted: Sequence[tuple[int, int]] | None = None
+    ) -> Iterator[RowChunk]:
+        """Yield the rows of one recording; keep them if they are all made and few."""
+        if number in self._cache:
+            yield from self._cache[number]
+            return
+        kept: list[RowChunk] | None = [] if wanted is None else None
+        available = self.cached_numbers - sum(map(_numbers, self._cache.values()))
+        for chunk in self._evaluate(number, wanted):
+            if kept is not None:
+                kept.append(chunk)
+                kept = kept if _numbers(kept) <= available else None
+            yield chunk
+        if kept is not None:
+            self._cache[number] = kept
+
+    def _evaluate(
+        self, number: int, wanted: Sequence[tuple[int, int]] | None
+    ) -> Iterator[RowChunk]:
+        observations = self.recordings[number]
+        mask, indices = np.asarray(observations.mask), acting_columns(self.base)
+        reduced = reduced_rows(self.base, observations, self.samples_per_chunk, wanted=wanted)
+        for rows, columns, forces in reduced:
+            whole = RowChunk(number, 0, rows, indices, columns, forces, mask[rows])
+            for block, own in divide_rows(self._edges[number], rows):
+                part = whole.part(slice(own.start - rows.start, own.stop - rows.start))
+                yield part._replace(block=self._first_block(number) + block)
+            if self.progress is not None:
+                done = sum(o.rows for o in self.recordings[:number]) + rows.stop
+                self.progress(done / sum(o.rows for o in self.recordings))
+
+    def _first_block(self, number: int) -> int:
+        return sum(len(edges) - 1 for edges in self._edges[:number])
+
+    def _part_of_progress(self, start: float, fraction: float) -> Progress | None:
+        """Return the progress of one recording among several."""
+        progress = self.progress
+        if progress is None:
+            return None
+        return lambda done: progress(min(1.0, start + fraction * done))
+
+    def residuals(
+        self, p: np.ndarray, spans: Sequence[Span] | None = None
+    ) -> Iterator[tuple[RowChunk, np.ndarray]]:
+        """Yield the rows with the residuals of some parameters [rows, joints]."""
+        for chunk in self.chunks(spans):
+            yield chunk, chunk_residuals(chunk, p)
+
+    def reweighted(
+        self, p: np.ndarray, weight: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    ) -> Blocks:
+        """Return the factors of rows that have weights of their own, by the same blocks of time.
+
+        Args:
+            p: Base parameters, which give each row its residual.
+            weight: Function from residuals and mask [rows, joints] to weights from 0 to 1.
+        """
+
+        def equations(chunk: RowChunk) -> list[np.ndarray]:
+            root = np.sqrt(weight(chunk_residuals(chunk, p), chunk.mask))
+            parts = zip(chunk.equations(), root.T, chunk.mask.T, strict=True)
+            return [w[kept, None] * rows for rows, w, kept in parts]
+
+        return self.fold(equations)
+
+
+def chunk_residuals(chunk: RowChunk, p: np.ndarray) -> Float[np.ndarray, "rows joints"]:
+    """Return measured less predicted forces of some rows [N m or N]."""
+    pairs = zip(chunk.columns, chunk.indices, strict=True)
+    predicted = [theta @ p[list(own)] for theta, own in pairs]
+    return chunk.forces - np.stack(predicted, axis=1)
+
+
+def _append(
+    parts: list[Factors],
+    chunks: Iterable[RowChunk],
+    equations: Callable[[RowChunk], Sequence[np.ndarray]],
+) -> None:
+    """Append the equations of some chunks to the factors of their blocks."""
+    for chunk in chunks:
+        parts[chunk.block] = parts[chunk.block].append(equations(chunk))
+
+
+def _numbers(chunks: Sequence[RowChunk]) -> int:
+    return sum(x.size for chunk in chunks for x in chunk.columns)
+
+
+def block_edges(observations: Observations, blocks: int) -> list[int]:
+    """Return the first row of each block of time, and the end of the last one.
+
+    All blocks have equally many rows that count.
+    """
+    counted = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
+    edges = [int(part[0]) for part in np.array_split(counted, blocks) if len(part)]
+    return [0, *edges[1:], observations.rows]
+
+
+def reduced_rows(
+    base: BaseParameters,
+    observations: Observations,
+    samples: int = RegressionProblem.samples_per_chunk,
+    read: Callable[[slice], tuple[Motion, np.ndarray]] | None = None,
+    wanted: Sequence[tuple[int, int]] | None = None,
+) -> Iterator[tuple[slice, list[np.ndarray], np.ndarray]]:
+    """Yield the rows of observations by chunks; forces of a known tool are subtracted.
+
+    Args:
+        base: The base parameters.
+        observations: Observations of a recording.
+        samples: Samples of a chunk.
+        read: Function that returns motion and forces of some samples; by default those of the log.
+        wanted: Ranges of rows; chunks without any of them are left out. By default all.
+
+    Yields:
+        Range of the rows; columns of each joint [rows, columns of the joint]; forces
+        [rows, joints] in [N m] or [N].
+    """
+    read = observations.read if read is None else read
+    for chunk in observations.chunks(samples):
+        first, last = chunk.rows
+        if wanted is not None and not any(a < last and first < b for a, b in wanted):
+            continue
+        yield slice(*chunk.rows), *reduce_chunk(base, *read(slice(*chunk.samples)), chunk)
+
+
+def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blocks, Blocks]]:
+    """Yield the blocks of time without one contiguous part, and that part, for each part in turn.
+
+    Args:
+        blocks: At least two blocks of time.
+        count: Number of parts.
+
+    Raises:
+        InputError: If there are fewer than two blocks.
+    """
+    size = len(blocks.parts)
+    if size < 2:
+        raise InputError(
+            "held-out errors need at least two blocks of rows, but there is one: record longer."
+        )
+    for part in np.array_split(np.arange(size), min(count, size)):
+        out = part.tolist()
+        rest = tuple(b for k, b in enumerate(blocks.parts) if k not in out)
+        yield Blocks(rest), Blocks(tuple(blocks.parts[k] for k in out))
