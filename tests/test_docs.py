@@ -24,6 +24,7 @@ from jaxid.experiment.mistakes import BAD
 from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
 from jaxid.experiment.sanity import SURE
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
+from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
 from jaxid.measurement.columns import Columns
 from jaxid.report.verdict import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO
 from jaxid.simulation.virtual import random_bodies
