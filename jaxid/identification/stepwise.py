@@ -23,7 +23,7 @@ from jaxid.identification.estimators import (
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.influence import AbstractInfluence, Channel
-from jaxid.identification.problem import RegressionProblem
+from jaxid.identification.problem import RegressionProblem, cross_validation_folds
 from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations
 

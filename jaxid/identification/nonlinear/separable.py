@@ -178,7 +178,7 @@ class SeparableRows:
         """The rows of everything that depends on shapes, for one recording."""
         observations = self._rows.recordings[number]
         found = np.empty((observations.rows, len(self._needed)))
-        for chunk in observations.chunks(CHUNK):
+        for chunk in observations.chunks(RegressionProblem.samples_per_chunk):
             motion, _ = observations.read(slice(*chunk.samples))
             arrays = (np.asarray(a, np.float64).T for a in (motion.q, motion.qd, motion.qdd))
             packed = evaluate_packed(self._program, np.asarray(x), *arrays)
