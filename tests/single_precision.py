@@ -95,7 +95,7 @@ def batch():
 def designed():
     return jid.design_excitation(
         base, harmonics=2, omega=1.0, starts=2, polish=1, generations=0, samples=50, key=key
-    ).numbers
+    ).trajectory.coefficients
 
 
 CASES = {

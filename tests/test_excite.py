@@ -19,8 +19,8 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from jaxid import cli
 from jaxid.errors import InputError
+from jaxid.excitation.criteria import CRITERIA
 from jaxid.excitation.limits import JointLimits
-from jaxid.excitation.plan import CRITERIA
 from jaxid.experiment.decoder import keys_of
 from jaxid.experiment.excitation import (
     compare_criteria,
@@ -344,7 +344,7 @@ def test_the_guide_shows_every_key():
 def test_limits_that_nobody_gave_are_named(written, excited):
     (written / "open.toml").write_text(EXPERIMENT.replace("acceleration = [4]", ""))
     robot = load_experiment(written / "open.toml").robot
-    limits = JointLimits.of(robot, excited.plan.limits.basis)
+    limits = JointLimits(robot, excited.plan.limits.basis)
     plan = dataclasses.replace(excited.plan, limits=limits)
     said = [remark.text for remark in plan_remarks(plan)]
     assert "Assumed, because not given: acceleration of `hinge` (8 rad/s²)." in said
@@ -384,8 +384,8 @@ def test_every_criterion_can_be_compared(written, run, monkeypatch):
     assert [plan.criterion.name for plan in plans] == [c.name for c in CRITERIA[:2]]
     for k, plan in enumerate(plans):
         assert plan.criteria[k].after <= 1.001 * min(p.criteria[k].after for p in plans)
-    assert told[-1].share == 1.0
-    assert "criterion 2 of 2" in told[-1].doing
+    assert told[-1].fraction == 1.0
+    assert "criterion 2 of 2" in told[-1].task
 
 
 def test_ctrl_c_ends_the_comparison_of_criteria_too(excited, run, no_pictures, monkeypatch):

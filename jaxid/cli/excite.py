@@ -9,7 +9,7 @@ from rich.text import Text
 
 from jaxid.cli.options import ExperimentFile, open_console
 from jaxid.errors import InputError
-from jaxid.excitation.plan import CRITERIA
+from jaxid.excitation.criteria import CRITERIA
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.folder import refuse_foreign_table

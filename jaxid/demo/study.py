@@ -288,7 +288,7 @@ def _design(
             polish=0,
             samples=SAMPLES,
             key=jax.random.key(seed),
-            progress=lambda now: progress(name, now.share),
+            progress=lambda now: progress(name, now.fraction),
             throw=False,
         )
 

@@ -1,1 +1,1 @@
-"""Motions that tell parameters apart: criteria, constraints, solvers, design (Eq. 36)."""
+"""Excitation: motions that determine the base parameters well; problem, solver, design (Eq. 36)."""

@@ -1,4 +1,6 @@
-r"""What a motion tells of the base parameters: the information matrix $\Theta_B^T W^2 \Theta_B$."""
+r"""Information of a motion about the base parameters: the matrix $\Theta_B^T W^2 \Theta_B$."""
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -14,69 +16,18 @@ from jaxid.trajectory.basis import AbstractBasis
 
 
 class Information(eqx.Module):
-    r"""The information of an experiment, as criteria need it.
+    r"""Information of an experiment, as criteria need it.
 
     Attributes:
         plain: The paper's $\Lambda = \Theta_B^T \Theta_B$ (Eq. 36).
-        weighted: The same in units of the noise, with what was known before; its inverse is the
+        weighted: The same in units of the noise, plus prior information; its inverse is the
             covariance of weighted least squares.
-        sizes: A size of each parameter, in its own unit.
+        sizes: Typical size of each parameter, in its unit.
     """
 
     plain: Float[AnyArray, "*batch base base"]
     weighted: Float[AnyArray, "*batch base base"]
     sizes: Float[AnyArray, " base"]
-
-
-class InformationMap(eqx.Module):
-    """From the numbers of a trajectory to its information, for many trajectories at once.
-
-    Attributes:
-        rows: The base regressor, joint by joint.
-        motion: Position, velocity and acceleration of a joint at the samples, by its numbers.
-        repeats: Measured samples that each evaluated one stands for.
-        weights: One over the standard deviation of each joint's noise [1/(N m) or 1/N].
-        prior: Information of earlier experiments.
-        sizes: A size of each parameter.
-    """
-
-    rows: JointRows
-    motion: Float[AnyArray, "3 samples variables"]
-    repeats: float
-    weights: Float[AnyArray, " joints"]
-    prior: Float[AnyArray, "base base"]
-    sizes: Float[AnyArray, " base"]
-
-    @classmethod
-    def of(
-        cls,
-        base: BaseParameters,
-        basis: AbstractBasis,
-        *,
-        evaluated: int,
-        measured: int,
-        weights: Float[AnyArray, " joints"],
-        prior: Float[AnyArray, "base base"],
-        sizes: Float[AnyArray, " base"],
-    ) -> "InformationMap":
-        """Evaluates a motion at few samples, and counts them as if all had been measured."""
-        motion = basis.rows(basis.times(evaluated))[:3]
-        rows = JointRows.of_base(base).for_gradients
-        return cls(rows, motion, measured / evaluated, weights, prior, sizes)
-
-    def __call__(self, x: Float[AnyArray, "starts joints variables"]) -> Information:
-        """The information of some trajectories of the basis."""
-        arrays = [jnp.einsum("sk,bjk->jbs", part, x) for part in np.asarray(self.motion)]
-        plain = jnp.zeros((x.shape[0], self.rows.size, self.rows.size), x.dtype)
-        weighted = plain
-        for own, columns, w in zip(
-            self.rows.columns, self.rows(*arrays), self.weights, strict=True
-        ):
-            k = np.array(own, int)
-            gram = self.repeats * jnp.asarray(_gram(columns))
-            plain = plain.at[:, k[:, None], k].add(gram)
-            weighted = weighted.at[:, k[:, None], k].add(w**2 * gram)
-        return Information(plain, weighted + self.prior[None], self.sizes)
 
 
 def information(
@@ -86,20 +37,20 @@ def information(
     prior: Float[AnyArray, "base base"] | None = None,
     sizes: Float[AnyArray, " base"] | None = None,
 ) -> Information:
-    """The information of one motion, sample by sample in NumPy (Eq. 36).
+    """Return the information of one motion, computed in NumPy (Eq. 36).
 
     Args:
-        base: The base parameters.
+        base: Base parameters.
         motion: All samples that will be measured.
-        weights: One over the standard deviation of each joint's noise [1/(N m) or 1/N].
+        weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
         prior: Information of earlier experiments; none if None.
-        sizes: A size of each parameter; one if None.
+        sizes: Typical size of each parameter; one if None.
     """
     plain = np.zeros((base.size, base.size))
     weighted = plain.copy() if prior is None else np.array(prior, np.float64)
-    rows = JointRows.of_base(base)
+    columns = JointRows.of_base(base).columns
     for own, theta, w in zip(
-        rows.columns, regressor_rows(base, motion), np.asarray(weights), strict=True
+        columns, regressor_rows(base, motion), np.asarray(weights), strict=True
     ):
         gram = theta.T @ theta
         place = np.ix_(own, own)
@@ -108,11 +59,67 @@ def information(
     return Information(plain, weighted, np.ones(base.size) if sizes is None else sizes)
 
 
+def information_map(
+    base: BaseParameters,
+    basis: AbstractBasis,
+    *,
+    samples: int,
+    measured: int,
+    weights: Float[AnyArray, " joints"],
+    prior: Float[AnyArray, "base base"],
+) -> Callable[[Float[Array, "starts joints variables"]], tuple[Array, Array]]:
+    """Return a function from coefficients of many trajectories to their information matrices.
+
+    Args:
+        base: Base parameters.
+        basis: Family of trajectories.
+        samples: Number of samples at which motions are evaluated.
+        measured: Number of measured samples for which they stand.
+        weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
+        prior: Information of earlier experiments.
+
+    Returns:
+        Function whose results are the plain and the weighted information.
+    """
+    rows = JointRows.of_base(base).for_gradients
+    motion = np.asarray(basis.rows(basis.times(samples))[:3])
+
+    def evaluate(x: Float[Array, "starts joints variables"]) -> tuple[Array, Array]:
+        arrays = [jnp.einsum("sk,bjk->jbs", part, x) for part in motion]
+        plain = jnp.zeros((x.shape[0], rows.size, rows.size), x.dtype)
+        weighted = plain
+        for own, columns, w in zip(rows.columns, rows(*arrays), weights, strict=True):
+            k = np.array(own, int)
+            gram = measured / samples * jnp.asarray(_gram(columns))
+            plain = plain.at[:, k[:, None], k].add(gram)
+            weighted = weighted.at[:, k[:, None], k].add(w**2 * gram)
+        return plain, weighted + prior[None]
+
+    return evaluate
+
+
+def standard_deviations(weighted: Float[AnyArray, "base base"]) -> Float[np.ndarray, " base"]:
+    """Return standard deviations from weighted information; infinite for undetermined parameters.
+
+    Args:
+        weighted: Weighted information.
+    """
+    weighted = np.asarray(weighted, np.float64)
+    square = np.diag(weighted)
+    scale = 1.0 / np.sqrt(np.where(square > 0, square, 1.0))
+    values, U = np.linalg.eigh(scale[:, None] * weighted * scale[None])
+    lost = values < 1e-12 * values[-1]
+    variances = (U[:, ~lost] ** 2 / values[None, ~lost]).sum(axis=1)
+    # A parameter is undetermined if it takes part in a direction without information.
+    undetermined = (np.abs(U[:, lost]) > 1e-3).any(axis=1)
+    return np.where(undetermined, np.inf, scale * np.sqrt(variances))
+
+
 @jax.custom_vjp
 def _gram(
     columns: Float[Array, "starts columns samples"],
 ) -> Float[Array, "starts columns columns"]:
-    """Products of columns; their derivative takes one product, where the plain rule takes two."""
+    """Return products of columns; the derivative takes one product instead of two."""
     return jnp.einsum("bis,bjs->bij", columns, columns)
 
 

@@ -1,8 +1,9 @@
 """A primal-dual interior point method with quasi-Newton curvature, for many starts in lockstep.
 
-Minimises f(y) subject to |R y - c| <= b, rows joint by joint. Each iteration evaluates value and
-gradient of every start once; the step towards the barrier's minimum needs products with the rows
-and one Cholesky factor for each start. Curvature is a damped BFGS matrix [1, procedure 18.2].
+Minimises f(y) subject to |R y - c| <= b, rows joint by joint, and to constraints that are not
+linear, which a common slack may exceed at a penalty. Each iteration evaluates value and gradient of
+every start once; the step towards the barrier's minimum needs products with the rows and one
+Cholesky factor for each start. Curvature is a damped BFGS matrix [1, procedure 18.2].
 
 [1] J. Nocedal, S. Wright, Numerical Optimization, 2nd ed., 2006, chapters 18 and 19.
 """
@@ -10,37 +11,23 @@ and one Cholesky factor for each start. Curvature is a damped BFGS matrix [1, pr
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Int
-from jaxid.excitation.limits import Grid, held_within
-
-TO_BOUNDARY = 0.995
-"""Share of the way to the next limit that a step may go."""
-DECREASE = 1e-4
-"""Share of the promised decrease that a step must give."""
-DAMPING = 0.1
-"""Curvature along a step is kept above this share of what was expected."""
-PATIENCE = 8
-"""Refused steps in a row before the curvature is forgotten."""
-COOLING = 0.9
-"""Factor of the barrier after a good step."""
-INSIDE = 0.985
-"""Share of the bound within which a stage starts."""
-REFINED = 12
-"""Steps of Newton's method that find the allowance of a motion."""
+from jaxid.arrays import AnyArray, Array, Bool, Float, Int
+from jaxid.excitation.limits import Grid
 
 
 class Evaluation(NamedTuple):
-    """What an objective gives for some starts; a leading axis for them.
+    """Objective and constraints of some starts; a leading axis for them.
 
     Attributes:
-        value: To be made small.
-        gradient: By the scaled numbers.
-        excess: Of each constraint that is not linear; not positive where it is kept.
-        slopes: Of these, by the scaled numbers.
+        value: Objective.
+        gradient: Its derivatives by the scaled coefficients.
+        excess: Constraints that are not linear; not positive where they are kept.
+        slopes: Their derivatives by the scaled coefficients.
     """
 
     value: Float[Array, "*starts"]
@@ -49,107 +36,112 @@ class Evaluation(NamedTuple):
     slopes: Float[Array, "*starts constraints scaled"]
 
     @classmethod
-    def free(cls, value: Array, gradient: Array) -> "Evaluation":
-        """That of an objective without constraints."""
+    def unconstrained(cls, value: Array, gradient: Array) -> "Evaluation":
+        """Return the evaluation of an objective without constraints."""
         none = gradient[..., None, :][..., :0, :]
         return cls(value, gradient, none[..., 0], none)
 
 
-class Bounds(NamedTuple):
-    """Something for each inequality: how much room it has left, or its multiplier.
+class Inequalities(NamedTuple):
+    """One number for each inequality: its distance from the bound, or its multiplier.
 
     Attributes:
-        limits: Of the joints, upwards and downwards.
-        constraints: What is not linear; it may be exceeded by the allowance.
-        allowance: Which must not be negative; one number, or none without constraints.
+        limits: Limits of the joints, upwards and downwards.
+        constraints: Constraints that are not linear, which the slack may exceed.
+        slack: Sign of the slack; one number, or none without constraints.
     """
 
     limits: Float[Array, "*starts 2 joints rows"]
     constraints: Float[Array, "*starts constraints"]
-    allowance: Float[Array, "*starts allowances"]
+    slack: Float[Array, "*starts slacks"]
 
 
 class State(NamedTuple):
-    """Where the starts are; a leading axis for them."""
+    """State of the method; a leading axis for the starts.
+
+    `y`, `slack`, `evaluation` and `duals` are the present point, `step`, `dual_step`, `length` and
+    `dual_length` the next trial, `slope` is the derivative of the merit along the step, `refused`
+    counts refused steps in a row, and `fresh` says that the point is yet to be evaluated.
+    """
 
     y: Float[Array, "*starts scaled"]
-    allowance: Float[Array, "*starts allowances"]
-    seen: Evaluation
-    duals: Bounds
+    slack: Float[Array, "*starts slacks"]
+    evaluation: Evaluation
+    duals: Inequalities
     curvature: Float[Array, "*starts scaled scaled"]
     barrier: Float[Array, "*starts"]
-    step: Float[Array, "*starts scaled_and_allowance"]
-    dual_step: Bounds
+    step: Float[Array, "*starts scaled_and_slack"]
+    dual_step: Inequalities
     length: Float[Array, "*starts"]
     dual_length: Float[Array, "*starts"]
     slope: Float[Array, "*starts"]
     refused: Int[Array, "*starts"]
-    fresh: Array
+    fresh: Bool[Array, "*starts"]
 
 
 class Stage(NamedTuple):
-    """One leg of a schedule.
+    """Bounds and barrier of one run of the method.
 
     Attributes:
-        bound: Limits are relaxed or tightened to this multiple of themselves.
+        bound: Multiple to which limits are relaxed or tightened.
         barrier: Weight of the logarithmic barrier at the start.
         least: Weight below which the barrier does not fall.
-        iterations: Number of evaluations.
-        price: Of the allowance by which constraints are exceeded.
+        penalty: Penalty of the slack by which constraints are exceeded.
     """
 
-    bound: float
-    barrier: float
-    least: float
-    iterations: int
-    price: float = 10.0
+    bound: Float[Array, ""] | float
+    barrier: Float[Array, ""] | float
+    least: Float[Array, ""] | float
+    penalty: Float[Array, ""] | float = 10.0
 
 
-class InteriorPoint:
-    """The method for one problem.
+class InteriorPoint(eqx.Module):
+    """The method within limits of the joints.
 
-    Args:
-        objective: From scaled numbers of all starts and a context to values and gradients.
+    Attributes:
         grid: Rows of the limits.
-        still: Scaled numbers of half of each joint's range.
-        stiffness: Curvature to begin with: small, so that first steps are large.
+        stiffness: Initial curvature: small, so that first steps are large.
+        to_boundary: Fraction of the way to the next limit that a step may go.
+        decrease: Fraction of the promised decrease that a step must give.
+        damping: Fraction of the expected curvature along a step below which it is damped.
+        patience: Refused steps in a row after which the curvature is forgotten.
+        cooling: Factor of the barrier after a good step.
+        inside: Fraction of the bound within which a stage starts.
     """
 
-    def __init__(
-        self,
-        objective: Callable[[Array, Any], Evaluation],
-        grid: Grid,
-        still: Float[AnyArray, "joints variables"],
-        stiffness: float = 0.3,
-    ):
-        self._objective, self._grid, self._still = objective, grid, still
-        self._stiffness = stiffness
-        self._run = jax.jit(self._iterate)
+    grid: Grid
+    stiffness: float = 0.3
+    to_boundary: float = 0.995
+    decrease: float = 1e-4
+    damping: float = 0.1
+    patience: int = 8
+    cooling: float = 0.9
+    inside: float = 0.985
 
-    def start(self, y: Float[AnyArray, "starts scaled"], constraints: int = 0) -> State:
-        """The state of some starts before the first stage.
+    def init(self, y: Float[AnyArray, "starts scaled"], constraints: int = 0) -> State:
+        """Return the state of some starts before the first stage.
 
         Args:
-            y: The starts.
-            constraints: How many the objective has that are not linear.
+            y: Scaled coefficients of the starts.
+            constraints: Number of constraints that are not linear.
         """
         starts, size = np.shape(y)
-        joints, rows = self._grid.c.shape
-        allowances = 1 if constraints else 0
+        slacks = 1 if constraints else 0
         none, flat = jnp.zeros(starts), jnp.zeros((starts, size))
-        duals = Bounds(
-            jnp.zeros((starts, 2, joints, rows)),
+        duals = Inequalities(
+            jnp.zeros((starts, 2, *self.grid.c.shape)),
             jnp.zeros((starts, constraints)),
-            jnp.zeros((starts, allowances)),
+            jnp.zeros((starts, slacks)),
         )
+        slopes = jnp.zeros((starts, constraints, size))
         return State(
             y=jnp.asarray(y),
-            allowance=duals.allowance,
-            seen=Evaluation(none, flat, duals.constraints, jnp.zeros((starts, constraints, size))),
+            slack=duals.slack,
+            evaluation=Evaluation(none, flat, duals.constraints, slopes),
             duals=duals,
-            curvature=jnp.tile(self._stiffness * jnp.eye(size), (starts, 1, 1)),
+            curvature=jnp.tile(self.stiffness * jnp.eye(size), (starts, 1, 1)),
             barrier=none,
-            step=jnp.zeros((starts, size + allowances)),
+            step=jnp.zeros((starts, size + slacks)),
             dual_step=duals,
             length=none,
             dual_length=none,
@@ -158,59 +150,114 @@ class InteriorPoint:
             fresh=jnp.ones(starts, bool),
         )
 
-    def run(self, state: State, stage: Stage, context: Any) -> State:
-        """One stage: moves the starts inside its bound, then iterates."""
-        bound = stage.bound * self._grid.bound
-        numbers = (jnp.asarray(x, float) for x in (bound, stage.barrier, stage.least, stage.price))
-        state = self._run(state, *numbers, jnp.asarray(stage.iterations), context)
-        return jax.block_until_ready(state)
+    def run(
+        self,
+        objective: Callable[[Array], Evaluation],
+        state: State,
+        stage: Stage,
+        iterations: Int[Array, ""] | int,
+    ) -> State:
+        """Move the starts inside the bound of a stage, then iterate until all have converged.
 
-    def _iterate(self, state: State, bound, barrier, least, price, iterations, context) -> State:
-        def begin(one: State) -> State:
-            y = held_within(self._grid, self._still, one.y, INSIDE * bound)
-            limits = self._limits_slack(y, bound)
-            central = barrier / limits
-            duals = jnp.clip(one.duals.limits, central / 1e3, central * 1e3)
-            fresh = jnp.all(one.duals.limits == 0) | jnp.any(y != one.y)
-            return one._replace(
-                y=y,
-                duals=one.duals._replace(limits=jnp.where(fresh, central, duals)),
-                barrier=barrier,
-                step=jnp.zeros_like(one.step),
-                dual_step=jax.tree.map(jnp.zeros_like, one.dual_step),
-                length=jnp.zeros_like(one.length),
-                dual_length=jnp.zeros_like(one.dual_length),
-                fresh=jnp.ones((), bool),
-            )
+        Args:
+            objective: Function from scaled coefficients of all starts to their evaluation.
+            state: State of the starts.
+            stage: Bounds and barrier.
+            iterations: Largest number of iterations.
+        """
 
-        def iteration(_, state: State) -> State:
-            size = state.y.shape[-1]
-            trial = state.y + state.length[:, None] * state.step[:, :size]
-            seen = self._objective(trial, context)
+        def proceed(carry: tuple[Array, State]) -> Array:
+            number, state = carry
+            return (number < iterations) & ~jnp.all(self.converged(state, stage))
 
-            def update(old: State, trial: Array, seen: Evaluation) -> State:
-                return self._update(old, trial, seen, bound, least, price)
+        def iterate(carry: tuple[Array, State]) -> tuple[Array, State]:
+            number, state = carry
+            return number + 1, self.step(objective, state, stage)
 
-            return each_start(update, state, trial, seen)
+        begun = jax.vmap(lambda one: self._begin(one, stage))(state)
+        return jax.lax.while_loop(proceed, iterate, (jnp.asarray(0), begun))[1]
 
-        return jax.lax.fori_loop(0, iterations, iteration, jax.vmap(begin)(state))
+    def converged(self, state: State, stage: Stage) -> Bool[Array, " starts"]:
+        """Return which starts cannot be improved further: the promised decrease is rounding."""
+        settled = (state.barrier <= stage.least) & ~state.fresh
+        scale = 1.0 + jnp.abs(state.evaluation.value)
+        return settled & (jnp.abs(state.slope) <= 1e-14 * scale)
 
-    def _update(self, old: State, trial, seen: Evaluation, bound, least, price) -> State:
-        """Takes the step or shortens it."""
+    def step(self, objective: Callable[[Array], Evaluation], state: State, stage: Stage) -> State:
+        """Evaluate the next trial of every start; take it, or shorten its step.
+
+        Args:
+            objective: Function from scaled coefficients of all starts to their evaluation.
+            state: State of the starts.
+            stage: Bounds and barrier.
+        """
+        trial = state.y + state.length[:, None] * state.step[:, : state.y.shape[-1]]
+
+        def update(old: State, trial: Array, evaluation: Evaluation) -> State:
+            return self._update(old, trial, evaluation, stage)
+
+        return map_starts(update, state, trial, objective(trial))
+
+    def _begin(self, one: State, stage: Stage) -> State:
+        """Move one start inside the bound, with multipliers on the central path."""
+        bound = stage.bound * self.grid.bound
+        y = self.grid.scale_into_limits(one.y, self.inside * bound)
+        central = stage.barrier / self._room(y, stage)
+        duals = jnp.clip(one.duals.limits, central / 1e3, central * 1e3)
+        moved = jnp.all(one.duals.limits == 0) | jnp.any(y != one.y)
+        return one._replace(
+            y=y,
+            duals=one.duals._replace(limits=jnp.where(moved, central, duals)),
+            barrier=jnp.asarray(stage.barrier, float),
+            step=jnp.zeros_like(one.step),
+            dual_step=jax.tree.map(jnp.zeros_like, one.dual_step),
+            length=jnp.zeros_like(one.length),
+            dual_length=jnp.zeros_like(one.dual_length),
+            fresh=jnp.ones((), bool),
+        )
+
+    def _update(self, old: State, trial: Array, evaluation: Evaluation, stage: Stage) -> State:
+        """Take the step of one start, or shorten it."""
         size = old.y.shape[-1]
-        allowance = _cheapest(old.allowance, seen.excess, price, old.barrier)
-        slack = self._slack(trial, allowance, seen.excess, bound)
-        before = self._slack(old.y, old.allowance, old.seen.excess, bound)
-        merit = _merit(old.seen.value, old.allowance, before, price, old.barrier)
-        new = _merit(seen.value, allowance, slack, price, old.barrier)
-        promised = DECREASE * old.length * old.slope
+        slack = _cheapest_slack(old.slack, evaluation.excess, stage.penalty, old.barrier)
+        room = self._rooms(trial, slack, evaluation.excess, stage)
+        before = self._rooms(old.y, old.slack, old.evaluation.excess, stage)
+        merit = _merit(old.evaluation.value, old.slack, before, stage.penalty, old.barrier)
+        new = _merit(evaluation.value, slack, room, stage.penalty, old.barrier)
+        promised = self.decrease * old.length * old.slope
         good = new <= merit + promised + 1e-10 * jnp.abs(merit)
-        finite = jnp.isfinite(seen.value) & jnp.all(jnp.isfinite(seen.gradient))
+        finite = jnp.isfinite(evaluation.value) & jnp.all(jnp.isfinite(evaluation.gradient))
         good = (good & finite) | old.fresh
+        taken = self._taken(old, trial, slack, evaluation, room, stage)
+        # A refused step is shortened to the minimum of a parabola through what is known.
+        rise = 2 * (new - merit - old.slope * old.length)
+        shorter = -old.slope * old.length**2 / rise
+        least, most = 0.1 * old.length, 0.5 * old.length
+        shorter = jnp.where(jnp.isfinite(shorter), jnp.clip(shorter, least, most), least)
+        forget = old.refused >= self.patience
+        flat = jnp.eye(size) * jnp.trace(old.curvature) / size
+        kept = old._replace(
+            curvature=jnp.where(forget, flat, old.curvature),
+            refused=jnp.where(forget, 0, old.refused + 1),
+        )
+        state = jax.tree.map(lambda a, b: jnp.where(good, a, b), taken, kept)
+        turned = self._directed(state, stage)
+        straight = state._replace(length=shorter)
+        return jax.tree.map(lambda a, b: jnp.where(good | forget, a, b), turned, straight)
 
-        barrier = jnp.where(old.length > 0.1, old.barrier * COOLING, old.barrier)
-        barrier = jnp.where(old.fresh, old.barrier, jnp.maximum(least, barrier))
-        central = jax.tree.map(lambda x: barrier / x, slack)
+    def _taken(
+        self,
+        old: State,
+        trial: Array,
+        slack: Array,
+        evaluation: Evaluation,
+        room: Inequalities,
+        stage: Stage,
+    ) -> State:
+        """Return the state of one start after its step was taken."""
+        barrier = jnp.where(old.length > 0.1, old.barrier * self.cooling, old.barrier)
+        barrier = jnp.where(old.fresh, old.barrier, jnp.maximum(stage.least, barrier))
+        central = jax.tree.map(lambda x: barrier / x, room)
         moved = jax.tree.map(
             lambda dual, step, c: jnp.clip(dual + old.dual_length * step, c / 1e3, c * 1e3),
             old.duals,
@@ -219,141 +266,122 @@ class InteriorPoint:
         )
         begun = central._replace(limits=old.duals.limits)
         duals = jax.tree.map(lambda a, b: jnp.where(old.fresh, a, b), begun, moved)
-        # Curvature is that of the Lagrangian: of the value and of what bends the constraints.
-        change = seen.gradient - old.seen.gradient
-        change = change + duals.constraints @ (seen.slopes - old.seen.slopes)
-        curvature = _updated(old.curvature, trial - old.y, change)
-        taken = old._replace(
+        # Curvature is that of the Lagrangian: of the value and of constraints that bend.
+        change = evaluation.gradient - old.evaluation.gradient
+        change = change + duals.constraints @ (evaluation.slopes - old.evaluation.slopes)
+        curvature = self._damped_bfgs(old.curvature, trial - old.y, change)
+        return old._replace(
             y=trial,
-            allowance=allowance,
-            seen=seen,
+            slack=slack,
+            evaluation=evaluation,
             duals=duals,
             curvature=jnp.where(old.fresh, old.curvature, curvature),
             barrier=barrier,
             refused=jnp.zeros((), old.refused.dtype),
             fresh=jnp.zeros((), bool),
         )
-        # A refused step is shortened to the minimum of a parabola through what is known.
-        rise = 2 * (new - merit - old.slope * old.length)
-        shorter = -old.slope * old.length**2 / rise
-        least_length, most_length = 0.1 * old.length, 0.5 * old.length
-        shorter = jnp.where(
-            jnp.isfinite(shorter), jnp.clip(shorter, least_length, most_length), least_length
-        )
-        forget = old.refused >= PATIENCE
-        flat = jnp.eye(size) * jnp.trace(old.curvature) / size
-        kept = old._replace(
-            curvature=jnp.where(forget, flat, old.curvature),
-            refused=jnp.where(forget, 0, old.refused + 1),
-        )
-        state = jax.tree.map(lambda a, b: jnp.where(good, a, b), taken, kept)
-        turned = self._directed(state, bound, price)
-        again = good | forget
-        straight = state._replace(length=shorter)
-        return jax.tree.map(lambda a, b: jnp.where(again, a, b), turned, straight)
 
-    def _directed(self, state: State, bound, price) -> State:
-        """The step to the barrier's minimum, and how far it may go."""
-        seen, size = state.seen, state.y.shape[-1]
-        slack = self._slack(state.y, state.allowance, seen.excess, bound)
-        ratio = jax.tree.map(lambda dual, room: dual / room, state.duals, slack)
-        central = jax.tree.map(lambda room: state.barrier / room, slack)
-        R = self._grid.R
+    def _directed(self, state: State, stage: Stage) -> State:
+        """Return one start with the step to the barrier's minimum, and how far it may go."""
+        evaluation, size, R = state.evaluation, state.y.shape[-1], self.grid.R
+        room = self._rooms(state.y, state.slack, evaluation.excess, stage)
+        ratio = jax.tree.map(lambda dual, x: dual / x, state.duals, room)
+        central = jax.tree.map(lambda x: state.barrier / x, room)
         blocks = jnp.einsum("jrk,jr,jrl->jkl", R, ratio.limits[0] + ratio.limits[1], R)
-        stiff = ratio.constraints[:, None] * seen.slopes
-        H = state.curvature + _block_diagonal(blocks) + seen.slopes.T @ stiff
+        stiff = ratio.constraints[:, None] * evaluation.slopes
+        H = state.curvature + _block_diagonal(blocks) + evaluation.slopes.T @ stiff
         ridge = 1e-9 * jnp.trace(H) / size
         push = jnp.einsum("jrk,jr->jk", R, central.limits[0] - central.limits[1]).reshape(size)
-        downhill = -(seen.gradient + push + central.constraints @ seen.slopes)
-        one = jnp.ones_like(state.allowance)
+        downhill = -(evaluation.gradient + push + central.constraints @ evaluation.slopes)
+        one = jnp.ones_like(state.slack)
         across = -jnp.outer(jnp.sum(stiff, axis=0), one)
-        corner = jnp.diag(jnp.sum(ratio.constraints) + ratio.allowance)
+        corner = jnp.diag(jnp.sum(ratio.constraints) + ratio.slack)
         H = jnp.block([[H, across], [across.T, corner]]) + ridge * jnp.eye(size + len(one))
-        spare = one * (jnp.sum(central.constraints) - price) + central.allowance
+        spare = one * (jnp.sum(central.constraints) - stage.penalty) + central.slack
         downhill = jnp.concatenate([downhill, spare])
         step = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(H), True), downhill)
         # Where rounding makes the matrix indefinite, its diagonal alone decides.
         step = jnp.where(jnp.all(jnp.isfinite(step)), step, downhill / jnp.diagonal(H))
         more = step[size:]
-        change = Bounds(self._along(step[:size]), seen.slopes @ step[:size] - jnp.sum(more), -more)
+        change = Inequalities(
+            self._along(step[:size]), evaluation.slopes @ step[:size] - jnp.sum(more), -more
+        )
         dual_step = jax.tree.map(
             lambda c, dual, r, x: c - dual + r * x, central, state.duals, ratio, change
         )
+        approach = jax.tree.map(lambda x, y: x / y, change, room)
+        dual_approach = jax.tree.map(lambda x, y: -x / y, dual_step, state.duals)
         return state._replace(
             step=step,
             dual_step=dual_step,
-            length=_to_boundary(jax.tree.map(lambda x, room: x / room, change, slack)),
-            dual_length=_to_boundary(
-                jax.tree.map(lambda x, dual: -x / dual, dual_step, state.duals)
-            ),
+            length=self._longest(approach),
+            dual_length=self._longest(dual_approach),
             slope=-jnp.sum(downhill * step),
         )
 
     def _along(self, y: Float[Array, " scaled"]) -> Float[Array, "2 joints rows"]:
-        """Rows times numbers, upwards and downwards."""
-        rows = jnp.einsum("jrk,jk->jr", self._grid.R, y.reshape(np.shape(self._still)))
+        """Return rows times coefficients, upwards and downwards."""
+        rows = jnp.einsum("jrk,jk->jr", self.grid.R, y.reshape(np.shape(self.grid.constant)))
         return jnp.stack([rows, -rows])
 
-    def _limits_slack(self, y: Float[Array, " scaled"], bound) -> Float[Array, "2 joints rows"]:
-        c = self._grid.c
-        return bound - (self._along(y) - np.stack([c, -c]))
+    def _room(self, y: Float[Array, " scaled"], stage: Stage) -> Float[Array, "2 joints rows"]:
+        """Return the distances from the limits of the joints."""
+        centre = np.stack([self.grid.c, -self.grid.c])
+        return stage.bound * self.grid.bound - (self._along(y) - centre)
 
-    def _slack(self, y: Array, allowance: Array, excess: Array, bound) -> Bounds:
-        return Bounds(self._limits_slack(y, bound), jnp.sum(allowance) - excess, allowance)
+    def _rooms(self, y: Array, slack: Array, excess: Array, stage: Stage) -> Inequalities:
+        return Inequalities(self._room(y, stage), jnp.sum(slack) - excess, slack)
+
+    def _longest(self, approach: Inequalities) -> Array:
+        """Return the longest step, at most 1, that stays inside all bounds."""
+        nearest = jnp.max(jnp.stack([jnp.max(x, initial=1e-12) for x in approach]))
+        return jnp.minimum(1.0, self.to_boundary / nearest)
+
+    def _damped_bfgs(self, B: Array, s: Array, change: Array) -> Array:
+        """Return the damped BFGS update, which stays positive definite [1, procedure 18.2]."""
+        Bs = B @ s
+        expected, actual = s @ Bs, s @ change
+        damped = self.damping * expected
+        mix = jnp.where(actual >= damped, 1.0, (expected - damped) / (expected - actual))
+        r = mix * change + (1.0 - mix) * Bs
+        new = B - jnp.outer(Bs, Bs) / expected + jnp.outer(r, r) / (s @ r)
+        return jnp.where((expected > 1e-16) & jnp.all(jnp.isfinite(new)), new, B)
 
 
-def each_start(function: Callable, *arguments: Any) -> Any:
-    """Applies a function of one start to many: at once, or on a CPU one by one.
+def map_starts(function: Callable, *arguments: Any) -> Any:
+    """Apply a function of one start to many: at once, or on a CPU one by one.
 
     There the matrices of one start stay in the cache, and its products are not loops of XLA.
 
     Args:
-        function: Of one start.
-        *arguments: With a leading axis for the starts.
+        function: Function of one start.
+        *arguments: Arguments with a leading axis for the starts.
     """
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda one: function(*one), arguments)
     return jax.vmap(function)(*arguments)
 
 
-def _cheapest(like: Array, excess: Array, price, barrier) -> Array:
-    """The allowance that costs least, with the barrier that keeps all constraints below it.
+def _cheapest_slack(like: Array, excess: Array, penalty: Any, barrier: Any) -> Array:
+    """Return the slack of least cost, with the barrier that keeps all constraints below it.
 
-    So a step may pass a constraint that bends: the allowance follows, and has its price.
+    So a step may exceed a constraint that bends: the slack follows, and is penalised.
     """
-    # From below, where the largest term alone is the price, the method grows to the root.
-    least = jnp.maximum(0.0, jnp.max(excess, initial=0.0))
-    allowance = least + barrier / price
+    # From below, where the largest term alone balances the penalty, Newton's method grows to it.
+    start = jnp.maximum(0.0, jnp.max(excess, initial=0.0)) + barrier / penalty
 
-    def grown(_, x: Array) -> Array:
+    def grow(_: Any, x: Array) -> Array:
         room = jnp.concatenate([x - excess, x[None]])
-        pull = jnp.sum(barrier / room) - price
+        pull = jnp.sum(barrier / room) - penalty
         return x + jnp.maximum(0.0, pull / jnp.sum(barrier / room**2))
 
-    return jnp.full_like(like, jax.lax.fori_loop(0, REFINED, grown, allowance))
+    return jnp.full_like(like, jax.lax.fori_loop(0, 12, grow, start))
 
 
-def _merit(value: Array, allowance: Array, slack: Bounds, price, barrier) -> Array:
-    """What a step must make smaller."""
-    logs = sum(jnp.sum(jnp.log(jnp.maximum(x, 1e-300))) for x in slack)
-    return value + price * jnp.sum(allowance) - barrier * logs
-
-
-def _to_boundary(approach: Bounds) -> Array:
-    """The longest step, at most 1, that keeps what must be positive so."""
-    nearest = jnp.max(jnp.stack([jnp.max(x, initial=1e-12) for x in approach]))
-    return jnp.minimum(1.0, TO_BOUNDARY / nearest)
-
-
-def _updated(B: Array, s: Array, change: Array) -> Array:
-    """The damped BFGS update, which keeps the matrix positive [1, procedure 18.2]."""
-    Bs = B @ s
-    expected, seen = s @ Bs, s @ change
-    damped = DAMPING * expected
-    mix = jnp.where(seen >= damped, 1.0, (expected - damped) / (expected - seen))
-    r = mix * change + (1.0 - mix) * Bs
-    new = B - jnp.outer(Bs, Bs) / expected + jnp.outer(r, r) / (s @ r)
-    return jnp.where((expected > 1e-16) & jnp.all(jnp.isfinite(new)), new, B)
+def _merit(value: Array, slack: Array, room: Inequalities, penalty: Any, barrier: Any) -> Array:
+    """Return the merit function, which a step must decrease."""
+    logs = sum(jnp.sum(jnp.log(jnp.maximum(x, 1e-300))) for x in room)
+    return value + penalty * jnp.sum(slack) - barrier * logs
 
 
 def _block_diagonal(blocks: Float[Array, "joints k l"]) -> Float[Array, "size size"]:

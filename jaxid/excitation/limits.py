@@ -1,250 +1,242 @@
-"""Limits of the joints as matrices: linear in a motion's numbers, and certified for all times.
+"""Limits of the joints as matrices: linear in the coefficients, and certified for all times.
 
-Numbers x of a trajectory are scaled, x = scale * y, so that each y alone meets a limit near one.
-All rows are scaled alike: a motion keeps its limits if |R y - c| <= 1 in every row.
+The coefficients x of a trajectory are scaled, x = scale * y, so that each y alone meets a limit
+near one. All rows are scaled alike: a motion keeps its limits if |R y - c| <= 1 in every row.
 """
 
 import itertools
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float
+from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.errors import InputError
 from jaxid.robot.limits import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.basis import AbstractBasis
 from jaxid.trajectory.fourier import complete_limits
 
-CERTIFIED = 512
-"""Rows of each order by which a motion is made to keep its limits at all times."""
-FEW = 11
-"""Numbers of a joint up to which such counts are enough: those of five harmonics."""
-CONSTANT = 1e-9
-"""How well a basis must be able to stand still, relative."""
-
 
 class Grid(NamedTuple):
-    """Rows of all joints on a grid of times.
+    """Limits of all joints on a grid of times.
 
     Attributes:
-        R: By scaled numbers, for each joint first positions, then the higher orders.
+        R: Rows by scaled coefficients, for each joint first positions, then the higher orders.
         c: Centres of the ranges, for positions; zero for the rest.
         kinds: Ranges of the rows of positions, velocities, accelerations, and jerks if limited.
-        bound: What |R y - c| must keep so that the limits hold at all times.
+        bound: Bound of |R y - c| with which the limits hold at all times.
+        constant: Scaled coefficients of a constant motion at half of each joint's range.
     """
 
     R: Float[np.ndarray, "joints rows variables"]
     c: Float[np.ndarray, "joints rows"]
     kinds: tuple[range, ...]
     bound: float
+    constant: Float[np.ndarray, "joints variables"]
 
-    @property
-    def positions(self) -> int:
-        """How many of the rows belong to positions."""
-        return len(self.kinds[0])
+    def scale_into_limits(
+        self, y: Float[Array, " scaled"], bound: Array | float | None = None, growth: float = 1.0
+    ) -> Float[Array, " scaled"]:
+        """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
+
+        Each joint's motion is scaled about its mean, then shifted into its range.
+
+        Args:
+            y: Scaled coefficients of one trajectory.
+            bound: Bound of the rows; that of the grid if None.
+            growth: Largest factor by which a motion may be enlarged where limits leave room.
+        """
+        bound = self.bound if bound is None else bound
+        motion, q, peak = self._motion(y)
+        s = jnp.minimum(growth, bound / jnp.maximum(peak, 1e-12))
+        low, high = self._shifts(q, s, bound)
+        shift = jnp.clip((1.0 - s) * q.mean(axis=1), low, jnp.maximum(low, high))
+        return (s[:, None] * motion + shift[:, None] * self.constant).reshape(y.shape)
+
+    def shrink(
+        self, y: Float[Array, " scaled"], fraction: Array | float
+    ) -> Float[Array, " scaled"]:
+        """Return the same motion made smaller, each joint's about its mean position.
+
+        Args:
+            y: Scaled coefficients of one trajectory.
+            fraction: Remaining fraction of its size.
+        """
+        motion, q, _ = self._motion(y)
+        shift = (1.0 - fraction) * q.mean(axis=1)
+        return (fraction * motion + shift[:, None] * self.constant).reshape(y.shape)
+
+    def fill(
+        self, y: Float[Array, " scaled"], places: Float[Array, " joints"], size: Array | float
+    ) -> Float[Array, " scaled"]:
+        """Return a motion of the same shape that fills a fraction of its limits.
+
+        Args:
+            y: Scaled coefficients of one trajectory.
+            places: Place of each joint in the range that is left, from 0 to 1.
+            size: Size relative to a motion that uses 95 % of the limits.
+        """
+        motion, q, peak = self._motion(y)
+        bound = 0.95 * self.bound
+        s = size * bound / peak
+        low, high = self._shifts(q, s, bound)
+        shift = low + (high - low) * places
+        return (s[:, None] * motion + shift[:, None] * self.constant).reshape(y.shape)
+
+    def _motion(self, y: Array) -> tuple[Array, Array, Array]:
+        """Return the coefficients by joint, the positions, and the largest use of a limit."""
+        motion = y.reshape(np.shape(self.constant))
+        rows = jnp.einsum("jrk,jk->jr", self.R, motion)
+        positions = len(self.kinds[0])
+        q, rest = rows[:, :positions], rows[:, positions:]
+        half = 0.5 * (q.max(axis=1) - q.min(axis=1))
+        return motion, q, jnp.maximum(jnp.abs(rest).max(axis=1), half)
+
+    def _shifts(self, q: Array, s: Array, bound: Array | float) -> tuple[Array, Array]:
+        """Return the least and largest shift that keep scaled positions in their range."""
+        centre = self.c[:, 0]
+        return centre - bound - s * q.min(axis=1), centre + bound - s * q.max(axis=1)
 
 
 class JointLimits(eqx.Module):
     """Limits of all joints on the trajectories of a basis.
 
     Attributes:
-        basis: The trajectories.
+        basis: Family of trajectories.
         limits: Finite ranges, speeds and accelerations; a jerk may be infinite.
-        names: Of the joints.
-        scale: Of a trajectory's numbers, x = scale * y.
-        still: The scaled numbers that move a joint by half of its range, and keep it there.
+        scale: Scale of the coefficients, x = scale * y.
+        constant: Scaled coefficients of a constant motion at half of each joint's range.
         assumed: Fields of the limits and joints (from 0) whose numbers were not given.
     """
 
     basis: AbstractBasis
     limits: Limits
-    names: tuple[str, ...] = eqx.field(static=True)
     scale: Float[AnyArray, "joints variables"]
-    still: Float[AnyArray, "joints variables"]
-    assumed: tuple[tuple[str, int], ...] = eqx.field(static=True, default=())
+    constant: Float[AnyArray, "joints variables"]
+    assumed: tuple[tuple[str, int], ...] = eqx.field(static=True)
 
-    @classmethod
-    def of(cls, robot: Robot, basis: AbstractBasis, limits: Limits | None = None) -> "JointLimits":
-        """The limits of a robot, or others; unknown ones are assumed.
+    def __init__(self, robot: Robot, basis: AbstractBasis, limits: Limits | None = None):
+        """Make the limits of a robot, or others; unknown ones are assumed.
+
+        Args:
+            robot: Robot whose joints move.
+            basis: Family of trajectories.
+            limits: Limits in place of the robot's.
 
         Raises:
             InputError: If no trajectory of the basis stands still anywhere else than at zero.
         """
         limits = robot.limits if limits is None else limits
-        assumed = tuple(
+        self.basis, self.limits = basis, complete_limits(robot.replace(limits=limits))
+        self.assumed = tuple(
             (name, int(j))
             for name in ("position_min", "position_max", "velocity", "acceleration")
             for j in np.flatnonzero(~np.isfinite(np.asarray(getattr(limits, name))))
         )
-        limits = complete_limits(robot.replace(limits=limits))
-        size = _sizes(limits)
-        rows = basis.envelope(enough(CERTIFIED, basis)).rows
+        rows, _ = basis.envelope(scale_samples(512, basis))
         reach = np.array([np.abs(r).max(axis=0) for r in rows])
         with np.errstate(divide="ignore"):
-            scale = np.min(size[:, :, None] / reach[:, None, :], axis=0)
+            self.scale = np.min(self._sizes[:, :, None] / reach[:, None, :], axis=0)
         one = np.linalg.lstsq(rows[0], np.ones(len(rows[0])), rcond=None)[0]
-        if np.abs(rows[0] @ one - 1.0).max() > CONSTANT or np.abs(rows[1] @ one).max() > CONSTANT:
+        if np.abs(rows[0] @ one - 1.0).max() > 1e-9 or np.abs(rows[1] @ one).max() > 1e-9:
             raise InputError(
                 "`basis` must hold motions that stand still at any position, but its functions "
                 "have no constant among them: add one."
             )
-        still = size[0][:, None] * one[None] / scale
-        return cls(basis, limits, robot.joint_names, scale, still, assumed)
+        self.constant = self._sizes[0][:, None] * one[None] / self.scale
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Joints and numbers of each."""
+        """Number of joints, and of coefficients of each."""
         joints, variables = self.scale.shape
         return joints, variables
 
-    def numbers(
+    @property
+    def _sizes(self) -> Float[np.ndarray, "4 joints"]:
+        """Half ranges, speeds, accelerations and jerks."""
+        x = self.limits
+        half = 0.5 * (np.asarray(x.position_max) - np.asarray(x.position_min))
+        return np.array([half, x.velocity, x.acceleration, x.jerk], np.float64)
+
+    @property
+    def _middles(self) -> Float[np.ndarray, " joints"]:
+        return 0.5 * (np.asarray(self.limits.position_min) + np.asarray(self.limits.position_max))
+
+    def coefficients(
         self, y: Float[AnyArray, "*batch scaled"]
     ) -> Float[AnyArray, "*batch joints variables"]:
-        """The numbers of trajectories from scaled ones."""
-        return y.reshape((*y.shape[:-1], *self.shape)) * self._scale(y.ndim - 1)
+        """Return the coefficients of trajectories from scaled ones."""
+        scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
+        return y.reshape((*y.shape[:-1], *self.shape)) * scale
 
     def scaled(
         self, x: Float[AnyArray, "*batch joints variables"]
     ) -> Float[AnyArray, "*batch scaled"]:
-        """The scaled numbers of trajectories."""
-        y = x / self._scale(x.ndim - 2)
+        """Return the scaled coefficients of trajectories."""
+        y = x / np.asarray(self.scale)[(None,) * (x.ndim - 2)]
         return y.reshape((*y.shape[:-2], -1))
 
-    def _scale(self, batch: int) -> Float[np.ndarray, "*ones joints variables"]:
-        return np.asarray(self.scale)[(None,) * batch]
-
-    def grid(self, points: int) -> Grid:
-        """The limits on about so many times, with the bound that certifies all times.
+    def grid(self, points: int = 512) -> Grid:
+        """Return the limits on a grid of times, with the bound that certifies all times.
 
         Args:
-            points: How many are enough for few numbers; more numbers get more.
+            points: Number of times for bases with few coefficients; more coefficients get more.
         """
-        envelope = self.basis.envelope(enough(points, self.basis))
-        size, limits = _sizes(self.limits), self.limits
+        envelope, factor = self.basis.envelope(scale_samples(points, self.basis))
+        size, scale = self._sizes, np.asarray(self.scale)
         orders = 4 if np.isfinite(size[3]).any() else 3
-        scale = np.asarray(self.scale)
-        R = [
-            scale[:, None] * envelope.rows[k][None] / size[k][:, None, None] for k in range(orders)
-        ]
-        middle = 0.5 * (np.asarray(limits.position_min) + np.asarray(limits.position_max)) / size[0]
-        c = [np.tile(middle[:, None], len(envelope.rows[0]))]
-        c += [np.zeros((len(size[0]), len(envelope.rows[k]))) for k in range(1, orders)]
+        R = [scale[:, None] * envelope[k][None] / size[k][:, None, None] for k in range(orders)]
+        c = [np.zeros((len(scale), len(envelope[k]))) for k in range(orders)]
+        c[0] += (self._middles / size[0])[:, None]
         ends = np.cumsum([0, *(part.shape[1] for part in c)])
         kinds = tuple(range(int(a), int(b)) for a, b in itertools.pairwise(ends))
-        return Grid(
-            np.concatenate(R, axis=1), np.concatenate(c, axis=1), kinds, 1 / envelope.factor
-        )
+        R, c = np.concatenate(R, axis=1), np.concatenate(c, axis=1)
+        return Grid(R, c, kinds, 1 / factor, np.asarray(self.constant))
 
     def use(self, x: Float[AnyArray, "joints variables"]) -> Float[np.ndarray, "4 joints"]:
-        """Which share of each limit a motion uses at most, certified; 1 is all of it.
+        """Return the largest used fraction of each limit, certified for all times.
 
-        Of a range it is the distance from its middle, over half of the range.
+        The used fraction of a range is the distance from its middle, over half of the range.
+
+        Args:
+            x: Coefficients.
         """
-        envelope, size = self.basis.envelope(enough(CERTIFIED, self.basis)), _sizes(self.limits)
-        low, high = np.asarray(self.limits.position_min), np.asarray(self.limits.position_max)
-        centre = np.vstack([0.5 * (low + high), np.zeros((3, len(low)))])
+        rows, factor = self.basis.envelope(scale_samples(512, self.basis))
+        centre = np.vstack([self._middles, np.zeros((3, len(self._middles)))])
         x = np.asarray(x)
         return np.array(
             [
-                envelope.factor * np.abs(x @ r.T - c[:, None]).max(axis=1) / s
-                for r, c, s in zip(envelope.rows, centre, size, strict=True)
+                factor * np.abs(x @ r.T - c[:, None]).max(axis=1) / s
+                for r, c, s in zip(rows, centre, self._sizes, strict=True)
             ]
         )
 
+    def random(
+        self, key: PRNGKeyArray, count: int, size: float = 1.0
+    ) -> Float[Array, "count scaled"]:
+        """Draw motions with random shapes and places that fill their limits, in scaled numbers.
 
-def enough(samples: int, basis: AbstractBasis) -> int:
-    """As many samples as a motion with many numbers needs to be seen like one with few.
-
-    Args:
-        samples: That are enough for few numbers.
-        basis: Of the motion.
-    """
-    return samples * max(FEW, basis.variables) // FEW
-
-
-def held_within(
-    grid: Grid,
-    still: Float[AnyArray, "joints variables"],
-    y: Float[Array, " scaled"],
-    bound: Float[Array, ""] | float,
-    growth: float = 1.0,
-) -> Float[Array, " scaled"]:
-    """The nearest motion of the same shape that keeps |R y - c| <= bound.
-
-    Each joint's motion is scaled about its mean, then shifted into its range.
-
-    Args:
-        grid: Rows of the limits.
-        still: Scaled numbers of half of each joint's range.
-        y: Scaled numbers of one trajectory.
-        bound: Of the rows.
-        growth: Most by which a motion may be enlarged where limits leave room; 1 for never.
-    """
-    motion = y.reshape(np.shape(still))
-    rows = jnp.einsum("jrk,jk->jr", grid.R, motion)
-    q, rest = rows[:, : grid.positions], rows[:, grid.positions :]
-    peak = jnp.maximum(jnp.abs(rest).max(axis=1), 0.5 * (q.max(axis=1) - q.min(axis=1)))
-    s = jnp.minimum(growth, bound / jnp.maximum(peak, 1e-12))
-    centre = grid.c[:, 0]
-    wanted = (1.0 - s) * q.mean(axis=1)
-    low, high = centre - bound - s * q.min(axis=1), centre + bound - s * q.max(axis=1)
-    shift = jnp.clip(wanted, low, jnp.maximum(low, high))
-    return (s[:, None] * motion + shift[:, None] * np.asarray(still)).reshape(y.shape)
+        Args:
+            key: Key of the random numbers.
+            count: Number of motions.
+            size: Size of the motions, relative to those that use 95 % of the limits.
+        """
+        joints, variables = self.shape
+        shape, place = jax.random.split(key)
+        draws = jax.random.normal(shape, (count, joints * variables), float)
+        places = jax.random.uniform(place, (count, joints), float)
+        fill = self.grid().fill
+        return jax.vmap(lambda y, place: fill(y, place, size))(draws, places)
 
 
-def calmed(
-    grid: Grid,
-    still: Float[AnyArray, "joints variables"],
-    y: Float[Array, " scaled"],
-    share: Float[Array, ""] | float,
-) -> Float[Array, " scaled"]:
-    """The same motion made smaller, each joint's about its mean position.
+def scale_samples(samples: int, basis: AbstractBasis) -> int:
+    """Return a number of samples that grows with the coefficients beyond those of five harmonics.
 
     Args:
-        grid: Rows of the limits.
-        still: Scaled numbers of half of each joint's range.
-        y: Scaled numbers of one trajectory.
-        share: Of its size that is left.
+        samples: Number of samples for few coefficients.
+        basis: Basis of the motion.
     """
-    motion = y.reshape(np.shape(still))
-    mean = jnp.einsum("jrk,jk->jr", grid.R[:, : grid.positions], motion).mean(axis=1)
-    return (share * motion + (1.0 - share) * mean[:, None] * np.asarray(still)).reshape(y.shape)
-
-
-def random_motion(
-    grid: Grid,
-    still: Float[AnyArray, "joints variables"],
-    draws: Float[Array, " scaled"],
-    places: Float[Array, " joints"],
-    reach: float = 0.95,
-    size: float = 1.0,
-) -> Float[Array, " scaled"]:
-    """A motion from random numbers that fills its limits, anywhere in its ranges.
-
-    Args:
-        grid: Rows of the limits, with the bound that certifies them.
-        still: Scaled numbers of half of each joint's range.
-        draws: Its shape.
-        places: Where in the range that is left each joint moves, from 0 to 1.
-        reach: Share of the limits to use.
-        size: Share of that, of the motion; its place is anywhere in what is left.
-    """
-    motion = draws.reshape(np.shape(still))
-    rows = jnp.einsum("jrk,jk->jr", grid.R, motion)
-    q, rest = rows[:, : grid.positions], rows[:, grid.positions :]
-    peak = jnp.maximum(jnp.abs(rest).max(axis=1), 0.5 * (q.max(axis=1) - q.min(axis=1)))
-    bound = reach * grid.bound
-    s = size * bound / peak
-    low = grid.c[:, 0] - bound - s * q.min(axis=1)
-    high = grid.c[:, 0] + bound - s * q.max(axis=1)
-    shift = low + (high - low) * places
-    return (s[:, None] * motion + shift[:, None] * np.asarray(still)).reshape(draws.shape)
-
-
-def _sizes(limits: Limits) -> Float[np.ndarray, "4 joints"]:
-    """Half ranges, speeds, accelerations and jerks."""
-    half = 0.5 * (np.asarray(limits.position_max) - np.asarray(limits.position_min))
-    return np.array([half, limits.velocity, limits.acceleration, limits.jerk], np.float64)
+    return samples * max(11, basis.variables) // 11

@@ -1,206 +1,338 @@
 """The search from many starts at once: relaxed limits first, then tight ones; then generations.
 
-The children of what was found are improved in the same way, and of parents and children the best
-live on. In the end limits are kept on a finer grid, so that less of them is left unused. Everything
-a search knows between two legs is in its state, so it can be stopped, saved and resumed.
+The children of the motions found are improved in the same way, and of parents and children the best
+survive. In the end limits are kept on a finer grid, so that less of them is left unused, and the
+best motions are polished one by one.
 """
 
-from typing import NamedTuple
+import functools
+import hashlib
+import io
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bool, Float, PRNGKeyArray
-from jaxid.excitation.interior_point import COOLING, InteriorPoint, Stage, State
-from jaxid.excitation.judge import Best, Judge
-from jaxid.excitation.limits import CERTIFIED, JointLimits, random_motion
-from jaxid.excitation.offspring import Offspring
-from jaxid.excitation.problem import Context, Problem
+from jaxid.errors import InputError
+from jaxid.excitation.candidates import (
+    PENALTY,
+    evaluate,
+    evaluate_within_limits,
+    shrink_to_constraints,
+)
+from jaxid.excitation.interior_point import InteriorPoint, Stage, State
+from jaxid.excitation.polish import polish
+from jaxid.excitation.problem import SEARCHED, ExcitationProblem
+from jaxid.io import write_bytes
 
-GRID = 64
-"""Rows of each order by which limits are kept during the search."""
 FINE = 256
-"""Rows of each order by which they are kept in the end."""
-CALM = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
-"""Sizes of further random motions, for starts that find no way to keep the constraints."""
-STRETCH = 25
-"""Iterations after which the peaks of constraints are looked for anew."""
-TIGHT = 0.998
-"""Share of the limits within which legs end: what is left is for rounding."""
-DEAR = 100.0
-"""What exceeding constraints costs from where it must come to an end."""
+"""Rows of each order by which limits are kept in the end."""
+POLISHING = 4
+"""Time of polishing one motion, relative to a step of the schedule."""
 
 
-class Leg(NamedTuple):
-    """A stage of the interior point method, and what goes with it.
+class ScheduleStep(NamedTuple):
+    """One step of the search schedule: a run of the interior point method.
 
     Attributes:
-        stage: Of the method.
-        sharpness: Of smooth extremes.
-        judged: Whether its results are compared with the best so far.
+        bound: Multiple to which limits are relaxed or tightened; 0.998 leaves room for rounding.
+        barrier: Weight of the barrier at the start.
+        least: Weight below which it does not fall.
+        iterations: Number of iterations.
+        sharpness: Sharpness of smooth extremes.
+        evaluated: Whether the results are compared with the best so far.
+        penalty: Penalty of exceeding constraints.
     """
 
-    stage: Stage
+    bound: float
+    barrier: float
+    least: float
+    iterations: int
     sharpness: float
-    judged: bool
+    evaluated: bool = False
+    penalty: float = 10.0
 
 
-LEGS = (
-    Leg(Stage(2.0, 1e-2, 1e-3, 80), 4.0, False),
-    Leg(Stage(1.5, 1e-3, 1e-3, 40), 4.0, False),
-    Leg(Stage(1.25, 1e-3, 1e-3, 40), 4.0, False),
-    Leg(Stage(1.1, 1e-3, 1e-3, 40), 4.0, False),
-    Leg(Stage(TIGHT, 1e-3, 1e-5, 100), 4.0, False),
-    Leg(Stage(TIGHT, 1e-3, 1e-6, 100), 4.0, True),
-    Leg(Stage(TIGHT, 1e-3, 1e-6, 150), 8.0, False),
-    Leg(Stage(TIGHT, 1e-3, 1e-6, 150), 8.0, True),
-    Leg(Stage(1.3, 1e-3, 1e-3, 60), 8.0, False),
-    Leg(Stage(TIGHT, 1e-3, 1e-6, 125), 8.0, False),
-    Leg(Stage(TIGHT, 1e-3, 1e-6, 125), 8.0, True),
-    Leg(Stage(TIGHT, 1e-3, 1e-6, 150), 20.0, True),
+SCHEDULE = (
+    ScheduleStep(2.0, 1e-2, 1e-3, 80, 4.0),
+    ScheduleStep(1.5, 1e-3, 1e-3, 40, 4.0),
+    ScheduleStep(1.25, 1e-3, 1e-3, 40, 4.0),
+    ScheduleStep(1.1, 1e-3, 1e-3, 40, 4.0),
+    ScheduleStep(0.998, 1e-3, 1e-5, 100, 4.0),
+    ScheduleStep(0.998, 1e-3, 1e-6, 100, 4.0, evaluated=True),
+    ScheduleStep(0.998, 1e-3, 1e-6, 150, 8.0),
+    ScheduleStep(0.998, 1e-3, 1e-6, 150, 8.0, evaluated=True),
+    ScheduleStep(1.3, 1e-3, 1e-3, 60, 8.0),
+    ScheduleStep(0.998, 1e-3, 1e-6, 125, 8.0),
+    ScheduleStep(0.998, 1e-3, 1e-6, 125, 8.0, evaluated=True),
+    ScheduleStep(0.998, 1e-3, 1e-6, 150, 20.0, evaluated=True),
 )
-"""Relaxed limits, then the limits; once more a little relaxed; sharper in the end."""
+"""Relaxed limits, then the limits; slightly relaxed once more; sharper in the end."""
 
-SETTLING = tuple(Leg(Stage(TIGHT, 1e-4, 1e-6, n, DEAR), 20.0, True) for n in (100, 50, 50))
-"""What follows where there are constraints: their peaks move, and what cannot be kept is dear."""
+SETTLING = tuple(
+    ScheduleStep(0.998, 1e-4, 1e-6, n, 20.0, evaluated=True, penalty=100.0) for n in (100, 50, 50)
+)
+"""Further steps where there are constraints: their peaks move, and exceeding them is expensive."""
 
-GENERATION = Leg(Stage(TIGHT, 1e-3, 1e-6, 150, DEAR), 20.0, True)
-"""How children are improved."""
-LAST = Leg(Stage(TIGHT, 1e-4, 1e-6, 300, DEAR), 20.0, True)
-"""On the fine grid."""
-
-
-class Searched(NamedTuple):
-    """What a search knows between two legs."""
-
-    state: State
-    leg: int
-    first: Float[AnyArray, " starts"]
-    best: Best
+GENERATION = ScheduleStep(0.998, 1e-3, 1e-6, 150, 20.0, evaluated=True, penalty=100.0)
+"""Improvement of children."""
+LAST = ScheduleStep(0.998, 1e-4, 1e-6, 300, 20.0, evaluated=True, penalty=100.0)
+"""Last improvement, on the fine grid."""
 
 
 class Search:
-    """The search for one problem.
+    """A search that can be stopped after each step, saved and resumed.
 
     Args:
-        problem: What is to be found.
-        starts: Number of starts.
-        generations: How often the motions have children.
+        problem: Problem to be solved.
+        key: Key of the random numbers.
+        starts: Number of random motions to start from.
+        generations: Number of generations.
+        polished: Number of the best motions that are polished.
 
     Attributes:
-        problem: The same.
-        judge: Of its motions.
+        done: Number of steps done.
+        first: Values of the random motions.
+        best: Best motions so far.
     """
 
-    def __init__(self, problem: Problem, starts: int, generations: int):
-        self.problem, self._starts = problem, starts
-        self._legs = LEGS + SETTLING if problem.constraints else LEGS
-        self._generations = generations
-        evaluation, limits = problem.evaluation(), problem.limits
-        self._solver = InteriorPoint(evaluation, limits.grid(GRID), limits.still)
-        self._fine = InteriorPoint(evaluation, limits.grid(FINE), limits.still)
-        self._offspring = Offspring(problem)
-        self.judge = Judge(problem)
-        self._worst = jax.jit(problem.worst)
-
-    def begin(self, key: PRNGKeyArray) -> Searched:
-        """Random motions that fill their limits."""
-        y = random_starts(self.problem.limits, key, self._starts)
-        best = self.judge(y)
-        state = self._solver.start(y, self.problem.conditions)
-        return Searched(state, 0, best.value, best)
-
-    def advance(self, searched: Searched, key: PRNGKeyArray) -> Searched:
-        """The next leg.
-
-        Args:
-            searched: What is known so far.
-            key: Of the random numbers, that with which the search began.
-        """
-        number, best = int(searched.leg), searched.best
-        bred = number - len(self._legs)
-        if bred < 0:
-            searched = self._continued(searched, self._legs[number])
-        elif bred < self._generations:
-            children = self._offspring(best.y, jax.random.fold_in(key, bred))
-            best = best.survivors(self._anew(self._solver, children, GENERATION))
-            searched = searched._replace(best=best)
-        else:
-            best = best.improved(self._anew(self._fine, best.y, LAST))
-            searched = searched._replace(best=best)
-        return searched._replace(leg=number + 1)
-
-    def _continued(self, searched: Searched, leg: Leg) -> Searched:
-        """A leg of the starts themselves."""
-        state, best = searched.state, searched.best
-        broken = np.asarray(best.excess) > 0
-        if searched.leg == len(LEGS) and broken.any():
-            state = self._calmed(state, broken)
-        state = self._improved(self._solver, state, leg)
-        if leg.judged:
-            best = best.improved(self.judge.within(state.y))
-        return searched._replace(state=state, best=best)
-
-    def _anew(self, solver: InteriorPoint, y: Float[AnyArray, "starts scaled"], leg: Leg) -> Best:
-        """What a leg makes of motions that it begins with."""
-        state = self._improved(solver, solver.start(y, self.problem.conditions), leg)
-        return self.judge.within(state.y)
-
-    def _improved(self, solver: InteriorPoint, state: State, leg: Leg) -> State:
-        for stage in self._stretches(leg.stage):
-            context = Context(jnp.asarray(leg.sharpness), self.problem.peaks(state.y))
-            state = solver.run(state, stage, context)
-        return state
-
-    def _stretches(self, stage: Stage) -> list[Stage]:
-        """A stage in parts, between which the instants of constraints follow their peaks."""
-        if not self.problem.constraints:
-            return [stage]
-        parts = range(-(-stage.iterations // STRETCH))
-        return [
-            stage._replace(
-                iterations=min(STRETCH, stage.iterations - k * STRETCH),
-                barrier=max(stage.least, stage.barrier * COOLING ** (k * STRETCH)),
-            )
-            for k in parts
-        ]
-
-    def _calmed(self, state: State, broken: Bool[np.ndarray, " starts"]) -> State:
-        """Starts anew where constraints are broken, from small motions that keep them best."""
-        many = jnp.concatenate(
-            [
-                random_starts(self.problem.limits, jax.random.key(k), 16, s)
-                for k, s in enumerate(CALM)
-            ]
-        )
-        best = jnp.argsort(jnp.maximum(self._worst(many), 0.0))
-        chosen = many[best[np.arange(self._starts) % len(many)]]
-        anew = self._solver.start(chosen, self.problem.conditions)
-        return jax.tree.map(
-            lambda a, b: jnp.where(broken.reshape(-1, *(1,) * (a.ndim - 1)), a, b), anew, state
-        )
+    def __init__(
+        self,
+        problem: ExcitationProblem,
+        key: PRNGKeyArray,
+        starts: int,
+        generations: int,
+        polished: int,
+    ):
+        self._problem, self._key = problem, key
+        self._schedule = SCHEDULE + SETTLING if problem.constraints else SCHEDULE
+        self._generations, self._polished = generations, min(polished, starts)
+        x = problem.limits.random(key, starts)
+        self.done, self.best = 0, evaluate(problem, x)
+        self.first = self.best.value
+        self._order = self.best.promising()
+        self._state = _begin(problem, SEARCHED, x)
 
     @property
-    def legs(self) -> int:
-        """Number of legs: of the starts, of their descendants, and the last one."""
-        return len(self._legs) + self._generations + 1
+    def steps(self) -> int:
+        """Number of steps: of the starts, of their descendants, the last one, and polishing."""
+        return self._searching + self._polished
+
+    @property
+    def searching(self) -> bool:
+        """Whether the next step is one of the search from many starts, not polishing."""
+        return self.done < self._searching
+
+    @property
+    def fraction(self) -> float:
+        """Completed fraction of the work, from 0 to 1."""
+        polished = max(self.done - self._searching, 0)
+        total = self._searching + POLISHING * self._polished
+        return (self.done - polished + POLISHING * polished) / total
+
+    @property
+    def _searching(self) -> int:
+        return len(self._schedule) + self._generations + 1
+
+    def advance(self) -> None:
+        """Do the next step."""
+        number, generation = self.done, self.done - len(self._schedule)
+        if generation < 0:
+            self._improve_starts(self._schedule[number])
+        elif generation < self._generations:
+            key = jax.random.fold_in(self._key, generation)
+            children = _improve(self._problem, SEARCHED, self._children(key), GENERATION)
+            self.best = self.best.survivors(evaluate_within_limits(self._problem, children.y))
+        elif generation == self._generations:
+            start = _begin(self._problem, FINE, self.best.x)
+            found = _improve(self._problem, FINE, start, LAST)
+            self.best = self.best.improved(evaluate_within_limits(self._problem, found.y))
+        else:
+            place = int(self._order[number - self._searching])
+            better = polish(self._problem, np.asarray(self.best.x[place]))
+            self.best = self.best.improved_at(place, better)
+        self.done = number + 1
+        if self.done <= self._searching:
+            self._order = self.best.promising()
+
+    def finish(self) -> None:
+        """Make motions smaller where no other keeps all constraints."""
+        if not (np.asarray(self.best.excess) <= 0.0).any():
+            for place, x in enumerate(np.asarray(self.best.x)):
+                self.best = self.best.improved_at(place, shrink_to_constraints(self._problem, x))
+
+    def save(self, path: str | Path) -> None:
+        """Write the state of the search.
+
+        Args:
+            path: Path of the file.
+        """
+        buffer = io.BytesIO()
+        eqx.tree_serialise_leaves(buffer, (self._digest(), self._content()))
+        write_bytes(path, buffer.getvalue())
+
+    def resume(self, path: str | Path) -> None:
+        """Go on from a state that was saved for the same problem and settings.
+
+        Args:
+            path: Path of the file.
+
+        Raises:
+            InputError: If the file is no state, or belongs to another search.
+        """
+        digest = self._digest()
+        try:
+            with Path(path).open("rb") as file:
+                if (eqx.tree_deserialise_leaves(file, digest) != digest).any():
+                    raise InputError(
+                        f"`{path}` was saved by a design with other settings: use those again, or "
+                        "remove the file to start anew."
+                    )
+                content = eqx.tree_deserialise_leaves(file, self._content())
+        except (ValueError, EOFError, RuntimeError, TypeError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"`{path}` is no saved state of a design: remove it.") from error
+        self.done = int(content[0])
+        self.first, self.best, self._order, self._state = content[1:]
+
+    def _content(self) -> tuple:
+        content = np.array(self.done), self.first, self.best, self._order
+        return *jax.tree.map(np.asarray, content), self._state
+
+    def _digest(self) -> np.ndarray:
+        """Return a digest of everything that the result depends on."""
+        p = self._problem
+        settings = len(self.first), self._generations, self._polished, p.samples
+        parts = p.base, p.limits, p.criterion, p.constraints, p.noise, p.prior, settings
+        digest = hashlib.sha256(eqx.tree_pformat(parts, width=10**6).encode())
+        for leaf in jax.tree.leaves((parts, jax.random.key_data(self._key))):
+            digest.update(np.asarray(leaf).tobytes() if eqx.is_array_like(leaf) else b"")
+        return np.frombuffer(digest.digest(), np.uint8)
+
+    def _improve_starts(self, step: ScheduleStep) -> None:
+        if self.done == len(SCHEDULE):
+            self._restart(np.asarray(self.best.excess) > 0)
+        self._state = _improve(self._problem, SEARCHED, self._state, step)
+        if step.evaluated:
+            found = evaluate_within_limits(self._problem, self._state.y)
+            self.best = self.best.improved(found)
+
+    def _restart(self, broken: Bool[np.ndarray, " starts"]) -> None:
+        """Start again where constraints are broken, from small motions that keep them best."""
+        if not broken.any():
+            return
+        limits = self._problem.limits
+        sizes = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
+        many = jnp.concatenate(
+            [limits.random(jax.random.key(k), 16, size) for k, size in enumerate(sizes)]
+        )
+        best = jnp.argsort(jnp.maximum(_watched_excess(self._problem, many), 0.0))
+        chosen = many[best[np.arange(len(broken)) % len(many)]]
+        self._state = jax.tree.map(
+            lambda a, b: jnp.where(broken.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
+            _begin(self._problem, SEARCHED, chosen),
+            self._state,
+        )
+
+    def _children(self, key: PRNGKeyArray) -> State:
+        children = crossover(self._problem, jnp.asarray(self.best.x), key)
+        return _begin(self._problem, SEARCHED, children)
 
 
-def random_starts(
-    limits: JointLimits, key: PRNGKeyArray, starts: int, size: float = 1.0
+def _begin(problem: ExcitationProblem, points: int, x: AnyArray) -> State:
+    return InteriorPoint(problem.limits.grid(points)).init(x, problem.conditions)
+
+
+def _improve(problem: ExcitationProblem, points: int, state: State, step: ScheduleStep) -> State:
+    """Run one step of the schedule; with constraints in parts, whose peaks are found anew."""
+    part = 25 if problem.constraints else step.iterations
+    for start in range(0, step.iterations, part):
+        barrier = max(step.least, step.barrier * 0.9**start)
+        stage = Stage(step.bound, barrier, step.least, step.penalty)
+        numbers = jax.tree.map(lambda x: jnp.asarray(x, float), (stage, step.sharpness))
+        iterations = jnp.asarray(min(part, step.iterations - start))
+        instants = _watched_instants(problem, state.y)
+        state = _run(problem, points, state, *numbers, iterations, instants)
+    return jax.block_until_ready(state)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _run(
+    problem: ExcitationProblem, points: int, state: State, stage, sharpness, iterations, instants
+) -> State:
+    solver = InteriorPoint(problem.limits.grid(points))
+
+    def objective(x: Array) -> Any:
+        return problem.evaluate(x, sharpness, instants)
+
+    return solver.run(objective, state, stage, iterations)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _watched_instants(problem: ExcitationProblem, x: Array) -> Array:
+    return problem.watched_instants(x)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _watched_excess(problem: ExcitationProblem, x: Array) -> Array:
+    return problem.watched_excess(x)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def crossover(
+    problem: ExcitationProblem, x: Float[Array, "starts scaled"], key: PRNGKeyArray, tries: int = 16
 ) -> Float[Array, "starts scaled"]:
-    """Motions with random shapes and places that fill their limits, in scaled numbers.
+    """Return one child of each motion with another one: the most promising of several.
+
+    Some joints of a child move as in one parent, the others as in another, begun at another time.
+    Limits hold for each joint alone, so that a child keeps the limits that its parents keep. The
+    information of a motion does not depend on when its period begins or which way it runs, so that
+    two good motions may fit together at one shift only: many children are tried.
 
     Args:
-        limits: Of the joints.
-        key: Of the random numbers.
-        starts: How many.
-        size: Of the motions, relative to those that fill the limits.
+        problem: Criterion, limits and constraints.
+        x: Scaled coefficients of the parents.
+        key: Key of the random numbers.
+        tries: Number of children of each motion of which the most promising one is kept.
     """
-    joints, variables = limits.shape
-    fine = limits.grid(CERTIFIED)
-    shape, place = jax.random.split(key)
-    draws = jax.random.normal(shape, (starts, joints * variables), float)
-    places = jax.random.uniform(place, (starts, joints), float)
-    return jax.vmap(lambda a, b: random_motion(fine, limits.still, a, b, size=size))(draws, places)
+    retimings = jnp.asarray(problem.basis.retimings())
+
+    def penalised(children: Array) -> Array:
+        value = problem.values(children, None, problem.search_samples)
+        if problem.constraints:
+            value = value + PENALTY * jnp.maximum(problem.watched_excess(children), 0.0)
+        return jnp.where(jnp.isnan(value), jnp.inf, value)
+
+    def another(best: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
+        children = _draw_children(problem, retimings, x, key)
+        value = penalised(children)
+        better = value < best[1]
+        return (jnp.where(better[:, None], children, best[0]), jnp.minimum(value, best[1])), None
+
+    none = x, jnp.full(len(x), jnp.inf)
+    return jax.lax.scan(another, none, jax.random.split(key, tries))[0][0]
+
+
+def _draw_children(
+    problem: ExcitationProblem, retimings: Array, x: Array, key: PRNGKeyArray
+) -> Array:
+    mate_key, kind_key, time_key, share_key, joint_key, other_key = jax.random.split(key, 6)
+    starts, (joints, _) = len(x), problem.limits.shape
+    ahead = jax.random.randint(mate_key, (starts,), 1, max(starts, 2))
+    # Half of the second parents are not retimed: motions of one descent fit together already.
+    which = jax.random.randint(time_key, (starts,), 0, len(retimings))
+    T = retimings[jnp.where(jax.random.uniform(kind_key, (starts,), float) < 0.5, 0, which)]
+    mates = problem.limits.coefficients(x[(jnp.arange(starts) + ahead) % starts])
+    mates = problem.limits.scaled(jnp.einsum("bvw,bjw->bjv", T, mates))
+    # A child has this expected fraction of joints from its second parent, and at least one.
+    share = jax.random.uniform(share_key, (starts, 1), float, 0.1, 0.5)
+    taken = jax.random.uniform(other_key, (starts, joints), float) < share
+    surely = jax.random.randint(joint_key, (starts, 1), 0, joints)
+    taken = (taken | (surely == np.arange(joints)[None]))[:, :, None]
+    first, second = (z.reshape(starts, joints, -1) for z in (x, mates))
+    return jnp.where(taken, second, first).reshape(x.shape)

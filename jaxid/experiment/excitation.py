@@ -10,19 +10,23 @@ import numpy as np
 
 from jaxid.arrays import Float, double_precision
 from jaxid.errors import InputError
-from jaxid.excitation.constraints.clearance import Clearance
-from jaxid.excitation.constraints.constraint import AbstractConstraint, Finding
-from jaxid.excitation.constraints.forces import (
+from jaxid.excitation.constraints import (
+    AbstractConstraint,
     AbstractForceLimits,
+    Clearance,
+    Finding,
     JointForces,
     MotorTorques,
     NominalForces,
+    TipAcceleration,
+    TipSpeed,
+    Workspace,
 )
-from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace
-from jaxid.excitation.design import DesignProgress, assumed_noise, design_excitation
+from jaxid.excitation.criteria import CRITERIA as ALL_CRITERIA
+from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.information import information
-from jaxid.excitation.plan import CRITERIA as ALL_CRITERIA
 from jaxid.excitation.plan import ExcitationPlan
+from jaxid.excitation.problem import assumed_noise
 from jaxid.experiment.decoder import within
 from jaxid.experiment.excitation_tables import CRITERIA
 from jaxid.experiment.experiment import Experiment
@@ -146,9 +150,9 @@ def compare_criteria(
     for number, criterion in enumerate(ALL_CRITERIA):
 
         def tell(now: DesignProgress, number: int = number) -> None:
-            share = (number + now.share) / len(ALL_CRITERIA)
-            doing = f"criterion {number + 1} of {len(ALL_CRITERIA)}, {now.doing}"
-            progress(now._replace(share=share, doing=doing))
+            share = (number + now.fraction) / len(ALL_CRITERIA)
+            doing = f"criterion {number + 1} of {len(ALL_CRITERIA)}, {now.task}"
+            progress(now._replace(fraction=share, task=doing))
 
         try:
             with within("excitation", experiment.path.name):
@@ -230,7 +234,7 @@ def find_constraints(
     if table.tip_acceleration is not None:
         constraints.append(TipAcceleration(table.tip_acceleration))
     if table.workspace is not None:
-        constraints.append(Workspace.of(*table.workspace))
+        constraints.append(Workspace(*table.workspace))
     if table.force_margin is None:
         return tuple(constraints)
     if nominal is None:
@@ -252,7 +256,7 @@ def _force_limits(
     """Return limits of joints' forces and motors' torques, as far as the robot has them."""
     robot = experiment.robot
     parameters = np.nan_to_num(nominal.parameters)
-    forces = NominalForces.of(experiment.base, parameters, nominal.covariance)
+    forces = NominalForces(experiment.base, parameters, nominal.covariance)
     limits: list[AbstractForceLimits] = []
     if np.isfinite(robot.limits.force).any():
         limits.append(JointForces(forces, margin))

@@ -98,7 +98,7 @@ def designing(console: Console) -> Iterator[Callable[[DesignProgress], None]]:
 
         def tell(now: DesignProgress) -> None:
             kept = "" if now.feasible else ", limits not yet kept"
-            text = f"{now.doing}, best so far {now.best:.5g}{kept}"
-            progress.update(task, description=text, completed=now.share)
+            text = f"{now.task}, best so far {now.best:.5g}{kept}"
+            progress.update(task, description=text, completed=now.fraction)
 
         yield tell

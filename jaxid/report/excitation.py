@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.arrays import double_precision
-from jaxid.excitation.constraints.constraint import Finding
+from jaxid.excitation.constraints import Finding
 from jaxid.excitation.plan import VAGUE, ExcitationPlan
 from jaxid.io import atomic_folder
 from jaxid.report.motion import joint_figure, tip_figure

@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.excitation.constraints.tip import tip_motion
+from jaxid.excitation.constraints import tip_motion
 from jaxid.report.style import (
     BLUE,
     GREY,

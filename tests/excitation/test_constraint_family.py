@@ -10,9 +10,16 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import CoulombFriction, RigidBodies
 from jaxid.dynamics.transitions import HardSign
-from jaxid.excitation.constraints.clearance import SIZE, Clearance
-from jaxid.excitation.constraints.forces import JointForces, MotorTorques, NominalForces
-from jaxid.excitation.constraints.tip import TipAcceleration, TipSpeed, Workspace, tip_motion
+from jaxid.excitation.constraints import (
+    Clearance,
+    JointForces,
+    MotorTorques,
+    NominalForces,
+    TipAcceleration,
+    TipSpeed,
+    Workspace,
+    tip_motion,
+)
 from jaxid.robot import library
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.drives import Drives
@@ -40,7 +47,7 @@ BASE = base_parameters(Model(ROBOT, (RigidBodies(),)))
 RANDOM = np.random.default_rng(0)
 NOMINAL = RANDOM.standard_normal(BASE.size)
 ROOT = 0.1 * RANDOM.standard_normal((BASE.size, BASE.size))
-EXPECTED = NominalForces.of(BASE, NOMINAL, ROOT @ ROOT.T, deviations=2.0)
+EXPECTED = NominalForces(BASE, NOMINAL, ROOT @ ROOT.T, deviations=2.0)
 SHAPES = CollisionModel(
     ROBOT,
     (
@@ -57,11 +64,11 @@ SHAPES = CollisionModel(
 )
 FAMILY = {
     "forces": JointForces(EXPECTED),
-    "known forces": JointForces(NominalForces.of(BASE, NOMINAL), margin=0.0),
+    "known forces": JointForces(NominalForces(BASE, NOMINAL), margin=0.0),
     "motors": MotorTorques(EXPECTED, margin=0.2),
     "speed": TipSpeed(1.5),
     "acceleration": TipAcceleration(8.0),
-    "workspace": Workspace.of((-0.3, 0.2, -np.inf), (0.4, 0.9, np.inf)),
+    "workspace": Workspace((-0.3, 0.2, -np.inf), (0.4, 0.9, np.inf)),
     "clearance": Clearance(SHAPES),
 }
 SERIES = random_fourier_series(ROBOT, omega=1.2, harmonics=3, seed=2)
@@ -112,6 +119,10 @@ def test_words_name_what_is_exceeded(name):
     found = constraint.describe(ROBOT, np.asarray(constraint(ROBOT, MOTION)))
     assert [f.name for f in found] == [e.name for e in entries]
     assert all(e.size > 0 for e in entries)
+    for f in found:
+        word = "with" if f.value <= 0 else "short" if f.least else "exceeds"
+        assert f"{abs(f.excess):.3g} {f.unit}" in str(f)
+        assert word in str(f)
 
 
 def test_forces_are_the_regressors_with_tool_and_deviations():
@@ -141,7 +152,7 @@ def test_a_joint_that_turns_round_may_need_friction_to_either_side():
     base = base_parameters(Model(ROBOT, terms))
     p = np.random.default_rng(3).standard_normal(base.size)
     p[[k for k, name in enumerate(base.names) if name.startswith("fc")]] = [5.0, 3.0, 1.0]
-    constraint = JointForces(NominalForces.of(base, p), margin=0.0)
+    constraint = JointForces(NominalForces(base, p), margin=0.0)
     limits = np.array([60.0, 9.0])
 
     def needed(motion):
@@ -167,7 +178,7 @@ def test_a_joint_that_turns_round_may_need_friction_to_either_side():
 
 
 def test_coupled_motors_share_joints():
-    values = np.asarray(MotorTorques(NominalForces.of(BASE, NOMINAL), margin=0.0)(ROBOT, MOTION))
+    values = np.asarray(MotorTorques(NominalForces(BASE, NOMINAL), margin=0.0)(ROBOT, MOTION))
     forces = np.asarray(BASE.inverse_dynamics(NOMINAL, MOTION) + BASE.model.tool_forces(MOTION))
     torques = np.linalg.solve(np.asarray(ROBOT.drives.reduction).T, forces.T).T
     expected = np.abs(torques[:, [0, 2]]) / [1.0, 0.4] - 1
@@ -198,7 +209,7 @@ def test_the_workspace_counts_in_half_edges():
 def test_clearance_is_that_of_the_model():
     gaps = np.asarray(SHAPES.clearance(ROBOT, MOTION.q))
     values = np.asarray(Clearance(SHAPES, distance=0.05)(ROBOT, MOTION))
-    np.testing.assert_allclose(values, (0.05 - gaps) / SIZE, atol=1e-9)
+    np.testing.assert_allclose(values, (0.05 - gaps) / 0.1, atol=1e-9)
     found = Clearance(SHAPES, distance=0.05).describe(ROBOT, values)
     worst = int(np.argmin(gaps.min(axis=0)))
     assert found[worst].excess == pytest.approx(0.05 - gaps.min(), abs=1e-9)
@@ -207,15 +218,15 @@ def test_clearance_is_that_of_the_model():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: NominalForces.of(BASE, NOMINAL[:3]), "`parameters` must hold one"),
-        (lambda: NominalForces.of(BASE, NOMINAL, np.eye(3)), "`covariance` must be"),
-        (lambda: NominalForces.of(BASE, NOMINAL, -np.eye(BASE.size)), "negative eigenvalue"),
-        (lambda: NominalForces.of(BASE, NOMINAL, deviations=-1.0), "`deviations` must"),
-        (lambda: TipSpeed(0.0), "`limit` of `TipSpeed`"),
-        (lambda: TipAcceleration(-1.0), "`limit` of `TipAcceleration`"),
-        (lambda: Workspace.of((0, 0, 0), (1, 0, 1)), "must be below"),
-        (lambda: Workspace.of((0, 0), (1, 1)), "three numbers"),
-        (lambda: Workspace.of([-np.inf] * 3, [np.inf] * 3), "all of space"),
+        (lambda: NominalForces(BASE, NOMINAL[:3]), "`parameters`"),
+        (lambda: NominalForces(BASE, NOMINAL, np.eye(3)), "`covariance`"),
+        (lambda: NominalForces(BASE, NOMINAL, -np.eye(BASE.size)), "`covariance`"),
+        (lambda: NominalForces(BASE, NOMINAL, deviations=-1.0), "`deviations`"),
+        (lambda: TipSpeed(0.0), "`limit`"),
+        (lambda: TipAcceleration(-1.0), "`limit`"),
+        (lambda: Workspace((0, 0, 0), (1, 0, 1)), "`low`"),
+        (lambda: Workspace((0, 0), (1, 1)), "`low`"),
+        (lambda: Workspace([-np.inf] * 3, [np.inf] * 3), "`low`"),
     ],
 )
 def test_refuses(make, message):

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.dynamics.motion import Motion
-from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
+from jaxid.excitation.constraints import AbstractConstraint, Finding
 from jaxid.robot import library
 
 
@@ -18,7 +18,7 @@ class SlowFirstJoint(AbstractConstraint):
     def entries(self, robot):
         half = float(0.5 * robot.limits.velocity[0])
         name = robot.joint_names[0]
-        return tuple(Entry(f"speed of `{name}` {way}", half, "rad/s") for way in ("up", "down"))
+        return tuple(Finding(f"speed of `{name}` {way}", half, "rad/s") for way in ("up", "down"))
 
 
 def test_findings_are_the_peaks_in_physical_units():

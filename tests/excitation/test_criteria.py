@@ -7,9 +7,13 @@ import pytest
 
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation import criteria as members
-from jaxid.excitation.information import Information, InformationMap, information
-from jaxid.excitation.plan import CRITERIA, deviations
-from jaxid.excitation.spectral import log_condition, spectral
+from jaxid.excitation.criteria import CRITERIA, log_condition, spectral
+from jaxid.excitation.information import (
+    Information,
+    information,
+    information_map,
+    standard_deviations,
+)
 from jaxid.trajectory.fourier import FourierBasis
 
 SIZE = 7
@@ -95,14 +99,8 @@ def test_compiled_information_is_that_of_all_samples(base, random):
     basis = FourierBasis(3, 1.2)
     x = random.standard_normal((5, 2, basis.variables))
     weights, prior = np.array([0.1, 0.7]), 1e-3 * np.eye(base.size)
-    made = InformationMap.of(
-        base,
-        basis,
-        evaluated=50,
-        measured=50,
-        weights=weights,
-        prior=prior,
-        sizes=np.ones(base.size),
+    plains, weighteds = information_map(
+        base, basis, samples=50, measured=50, weights=weights, prior=prior
     )(jnp.asarray(x))
     for k, one in enumerate(x):
         motion = basis.trajectory(one).motion(basis.times(50))
@@ -111,8 +109,8 @@ def test_compiled_information_is_that_of_all_samples(base, random):
         weighted = np.einsum("sji,j,sjk->ik", theta, weights**2, theta) + prior
         exact = information(base, motion, weights, prior)
         for got, asked in (
-            (made.plain[k], plain),
-            (made.weighted[k], weighted),
+            (plains[k], plain),
+            (weighteds[k], weighted),
             (exact.plain, plain),
             (exact.weighted, weighted),
         ):
@@ -121,11 +119,13 @@ def test_compiled_information_is_that_of_all_samples(base, random):
 
 def test_deviations_are_those_of_the_inverse_and_infinite_where_nothing_is_known():
     V = sample().weighted
-    np.testing.assert_allclose(deviations(V), np.sqrt(np.diag(np.linalg.inv(V))), rtol=1e-8)
+    np.testing.assert_allclose(
+        standard_deviations(V), np.sqrt(np.diag(np.linalg.inv(V))), rtol=1e-8
+    )
     A = np.random.default_rng(0).standard_normal((30, 4))
     A[:, 2] = 0.0
     A[:, 1] = A[:, 0]
-    found = deviations(A.T @ A)
+    found = standard_deviations(A.T @ A)
     np.testing.assert_array_equal(np.isinf(found), [True, True, True, False])
 
 

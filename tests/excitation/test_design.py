@@ -1,6 +1,7 @@
 """Whole designs on a small arm: limits for all times, better than random, stopped and resumed."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -8,23 +9,18 @@ import numpy as np
 import pytest
 
 from jaxid.dynamics.motion import Motion
-from jaxid.excitation.constraints.clearance import Clearance
-from jaxid.excitation.constraints.constraint import AbstractConstraint, Entry
+from jaxid.excitation.constraints import AbstractConstraint, Clearance, Finding
 from jaxid.excitation.criteria import ConditionNumber, DOptimal
-from jaxid.excitation.design import design_excitation
+from jaxid.excitation.design import design_excitation, minimise
 from jaxid.excitation.information import information
-from jaxid.excitation.state import fingerprint
+from jaxid.excitation.problem import ExcitationProblem
+from jaxid.excitation.search import Search
 from jaxid.robot.collision import GROUND, Capsule, CollisionModel
 from jaxid.trajectory.files import load_trajectory
+from jaxid.trajectory.fourier import FourierBasis
 
-SETTINGS = {
-    "harmonics": 3,
-    "omega": 1.1,
-    "starts": 3,
-    "generations": 2,
-    "polish": 1,
-    "samples": 200,
-}
+EFFORT = {"starts": 3, "generations": 2, "polish": 1}
+SETTINGS = {"harmonics": 3, "omega": 1.1, "samples": 200, **EFFORT}
 
 
 class LowTip(AbstractConstraint):
@@ -36,12 +32,17 @@ class LowTip(AbstractConstraint):
         return (jnp.sum(motion.q, axis=-1, keepdims=True) - self.bound) / 1.0
 
     def entries(self, robot):
-        return (Entry("tilt of the tip", 1.0, "rad"),)
+        return (Finding("tilt of the tip", 1.0, "rad"),)
 
 
 @pytest.fixture(scope="module")
-def plan(base):
-    return design_excitation(base, key=jax.random.key(3), **SETTINGS)
+def problem(base):
+    return ExcitationProblem(base, FourierBasis(3, 1.1), samples=200)
+
+
+@pytest.fixture(scope="module")
+def plan(problem):
+    return minimise(problem, key=jax.random.key(3), **EFFORT)
 
 
 def excess(plan):
@@ -94,7 +95,7 @@ def test_writes_a_table_and_itself(plan, tmp_path):
     np.testing.assert_array_equal(again.coefficients, plan.trajectory.coefficients)
 
 
-def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(base, plan, tmp_path):
+def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(problem, plan, tmp_path):
     seen = []
 
     def stop(progress):
@@ -102,28 +103,56 @@ def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(base, pl
         if len(seen) == 9:
             raise KeyboardInterrupt
 
-    file = tmp_path / "design.npz"
-    arguments = {"key": jax.random.key(3), "state": file, **SETTINGS}
-    stopped = design_excitation(base, progress=stop, **arguments)
+    file = tmp_path / "design.state"
+    arguments = {"key": jax.random.key(3), "state": file, **EFFORT}
+    stopped = minimise(problem, progress=stop, **arguments)
     assert stopped.interrupted
     assert excess(stopped) <= 0.0
-    assert seen[0].share < seen[-1].share < 1.0
+    assert seen[0].fraction < seen[-1].fraction < 1.0
     assert seen[-1].best <= seen[0].best
-    resumed = design_excitation(base, resume=True, **arguments)
+    resumed = minimise(problem, resume=True, **arguments)
     assert not resumed.interrupted
-    np.testing.assert_array_equal(resumed.numbers, plan.numbers)
+    expected = plan.trajectory.coefficients
+    np.testing.assert_array_equal(resumed.trajectory.coefficients, expected)
     with pytest.raises(ValueError, match="other settings"):
-        design_excitation(base, resume=True, **{**arguments, "samples": 100})
+        minimise(problem, resume=True, **{**arguments, "key": jax.random.key(4)})
     file.write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="no saved state"):
-        design_excitation(base, resume=True, **arguments)
+        minimise(problem, resume=True, **arguments)
 
 
-def test_generations_never_make_a_motion_worse(base, plan):
-    calm = design_excitation(base, key=jax.random.key(3), **{**SETTINGS, "generations": 0})
+def test_every_step_keeps_or_improves_the_best_motion(problem, plan):
+    """Guaranteed for any rounding: the best motion so far is only replaced by a better one."""
+    seen = []
+    minimise(problem, key=jax.random.key(3), progress=seen.append, **EFFORT)
+    values = [one.best for one in seen]
+    assert all(after <= before for before, after in itertools.pairwise(values))
+    assert seen[-1].fraction == 1.0
     d = DOptimal()
-    assert d.value(plan.information) <= d.value(calm.information)
     assert d.value(plan.information) < 0.9 * d.value(plan.reference)
+
+
+def test_the_problems_functions_are_those_of_the_motion(pendulum):
+    """`value`, `inequalities` and `violation` run under `jit` and agree with the exact ones."""
+    basis = FourierBasis(3, 1.1)
+    problem = ExcitationProblem(pendulum, basis, constraints=(LowTip(0.5),), samples=200)
+    x = problem.random(jax.random.key(0))
+    value = jax.jit(problem.value)
+    assert float(value(x)) == pytest.approx(problem.exact_value(x), abs=1e-9)
+    motion = problem.trajectory(x).motion(basis.times(200))
+    information_ = information(pendulum, motion, 1.0 / problem.noise)
+    assert float(value(x)) == pytest.approx(np.log(DOptimal().value(information_)), abs=1e-9)
+    slope = jax.grad(problem.value)(x)
+    direction = np.linspace(-1.0, 1.0, problem.size)
+    quotient = (value(x + 1e-6 * direction) - value(x - 1e-6 * direction)) / 2e-6
+    assert float(slope @ direction) == pytest.approx(float(quotient), rel=1e-5)
+    violation = jax.jit(problem.violation)
+    q = problem.trajectory(x).motion(np.linspace(0.0, basis.duration, 20_000)).q
+    assert float(violation(x)) == pytest.approx(float(np.max(q)) - 0.5, abs=1e-5)
+    inequalities = jax.jit(problem.inequalities)
+    for factor in (0.05, 1.0, 3.0):
+        broken = float(jnp.max(inequalities(factor * x)))
+        assert broken == pytest.approx(float(violation(factor * x)), abs=0.05)
 
 
 def test_constraints_are_kept_where_they_bind(pendulum):
@@ -152,19 +181,19 @@ def test_what_is_known_already_is_not_measured_again(pendulum):
     motion = after.trajectory.motion(after.limits.basis.times(after.samples))
     alone = information(pendulum, motion, 1.0 / after.noise).weighted
     np.testing.assert_allclose(after.information.weighted, alone + prior, rtol=1e-9)
-    with pytest.raises(ValueError, match="in units of the noise"):
+    with pytest.raises(ValueError, match="`prior`"):
         design_excitation(pendulum, prior=prior, criterion=ConditionNumber(), **SETTINGS)
-    with pytest.raises(ValueError, match="`prior` must be a matrix"):
+    with pytest.raises(ValueError, match="`prior`"):
         design_excitation(pendulum, prior=np.eye(2), **SETTINGS)
 
 
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ({"starts": 0}, "`starts` must be at least 1"),
-        ({"polish": -1}, "`polish` must be at least 0"),
-        ({"generations": -1}, "`generations` must be at least 0"),
-        ({"noise": np.array([1.0, -1.0])}, "`noise` must hold one positive"),
+        ({"starts": 0}, "`starts`"),
+        ({"polish": -1}, "`polish`"),
+        ({"generations": -1}, "`generations`"),
+        ({"noise": np.array([1.0, -1.0])}, "`noise`"),
     ],
 )
 def test_refuses_what_makes_no_sense(base, argument, message):
@@ -178,15 +207,31 @@ def test_a_constraint_sees_each_sample_by_itself(arm):
     np.testing.assert_allclose(whole[2], LowTip(0.3)(arm, motion[2]))
 
 
-def test_a_state_belongs_to_the_pairs_that_are_watched(pendulum):
+def test_a_state_belongs_to_the_pairs_that_are_watched(pendulum, tmp_path):
     """They are no arrays, and decide all the same."""
-    robot = pendulum.model.robot
     shapes = (
         Capsule("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),
         Capsule("post", GROUND, start=(2.0, 0, 0), end=(2.0, 0, 1.0), radius=0.05),
         Capsule("far", GROUND, start=(9.0, 0, 0), end=(9.0, 0, 1.0), radius=0.05),
     )
-    models = [CollisionModel(robot, shapes, (), (("hand", x),)) for x in ("post", "far", "far")]
-    post, far, again = (fingerprint(Clearance(m, distance=0.02)) for m in models)
-    assert post != far
-    assert far == again
+    models = [
+        CollisionModel(pendulum.model.robot, shapes, (), (("hand", x),))
+        for x in ("post", "far", "far")
+    ]
+    post, far, again = (
+        Search(
+            ExcitationProblem(
+                pendulum, FourierBasis(1, 1.1), constraints=(Clearance(m, distance=0.02),)
+            ),
+            jax.random.key(0),
+            1,
+            0,
+            0,
+        )
+        for m in models
+    )
+    post.save(tmp_path / "state")
+    with pytest.raises(ValueError, match="other settings"):
+        far.resume(tmp_path / "state")
+    far.save(tmp_path / "state")
+    again.resume(tmp_path / "state")

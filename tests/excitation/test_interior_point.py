@@ -1,5 +1,6 @@
 """The interior point method against scipy on convex problems whose limits bind."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
@@ -13,7 +14,7 @@ RANDOM = np.random.default_rng(0)
 
 def problem(arm):
     """Limits, a wish outside of them, and how dear it is to be away from it."""
-    limits = JointLimits.of(arm, FourierBasis(3, 1.1))
+    limits = JointLimits(arm, FourierBasis(3, 1.1))
     size = limits.scale.size
     A, wish = RANDOM.standard_normal((size, size)), 1.5 * RANDOM.standard_normal(size)
     return limits, wish, 0.1 * A @ A.T + np.eye(size)
@@ -21,11 +22,11 @@ def problem(arm):
 
 def solved(limits, objective, constraints=0, stages=()):
     grid, size = limits.grid(64), limits.scale.size
-    solver = InteriorPoint(objective, grid, limits.still)
-    start = jnp.asarray(0.1 * RANDOM.standard_normal((3, size)))
-    state = solver.start(start, constraints)
-    for stage in stages or (Stage(2.0, 1.0, 1e-3, 40), Stage(1.0, 1.0, 1e-8, 200)):
-        state = solver.run(state, stage, None)
+    solver = InteriorPoint(grid)
+    state = solver.init(0.1 * RANDOM.standard_normal((3, size)), constraints)
+    run = jax.jit(lambda *arguments: solver.run(objective, *arguments))
+    for stage, iterations in stages or ((Stage(2.0, 1.0, 1e-3), 40), (Stage(1.0, 1.0, 1e-8), 200)):
+        state = run(state, jax.tree.map(float, stage), iterations)
     rows = np.zeros((*grid.c.shape, 2, limits.shape[1]))
     for j in range(2):
         rows[j, :, j] = grid.R[j]
@@ -50,14 +51,14 @@ def by_scipy(wish, H, G, c, bound, *more):
 def test_reaches_the_constrained_minimum_from_every_start(arm):
     limits, wish, H = problem(arm)
 
-    def objective(y, context):
+    def objective(y):
         away = y - wish[None]
-        return Evaluation.free(0.5 * jnp.einsum("bi,ij,bj->b", away, H, away), away @ H)
+        return Evaluation.unconstrained(0.5 * jnp.einsum("bi,ij,bj->b", away, H, away), away @ H)
 
     state, G, c, bound = solved(limits, objective)
     best = by_scipy(wish, H, G, c, bound)
     assert best.success
-    np.testing.assert_allclose(state.seen.value, best.fun, rtol=1e-4)
+    np.testing.assert_allclose(state.evaluation.value, best.fun, rtol=1e-4)
     assert (np.abs(np.asarray(state.y) @ G.T - c) <= bound).all()
 
 
@@ -66,7 +67,7 @@ def curved(wish, H, radii):
     size = len(wish)
     places = 0.3 * RANDOM.standard_normal((len(radii), size))
 
-    def objective(y, context):
+    def objective(y):
         away, from_places = y - wish[None], y[:, None] - places[None]
         return Evaluation(
             0.5 * jnp.einsum("bi,ij,bj->b", away, H, away),
@@ -82,7 +83,7 @@ def test_keeps_constraints_that_are_not_linear(arm):
     limits, wish, H = problem(arm)
     radii = np.array([1.4, 1.6, 1.8])
     objective, places = curved(wish, H, radii)
-    stages = (Stage(1.0, 1e-1, 1e-3, 80, 100.0), Stage(1.0, 1e-3, 1e-8, 300, 100.0))
+    stages = ((Stage(1.0, 1e-1, 1e-3, 100.0), 80), (Stage(1.0, 1e-3, 1e-8, 100.0), 300))
     state, G, c, bound = solved(limits, objective, 3, stages)
     ball = {
         "type": "ineq",
@@ -92,8 +93,8 @@ def test_keeps_constraints_that_are_not_linear(arm):
     best = by_scipy(wish, H, G, c, bound, ball)
     assert best.success
     assert best.fun > 1.02 * by_scipy(wish, H, G, c, bound).fun, "the ellipsoids bind"
-    np.testing.assert_allclose(state.seen.value, best.fun, rtol=1e-4)
-    assert np.max(state.seen.excess) <= 1e-6
+    np.testing.assert_allclose(state.evaluation.value, best.fun, rtol=1e-4)
+    assert np.max(state.evaluation.excess) <= 1e-6
     assert (np.abs(np.asarray(state.y) @ G.T - c) <= bound).all()
 
 
@@ -101,7 +102,7 @@ def test_what_cannot_be_kept_is_exceeded_as_little_as_can_be(arm):
     limits, wish, H = problem(arm)
     radii = np.array([0.5, 0.6])
     objective, places = curved(wish, H, radii)
-    stages = (Stage(1.0, 1.0, 1e-2, 100, 100.0), Stage(1.0, 1e-2, 1e-6, 400, 100.0))
+    stages = ((Stage(1.0, 1.0, 1e-2, 100.0), 100), (Stage(1.0, 1e-2, 1e-6, 100.0), 400))
     state, G, c, bound = solved(limits, objective, 2, stages)
 
     def excess(y):
@@ -119,5 +120,5 @@ def test_what_cannot_be_kept_is_exceeded_as_little_as_can_be(arm):
     )
     assert least.success
     assert least.fun > 0.5
-    found = np.max(state.seen.excess, axis=1)
+    found = np.max(state.evaluation.excess, axis=1)
     np.testing.assert_allclose(found, least.fun, rtol=1e-2)

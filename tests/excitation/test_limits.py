@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.excitation.limits import JointLimits, calmed, held_within, random_motion
-from jaxid.excitation.search import random_starts
+from jaxid.excitation.limits import JointLimits
 from jaxid.robot.limits import Limits
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
@@ -16,7 +15,7 @@ BASES = (FourierBasis(4, 1.1), RestToRestBasis(4, 1.1), RestToRestSplineBasis(12
 
 @pytest.fixture(params=BASES, ids=lambda b: type(b).__name__)
 def limits(request, arm):
-    return JointLimits.of(arm, request.param)
+    return JointLimits(arm, request.param)
 
 
 def peaks(limits, x, samples=8000):
@@ -39,12 +38,12 @@ def test_random_and_restored_motions_keep_limits_and_use_them(limits):
         shape, place = jax.random.split(jax.random.key(seed))
         size = limits.scale.size
         draws = 3.0 * jax.random.normal(shape, (size,))
-        y = random_motion(fine, limits.still, draws, jax.random.uniform(place, (2,)))
-        assert -0.12 < peaks(limits, limits.numbers(y)) <= 0.0
+        y = fine.fill(draws, jax.random.uniform(place, (2,)), 1.0)
+        assert -0.12 < peaks(limits, limits.coefficients(y)) <= 0.0
         # A motion that breaks its limits, and one that leaves room.
         for z, growth in ((3.0 * y + 0.5, 1.0), (0.97 * y, 1.1)):
-            held = held_within(fine, limits.still, z, fine.bound, growth)
-            x = np.asarray(limits.numbers(held))
+            held = fine.scale_into_limits(z, growth=growth)
+            x = np.asarray(limits.coefficients(held))
             assert peaks(limits, x) <= 1e-12
             assert limits.use(x).max() <= 1.0 + 1e-9
             assert (limits.use(x).max(axis=0) > 0.9).all()
@@ -53,19 +52,19 @@ def test_random_and_restored_motions_keep_limits_and_use_them(limits):
 def test_what_is_within_is_not_touched(limits):
     fine = limits.grid(512)
     y = jnp.asarray(0.01 * np.random.default_rng(0).standard_normal(limits.scale.size))
-    middle = held_within(fine, limits.still, y, fine.bound)
-    again = held_within(fine, limits.still, middle, fine.bound)
+    middle = fine.scale_into_limits(y)
+    again = fine.scale_into_limits(middle)
     np.testing.assert_allclose(again, middle, atol=1e-12)
 
 
-def test_a_calmer_motion_is_smaller_about_the_same_place(limits):
+def test_a_shrunk_motion_is_smaller_about_the_same_place(limits):
     fine = limits.grid(512)
-    y = random_starts(limits, jax.random.key(1), 1)[0]
-    half = calmed(fine, limits.still, y, 0.5)
-    assert peaks(limits, limits.numbers(half)) <= 0.0
+    y = limits.random(jax.random.key(1), 1)[0]
+    half = fine.shrink(y, 0.5)
+    assert peaks(limits, limits.coefficients(half)) <= 0.0
     rows = limits.basis.rows(np.linspace(0.0, limits.basis.duration, 100))
     (q, qd), (q_half, qd_half) = (
-        [part @ np.asarray(limits.numbers(z)).T for part in rows[:2]] for z in (y, half)
+        [part @ np.asarray(limits.coefficients(z)).T for part in rows[:2]] for z in (y, half)
     )
     np.testing.assert_allclose(qd_half, 0.5 * qd, atol=1e-12)
     place = 2 * q_half - q
@@ -74,17 +73,17 @@ def test_a_calmer_motion_is_smaller_about_the_same_place(limits):
     assert (place[0] < np.max(q, axis=0)).all()
 
 
-def test_scaled_numbers_go_there_and_back(limits, random):
+def test_scaled_coefficients_go_there_and_back(limits, random):
     x = random.standard_normal((3, *limits.shape))
-    np.testing.assert_allclose(limits.numbers(limits.scaled(x)), x, atol=1e-12)
+    np.testing.assert_allclose(limits.coefficients(limits.scaled(x)), x, atol=1e-12)
 
 
 def test_unknown_limits_are_assumed_and_known_jerks_are_kept(arm):
-    free = JointLimits.of(arm, BASES[0], Limits(2))
+    free = JointLimits(arm, BASES[0], Limits(2))
     assert np.isfinite(free.limits.acceleration).all()
     assert len(free.grid(64).kinds) == 3
-    jerky = JointLimits.of(arm, BASES[0], Limits(2, jerk=[5.0, np.inf]))
+    jerky = JointLimits(arm, BASES[0], Limits(2, jerk=[5.0, np.inf]))
     grid = jerky.grid(64)
     assert len(grid.kinds) == 4
-    y = held_within(grid, jerky.still, jnp.ones(jerky.scale.size), grid.bound)
-    assert jerky.use(jerky.numbers(np.asarray(y)))[3, 0] <= 1.05
+    y = grid.scale_into_limits(jnp.ones(jerky.scale.size))
+    assert jerky.use(jerky.coefficients(np.asarray(y)))[3, 0] <= 1.05

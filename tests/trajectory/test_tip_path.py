@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxid.excitation.constraints.tip import tip_motion
+from jaxid.excitation.constraints import tip_motion
 from jaxid.robot import library
 from jaxid.robot.kinematics import tip_placement
 from jaxid.trajectory.tip_path import Line, TipPath, iso9283_path, joint_path

@@ -1,1 +1,0 @@
-"""What a motion must keep beside the limits of its joints."""

@@ -1,0 +1,114 @@
+"""Candidates and their children: which survive, which parents their joints come from."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxid.excitation.candidates import PENALTY, Candidates, evaluate, evaluate_within_limits
+from jaxid.excitation.constraints import TipSpeed
+from jaxid.excitation.criteria import ConditionNumber, DOptimal
+from jaxid.excitation.problem import ExcitationProblem
+from jaxid.excitation.search import crossover
+from jaxid.trajectory.fourier import FourierBasis
+
+BASIS = FourierBasis(3, 1.1)
+
+
+@pytest.fixture(scope="module")
+def problem(base):
+    return ExcitationProblem(base, BASIS, noise=np.ones(2), samples=200)
+
+
+@pytest.fixture(scope="module")
+def parents(problem):
+    return problem.limits.random(jax.random.key(1), 6)
+
+
+def test_start_and_direction_of_a_period_do_not_matter(problem):
+    """Children rely on this: all joints retimed together give the same information."""
+    x = problem.random(jax.random.key(0))
+    coefficients = problem.limits.coefficients(np.asarray(x))
+    retimed = [
+        problem.exact_value(problem.limits.scaled(coefficients @ T.T))
+        for T in BASIS.retimings()[::9]
+    ]
+    np.testing.assert_allclose(retimed, problem.exact_value(x), atol=1e-9)
+
+
+def test_each_joint_of_a_child_moves_as_in_a_parent(problem, parents):
+    children = crossover(problem, parents, jax.random.key(2))
+    limits, maps = problem.limits, BASIS.retimings()
+    first = np.asarray(limits.coefficients(parents))
+    foreign = 0
+    for place, child in enumerate(np.asarray(limits.coefficients(children))):
+        for joint, x in enumerate(child):
+            if np.array_equal(x, first[place, joint]):
+                continue
+            foreign += 1
+            others = np.delete(first[:, joint], place, axis=0)
+            possible = np.einsum("rvw,ow->orv", maps, others).reshape(-1, len(x))
+            assert np.abs(possible - x).max(axis=1).min() < 1e-9 * np.abs(x).max()
+    assert 6 <= foreign < first.shape[0] * first.shape[1]
+    np.testing.assert_array_equal(crossover(problem, parents, jax.random.key(2)), children)
+    # Limits hold for each joint alone: children keep them like their parents.
+    assert (limits.use(limits.coefficients(np.asarray(children[0])))[:3] < 1.01).all()
+
+
+def test_the_most_promising_children_are_kept(problem, parents):
+    many = evaluate(problem, crossover(problem, parents, jax.random.key(4))).value
+    firsts = [
+        evaluate(problem, crossover(problem, parents, jax.random.key(k), 1)).value for k in range(4)
+    ]
+    assert np.mean(many) < min(np.mean(one) for one in firsts)
+
+
+def test_constraints_count_among_children(base, problem, parents):
+    limited = ExcitationProblem(
+        base, BASIS, constraints=(TipSpeed(1.5),), noise=np.ones(2), samples=200
+    )
+    slow, free = (
+        np.asarray(limited.watched_excess(crossover(p, parents, jax.random.key(6))))
+        for p in (limited, problem)
+    )
+    assert slow.mean() < free.mean() - 0.05
+
+
+def test_a_single_motion_has_children_too(problem, parents):
+    child = np.asarray(crossover(problem, parents[:1], jax.random.key(8)))
+    assert child.shape == (1, problem.size)
+    assert np.isfinite(child).all()
+    assert not np.array_equal(child, parents[:1])
+
+
+def test_a_small_excess_does_not_outweigh_a_better_value():
+    best = Candidates(np.zeros((3, 1)), np.array([-1.0, -1.5, -1.6]), np.array([-0.1, 0.01, 1.0]))
+    assert list(best.order()) == [0, 1, 2]
+    assert list(best.promising()) == [1, 0, 2]
+    assert 0.01 * PENALTY < 0.5
+
+
+def test_the_best_of_two_generations_survive_and_none_twice():
+    parents = Candidates(
+        np.arange(3.0)[:, None], np.array([-1.0, -2.0, -3.0]), np.array([-1.0, -1, 0.2])
+    )
+    children = Candidates(
+        np.arange(10.0, 13.0)[:, None], np.array([-2.0, -1.5, np.inf]), np.array([-1.0, -1, np.inf])
+    )
+    best = parents.survivors(children)
+    assert list(best.x[:, 0]) == [1.0, 11.0, 0.0]
+    assert list(best.value) == [-2.0, -1.5, -1.0]
+    assert list(parents.survivors(parents).x[:, 0]) == [1.0, 0.0, 2.0]
+
+
+def test_a_motion_is_enlarged_to_its_limits_only_where_that_is_better(pendulum):
+    """A condition number may well become worse: what a polished motion gained would be lost."""
+    for criterion in (ConditionNumber(), DOptimal()):
+        free = ExcitationProblem(
+            pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100
+        )
+        x = 0.97 * np.asarray(free.limits.random(jax.random.key(8), 20))
+        before, within = evaluate(free, x), evaluate_within_limits(free, x)
+        assert (within.value <= before.value + 1e-9).all()
+        larger = np.abs(within.x).max(axis=1) > 1.02 * np.abs(x).max(axis=1)
+        assert larger.any()
+        assert not larger.all()
