@@ -193,7 +193,7 @@ def run_study(
     _ = base.expressions
     plans = () if motion is not None else _design(base, seed, starts, progress)
     if motion is None:
-        motion = jid.FourierBasis(HARMONICS, OMEGA).trajectory(plans[0].numbers)
+        motion = jid.FourierBasis(HARMONICS, OMEGA).trajectory(plans[0].trajectory.coefficients)
     progress("adding the leads", 0.0)
     played = jid.with_leads(motion, robot, periods=periods)
     progress("inverse kinematics of the verification path", 0.0)

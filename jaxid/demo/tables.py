@@ -271,7 +271,7 @@ def record(study: Study) -> dict[str, Any]:
                         "random": {c.name: c.before for c in plan.criteria},
                         "gain": plan.mean_gain,
                         "feasible": plan.feasible,
-                        "numbers": np.asarray(plan.numbers),
+                        "numbers": np.asarray(plan.trajectory.coefficients),
                     }
                     for plan in study.plans
                 ],
