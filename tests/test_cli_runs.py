@@ -214,8 +214,6 @@ def test_searches_that_two_runs_cannot_share_are_refused(folder, run):  # noqa: 
     (folder / "shapes.toml").write_text(EXPERIMENT + "[estimator]\nnonlinear_friction = true\n")
     said = "`estimator.nonlinear_friction` would find other shapes of friction in each run"
     assert refused(run("payload", "shapes.toml", *logs), said)
-    (folder / "steps.toml").write_text(EXPERIMENT + '[estimator]\nkind = "stepwise"\n')
-    assert refused(run("payload", "steps.toml", *logs), '`estimator.kind = "stepwise"`')
     (folder / "huber.toml").write_text(EXPERIMENT + '[estimator]\nkind = "huber"\n')
     code, out, err = run("payload", "huber.toml", *logs)
     assert (code, err) == (0, "")

@@ -93,7 +93,9 @@ def main() -> None:
     try:
         require_one_log_per_option()
         app()
-    except (InputError, OSError) as error:
+    except (InputError, OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
+            raise  # of JAX, not a failed search
         open_console(stderr=True).print(Text(f"jaxid: {describe_error(error)}"), soft_wrap=True)
         raise SystemExit(2) from None
 

@@ -1,4 +1,4 @@
-"""The command `jaxid excite`: a motion to record, and what is left of it when it is stopped."""
+"""The command `jaxid excite`: design of a motion to record, also when it is stopped."""
 
 import shlex
 from pathlib import Path
@@ -89,6 +89,6 @@ def _nothing(state: Path) -> str:
 
 
 def _command_line(experiment: Path, output: Path, all_criteria: bool) -> str:
-    """The line that makes a motion again: without `--resume`, for a design is the same with it."""
+    """Return the command line that makes a motion again; the result is the same with `--resume`."""
     words = ["jaxid", "excite", str(experiment), "-o", str(output)]
     return shlex.join([*words, *(["--all-criteria"] if all_criteria else [])])

@@ -40,9 +40,9 @@ Loaded = Annotated[
     ),
 ]
 UNLIKELY = 0.01
-"""Chance that states share what they should, of 1, below which that needs a word."""
+"""Probability that the states agree on shared parameters, below which a remark is made."""
 UNUSUAL = 4.0
-"""Distance of an estimate from what could exist, in standard deviations, that needs a word."""
+"""Distance from a consistent body [standard deviations] from which a remark is made."""
 
 
 def compare(
@@ -53,7 +53,7 @@ def compare(
         Path, typer.Argument(help="Report of another run of the same robot.", metavar="WARM")
     ],
     level: Annotated[
-        float, typer.Option("--level", metavar="L", help="Confidence of the decisions, of 1.")
+        float, typer.Option("--level", metavar="L", help="Confidence of the decisions (0-1).")
     ] = 0.95,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of table and figure.")
@@ -224,7 +224,7 @@ def _pair(
 def _runs(
     experiment: Experiment, each: list[list[Path]], names: list[str]
 ) -> tuple[list[Run], list[str]]:
-    """A run of the logs and reports of each state, and doubts."""
+    """Return a run of the logs and reports of each state, and findings on the logs."""
     doubts = [*require_plain(experiment)]
     files = [p for paths in each for p in paths if not is_report(p)]
     choices = len(files) + 1 if experiment.candidates else 0
@@ -283,7 +283,7 @@ def _tool(found: Payload, joint: str) -> list[str]:
 
 
 def _corrected(experiment: Experiment, gains: np.ndarray) -> tuple[str, list[float]]:
-    """The key of the file that makes forces true, and its values."""
+    """Return the key of the file that corrects forces, and its values."""
     columns = experiment.columns
     if columns is not None and columns.torque_constants is not None:
         return "torque_constants", (np.array(columns.torque_constants) * gains).tolist()

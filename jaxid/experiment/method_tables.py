@@ -313,7 +313,7 @@ def build_rows(
     factors: list[Count] | None = None,
     min_speed: Magnitude | list[Magnitude] | None = None,
 ) -> tuple[AbstractDecimation, Float[np.ndarray, " joints"] | None]:
-    """Samples that become rows of the least-squares problem.
+    """Rows of the least-squares problem, and samples that become rows.
 
     Args:
         robot: Robot with the joints.

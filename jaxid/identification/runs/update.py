@@ -159,8 +159,8 @@ def load_run(path: str | Path, base: BaseParameters) -> Run:
     )
 
 
-def _no_run(path: str | Path) -> ValueError:
-    return ValueError(f"`{path}` must hold a run (`{SCHEMA}`), as `save_run` writes it.")
+def _no_run(path: str | Path) -> InputError:
+    return InputError(f"`{path}` must hold a run (`{SCHEMA}`), as `save_run` writes it.")
 
 
 def _shapes(base: BaseParameters) -> dict[str, tuple[int, ...]]:
