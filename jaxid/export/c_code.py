@@ -1,5 +1,6 @@
 """The feed-forward as one C99 file and its header."""
 
+import inspect
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -7,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.dynamics.machine import program_of
 from jaxid.export.feed_forward import other_forces, torques
 from jaxid.identification.fit import Fit
 from jaxid.io import atomic_folder
@@ -89,70 +89,43 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
     one, rest = (model.robot.joints,), np.zeros(model.robot.joints)
     torque, others = torques(fit), other_forces(fit)
     # Only the base parameters: composite bodies have fewer operations then.
-    p = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
+    own = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
 
-    def friction(q, qd):
-        return others(q, qd, rest) - others(q, rest, rest)
-
-    motion = ("q", "qd", "qdd")
-    return (
-        CFunction(
-            "torque",
-            "Feed-forward torques on base parameters (Eq. 39, factored).",
-            trace(torque, one, one, one),
-            motion,
-            "tau",
+    functions = {
+        "torque": ("Feed-forward torques on base parameters (Eq. 39, factored)", torque),
+        "torque_of_parameters": (
+            "The same for given base parameters p, as Theta_B p (Eq. 39)",
+            lambda q, qd, qdd, p: base.columns(q, qd, qdd) @ p,
         ),
-        CFunction(
-            "torque_of_parameters",
-            "The same for given base parameters p, as Theta_B p (Eq. 39).",
-            trace(lambda q, v, a, x: base.columns(q, v, a) @ x, one, one, one, (base.size,)),
-            (*motion, "p"),
-            "tau",
+        "torque_of_masses": (
+            "The same as M qdd + h, with M by composite bodies (Eq. 38)",
+            lambda q, qd, qdd: model.inertia(own, q) @ qdd + model.bias(own, q, qd),
         ),
-        CFunction(
-            "torque_of_masses",
-            "The same as M qdd + h, with M by composite bodies (Eq. 38).",
-            trace(lambda q, v, a: model.inertia(p, q) @ a + model.bias(p, q, v), one, one, one),
-            motion,
-            "tau",
+        "mass_matrix": (
+            "Mass matrix M, rotors included, row by row (Eq. 38)",
+            lambda q: model.inertia(own, q),
         ),
-        CFunction(
-            "mass_matrix",
-            "Mass matrix M, rotors included, row by row (Eq. 38).",
-            trace(lambda q: model.inertia(p, q), one),
-            ("q",),
-            "m",
+        "bias": (
+            "Forces h without accelerations: Coriolis, gravity, friction (Eq. 38)",
+            lambda q, qd: torque(q, qd, rest),
         ),
-        CFunction(
-            "bias",
-            "Forces h without accelerations: Coriolis, gravity, friction (Eq. 38).",
-            trace(lambda q, v: torque(q, v, rest), one, one),
-            ("q", "qd"),
-            "h",
+        "gravity": (
+            "Forces at rest: gravity, springs, offsets",
+            lambda q: torque(q, rest, rest),
         ),
-        CFunction(
-            "gravity",
-            "Forces at rest: gravity, springs, offsets.",
-            trace(lambda q: torque(q, rest, rest), one),
-            ("q",),
-            "tau",
+        "friction": (
+            "Friction: the forces that motion adds to those at rest",
+            lambda q, qd: others(q, qd, rest) - others(q, rest, rest),
         ),
-        CFunction(
-            "friction",
-            "Friction: the forces that motion adds to those at rest.",
-            trace(friction, one, one),
-            ("q", "qd"),
-            "tau",
-        ),
-        CFunction(
-            "regressor",
-            "Base regressor Theta_B, row by row (Eq. 23).",
-            program_of(base, base.columns, one, one, one),
-            motion,
-            "theta",
-        ),
-    )
+        "regressor": ("Base regressor Theta_B, row by row (Eq. 23)", base.columns),
+    }
+    outputs = {"mass_matrix": "m", "bias": "h", "regressor": "theta"}
+    written = []
+    for name, (summary, function) in functions.items():
+        inputs = tuple(inspect.signature(function).parameters)
+        program = trace(function, *((base.size,) if x == "p" else one for x in inputs))
+        written.append(CFunction(name, summary, program, inputs, outputs.get(name, "tau")))
+    return tuple(written)
 
 
 def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
@@ -165,7 +138,7 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
     terms = ", ".join(type(t).__name__ for t in fit.base.model.terms)
     prototypes = "\n\n".join(
-        f"/* {_ascii(x.summary)}\n   {x.program.counts.total} operations: {x.program.counts}.\n"
+        f"/* {x.summary}.\n   {x.program.counts.total} operations: {x.program.counts}.\n"
         f"   {_sizes(x)} */\n"
         f"{writer.declaration(f'{name}_{x.name}', x.inputs, (x.output,))};"
         for x in functions

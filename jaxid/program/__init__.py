@@ -2,11 +2,10 @@
 
 It knows nothing about robots. `trace` runs an ordinary JAX function on scalars that fold constants
 and merge equal expressions; the remaining sequence of operations is a `Program`. `lower` runs it in
-JAX, `evaluate` in NumPy, `to_python` on single floats; `to_c` writes it in C.
+JAX, `evaluate` in NumPy, `to_python` on single floats; a `CWriter` writes it in C.
 """
 
 from jaxid.program.c import CWriter as CWriter
-from jaxid.program.c import to_c as to_c
 from jaxid.program.evaluation import evaluate as evaluate
 from jaxid.program.evaluation import evaluate_packed as evaluate_packed
 from jaxid.program.evaluation import to_python as to_python
@@ -14,7 +13,6 @@ from jaxid.program.program import OperationCounts as OperationCounts
 from jaxid.program.program import Program as Program
 from jaxid.program.program import select_outputs as select_outputs
 from jaxid.program.reverse_mode import Reversible as Reversible
-from jaxid.program.sincos import library_sine_cosine as library_sine_cosine
 from jaxid.program.sincos import sine_cosine as sine_cosine
 from jaxid.program.trace import FREE as FREE
 from jaxid.program.trace import trace as trace
@@ -25,4 +23,3 @@ from jaxid.program.xla import Lowered as Lowered
 from jaxid.program.xla import NoFence as NoFence
 from jaxid.program.xla import default_fence as default_fence
 from jaxid.program.xla import lower as lower
-from jaxid.program.xla import unpack as unpack

@@ -93,7 +93,13 @@ class CWriter:
     def definition(
         self, program: Program, name: str, inputs: Sequence[str], outputs: Sequence[str]
     ) -> str:
-        """Write a program as the definition of a C function, as `to_c` describes it.
+        """Write a program as the definition of a C function.
+
+        The function allocates nothing and has no loops, and its choices compile to selections: its
+        run time does not depend on the data, if that of the mathematical library does not. It takes
+        a pointer for each input, then one for each output, all to numbers in C order. Every entry
+        of an output is written, constants too. All inputs are read before an output is written, so
+        that they may share memory.
 
         Args:
             program: Program made by `trace`.
@@ -310,58 +316,6 @@ static void {self.prefix}_tanh(const {kind} *{alone}x, {kind} *{alone}y)
     }}
 }}
 """
-
-
-def to_c(
-    program: Program,
-    name: str,
-    inputs: Sequence[str] | None = None,
-    outputs: Sequence[str] | None = None,
-    *,
-    double: bool = True,
-) -> str:
-    """Write a program as one C99 function, which is also valid C++.
-
-    The function allocates nothing and has no loops, and its choices compile to selections: its run
-    time does not depend on the data, if that of the mathematical library does not. It takes a
-    pointer for each input, then one for each output, all to numbers in C order. Every entry of an
-    output is written, constants too. All inputs are read before an output is written, so that they
-    may share memory.
-
-    Args:
-        program: Program made by `trace`.
-        name: Name of the C function.
-        inputs: Names of the inputs; by default `input0`, `input1`, ...
-        outputs: Names of the outputs; by default `output0`, `output1`, ...
-        double: Whether the C code computes in `double` (otherwise `float`).
-
-    Raises:
-        InputError: If a name is not an identifier of C or is used twice, or there are not as many
-            names as inputs or outputs.
-    """
-    writer = CWriter(double)
-    inputs = _names(inputs, "input", len(program.input_shapes))
-    outputs = _names(outputs, "output", len(program.output_shapes))
-    shapes = zip([*inputs, *outputs], [*program.input_shapes, *program.output_shapes], strict=True)
-    sizes = "\n".join(f"   {x}: {math.prod(s)} numbers, shape {list(s)}." for x, s in shapes)
-    return f"""#include <math.h>
-
-/* Generated code: do not edit.
-{sizes}
-   {program.counts}. */
-#ifdef __cplusplus
-extern "C"
-#endif
-{writer.declaration(name, inputs, outputs)};
-
-{writer.definition(program, name, inputs, outputs)}"""
-
-
-def _names(given: Sequence[str] | None, stem: str, count: int) -> list[str]:
-    names = [f"{stem}{k}" for k in range(count)] if given is None else list(given)
-    if len(names) != count:
-        raise InputError(f"`{stem}s` must name the program's {count} {stem}s, but has {names}.")
-    return names
 
 
 def _check_names(names: list[str]) -> None:

@@ -26,7 +26,7 @@ class _Plan(NamedTuple):
     """Assignment of values to memory cells: cells of the results first, then reused cells.
 
     Attributes:
-        loads: For each entry of an input its cell, the input's number and the entry's position.
+        loads: Cell, input's number and entry's position for each entry that is read.
         steps: Function, operands, result's cell, and whether it can write into that cell.
         results: Cells of the nodes that are results.
         cells: Number of cells.
@@ -43,7 +43,7 @@ def evaluate(program: Program, *arrays: AnyArray) -> Any:
 
     Args:
         program: Program made by `trace`.
-        arrays: For each input an array of the input's shape, followed by any batch axes.
+        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
 
     Returns:
         Outputs in the structure of the traced function, each with the batch axes last.
@@ -67,7 +67,7 @@ def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | fl
 
     Args:
         program: Program made by `trace`.
-        arrays: For each input an array of the input's shape, followed by any batch axes.
+        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
 
     Returns:
         For each entry of each output, in order, an array of the batch's shape, or a constant.

@@ -12,8 +12,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.program.operations import Operation
-from jaxid.program.rewrite import live_scalars, rewrite
-from jaxid.program.scalar import Graph, Operand, Scalar
+from jaxid.program.scalar import Graph, Operand, Scalar, live_scalars, rewrite
 
 Reference = int | float
 """An operand or a result: the position of a node (int) or a constant (float)."""

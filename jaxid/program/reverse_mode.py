@@ -37,53 +37,18 @@ class Reversible(eqx.Module):
         """Program that is computed."""
         return self.lowered.program
 
-    def __call__(self, *arrays: AnyArray) -> list[Array | float]:
-        """Compute the packed result, as `Lowered` does."""
-        entries, varying = self.lowered.entries(*arrays), _varying(self.program)
-        values: Any = _values(self.lowered, entries) if varying else []
-        by_node = dict(zip(varying, values, strict=True))
-        return [by_node[x] if isinstance(x, int) else x for x in self.program.outputs]
-
     def stacked(self, groups: Groups, *arrays: AnyArray) -> list[Array]:
         """Compute entries of the packed result, stacked: faster to trace than one by one.
 
         Args:
             groups: Positions in the packed result; each group becomes one array.
-            arrays: For each input an array of the input's shape, followed by any batch axes.
+            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
 
         Returns:
             For each group an array with its entries along the last axis but one.
         """
         stacked: Any = _stacked(self.lowered, groups, self.lowered.entries(*arrays))
         return stacked
-
-
-def _varying(program: Program) -> list[int]:
-    """Return positions of the nodes that are outputs, without repetitions."""
-    return list(dict.fromkeys(x for x in program.outputs if isinstance(x, int)))
-
-
-def _computed(lowered: Lowered, entries: list[Array]) -> tuple[Values, Array]:
-    """Return all nodes, and an array of the batch's shape."""
-    first = next(x[0] for x in entries if len(x))
-    return lowered.run(entries, primitives(first)), first
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _values(lowered: Lowered, entries: list[Array]) -> list[Array]:
-    return _values_forward(lowered, entries)[0]
-
-
-def _values_forward(lowered: Lowered, entries: list[Array]) -> tuple[list[Array], Values]:
-    values, _ = _computed(lowered, entries)
-    return [values.nodes[k] for k in _varying(lowered.program)], values
-
-
-def _values_backward(lowered: Lowered, values: Values, given: list[Array]) -> tuple[list[Array]]:
-    return (_pull(lowered, values, zip(_varying(lowered.program), given, strict=True), given[0]),)
-
-
-_values.defvjp(_values_forward, _values_backward)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -94,7 +59,8 @@ def _stacked(lowered: Lowered, groups: Groups, entries: list[Array]) -> list[Arr
 def _stacked_forward(
     lowered: Lowered, groups: Groups, entries: list[Array]
 ) -> tuple[list[Array], tuple[Values, Array]]:
-    values, first = _computed(lowered, entries)
+    first = next(x[0] for x in entries if len(x))
+    values = lowered.run(entries, primitives(first))
     axis = max(first.ndim - 1, 0)
     arrays = []
     for group in groups:

@@ -162,7 +162,7 @@ class Lowered(eqx.Module):
         """Compute the packed result.
 
         Args:
-            arrays: For each input an array of the input's shape, followed by any batch axes.
+            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
 
         Returns:
             For each entry of each output, in order, an array of the batch's shape, or a constant.
@@ -186,9 +186,14 @@ class Lowered(eqx.Module):
 
         Constants cost memory and time here; prefer the packed result.
         """
-        packed = self(*arrays)
-        batch = self.program.batch_shape([np.shape(x) for x in arrays])
-        return unpack(self.program, packed, batch, jnp.result_type(*arrays, float))
+        program, dtype = self.program, jnp.result_type(*arrays, float)
+        batch = program.batch_shape([np.shape(x) for x in arrays])
+        full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
+        leaves = []
+        for entries, shape in zip(program.split(full), program.output_shapes, strict=True):
+            stacked = jnp.stack(entries) if entries else jnp.zeros((0, *batch), dtype)
+            leaves.append(stacked.reshape((*shape, *batch)))
+        return jax.tree.unflatten(program.structure, leaves)
 
     def run(self, entries: list[Array], operations: dict[Operation, Callable]) -> Values:
         """Compute all nodes.
@@ -277,16 +282,6 @@ def lower(
     if fence is None:
         fence = default_fence(jax.default_backend(), jax.__version_info__)
     return Lowered(program, fence, fenced_nodes(program), sine_cosine)
-
-
-def unpack(program: Program, packed: list, batch: tuple[int, ...], dtype: Any) -> Any:
-    """Return a packed result as dense arrays in the structure of the traced function."""
-    full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in packed]
-    leaves = []
-    for entries, shape in zip(program.split(full), program.output_shapes, strict=True):
-        stacked = jnp.stack(entries) if entries else jnp.zeros((0, *batch), dtype)
-        leaves.append(stacked.reshape((*shape, *batch)))
-    return jax.tree.unflatten(program.structure, leaves)
 
 
 def _entries(x: Array, shape: tuple[int, ...], batch: tuple[int, ...]) -> Array:

@@ -12,6 +12,7 @@ from export_samples import changed, fit_of, motion, possible
 
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
+from jaxid.errors import InputError
 from jaxid.export.c_code import c_functions
 from jaxid.export.feed_forward import torque_program
 from jaxid.program import evaluate
@@ -183,9 +184,7 @@ def test_numbers_that_are_not_finite_give_nan(compiled, fit):
 
 
 def test_names_in_c(small, tmp_path):
-    with pytest.raises(
-        jid.InputError if hasattr(jid, "InputError") else ValueError, match="7 axes"
-    ):
+    with pytest.raises(InputError, match="7 axes"):
         jid.export_c(small, tmp_path, name="7 axes")
     assert not list(tmp_path.iterdir())
 

@@ -103,20 +103,15 @@ def test_refusals_are_one_sentence(run, tmp_path, arguments, message):
     assert sorted(p.name for p in tmp_path.rglob("*")) == before
 
 
-def test_a_urdf_is_asked_for_where_it_is_not_known(run, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("target", "full", "message"),
+    [("urdf", True, "name it with `--urdf`"), ("mjcf", False, 'kind = "consistent"')],
+)
+def test_what_is_missing_is_named(run, tmp_path, monkeypatch, target, full, message):
     monkeypatch.chdir(tmp_path)
     model = jid.Model(jid.robots.planar_arm(1, 0.4))
-    fit_of(model, possible(model), full=True).save("arm.json")
-    code, _, err = run("arm.json", "--to", "urdf")
+    fit_of(model, possible(model), full=full).save("arm.json")
+    code, _, err = run("arm.json", "--to", target)
     assert code == 2
-    assert "name it with `--urdf`" in err
-
-
-def test_a_fit_of_no_bodies_says_the_way_out(run, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    model = jid.Model(jid.robots.planar_arm(1, 0.4))
-    fit_of(model, possible(model)).save("arm.json")
-    code, _, err = run("arm.json", "--to", "mjcf")
-    assert code == 2
-    assert 'kind = "consistent"' in err
-    assert not (tmp_path / "arm.xml").exists()
+    assert message in err
+    assert [p.name for p in tmp_path.iterdir()] == ["arm.json"]

@@ -3,6 +3,7 @@
 import importlib.util
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from export_samples import changed, fit_of, motion, possible
@@ -10,7 +11,6 @@ from lxml import etree
 
 import jaxid as jid
 from jaxid.export.inertials import joint_dynamics
-from jaxid.export.mjcf import mjcf_text
 
 URDF = """<?xml version="1.0"?>
 <!-- kept -->
@@ -165,14 +165,6 @@ def test_the_mjcf_gives_the_same_torques_in_mujoco(fit, tmp_path, name):
     assert fit.checksum in path.read_text("utf-8")
 
 
-def test_mjcf_of_any_robot_and_bodies(fit):
-    mujoco = pytest.importorskip("mujoco")
-    robot, bodies = fit.base.model.robot, fit.standard_parameters[:30].reshape(3, 10)
-    model = mujoco.MjModel.from_xml_string(mjcf_text(robot, bodies, damping=0.5, timestep=0.002))
-    assert model.opt.timestep == 0.002
-    np.testing.assert_array_equal(model.dof_damping, 0.5)
-
-
 def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, source):
     pin = pytest.importorskip("pinocchio")
     rows, m = jid.pinocchio_parameters(fit), motion(3, 20)
@@ -186,23 +178,42 @@ def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, sourc
     )
 
 
-def test_the_exported_function_takes_any_number_of_samples(fit):
-    exported = jid.exported_function(fit)
-    for samples in (1, 30):
-        m = motion(3, samples)
-        wanted = fit.predict(m)
-        np.testing.assert_allclose(exported.call(m.q, m.qd, m.qdd), wanted, rtol=1e-11, atol=1e-11)
-
-
-def test_a_file_of_the_exported_function_runs_without_jaxid(fit, tmp_path):
+def test_the_exported_function_takes_any_number_of_samples_and_needs_no_jaxid(fit, tmp_path):
+    exported, m = jid.exported_function(fit), motion(3, 30)
+    np.testing.assert_allclose(
+        exported.call(m.q, m.qd, m.qdd), fit.predict(m), rtol=1e-11, atol=1e-11
+    )
     if importlib.util.find_spec("flatbuffers") is None:
         with pytest.raises(RuntimeError, match="pip install flatbuffers"):
             jid.export_jax(fit, tmp_path / "arm.bin")
         return
-    path = jid.export_jax(fit, tmp_path / "arm.bin")
-    read, m = jax.export.deserialize(bytearray(path.read_bytes())), motion(3, 7)
+    path, m = jid.export_jax(fit, tmp_path / "arm.bin"), motion(3, 1)
+    read = jax.export.deserialize(bytearray(path.read_bytes()))
     found = read.call(m.q, m.qd, m.qdd)
     np.testing.assert_allclose(found, fit.predict(m), rtol=1e-11, atol=1e-11)
+
+
+class Drag(jid.AbstractTerm):
+    """A damping term of a user, with one friction that depends on the direction."""
+
+    def parameters(self, robot):
+        return (("d1", "N m s"), ("c2+", "N m"), ("c2-", "N m"), ("x3", "N m s²"), ("s1", "N m"))
+
+    def columns(self, robot, q, qd, qdd):
+        one = np.eye(3)
+        falling = jnp.minimum(jnp.sign(qd[1]), 0.0)
+        rising = jnp.maximum(jnp.sign(qd[1]), 0.0)
+        parts = (qd[0] * one[0], rising * one[1], falling * one[1], qd[2] ** 3 * one[2])
+        return jnp.stack([*parts, q[0] * one[0]], axis=1)
+
+
+def test_joint_friction_is_read_from_the_terms_of_a_user(fit):
+    model = jid.Model(fit.base.model.robot, (jid.RigidBodies(), Drag()))
+    p = np.concatenate([possible(jid.Model(model.robot, model.terms[:1])), [2.0, 4.0, 1.0, 9, 9]])
+    joints = joint_dynamics(fit_of(model, p, full=True))
+    np.testing.assert_allclose(joints.damping, [2.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(joints.friction, [0.0, 2.5, 0.0], atol=1e-12)
+    assert joints.left_out == ("x3", "s1")
 
 
 def as_urdf(fit, path):

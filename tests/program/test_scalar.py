@@ -1,10 +1,18 @@
+"""Simplification of expressions: while they are built, and with all uses known."""
+
 import gc
+import importlib.util
 import math
 import weakref
+from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from jaxid.program import evaluate, trace
 from jaxid.program.operations import Operation
 from jaxid.program.scalar import (
     Graph,
@@ -19,18 +27,25 @@ from jaxid.program.scalar import (
     select,
 )
 
+FENCES = Path(__file__).resolve().parents[2] / "benchmarks" / "fences.py"
+
 
 @pytest.fixture
 def graph():
     return Graph()
 
 
-def leaf(graph, k):
-    return graph.node(Operation.INPUT, 0, k)
+@pytest.fixture
+def x(graph):
+    return graph.node(Operation.INPUT, 0, 0)
 
 
-def test_equal_expressions_are_one_object(graph):
-    x, y = leaf(graph, 0), leaf(graph, 1)
+@pytest.fixture
+def y(graph):
+    return graph.node(Operation.INPUT, 0, 1)
+
+
+def test_equal_expressions_are_one_object(x, y):
     assert x * y is y * x
     assert x + y is y + x
     assert (-x) * y is -(x * y)
@@ -42,8 +57,7 @@ def test_equal_expressions_are_one_object(graph):
     assert negate(negate(x)) is x
 
 
-def test_constants_vanish_and_merge(graph):
-    x = leaf(graph, 0)
+def test_constants_vanish_and_merge(x):
     assert 0.0 * x == 0.0
     assert 1.0 * x is x
     assert -1.0 * x is -x
@@ -54,31 +68,29 @@ def test_constants_vanish_and_merge(graph):
     assert (x - 2.0) is -(2.0 - x)
     assert add(2.0, 3.0) == 5.0
     assert multiply(0.0, x) == 0.0
+    assert negate(2.0) == -2.0
 
 
-def test_merged_factors_do_not_overflow(graph):
-    x = leaf(graph, 0)
+def test_merged_factors_do_not_overflow(x):
     product = 1e-200 * (1e-200 * x)
     assert product.operands[0] == 1e-200
     assert divide(x, 0.0).operation is Operation.DIVIDE
 
 
-def test_constants_fold_as_ieee_754_says():
+def test_constants_are_computed_by_ieee_754():
     assert divide(1.0, 0.0) == math.inf
     assert math.isnan(divide(0.0, 0.0))
     assert math.isnan(apply(Operation.SQUARE_ROOT, -1.0))
     assert apply(Operation.SINE, 0.5) == np.sin(0.5)
 
 
-def test_signs_move_out_of_odd_functions_and_vanish_in_even_ones(graph):
-    x = leaf(graph, 0)
+def test_signs_move_out_of_odd_functions_and_vanish_in_even_ones(x):
     assert apply(Operation.SINE, -x) is -apply(Operation.SINE, x)
     assert apply(Operation.COSINE, -x) is apply(Operation.COSINE, x)
     assert apply(Operation.EXPONENTIAL, -x) is not apply(Operation.EXPONENTIAL, x)
 
 
-def test_powers_are_products(graph):
-    x = leaf(graph, 0)
+def test_powers_are_products(x):
     square = x * x
     assert integer_power(x, 4) is square * square
     assert power(x, 3.0) is x * square
@@ -87,8 +99,7 @@ def test_powers_are_products(graph):
     assert power(x, 0.3).operation is Operation.POWER
 
 
-def test_choices_that_are_known_are_made(graph):
-    x, y = leaf(graph, 0), leaf(graph, 1)
+def test_known_choices_are_made(x, y):
     less = apply(Operation.LESS, x, y)
     assert select(True, x, y) is x
     assert select(False, x, y) is y
@@ -98,24 +109,69 @@ def test_choices_that_are_known_are_made(graph):
     assert logic(Operation.OR, True, less) is True
     assert logic(Operation.OR, less, False) is less
     assert logic(Operation.AND, less, less) is less
-
-
-def test_a_comparison_with_itself_is_kept_because_it_finds_nan(graph):
-    x = leaf(graph, 0)
+    # This comparison finds NaN.
     assert apply(Operation.NOT_EQUAL, x, x).operation is Operation.NOT_EQUAL
 
 
-def test_a_graph_dies_with_its_scalars():
+def test_a_graph_is_freed_with_its_scalars():
     class Watched(Graph):
         __slots__ = ("__weakref__",)
 
     graph = Watched()
-    x = leaf(graph, 0) * 2.0
+    x = graph.node(Operation.INPUT, 0, 0) * 2.0
     alive = weakref.ref(graph)
     del graph, x
     gc.collect()
     assert alive() is None
 
 
-def test_negation_of_a_number_is_a_number():
-    assert negate(2.0) == -2.0
+@pytest.mark.parametrize(
+    ("function", "size", "counts"),
+    [
+        (lambda x: 0.3 * x[0] - 0.3 * x[1] + x[2], 3, (1, 2, 0)),
+        (lambda x: x[0] * x[1] + x[2] + x[1] * x[3], 4, (1, 2, 0)),
+        (lambda x: sum(0.5 * x[k] for k in range(4)), 4, (1, 3, 0)),
+        # Products that are needed elsewhere stay.
+        (lambda x: (0.3 * x[0] + 0.3 * x[1], 0.3 * x[0], 0.3 * x[1]), 2, (2, 1, 0)),
+        (lambda x: -(x[0] - x[1]), 2, (0, 1, 0)),
+        (lambda x: jnp.stack([x[0] - x[1], x[1] - x[0]]), 2, (0, 1, 1)),
+    ],
+)
+def test_common_factors_and_negated_differences(function, size, counts):
+    c = trace(function, (size,)).counts
+    assert (c.multiplications, c.additions, c.negations) == counts
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 4)] * 3), min_size=2, max_size=9), st.integers(0, 9))
+@settings(max_examples=30, deadline=None, derandomize=True)
+def test_sums_of_products_keep_their_value(terms, split):
+    c = np.array([0.5, -0.3, 2.0, 1.7, 0.0])
+
+    def function(x):
+        def total(some):
+            return sum((-1) ** i * c[k] * x[i] * x[j] * (1.0 + x[i]) for i, j, k in some)
+
+        first = total(terms[:split]) + jnp.zeros(())
+        return jnp.stack([first, first - total(terms[split:]), jnp.sin(total(terms))])
+
+    x = np.random.default_rng(0).uniform(-1, 1, (5, 3))
+    got = evaluate(trace(function, (5,)), x)
+    want = [function(column) for column in x.T]
+    np.testing.assert_allclose(got.T, want, rtol=1e-13, atol=1e-14)
+
+
+def test_operations_of_a_seven_joint_regressor(monkeypatch):
+    """Exact numbers, which show a careless change of the compiler, or of JAX."""
+    monkeypatch.syspath_prepend(FENCES.parent)
+    specification = importlib.util.spec_from_file_location("fences", FENCES)
+    benchmark = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(benchmark)
+    n = (benchmark.JOINTS,)
+    program = trace(benchmark.regressor, n, n, n)
+    assert (program.counts.multiplications, program.counts.additions) == (842, 640)
+    assert (program.counts.functions, program.counts.divisions) == (12, 0)
+    assert int(program.nonzeros.sum()) == 255
+
+    p = np.random.default_rng(0).uniform(0.5, 1.5, (7, 10))
+    program = trace(lambda *x: jnp.einsum("jbk,bk->j", benchmark.regressor(*x), p), n, n, n)
+    assert program.counts.multiplications < 842 + 255

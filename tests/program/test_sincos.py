@@ -73,10 +73,3 @@ def test_derivatives_are_exact_also_the_second_and_across_quarters():
     np.testing.assert_allclose(second, -np.cos(x), atol=2e-16, rtol=0)
     _, tangent = jax.jvp(sine_cosine, (jnp.asarray(x),), (jnp.full_like(x, 2.0),))
     np.testing.assert_allclose(tangent[1], -2 * np.sin(x), atol=4e-16, rtol=0)
-
-
-def test_vmap_and_jit_agree_with_the_plain_call():
-    x = jnp.linspace(-3.0, 3.0, 20).reshape(4, 5)
-    for got in (jax.vmap(sine_cosine)(x), pair(x)):
-        for a, b in zip(got, sine_cosine(x), strict=True):
-            np.testing.assert_allclose(a, b, atol=2e-16, rtol=0)

@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-import threading
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,7 @@ from jaxid.program import FREE, evaluate, trace
 
 
 @given(random_functions())
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 def test_a_program_equals_its_function(function):
     x = samples(0, (5,))
     program = trace(function, (SIZE,), (SIZE,))
@@ -33,7 +32,6 @@ def test_a_program_equals_its_function(function):
         lambda a, b: jax.jvp(chain, (a, b), (b, a)),
         lambda a, b: jax.vjp(chain, a, b)[1](jnp.outer(b, a)),
         lambda a, b: jax.linear_transpose(lambda r: chain(a, r), b)(jnp.outer(a, b)),
-        lambda a, b: jax.vmap(lambda r: jnp.sum(chain(a, r)))(jnp.outer(a, b)),
         lambda a, b: jax.hessian(lambda x: jnp.sum(chain(x, b)))(a),
         lambda a, b: jax.jit(chain)(a, b),
         lambda a, b: jax.checkpoint(chain)(a, b),
@@ -76,12 +74,8 @@ def test_counts_of_a_known_product():
     assert (counts.multiplications, counts.additions) == (12, 8)
     counts = trace(lambda a, b: jnp.cross(a, b), (3,), (3,)).counts
     assert (counts.multiplications, counts.additions, counts.negations) == (6, 3, 0)
-
-
-def test_counts_of_functions_divisions_and_selections():
     counts = trace(lambda x: (jnp.sin(x) / jnp.cos(x), jnp.abs(x)), ()).counts
     assert (counts.functions, counts.divisions, counts.selections) == (2, 1, 1)
-    assert str(counts).startswith("0 multiplications, 0 additions, 1 divisions")
 
 
 def test_nonzeros_tell_which_outputs_can_differ_from_zero():
@@ -133,30 +127,6 @@ def test_tracing_works_inside_of_another_trace():
     assert outer(jnp.float64(1.0)) == 2.0
 
 
-def test_programs_differ_even_if_their_functions_are_equal():
-    a, b = (trace(jnp.sin, (2,)) for _ in range(2))
-    assert a != b
-    assert len({a, b}) == 2
-
-
-def test_traces_in_parallel_do_not_disturb_each_other():
-    programs = {}
-
-    def work(k):
-        programs[k] = trace(jax.jacfwd(chain), (3,), (3,))
-
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len({p.nodes for p in programs.values()}) == 1
-
-
-def test_zero_times_x_hides_nan_as_documented():
-    assert evaluate(trace(lambda x: 0.0 * x, ()), np.array(np.nan)) == 0.0
-
-
 def test_constants_stay_in_float64_where_jax_runs_in_float32():
     code = (
         "import numpy as np, jax, jax.numpy as jnp\n"
@@ -172,10 +142,4 @@ def test_constants_stay_in_float64_where_jax_runs_in_float32():
         "assert evaluate(q, np.ones(2))[0] == 0.2\n"
     )
     environment = {**os.environ, "JAX_ENABLE_X64": "0", "JAX_PLATFORMS": "cpu"}
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stderr
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)

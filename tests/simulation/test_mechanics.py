@@ -9,7 +9,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.robot import Robot
-from jaxid.simulation.friction import CableForce, LuGreFriction, SmoothFriction
+from jaxid.simulation.friction import LuGreFriction, SmoothFriction
 from jaxid.simulation.mechanics import (
     BacklashGear,
     DriveTrain,
@@ -201,11 +201,3 @@ def test_backlash_lets_the_joint_rattle_within_the_play():
     assert (np.abs(twists).max(axis=0) > 0.5 * play).all()
     # There are times without contact, and both flanks are reached.
     assert (np.ptp(twists, axis=0) > 0.95 * play).all()
-
-
-def test_cables_pull_to_their_rest():
-    cable = CableForce(np.array([40.0, 0.0]), np.array([0.3, 0.0]), ZERO)
-    machine = plant(SmoothFriction(np.array([80.0, 1.0]), ZERO), disturbances=(cable,))
-    machine.start(ZERO, ZERO, ZERO)
-    q, _, _ = moved(machine, ZERO, 20000)
-    np.testing.assert_allclose(q[-1], [0.3, 0.0], atol=1e-3)
