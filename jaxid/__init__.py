@@ -118,9 +118,6 @@ from jaxid.identification.solutions import Complete as Complete
 from jaxid.identification.solutions import CrossValidated as CrossValidated
 from jaxid.identification.solutions import Ridge as Ridge
 from jaxid.identification.solutions import Truncated as Truncated
-from jaxid.identification.stepwise import Stepwise as Stepwise
-from jaxid.identification.stepwise import StepwiseComparison as StepwiseComparison
-from jaxid.identification.stepwise import identify_stepwise as identify_stepwise
 from jaxid.identification.uncertainty.methods import AbstractUncertainty as AbstractUncertainty
 from jaxid.identification.uncertainty.methods import BlockJackknife as BlockJackknife
 from jaxid.identification.uncertainty.methods import IndependentRows as IndependentRows

@@ -118,7 +118,6 @@ CASES = {
         jid.fit_problem(jid.factorise_across_processes(base, [cold]), jid.LeastSquares()).parameters
     ),
     "essential_parameters": lambda: jid.essential_parameters(plain(), cold).fit.parameters,
-    "identify_stepwise": lambda: jid.identify_stepwise(base, [cold]).stepwise.parameters,
     "identify_states": lambda: jid.identify_states(runs()).found.parameters,
     "update": lambda: jid.update(*runs()).fit.parameters,
     "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,
