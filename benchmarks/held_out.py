@@ -24,6 +24,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from stepwise import Stepwise
 
 import jaxid as jid
 from jaxid.experiment.experiment import load_experiment
@@ -63,7 +64,7 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
         consistent = jid.identify(base, train, jid.PhysicallyConsistent(pull=pull))
         price = f"price {consistent.consistency.price:.1%}"
         yield "physically consistent", consistent, ", ".join(filter(None, (remark, price)))
-    stepwise = jid.identify(base, train, jid.Stepwise())
+    stepwise = jid.identify(base, train, Stepwise())
     yield "axis by axis", stepwise, ""
     essential = jid.essential_parameters(wls, train)
     yield "essential parameters", essential.fit, f"{essential.chosen.left} of {base.size}"

@@ -1,4 +1,8 @@
-"""Axis by axis, with and without friction first, beside identification at once.
+"""Identification axis by axis, with and without friction first, compared with all at once.
+
+Axis by axis: the last axis is identified from its own force, its parameters are taken for known,
+then comes the axis before it. Friction can be identified first, from motions of single axes. Errors
+of the outer axes are passed on to the inner ones.
 
 The robot: the virtual Panda of `jaxid example` (random bodies, friction with a little Stribeck
 effect that no model below has, noise of 1 % of the largest torques, 19-bit encoders), of one seed
@@ -14,9 +18,9 @@ Coulomb friction in percent of their true values.
     python benchmarks/stepwise.py [--quick]       # five turns, or one
 """
 
+import dataclasses
 import sys
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -24,8 +28,68 @@ import jaxid as jid
 from jaxid.simulation.example import virtual_log, virtual_panda
 
 TURNS, ALONE, FILTER, EVERY = 5, 4.0, jid.ZeroPhaseButterworth(10.0), 20
+DECIDED = 1e-4
+"""Fraction (0 to 1) of a column that must be new for an axis to determine its parameter."""
 
 jax.config.update("jax_enable_x64", True)
+
+
+class Stepwise(jid.AbstractEstimator):
+    """Least squares for one axis after the other, from the tip inward; deviations are not computed.
+
+    Attributes:
+        single_axes: Motions of one axis each; from them friction is identified first, and kept.
+    """
+
+    single_axes: tuple[jid.Observations, ...] = ()
+
+    def __call__(self, problem):
+        """Identify the axes from the last to the first."""
+        base = problem.base
+        p, known = np.zeros(base.size), set()
+        for j, observations in enumerate(self.single_axes):
+            alone = jid.RegressionProblem(base, [observations], divisions=1).factors.joints[j]
+            friction = [c for c, k in enumerate(alone.columns) if is_friction(base.names[k])]
+            # In the motion of one axis most columns are alike: only their span counts.
+            R = np.asarray(alone.R) / np.maximum(np.linalg.norm(alone.R, axis=0), 1e-300)
+            others = [c for c in range(len(alone.columns)) if c not in friction]
+            U, s, _ = np.linalg.svd(R[:, others], full_matrices=False)
+            U = U[:, s > DECIDED * s.max(initial=0.0)]
+            rest = R - U @ (U.T @ R)
+            found = np.linalg.lstsq(rest[:, friction], rest[:, -1], rcond=DECIDED)[0]
+            scale = np.linalg.norm(alone.R, axis=0)
+            for c, value in zip(friction, found, strict=True):
+                p[alone.columns[c]] = value * scale[-1] / scale[c]
+                known.add(alone.columns[c])
+        for joint in reversed(problem.factors.joints):
+            R = np.asarray(joint.R)
+            new = [c for c, k in enumerate(joint.columns) if k not in known]
+            rest = R[:, -1] - R[:, :-1] @ p[list(joint.columns)]
+            scale = np.maximum(np.linalg.norm(R[:, new], axis=0), 1e-300)
+            kept = independent(R[:, new] / scale)
+            values = np.linalg.lstsq(R[:, new][:, kept], rest, rcond=None)[0]
+            for c, value in zip(kept, values, strict=True):
+                p[joint.columns[new[c]]] = value
+                known.add(joint.columns[new[c]])
+        return dataclasses.replace(jid.LeastSquares()(problem), parameters=p)
+
+
+def is_friction(name: str) -> bool:
+    """Return whether a base parameter is friction; offsets look like weight in a single motion."""
+    return name.startswith(("fv", "fc")) and name[2:].isdigit()
+
+
+def independent(R: np.ndarray) -> list[int]:
+    """Return the columns of length one that are not combinations of earlier ones."""
+    Q, kept = np.zeros((len(R), 0)), []
+    for k in range(R.shape[1]):
+        rest = R[:, k]
+        for _ in range(2):
+            rest = rest - Q @ (Q.T @ rest)
+        if np.linalg.norm(rest) > DECIDED:
+            Q = np.column_stack([Q, rest / np.linalg.norm(rest)])
+            kept.append(k)
+    return kept
 
 
 def observed(robot: jid.Robot, recording: jid.Recording) -> jid.Observations:
@@ -40,11 +104,8 @@ def single_axes(virtual, seed: int) -> tuple[jid.Observations, ...]:
     logs = []
     for j in range(robot.joints):
         alone = np.arange(robot.joints) == j
-        series = eqx.tree_at(
-            lambda s: (s.a, s.b),
-            whole,
-            (np.where(alone[:, None], whole.a, 0.0), np.where(alone[:, None], whole.b, 0.0)),
-        )
+        kept = alone[:, None] | (np.arange(whole.coefficients.shape[1]) == 0)
+        series = dataclasses.replace(whole, coefficients=np.where(kept, whole.coefficients, 0.0))
         recording = virtual.measure(
             series, duration=ALONE, sample_time=0.002, seed=seed + j, name=f"axis {j + 1}"
         )
@@ -63,8 +124,8 @@ def turn(seed: int) -> dict[str, tuple[float, float]]:
     found = {
         "at once": jid.identify(base, seen),
         "at once, with the single axes' logs": jid.identify(base, [seen, *alone]),
-        "axis by axis": jid.identify(base, seen, jid.Stepwise()),
-        "axis by axis, friction first": jid.identify(base, seen, jid.Stepwise(alone)),
+        "axis by axis": jid.identify(base, seen, Stepwise()),
+        "axis by axis, friction first": jid.identify(base, seen, Stepwise(alone)),
     }
     motion = unseen.reduced_motion
     truth, largest = virtual.forces(motion), np.asarray(robot.max_forces)

@@ -4,9 +4,9 @@ import numpy as np
 from scipy import stats
 
 from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.estimators import GivenWeights
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.delay import estimate_delay
-from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.observations import Observations
 
 EXPLAINED = 0.3

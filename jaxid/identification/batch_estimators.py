@@ -13,7 +13,7 @@ from jaxid.identification.estimators import AbstractEstimator
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import identify
 from jaxid.identification.normal_equations import BatchFit
-from jaxid.identification.uncertainty.methods import IndependentRows, SpectralSandwich
+from jaxid.identification.uncertainty import IndependentRows, SpectralSandwich
 from jaxid.measurement.observations import Observations
 
 AS_IT_IS = 0.4
@@ -76,8 +76,6 @@ def estimate_each(
         jnp.asarray([bool(np.isfinite(fit.naive_standard_deviations).all()) for fit in first]),
         stacked("naive_standard_deviations"),
         jnp.asarray(
-            np.stack([np.asarray(fit.uncertainty.freedom) for fit in fits]).reshape(
-                len(Q), *draws, -1
-            )
+            np.stack([np.asarray(fit.uncertainty.dof) for fit in fits]).reshape(len(Q), *draws, -1)
         ),
     )

@@ -21,13 +21,12 @@ from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.batch_estimators import estimate_each
-from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
+from jaxid.identification.estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.normal_equations import BatchFit, DataSets, solve
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.robot_family import geometries
-from jaxid.identification.weights import GivenWeights
 from jaxid.robot.robot import Robot
 
 IN_A_CALL = 16
@@ -209,7 +208,7 @@ def _solved_again(
             p[k, draw], naive[k, draw] = again.parameters, found
             deviations[k, draw] = found if row_time is None else again.standard_deviations
             if row_time is not None:
-                freedom[k, draw] = again.uncertainty.freedom
+                freedom[k, draw] = again.uncertainty.dof
             rms[k, draw] = again.residual_rms
             condition[k] = again.condition_numbers.scaled if known else np.inf
             determined[k] = known

@@ -1,4 +1,4 @@
-"""Essential parameters: those without which the model predicts worse."""
+"""Essential parameters: backward elimination of parameters that do not improve the prediction."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,43 +9,40 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
+from jaxid.identification.estimators.solutions import NUMERICAL
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem, cross_validation_folds
-from jaxid.identification.solutions import NUMERICAL
-from jaxid.identification.uncertainty.methods import AbstractUncertainty
+from jaxid.identification.uncertainty import AbstractUncertainty
 from jaxid.measurement.observations import Observations
-
-COST = 0.02
-"""Held-out error that leaving parameters out may cost, of the smallest on the way, of 1."""
 
 
 class Elimination(eqx.Module):
     """One step of backward elimination.
 
     Attributes:
-        name: Of the base parameter that is left out; empty before the first step.
-        deviation: Its standard deviation relative to its size when it was left out, of 1.
-        left: Number of parameters that are left.
-        error: Weighted error on the rows themselves, relative to the forces, of 1.
-        held_out: Weighted error on blocks of time not seen, relative to the forces, of 1.
+        name: Base parameter that is eliminated; empty before the first step.
+        deviation: Its standard deviation relative to its size.
+        remaining: Number of remaining parameters.
+        error: Weighted error on the rows themselves, relative to the forces.
+        held_out: Weighted error on held-out blocks of time, relative to the forces.
     """
 
     name: str = eqx.field(static=True)
     deviation: float
-    left: int = eqx.field(static=True)
+    remaining: int = eqx.field(static=True)
     error: float
     held_out: float
 
 
 class EssentialParameters(eqx.Module):
-    """What is left of a model when parameters that tell nothing are left out.
+    """Result of backward elimination.
 
     Attributes:
-        fit: Of the essential parameters alone; the others are zero.
-        full: The fit that it began with.
-        path: All steps, from the full model on, beyond the chosen one too.
+        fit: Fit of the essential parameters alone; the others are zero.
+        full: Fit of all parameters.
+        path: All steps, from the full model to a single parameter.
     """
 
     fit: Fit
@@ -53,28 +50,28 @@ class EssentialParameters(eqx.Module):
     path: tuple[Elimination, ...]
 
     @property
-    def chosen(self) -> Elimination:
-        """The step at which elimination was stopped."""
-        return next(step for step in self.path if step.left == self.fit.base.size)
+    def last(self) -> Elimination:
+        """Last step that is taken."""
+        return next(step for step in self.path if step.remaining == self.fit.base.size)
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """Names of the parameters that are not essential, in the order in which they went."""
-        return tuple(s.name for s in self.path[1:] if s.left >= self.fit.base.size)
+    def eliminated(self) -> tuple[str, ...]:
+        """Names of the parameters that are not essential, in the order of elimination."""
+        return tuple(s.name for s in self.path[1:] if s.remaining >= self.fit.base.size)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know, in sentences."""
-        if not self.left_out:
+        """Sentences for the user."""
+        if not self.eliminated:
             return (str(self),)
-        return str(self), f"left out, and taken as zero: {', '.join(self.left_out)}."
+        return str(self), f"eliminated, and taken as zero: {', '.join(self.eliminated)}."
 
     def __str__(self):
-        first, last = self.path[0], self.chosen
+        first, last = self.path[0], self.last
         return (
-            f"{last.left} of {first.left} base parameters are essential: with them alone the error "
-            f"on blocks of time not seen is {100 * last.held_out:.2f} % of the forces, with all "
-            f"{100 * first.held_out:.2f} %."
+            f"{last.remaining} of {first.remaining} base parameters are essential: with them alone "
+            f"the error on held-out blocks of time is {100 * last.held_out:.2f} % of the forces, "
+            f"with all {100 * first.held_out:.2f} %."
         )
 
 
@@ -82,47 +79,43 @@ def essential_parameters(
     fit: Fit,
     observations: Observations | Sequence[Observations],
     *,
-    cost: float = COST,
+    cost: float = 0.02,
     uncertainty: AbstractUncertainty | None = None,
 ) -> EssentialParameters:
-    """Leaves out the parameter with the largest relative standard deviation, again and again.
+    """Eliminate the parameter with the largest relative standard deviation, again and again.
 
-    Errors on blocks of time that were left out in turn decide where to stop: at the fewest
-    parameters whose error exceeds the smallest on the way by `cost` at most. Standard deviations
-    are those of the fit, changed as they change for independent rows. (Pham and Gautier, 1991.)
+    Held-out errors decide where to stop: at the fewest parameters whose error exceeds the smallest
+    on the path by `cost` at most. Standard deviations are those of the fit, scaled by the change of
+    those for independent rows (Pham and Gautier, 1991).
 
     Args:
-        fit: Of all base parameters.
-        observations: Those of the fit.
-        cost: Held-out error that this may cost, of the smallest on the way, of 1.
-        uncertainty: How standard deviations are found; the spectral sandwich if None.
+        fit: Fit of all base parameters.
+        observations: Observations of the fit.
+        cost: Acceptable relative increase of the held-out error.
+        uncertainty: Method for the standard deviations; by default the spectral sandwich.
 
     Raises:
         InputError: If `cost` is negative, or the observations are not those of the fit.
     """
     if not cost >= 0:
-        raise InputError(f"`cost` must be a share of zero or more, but is {cost:g}.")
-    single = isinstance(observations, Observations)
-    recordings = (observations,) if single else tuple(observations)
-    rows = RegressionProblem(fit.base, recordings)
-    if [int(n) for n in rows.factors.rows] != list(fit.rows):
-        raise InputError(
-            "`observations` must be those that the fit was made of, but they have other rows."
-        )
-    path, kept = _eliminated(fit, rows)
+        raise InputError(f"`cost` must be zero or more, but is {cost:g}.")
+    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    problem = RegressionProblem(fit.base, recordings)
+    if [int(n) for n in problem.factors.rows] != list(fit.rows):
+        raise InputError("`observations` must be those of the fit, but they have other rows.")
+    path, kept = _eliminate(fit, problem)
     smallest = min(step.held_out for step in path)
     within = [k for k, step in enumerate(path) if step.held_out <= (1 + cost) * smallest]
-    base = restricted(fit.base, kept[within[-1]])
-    left = fit_problem(RegressionProblem(base, recordings), fit.estimator, uncertainty=uncertainty)
-    return EssentialParameters(left, fit, tuple(path))
+    reduced = RegressionProblem(restrict(fit.base, kept[within[-1]]), recordings)
+    return EssentialParameters(fit_problem(reduced, fit.estimator, uncertainty), fit, tuple(path))
 
 
-def restricted(base: BaseParameters, kept: Sequence[int]) -> BaseParameters:
-    """The model in which only some base parameters are not zero.
+def restrict(base: BaseParameters, kept: Sequence[int]) -> BaseParameters:
+    """Return the base parameters of a model in which the others are zero.
 
     Args:
         base: All base parameters.
-        kept: Positions of those that are left.
+        kept: Positions of those that remain.
     """
     return dataclasses.replace(
         base,
@@ -131,46 +124,39 @@ def restricted(base: BaseParameters, kept: Sequence[int]) -> BaseParameters:
     )
 
 
-def _eliminated(fit: Fit, rows: RegressionProblem) -> tuple[list[Elimination], list[list[int]]]:
-    """The path to a single parameter, and which are left at each step."""
-    weights, names = np.asarray(fit.weights), fit.base.names
+def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination], list[list[int]]]:
+    """Return the path to a single parameter, and the remaining parameters at each step."""
+    factors, weights, names = problem.factors, np.asarray(fit.weights), fit.base.names
     squares = weights**2
-    whole = float(squares @ rows.factors.force_squares)
-    R, z = rows.factors.weighted(weights)
+    total = float(squares @ factors.force_squares)
+    R, z = factors.weighted(weights)
     parts = [
         (rest.total.weighted(weights), part.total)
-        for rest, part in cross_validation_folds(rows.blocks, 10)
+        for rest, part in cross_validation_folds(problem.blocks, 10)
     ]
     kept = list(range(fit.base.size))
-    deviations = _deviations(rows.factors, R, z, weights, kept)[1]
-    honest = np.asarray(fit.standard_deviations)
-    known = np.isfinite(honest) & (deviations > 0)
-    ratio = np.where(known, honest / np.where(deviations > 0, deviations, 1.0), np.inf)
-    path, sets, name, share = [], [], "", 0.0
+    naive = _estimates(factors, R, z, weights, kept)[1]
+    deviations = np.asarray(fit.standard_deviations)
+    known = np.isfinite(deviations) & (naive > 0)
+    ratio = np.where(known, deviations / np.where(naive > 0, naive, 1.0), np.inf)
+    path, sets, name, deviation = [], [], "", 0.0
     while kept:
-        p, naive = _deviations(rows.factors, R, z, weights, kept)
-        left_out = sum(squares @ part.residual_squares(_solved(*r, kept)) for r, part in parts)
-        error = float(squares @ rows.factors.residual_squares(p))
+        p, naive = _estimates(factors, R, z, weights, kept)
+        error = float(squares @ factors.residual_squares(p))
+        held_out = sum(squares @ part.residual_squares(_solve(*r, kept)) for r, part in parts)
+        errors = float(np.sqrt(error / total)), float(np.sqrt(held_out / total))
         sets.append(list(kept))
-        path.append(
-            Elimination(
-                name,
-                share,
-                len(kept),
-                float(np.sqrt(error / whole)),
-                float(np.sqrt(left_out / whole)),
-            )
-        )
+        path.append(Elimination(name, deviation, len(kept), *errors))
         size = np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
         relative = ratio[kept] * naive / size
         worst = int(np.argmax(relative))
-        name, share = names[kept[worst]], float(relative[worst])
+        name, deviation = names[kept[worst]], float(relative[worst])
         del kept[worst]
     return path, sets
 
 
-def _solved(R: np.ndarray, z: np.ndarray, kept: list[int]) -> np.ndarray:
-    """Least squares in some parameters; the others are zero."""
+def _solve(R: np.ndarray, z: np.ndarray, kept: list[int]) -> np.ndarray:
+    """Return the least-squares solution in some parameters; the others are zero."""
     p = np.zeros(R.shape[1])
     scale = np.linalg.norm(R[:, kept], axis=0)
     scale = np.where(scale > 0, scale, 1.0)
@@ -178,15 +164,15 @@ def _solved(R: np.ndarray, z: np.ndarray, kept: list[int]) -> np.ndarray:
     return p
 
 
-def _deviations(
+def _estimates(
     factors: Factors,
     R: np.ndarray,
     z: np.ndarray,
     weights: Float[AnyArray, " joints"],
     kept: list[int],
 ) -> tuple[Float[np.ndarray, " base"], Float[np.ndarray, " kept"]]:
-    """Estimates, and standard deviations for independent rows with a variance of each joint."""
-    p = _solved(R, z, kept)
+    """Return estimates, and standard deviations for independent rows and joints' variances."""
+    p = _solve(R, z, kept)
     variances = factors.residual_squares(p) / np.maximum(factors.rows, 1)
     half = np.linalg.pinv(R[:, kept], rcond=NUMERICAL)
     B = half @ half.T
@@ -196,6 +182,6 @@ def _deviations(
         own = [(place[k], c) for c, k in enumerate(joint.columns) if k in place]
         if own:
             rows, columns = (list(x) for x in zip(*own, strict=True))
-            felt = w**2 * np.asarray(joint.R)[:, columns] @ B[rows]
-            inner += variance * np.sum(felt**2, axis=0)
+            influence = w**2 * np.asarray(joint.R)[:, columns] @ B[rows]
+            inner += variance * np.sum(influence**2, axis=0)
     return p, np.sqrt(inner)

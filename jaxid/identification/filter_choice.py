@@ -1,4 +1,4 @@
-"""Filters chosen by data: which one lets the model predict forces that it has not seen."""
+"""Choice of the filter: by the error of prediction on held-out parts of the log."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -15,20 +15,14 @@ from jaxid.measurement.decimation import AbstractDecimation, Subsample
 from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.recording import Recording
-from jaxid.robot.robot import Robot
-
-Slow = Sequence[float] | Float[AnyArray, " joints"] | None
-CUTOFFS = 9
-ROWS_PER_CUTOFF = 5.0
-"""Rows for each period of the cut-off that decimation leaves."""
 
 
 class FilterCandidate(eqx.Module):
     """A filter with its decimation.
 
     Attributes:
-        filter: For motion, forces and columns.
-        decimation: For forces and columns.
+        filter: Filter of motion, forces and columns.
+        decimation: Decimation of forces and columns.
     """
 
     filter: AbstractFilter
@@ -36,16 +30,15 @@ class FilterCandidate(eqx.Module):
 
 
 class FilterChoice(eqx.Module):
-    """The filter that was chosen, and why.
+    """Result of a choice of filters.
 
     Attributes:
-        candidates: In the order given.
-        cutoffs: Of forces and columns [Hz].
-        errors: For each candidate and part of the log the held-out error relative to the forces,
-            of 1.
-        correlations: For each candidate the mean correlation of neighbouring rows of the residuals,
-            of 1: near zero where rows are independent.
-        best: Which candidate is chosen.
+        candidates: Candidates in the given order.
+        cutoffs: Cut-off frequencies of forces and columns [Hz].
+        errors: Held-out error of each candidate on each part of the log, relative to the forces.
+        correlations: Mean correlation of neighbouring rows of the residuals for each candidate:
+            near zero where rows are independent.
+        best: Index of the chosen candidate.
     """
 
     candidates: tuple[FilterCandidate, ...]
@@ -66,7 +59,7 @@ class FilterChoice(eqx.Module):
 
     @property
     def curve(self) -> Float[np.ndarray, " candidates"]:
-        """For each candidate the held-out error of the whole log, of 1."""
+        """Held-out error of each candidate on the whole log."""
         return np.sqrt(np.mean(np.asarray(self.errors) ** 2, axis=1))
 
     def __str__(self):
@@ -75,13 +68,13 @@ class FilterChoice(eqx.Module):
             for cutoff, error in zip(np.asarray(self.cutoffs), self.curve, strict=True)
         )
         return (
-            f"a cut-off of {np.asarray(self.cutoffs)[self.best]:.3g} Hz predicts unseen parts of "
+            f"a cut-off of {np.asarray(self.cutoffs)[self.best]:.3g} Hz predicts held-out parts of "
             f"the log best (errors by cut-off: {shown})."
         )
 
 
 class AbstractFilterCriterion(eqx.Module):
-    """What a filter is chosen by."""
+    """A criterion by which a filter is chosen."""
 
     @abstractmethod
     def choose(
@@ -89,28 +82,28 @@ class AbstractFilterCriterion(eqx.Module):
         errors: Float[np.ndarray, "candidates folds"],
         correlations: Float[np.ndarray, " candidates"],
     ) -> int:
-        """Number of the best candidate."""
+        """Return the index of the best candidate."""
 
 
 class HeldOutError(AbstractFilterCriterion):
-    """The smallest error on parts of the log that the fit has not seen."""
+    """Smallest error on held-out parts of the log."""
 
     def choose(self, errors, correlations):
-        """The smallest mean square."""
+        """Return the candidate with the smallest mean square."""
         return int(np.argmin(np.mean(errors**2, axis=1)))
 
 
 class WhitestResidual(AbstractFilterCriterion):
-    """The residuals whose neighbouring rows are least alike.
+    """Smallest correlation of neighbouring rows of the residuals.
 
     Attributes:
-        cost: Held-out error that this may cost, of the smallest one, of 1.
+        cost: Acceptable relative increase of the held-out error.
     """
 
     cost: float = eqx.field(static=True, default=0.05)
 
     def choose(self, errors, correlations):
-        """The smallest correlation among candidates that predict nearly as well as the best."""
+        """Return the whitest candidate of those that predict nearly as well as the best."""
         whole = np.sqrt(np.mean(errors**2, axis=1))
         good = whole <= (1 + self.cost) * whole.min()
         return int(np.argmin(np.where(good, np.abs(correlations), np.inf)))
@@ -119,22 +112,21 @@ class WhitestResidual(AbstractFilterCriterion):
 def butterworth_candidates(
     sample_time: float, cutoffs: Sequence[float] | None = None, order: int = 4
 ) -> tuple[FilterCandidate, ...]:
-    """Zero-phase Butterworth filters, each decimated to about five rows for each of its periods.
+    """Return zero-phase Butterworth filters, each decimated to about five rows for each period.
 
     Args:
-        sample_time: Of the recording [s].
-        cutoffs: From 1 Hz to a fifth of the sampling rate, but no more than 100 Hz, if None [Hz].
-        order: Of one direction.
+        sample_time: Sample time of the recording [s].
+        cutoffs: Cut-off frequencies [Hz]; by default nine from 1 Hz to a fifth of the sampling
+            rate, but at most 100 Hz.
+        order: Order of one direction.
     """
     if cutoffs is None:
         highest = min(100.0, 0.2 / sample_time)
-        cutoffs = [float(f) for f in np.geomspace(min(1.0, 0.1 * highest), highest, CUTOFFS)]
+        cutoffs = [float(f) for f in np.geomspace(min(1.0, 0.1 * highest), highest, 9)]
+    steps = [max(1, int(1.0 / (5.0 * f * sample_time))) for f in cutoffs]
     return tuple(
-        FilterCandidate(
-            ZeroPhaseButterworth(f, order),
-            Subsample(max(1, int(1.0 / (ROWS_PER_CUTOFF * f * sample_time)))),
-        )
-        for f in cutoffs
+        FilterCandidate(ZeroPhaseButterworth(f, order), Subsample(step))
+        for f, step in zip(cutoffs, steps, strict=True)
     )
 
 
@@ -145,27 +137,26 @@ def choose_filter(
     *,
     estimator: AbstractEstimator | None = None,
     criterion: AbstractFilterCriterion | None = None,
-    slow: Slow = None,
+    min_speed: Sequence[float] | Float[AnyArray, " joints"] | None = None,
     progress: Progress | None = None,
 ) -> FilterChoice:
-    """Searches the filter with which a model predicts best what it has not seen.
+    """Choose the filter with which a model predicts held-out parts of the log best.
 
     With each candidate the model is fitted to all parts of the log but one, and predicts the forces
     of that part from the candidate's own motion. Measured and predicted forces are compared in the
-    *widest* band of all candidates, the same for all of them: a filter that hides what it cannot
-    explain gains nothing.
+    *widest* band of all candidates: a filter that hides unexplained forces gains nothing.
 
     Args:
-        base: What can be identified on this robot.
+        base: Base parameters of the robot.
         recordings: One or several logs.
-        candidates: Butterworth filters of several cut-offs if None.
-        estimator: Weighted least squares with the largest forces if None.
-        criterion: `HeldOutError` if None.
-        slow: Speed of each joint below which its rows do not count [rad/s or m/s].
-        progress: Is told now and then which share of the candidates is done, of 1.
+        candidates: Candidates; by default Butterworth filters of several cut-off frequencies.
+        estimator: Estimator; by default least squares weighted by the largest forces.
+        criterion: Criterion; by default `HeldOutError`.
+        min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
+        progress: Callback, called with the completed fraction (0 to 1).
 
     Raises:
-        InputError: If there are no candidates, or a log and a candidate do not go together.
+        InputError: If there are no candidates, or a log and a candidate do not fit to each other.
     """
     logs = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     if candidates is None:
@@ -177,80 +168,69 @@ def choose_filter(
     robot, dt = base.model.robot, logs[0].sample_time
     cutoffs = np.array([c.filter.low_pass(dt).cutoff for c in candidates])
     edge = max(c.filter.edge(dt) for c in candidates)
-    widest = candidates[int(np.argmax(cutoffs))]
-    judges = [_inner(_observed(x, robot, widest, slow), edge) for x in logs]
-    weights = np.asarray(estimator(RegressionProblem(base, judges)).weights)
+
+    def inner_observations(candidate: FilterCandidate) -> list[Observations]:
+        filtered = [
+            observe(log, robot, candidate.filter, candidate.decimation, min_speed) for log in logs
+        ]
+        return [_inner_rows(o, edge) for o in filtered]
+
+    widest = inner_observations(candidates[int(np.argmax(cutoffs))])
+    weights = np.asarray(estimator(RegressionProblem(base, widest)).weights)
     errors, correlations = [], []
     for number, candidate in enumerate(candidates):
-        seen = [_inner(_observed(x, robot, candidate, slow), edge) for x in logs]
-        rows = RegressionProblem(base, seen)
-        judge = RegressionProblem(
-            base, [_with_motion(*pair) for pair in zip(judges, seen, strict=True)]
-        )
-        errors.append(_errors(rows, judge, estimator, weights**2))
-        correlations.append(_correlation(rows, estimator))
+        own = inner_observations(candidate)
+        problem = RegressionProblem(base, own)
+        test = RegressionProblem(base, [_with_motion(*x) for x in zip(widest, own, strict=True)])
+        errors.append(_held_out_errors(problem, test, estimator, weights**2))
+        correlations.append(_correlation(problem, estimator))
         if progress is not None:
             progress((number + 1) / len(candidates))
     best = criterion.choose(np.array(errors), np.array(correlations))
     return FilterChoice(tuple(candidates), cutoffs, np.array(errors), np.array(correlations), best)
 
 
-def _observed(
-    recording: Recording, robot: Robot, candidate: FilterCandidate, slow: Slow
-) -> Observations:
-    return observe(recording, robot, candidate.filter, candidate.decimation, slow)
-
-
-def _inner(observations: Observations, edge: int) -> Observations:
-    """Only rows that are far enough from the ends for the slowest candidate."""
+def _inner_rows(observations: Observations, edge: int) -> Observations:
+    """Mask rows that are too close to the ends for the slowest candidate."""
     at = observations.instants
     far = np.zeros(len(at), bool)
     for a, b in observations.segments:
         far |= (at >= a + edge) & (at < b - edge)
-    mask = np.asarray(observations.mask) & far[:, None]
-    return observations.replace(mask=mask)
+    return observations.replace(mask=np.asarray(observations.mask) & far[:, None])
 
 
-def _with_motion(judge: Observations, observations: Observations) -> Observations:
-    """A candidate's motion with forces and rows of the widest band."""
-    if judge.motion.q.shape != observations.motion.q.shape:
+def _with_motion(widest: Observations, own: Observations) -> Observations:
+    """Return a candidate's motion with forces and rows of the widest band."""
+    if widest.samples != own.samples:
         raise InputError(
-            f"the filters of `candidates` leave different parts of `{judge.name}`, whose gaps are "
-            "close together: choose on a log without, or take filters whose edges are alike."
+            f"the filters of `candidates` leave different parts of `{widest.name}`, whose gaps are "
+            "close together: choose on a log without, or take filters with similar edges."
         )
-    return judge.replace(motion=observations.motion)
+    return widest.replace(motion=own.motion)
 
 
-def _errors(
-    rows: RegressionProblem,
-    judge: RegressionProblem,
+def _held_out_errors(
+    problem: RegressionProblem,
+    test: RegressionProblem,
     estimator: AbstractEstimator,
     squares: Float[np.ndarray, " joints"],
 ) -> Float[np.ndarray, " folds"]:
-    """Errors on parts not seen, relative to the forces of all parts."""
-    whole = squares @ judge.factors.force_squares / 5
-    pairs = zip(
-        cross_validation_folds(rows.blocks), cross_validation_folds(judge.blocks), strict=True
-    )
-    return np.array(
-        [
-            np.sqrt(
-                squares
-                @ part.total.residual_squares(
-                    estimator(RegressionProblem(rows.base, blocks=rest)).parameters
-                )
-                / whole
-            )
-            for (rest, _), (_, part) in pairs
-        ]
-    )
+    """Return the errors on held-out parts, relative to the forces of all parts."""
+    folds = cross_validation_folds(problem.blocks), cross_validation_folds(test.blocks)
+    pairs = [(rest, part) for (rest, _), (_, part) in zip(*folds, strict=True)]
+    total = squares @ test.factors.force_squares / len(pairs)
+    errors = []
+    for rest, part in pairs:
+        p = estimator(RegressionProblem(problem.base, blocks=rest)).parameters
+        errors.append(np.sqrt(squares @ part.total.residual_squares(p) / total))
+    return np.array(errors)
 
 
-def _correlation(rows: RegressionProblem, estimator: AbstractEstimator) -> float:
-    """How alike neighbouring rows of the residuals are: the mean of the joints."""
-    power, alike = np.zeros(rows.robot.joints), np.zeros(rows.robot.joints)
-    for chunk, residuals in rows.residuals(np.asarray(estimator(rows).parameters)):
+def _correlation(problem: RegressionProblem, estimator: AbstractEstimator) -> float:
+    """Return the correlation of neighbouring rows of the residuals, as a mean of the joints."""
+    power, product = np.zeros(problem.robot.joints), np.zeros(problem.robot.joints)
+    for chunk, residuals in problem.residuals(np.asarray(estimator(problem).parameters)):
         e = np.where(chunk.mask, residuals, 0.0)
         power += np.sum(e**2, axis=0)
-        alike += np.sum(e[1:] * e[:-1], axis=0)
-    return float(np.mean(alike / np.where(power > 0, power, 1.0)))
+        product += np.sum(e[1:] * e[:-1], axis=0)
+    return float(np.mean(product / np.where(power > 0, power, 1.0)))

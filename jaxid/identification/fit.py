@@ -13,12 +13,14 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.consistency.estimator import Consistency
-from jaxid.identification.estimators import AbstractEstimator, EstimatorInWords
+from jaxid.identification.estimators import (
+    AbstractEstimator,
+    AbstractSpectralSolution,
+    EstimatorInWords,
+)
 from jaxid.identification.identifiability import UndeterminedDirection
 from jaxid.identification.model_file import checksum_of, read_model, write_model
-from jaxid.identification.solutions import AbstractSpectralSolution
-from jaxid.identification.uncertainty.residuals import ResidualSpectra
-from jaxid.identification.uncertainty.uncertainty import Uncertainty
+from jaxid.identification.uncertainty import ResidualSpectra, Uncertainty
 from jaxid.io import to_json
 from jaxid.measurement.observations import Observations
 

@@ -5,8 +5,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
 from jaxid.identification.factors import Blocks
-from jaxid.identification.solutions import NUMERICAL, Decomposition
 
 LARGEST_UNCERTAINTY = 0.1
 """Fraction of the forces by which an undetermined combination may be wrong."""

@@ -8,13 +8,18 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.estimators import AbstractEstimator, Estimate, WeightedLeastSquares
+from jaxid.identification.estimators import (
+    AbstractEstimator,
+    AbstractSpectralSolution,
+    Estimate,
+    WeightedLeastSquares,
+)
+from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import ConditionNumbers, Fit
 from jaxid.identification.identifiability import undetermined
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.solutions import NUMERICAL, AbstractSpectralSolution, Decomposition
-from jaxid.identification.uncertainty.methods import AbstractUncertainty, SpectralSandwich
+from jaxid.identification.uncertainty import AbstractUncertainty, SpectralSandwich
 from jaxid.measurement.observations import Observations, Progress
 
 
@@ -146,7 +151,7 @@ def _naive_covariance(
     s = np.asarray(decomposition.values)
     B, weights = np.asarray(estimate.inverse), np.asarray(estimate.weights)
     squares = factors.residual_squares(estimate.parameters)
-    taken = estimate.taken
+    taken = estimate.effective_parameters
     if taken is None:
         taken = float(np.sum((R @ B) * R))
     free = 1.0 - taken / float(factors.rows.sum())

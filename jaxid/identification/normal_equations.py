@@ -17,7 +17,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float
 from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
-from jaxid.identification.uncertainty.compiled import LineSums, line_sums, variances
+from jaxid.identification.uncertainty.spectral import LineSums, line_sums, variances
 
 AT_ONCE = 2048
 """Samples whose columns are held at once."""

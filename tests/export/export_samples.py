@@ -6,7 +6,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.uncertainty.uncertainty import Uncertainty
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.simulation.virtual import random_bodies
 
 
@@ -16,7 +16,7 @@ def fit_of(model: jid.Model, p: np.ndarray, *, full: bool = False) -> Fit:
     return Fit(
         base=base,
         parameters=np.asarray(base.from_standard(p)),
-        uncertainty=Uncertainty.given(np.eye(base.size)),
+        uncertainty=Uncertainty(np.eye(base.size), np.full(base.size, np.inf), np.eye(base.size)),
         weights=np.ones(n),
         condition_numbers=ConditionNumbers(1.0, 1.0, 1.0),
         rows=(1,) * n,

@@ -92,7 +92,7 @@ def test_honest_deviations_of_many_draws(base):
         np.testing.assert_allclose(
             fit.standard_deviations[k, draw], one.standard_deviations, rtol=1e-8
         )
-        np.testing.assert_allclose(fit.freedom[k, draw], one.uncertainty.freedom, rtol=1e-8)
+        np.testing.assert_allclose(fit.freedom[k, draw], one.uncertainty.dof, rtol=1e-8)
 
 
 def test_honest_deviations_under_jit_and_by_chunks(base, monkeypatch):

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
+from jaxid.identification.estimators import Complete
+from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Factors
-from jaxid.identification.solutions import Complete, Decomposition
 
 TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
 ROBOT = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))

@@ -1,7 +1,5 @@
 """The family of estimators: laws for all members, and what each is for."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import optimize
@@ -100,14 +98,14 @@ def test_every_estimator_goes_through_logs_that_are_not_held(base, noisy, k, mon
 @pytest.mark.parametrize("k", range(3, 8))
 def test_what_needs_rows_refuses_factors(base, noisy, k):
     blocks = jid.RegressionProblem(base, [noisy]).blocks
-    with pytest.raises(ValueError, match="needs the rows themselves, but only their factors"):
+    with pytest.raises(ValueError, match="only their factors"):
         jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), members(noisy)[k])
 
 
 @pytest.mark.parametrize("loss", [jid.Huber(), jid.Tukey()])
 def test_a_loss_is_consistent_with_itself(loss):
     x = np.linspace(-8, 8, 4001)
-    felt = x * loss.share(x)
+    felt = x * loss.weight(x)
     np.testing.assert_allclose(np.gradient(felt, x)[1:-1], loss.slope(x)[1:-1], atol=0.6)
     smooth = np.abs(np.abs(x) - loss.limit) > 0.01
     np.testing.assert_allclose(np.gradient(felt, x)[smooth], loss.slope(x)[smooth], atol=5e-3)
@@ -153,7 +151,7 @@ def test_a_ridge_towards_a_prior_is_solved_as_numpy_does(base, noisy):
     plain = jid.identify(base, noisy, ridge)
     truth = np.asarray(base.from_standard(standard_parameters(base.model)))
     assert np.linalg.norm(fit.parameters - truth) < np.linalg.norm(plain.parameters - truth)
-    with pytest.raises(ValueError, match="must be the 26 standard parameters of the model"):
+    with pytest.raises(ValueError, match="`parameters`"):
         jid.identify(base, noisy, jid.RelativeTo(prior[:5], ridge))
 
 
@@ -210,9 +208,7 @@ def test_instruments_take_the_bias_of_noisy_columns_away(base):
         random = np.random.default_rng(seed)
         noise = [s * random.standard_normal((3000, 2)) for s in (0.003, 0.1, 1.5)]
         m = clean.motion
-        o = dataclasses.replace(
-            clean, motion=jid.Motion(m.q + noise[0], m.qd + noise[1], m.qdd + noise[2])
-        )
+        o = clean.replace(motion=jid.Motion(m.q + noise[0], m.qd + noise[1], m.qdd + noise[2]))
         plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
         fit = jid.identify(base, o, jid.InstrumentalVariables((reference,), MEASURED))
         errors["plain"].append(plain.parameters - truth)
@@ -223,5 +219,5 @@ def test_instruments_take_the_bias_of_noisy_columns_away(base):
     }
     assert np.sqrt(np.mean(bias["instruments"] ** 2)) < 1.6
     assert np.sqrt(np.mean(bias["plain"] ** 2)) > 6.0
-    with pytest.raises(ValueError, match="must hold one entry, or one for each of 1 record"):
+    with pytest.raises(ValueError, match="`references`"):
         jid.identify(base, clean, jid.InstrumentalVariables((reference, reference), MEASURED))

@@ -5,8 +5,8 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
+from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.fit import Trust
-from jaxid.identification.solutions import Decomposition
 
 WEIGHTED = jid.WeightedLeastSquares(jid.MeasuredForces())
 
@@ -206,7 +206,7 @@ def test_ridge_solves_its_normal_equations(base, noisy):
 def test_cross_validation_leaves_clean_data_alone(base):
     o = observations(base.model, standard_parameters(base.model), noise=1e-3)
     fit = jid.identify(base, o, jid.LeastSquares(jid.CrossValidated()))
-    assert fit.solution.share < 2e-3
+    assert fit.solution.strength < 2e-3
 
 
 def test_cross_validation_pulls_where_data_are_poor(base):
@@ -215,7 +215,7 @@ def test_cross_validation_pulls_where_data_are_poor(base):
     fit = jid.identify(base, o, jid.LeastSquares(jid.CrossValidated()))
     plain = jid.identify(base, o, jid.LeastSquares())
     fresh = observations(base.model, p, samples=800, seed=9)
-    assert fit.solution.share > 1e-2
+    assert fit.solution.strength > 1e-2
     errors = [jid.validate(f, fresh).errors[0].relative for f in (fit, plain)]
     assert errors[0] < 0.8 * errors[1]
 

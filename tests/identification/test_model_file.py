@@ -139,7 +139,9 @@ def test_a_class_outside_of_the_family_is_not_looked_up():
 
 def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
     log = observations(fit.base.model, standard_parameters(fit.base.model))
-    fit = dataclasses.replace(fit, estimator=jid.NonlinearFriction(free=lambda terms: [terms[1].transition.epsilon]))
+    fit = dataclasses.replace(
+        fit, estimator=jid.NonlinearFriction(free=lambda terms: [terms[1].transition.epsilon])
+    )
     loaded = jid.load(fit.save(tmp_path / "arm.json"))
     assert str(loaded.estimator) == str(fit.estimator)
     assert loaded.checksum == fit.checksum

@@ -7,10 +7,9 @@ import pytest
 import virtual
 
 import jaxid as jid
-from jaxid.identification.nonlinear.estimator import NonlinearFriction
-from jaxid.identification.nonlinear.projection import Search, project
-from jaxid.identification.nonlinear.separable import SeparableRows
-from jaxid.identification.nonlinear.shapes import Shapes
+from jaxid.identification.estimators import NonlinearFriction
+from jaxid.identification.estimators.friction import project, search_shapes
+from jaxid.identification.estimators.friction_rows import SeparableProblem, select_shapes
 
 ROBOT = jid.robots.planar_arm(3)
 TRUE_EPSILON, TRUE_SPEED = np.array([0.02, 0.05, 0.03]), np.array([0.2, 0.3, 0.15])
@@ -37,8 +36,8 @@ def observations(**changed):
 
 
 def separable(base, o, free=None):
-    rows = jid.RegressionProblem(base, [o])
-    return SeparableRows(rows, Shapes.of(base, free))
+    problem = jid.RegressionProblem(base, [o])
+    return SeparableProblem(problem, select_shapes(base, free))
 
 
 def test_shapes_are_found_again_through_filters():
@@ -83,10 +82,10 @@ def test_the_jacobian_is_that_of_what_is_left(exponent):
     weights, x = np.array([1.0, 2.0, 3.0]), rows.shapes.values(base)
 
     def left(x):
-        r = project(rows.blocks(x).total, rows, weights).residual
+        r = project(rows, rows.blocks(x).total, weights).residual
         return 0.5 * r @ r
 
-    at = project(rows.blocks(x).total, rows, weights)
+    at = project(rows, rows.blocks(x).total, weights)
     slopes = at.jacobian.T @ at.residual
     for k in range(len(x)):
         step = np.zeros(len(x))
@@ -101,7 +100,7 @@ def test_deviations_of_shapes_agree_with_their_scatter():
     for seed in range(20):
         o = observations(samples=600, noise=0.3, noise_seed=seed)
         rows = separable(START, o)
-        found.append(Search(rows, np.ones(3), rows.shapes.values(START))().x)
+        found.append(search_shapes(rows, np.ones(3), rows.shapes.values(START)).x)
     fit = jid.identify_nonlinear(
         START, observations(samples=600, noise=0.3), NonlinearFriction(WLS)
     )
@@ -112,13 +111,9 @@ def test_deviations_of_shapes_agree_with_their_scatter():
     assert (scatter / fit.shape_deviations < 1.6).all()
     assert (scatter / fit.shape_deviations > 1 / 1.6).all()
     assert (np.abs(fit.shapes - [*TRUE_EPSILON, *TRUE_SPEED]) < 4 * fit.shape_deviations).all()
-
-
-def test_unknown_shapes_make_their_levels_less_certain():
-    o = observations(samples=600, noise=0.3)
-    whole = jid.identify_nonlinear(START, o, NonlinearFriction(WLS))
-    known = jid.identify(whole.fit.base, o, WLS)
-    ratio = whole.fit.standard_deviations / known.standard_deviations
+    # Unknown shapes make the levels of friction less certain.
+    known = jid.identify(fit.fit.base, observations(samples=600, noise=0.3), WLS)
+    ratio = fit.fit.standard_deviations / known.standard_deviations
     assert (ratio > 1 - 1e-9).all()
     assert ratio[list(START.names).index("fs1")] > 1.1
 
@@ -132,7 +127,7 @@ def test_it_pays_where_friction_is_nonlinear_and_only_there():
     assert whole.better.base is whole.fit.base
     assert whole.better.notes[-2] == str(whole.held_out)
     assert "vs3 = 0.1" in whole.better.notes[-1]
-    assert "nonlinear friction pays: it leaves" in str(whole.held_out)
+    assert "nonlinear friction pays: on held-out blocks" in str(whole.held_out)
 
     plain = model(0.03)
     p = virtual.standard_parameters(plain, seed=3)
@@ -156,17 +151,17 @@ def test_two_recordings_are_fitted_together():
 def test_what_cannot_be_searched_is_refused():
     terms = (jid.RigidBodies(), jid.CoulombFriction(jid.HardSign()))
     hard = jid.base_parameters(jid.Model(ROBOT, terms))
-    with pytest.raises(ValueError, match="no friction law with a shape"):
-        Shapes.of(hard)
-    with pytest.raises(ValueError, match="`free` picks a leaf that is no shape"):
-        Shapes.of(START, lambda terms: (terms[2].transition.dead_zone,))
+    with pytest.raises(ValueError, match="`model`"):
+        select_shapes(hard)
+    with pytest.raises(ValueError, match="`free`"):
+        select_shapes(START, lambda terms: (terms[2].transition.dead_zone,))
     friction = jid.StribeckFriction(), jid.LoadFriction(np.ones((3, 10)))
     double = jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), *friction)))
-    with pytest.raises(ValueError, match="two terms have a shape called `eps`"):
-        Shapes.of(double, lambda t: (t[1].transition.epsilon, t[2].transition.epsilon))
+    with pytest.raises(ValueError, match="`eps`"):
+        select_shapes(double, lambda t: (t[1].transition.epsilon, t[2].transition.epsilon))
     zero = dataclasses.replace(START, model=model(0.04, np.array([0.1, 0.0, 0.1])))
-    with pytest.raises(ValueError, match="`vs2` must begin at a positive number"):
-        Shapes.of(zero).values(zero)
+    with pytest.raises(ValueError, match="`vs2`"):
+        select_shapes(zero).values(zero)
     blocks = jid.RegressionProblem(START, [observations(samples=300)]).blocks
     with pytest.raises(ValueError, match="needs the rows themselves"):
         jid.fit_problem(jid.RegressionProblem(START, blocks=blocks), NonlinearFriction(WLS))

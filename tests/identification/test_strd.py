@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from strd import PROBLEMS, exact
 
+from jaxid.identification.estimators import Complete
+from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Factors, JointFactor
-from jaxid.identification.solutions import Complete, Decomposition
 
 DIGITS = {
     "Norris": 12,

@@ -5,7 +5,7 @@ import pytest
 
 import jaxid as jid
 from jaxid.identification.fit import ConditionNumbers
-from jaxid.identification.uncertainty.uncertainty import Uncertainty
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.validation import TorqueErrors, definiteness, position_range
 
 
@@ -69,7 +69,7 @@ def fit_of(parameters):
     return jid.Fit(
         base=base,
         parameters=np.array(parameters),
-        uncertainty=Uncertainty.given(np.eye(2)),
+        uncertainty=Uncertainty(np.eye(2), np.full(2, np.inf), np.eye(2)),
         weights=np.ones(2),
         condition_numbers=ConditionNumbers(1.0, 1.0, 1.0),
         rows=(1, 1),

@@ -21,9 +21,13 @@ from jaxid.identification.consistency.feasible_set import (
     scaled_rows,
 )
 from jaxid.identification.consistency.pseudo_inertia import Values, consistency_margin
-from jaxid.identification.estimators import AbstractEstimator, Estimate
-from jaxid.identification.solutions import Complete
-from jaxid.identification.weights import AbstractWeights, MaximumForces
+from jaxid.identification.estimators import (
+    AbstractEstimator,
+    AbstractWeights,
+    Complete,
+    Estimate,
+    MaximumForces,
+)
 
 
 class Outcome(enum.Enum):
@@ -138,7 +142,7 @@ class PhysicallyConsistent(AbstractEstimator):
             RuntimeError: If the optimum was not proved and `throw` is set.
         """
         weights = self.weights(rows.robot, rows.factors)
-        free = Estimate.solved(rows, weights, Complete())
+        free = Estimate.solve(rows, weights, Complete())
         R, z = rows.factors.weighted(weights)
         feasible = self.feasible_set(rows.base)
         count = int(rows.factors.rows.sum())

@@ -10,12 +10,12 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
+from jaxid.identification.estimators import AbstractWeights, Complete, MaximumForces
+from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Blocks, RowChunk
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.comparison import joint_test
 from jaxid.identification.runs.left_out import block_covariance
-from jaxid.identification.solutions import Complete, Decomposition
-from jaxid.identification.weights import AbstractWeights, MaximumForces
 from jaxid.measurement.observations import Observations, without_delay
 
 BLOCKS = 20

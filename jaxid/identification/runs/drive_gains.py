@@ -13,6 +13,8 @@ from scipy import optimize
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
+from jaxid.identification.estimators import Complete
+from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
 from jaxid.identification.factors import Factors
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.runs.left_out import Block, block_covariance
@@ -20,7 +22,6 @@ from jaxid.identification.runs.payload import body_columns
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
-from jaxid.identification.solutions import NUMERICAL, Complete, Decomposition
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Tool
 

@@ -11,7 +11,7 @@ from scipy import stats
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.fit import Fit
-from jaxid.identification.uncertainty.uncertainty import Uncertainty
+from jaxid.identification.uncertainty import Uncertainty
 
 
 class Estimates(eqx.Module):
@@ -110,7 +110,7 @@ def _words(name: str) -> str:
 
 def freedom_of(fit: Fit) -> Float[np.ndarray, " base"]:
     """Degrees of freedom of a fit's standard deviations."""
-    return np.asarray(fit.uncertainty.freedom)
+    return np.asarray(fit.uncertainty.dof)
 
 
 def with_covariance(

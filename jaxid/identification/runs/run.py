@@ -9,14 +9,19 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.estimators import WeightedLeastSquares
+from jaxid.identification.estimators import (
+    AbstractWeights,
+    Complete,
+    GivenWeights,
+    MaximumForces,
+    WeightedLeastSquares,
+)
+from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.estimates import freedom_of, with_covariance
-from jaxid.identification.solutions import Complete, Decomposition
-from jaxid.identification.weights import AbstractWeights, GivenWeights, MaximumForces
 from jaxid.measurement.observations import Observations, Progress
 
 ROUNDING = 1e-7

@@ -14,10 +14,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
+from jaxid.identification.estimators import Complete
+from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
 from jaxid.identification.runs.left_out import Block, block_covariance
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.twice import refuse_shared
-from jaxid.identification.solutions import NUMERICAL, Complete, Decomposition
 
 
 class Tied(eqx.Module):

@@ -1,1 +1,8 @@
-"""How far estimates can be trusted: spectral sandwich, block jackknife, residual spectra."""
+"""Uncertainty of estimates: spectral sandwich, block jackknife, residual spectra."""
+
+from jaxid.identification.uncertainty.jackknife import BlockJackknife as BlockJackknife
+from jaxid.identification.uncertainty.result import AbstractUncertainty as AbstractUncertainty
+from jaxid.identification.uncertainty.result import IndependentRows as IndependentRows
+from jaxid.identification.uncertainty.result import ResidualSpectra as ResidualSpectra
+from jaxid.identification.uncertainty.result import Uncertainty as Uncertainty
+from jaxid.identification.uncertainty.spectral import SpectralSandwich as SpectralSandwich

@@ -1,4 +1,4 @@
-"""The estimator: definite mass matrices, bounds and priors that hold, and what it says."""
+"""The estimator: definite mass matrices, bounds and priors that hold, and its notes."""
 
 import sys
 from pathlib import Path
@@ -8,20 +8,15 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.identification.consistency import solver
+from jaxid.identification.consistency import consistency_margin, solver
 from jaxid.identification.consistency.feasible_set import nominal_bodies
-from jaxid.identification.consistency.pseudo_inertia import consistency_margin, inertial_parameters
+from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from virtual import observations
 
-TERMS = (
-    jid.RigidBodies(),
-    jid.ViscousFriction(),
-    jid.CoulombFriction(),
-    jid.RotorInertia(),
-    jid.ConstantOffset(),
-)
+FRICTION = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia(), jid.ConstantOffset())
+TERMS = (jid.RigidBodies(), *FRICTION)
 WEIGHTS = jid.MeasuredForces()
 
 
@@ -36,54 +31,47 @@ def panda():
     return case(jid.robots.panda())
 
 
-def test_the_mass_matrix_is_definite_where_least_squares_fail(panda):
+@pytest.fixture(scope="module")
+def consistent(panda):
+    base, _, o = panda
+    return jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
+
+
+def test_the_mass_matrix_is_definite_where_least_squares_fail(panda, consistent):
     base, _, o = panda
     free = jid.identify(base, o, jid.WeightedLeastSquares(WEIGHTS))
-    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
     assert not jid.validate(free, o).definiteness.positive_definite
-    assert jid.validate(fit, o).definiteness.positive_definite
-    found = fit.consistency
+    assert jid.validate(consistent, o).definiteness.positive_definite
+    found = consistent.consistency
     assert (found.margins > 0).all()
     assert (found.bodies[:, 0] > 0).all()
     assert (found.bodies[:, 0] < found.bounds.mass_max).all()
     assert found.iterations < solver.MAX_ITERATIONS
-    weigh = fit.weights**2 * np.array(fit.rows)
-    price = np.sqrt((weigh @ fit.residual_rms**2) / (weigh @ free.residual_rms**2)) - 1
-    np.testing.assert_allclose(found.residual_increase, price, rtol=1e-6)
-    assert 0 < found.residual_increase < 0.1
+    weigh = consistent.weights**2 * np.array(consistent.rows)
+    squares = [weigh @ fit.residual_rms**2 for fit in (consistent, free)]
+    increase = np.sqrt(squares[0] / squares[1]) - 1
+    np.testing.assert_allclose(found.residual_increase, increase, rtol=1e-6)
+    assert 0 < increase < 0.1
 
 
-def test_standard_and_base_parameters_are_one_thing(panda):
-    base, _, o = panda
-    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
-    np.testing.assert_allclose(base.from_standard(fit.full_parameters), fit.parameters, rtol=1e-9)
+def test_standard_and_base_parameters_agree(panda, consistent):
+    base, full = panda[0], consistent.full_parameters
+    np.testing.assert_allclose(base.from_standard(full), consistent.parameters, rtol=1e-9)
     names = base.model.parameter_names
     drives = [k for k, name in enumerate(names) if name[:2] in ("fv", "fc", "Ia")]
-    assert (fit.full_parameters[drives] >= 0).all()
-    assert (fit.full_parameters[[k for k, n in enumerate(names) if n[:2] == "fo"]] < 0).any()
-
-
-def test_factors_of_a_log_in_parts_are_enough(panda):
-    base, _, o = panda
-    estimator = jid.PhysicallyConsistent(WEIGHTS)
-    whole = jid.identify(base, o, estimator)
-    parts = jid.fit_problem(jid.RegressionProblem(base, o.split(0.5)), estimator)
-    np.testing.assert_allclose(parts.parameters, whole.parameters, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(
-        parts.consistency.residual_increase, whole.consistency.residual_increase, atol=1e-6
-    )
+    assert (full[drives] >= 0).all()
+    assert (full[[k for k, n in enumerate(names) if n[:2] == "fo"]] < 0).any()
 
 
 def test_the_margin_holds_in_every_pose(panda):
     base, _, o = panda
     margin = 0.05
     fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, margin=margin))
-    model = base.model
-    nominal = np.zeros(model.size)
+    nominal = np.zeros(base.model.size)
     balls = inertial_parameters(nominal_bodies(fit.consistency.bounds))
     nominal[: balls.size] = balls.ravel()
     q = np.random.default_rng(0).uniform(-3, 3, (200, 7))
-    M = np.asarray(model.mass_matrix(fit.full_parameters - margin * nominal, q))
+    M = np.asarray(base.model.mass_matrix(fit.full_parameters - margin * nominal, q))
     assert np.linalg.eigvalsh(M).min() > 0
 
 
@@ -106,15 +94,8 @@ def test_coupled_drives_are_definite():
     assert jid.validate(fit, o).definiteness.positive_definite
 
 
-def test_coupled_drives_need_their_own_columns():
-    model = jid.Model(jid.robots.tx40(), (jid.RigidBodies(), jid.CoupledDrives()))
-    base = jid.base_parameters(model)
-    with pytest.raises(ValueError, match=r"add `RotorInertia\(\)`"):
-        jid.PhysicallyConsistent().feasible_set(base)
-
-
 def test_seven_parameters_are_bodies_with_principal_axes():
-    terms = (jid.RigidBodies(principal_axes=True), *TERMS[1:])
+    terms = (jid.RigidBodies(principal_axes=True), *FRICTION)
     base = jid.base_parameters(jid.Model(jid.robots.planar_arm(3, 0.5), terms))
     o = observations(base.model, np.full(base.model.size, 0.4), noise=2.0)
     fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
@@ -134,9 +115,9 @@ def test_bounds_hold_and_are_named(panda):
     assert (m >= 0.2).all()
     assert m[3] <= 2.0
     assert (h[:, 1] <= 0.01 * m).all()
-    said = " ".join(fit.notes)
-    assert "20 kg together" in said
-    assert "masses m1, m2" in said
+    notes = " ".join(fit.notes)
+    assert "20 kg together" in notes
+    assert "masses m1, m2" in notes
     assert "of the centre of mass of body" in " ".join(fit.consistency.active)
 
 
@@ -152,18 +133,14 @@ def test_a_strong_pull_leads_to_its_bodies(panda):
     assert gaps[2] < 0.05 * gaps[0]
 
 
-def test_a_pull_gives_the_mass_matrix_a_margin(panda):
+def test_a_pull_gives_the_mass_matrix_a_margin(panda, consistent):
     base, _, o = panda
-    smallest = [
-        jid.validate(
-            jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=pull)), o
-        ).definiteness.smallest
-        for pull in (None, jid.EntropicPull())
-    ]
+    pulled = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=jid.EntropicPull()))
+    smallest = [jid.validate(fit, o).definiteness.smallest for fit in (consistent, pulled)]
     assert smallest[1] > smallest[0] > 0
 
 
-def test_what_is_known_roughly_counts(panda):
+def test_a_parameter_prior_counts(panda):
     base, p, o = panda
     deviations = np.full(base.model.size, np.inf)
     deviations[0] = 1e-4
@@ -172,26 +149,32 @@ def test_what_is_known_roughly_counts(panda):
     np.testing.assert_allclose(fit.consistency.bodies[0, 0], p[0], atol=1e-3)
 
 
+def bounds(**change):
+    return lambda: jid.BodyBounds.from_geometry(jid.robots.panda()).replace(**change)
+
+
+def coupled_without_rotors():
+    model = jid.Model(jid.robots.tx40(), (jid.RigidBodies(), jid.CoupledDrives()))
+    return jid.PhysicallyConsistent().feasible_set(jid.base_parameters(model))
+
+
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("refused", "message"),
     [
-        ({"mass_max": 0.0}, "`mass_max` must be positive"),
-        ({"mass_min": 500.0}, "`mass_min` must be at least 0"),
-        ({"total_mass": 5000.0}, "`total_mass` must lie between the sums"),
-        ({"centre_min": [0.9, 0.9, 0.9]}, "no centre of mass of body 1"),
-        ({"centre_min": [0.1, 0, 0], "centre_max": [0, 1, 1]}, "`centre_min` must be below"),
-        ({"radius": [1.0, 2.0]}, "`radius` must hold numbers for all bodies"),
+        (bounds(mass_max=0.0), "`mass_max`"),
+        (bounds(mass_min=500.0), "`mass_min`"),
+        (bounds(total_mass=5000.0), "`total_mass`"),
+        (bounds(centre_min=[0.9, 0.9, 0.9]), "no centre of mass of body 1"),
+        (bounds(centre_min=[0.1, 0, 0], centre_max=[0, 1, 1]), "`centre_min`"),
+        (bounds(radius=[1.0, 2.0]), "`radius`"),
+        (lambda: jid.EntropicPull(np.array([[1.0, 0, 0, 0, 1, 1, 3.0, 0, 0, 0]])), "`bodies`"),
+        (lambda: jid.PhysicallyConsistent(margin=1.0), "`margin`"),
+        (coupled_without_rotors, r"`RotorInertia\(\)`"),
     ],
 )
-def test_bounds_that_no_body_satisfies_are_refused(change, message):
-    bounds = jid.BodyBounds.from_geometry(jid.robots.panda())
+def test_invalid_knowledge_is_rejected(refused, message):
     with pytest.raises(ValueError, match=message):
-        bounds.replace(**change)
-
-
-def test_priors_that_are_no_bodies_are_refused():
-    with pytest.raises(ValueError, match="body 2 is not"):
-        jid.EntropicPull(np.array([[1.0, 0, 0, 0, 1, 1, k, 0, 0, 0] for k in (1.0, 3.0)]))
+        refused()
 
 
 def test_a_search_without_proof_is_an_error_unless_told_otherwise(panda, monkeypatch):

@@ -1,4 +1,4 @@
-"""How much the rows of each joint count: the diagonal of W (Eq. 30)."""
+"""Weights of the joints: the diagonal of W (Eq. 30)."""
 
 from abc import abstractmethod
 
@@ -7,8 +7,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, is_traced, one_or_each
 from jaxid.errors import InputError
+from jaxid.identification.estimators.solutions import Complete, Decomposition
 from jaxid.identification.factors import Factors
-from jaxid.identification.solutions import Complete, Decomposition
 from jaxid.robot.robot import Robot
 
 
@@ -17,28 +17,28 @@ class AbstractWeights(eqx.Module):
 
     @abstractmethod
     def __call__(self, robot: Robot, factors: Factors) -> Float[np.ndarray, " joints"]:
-        """The weights [1/(N m) or 1/N] for some observations of a robot."""
+        """Return the weights [1/(N m) or 1/N] for some observations of a robot."""
 
 
 class Unweighted(AbstractWeights):
-    r"""Every row counts the same, whatever its unit (Eq. 28)."""
+    """Equal weights for all rows, whatever their unit (Eq. 28)."""
 
     def __call__(self, robot, factors):
-        """Ones."""
+        """Return ones."""
         return np.ones(robot.joints)
 
 
 class GivenWeights(AbstractWeights):
-    """Weights that are known from elsewhere.
+    """Known weights.
 
     Attributes:
-        weights: One for each joint [1/(N m) or 1/N].
+        weights: Weight of each joint [1/(N m) or 1/N].
     """
 
     weights: Float[AnyArray, " joints"] = eqx.field(converter=one_or_each)
 
     def __check_init__(self):
-        # Trees of what is no array, such as `in_axes` of `vmap`, have no values; nor have tracers.
+        # `in_axes` of `vmap` and tracers have no values to check.
         if not isinstance(self.weights, AnyArray) or is_traced(self.weights):
             return
         w = np.asarray(self.weights)
@@ -49,10 +49,10 @@ class GivenWeights(AbstractWeights):
             )
 
     def __call__(self, robot, factors):
-        """As they are.
+        """Return the weights.
 
         Raises:
-            InputError: If there are more or fewer than joints.
+            InputError: If their number is not that of the joints.
         """
         if np.shape(self.weights) != (robot.joints,):
             raise InputError(
@@ -63,10 +63,10 @@ class GivenWeights(AbstractWeights):
 
 
 class MaximumForces(AbstractWeights):
-    r"""The reciprocals of the largest forces, $1 / (i_{Gj} M_{j,max})$ (Eq. 30)."""
+    r"""Reciprocals of the largest forces, $1 / (i_{Gj} M_{j,max})$ (Eq. 30)."""
 
     def __call__(self, robot, factors):
-        """The reciprocals.
+        """Return the reciprocals.
 
         Raises:
             InputError: If the largest force of some joint is not known.
@@ -75,24 +75,24 @@ class MaximumForces(AbstractWeights):
 
 
 class MeasuredForces(AbstractWeights):
-    """The reciprocals of the forces' RMS values: where the largest forces are not known."""
+    """Reciprocals of the RMS values of the forces, where the largest forces are not known."""
 
     def __call__(self, robot, factors):
-        """The reciprocals."""
+        """Return the reciprocals."""
         return _reciprocal(np.sqrt(factors.force_squares / np.maximum(factors.rows, 1)))
 
 
 class ResidualVariances(AbstractWeights):
-    """The reciprocals of the residuals' standard deviations, found by solving again.
+    """Reciprocals of the residuals' standard deviations, found iteratively.
 
     Attributes:
-        iterations: How often weights and parameters are found in turn.
+        iterations: Number of times that weights and parameters are computed in turn.
     """
 
     iterations: int = eqx.field(static=True, default=5)
 
     def __call__(self, robot, factors):
-        """Starts from the size of the forces."""
+        """Return the reciprocals; the iteration starts from the size of the forces."""
         weights = MeasuredForces()(robot, factors)
         for _ in range(self.iterations):
             decomposition = Decomposition.of(*factors.weighted(weights))
@@ -103,6 +103,6 @@ class ResidualVariances(AbstractWeights):
 
 
 def _reciprocal(deviations: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
-    """Reciprocals that a joint without any force or residual does not make infinite."""
+    """Return reciprocals that are finite also for a joint without any force or residual."""
     floor = max(1e-9 * float(deviations.max()), np.finfo(float).tiny)
     return 1.0 / np.maximum(deviations, floor)

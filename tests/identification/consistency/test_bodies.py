@@ -1,9 +1,10 @@
-"""Pseudo-inertias against clouds of points, and the laws of bodies that could exist."""
+"""Single bodies: pseudo-inertias against clouds of points, and the nearest consistent body."""
 
 import numpy as np
 import pytest
 
 import jaxid as jid
+from jaxid.identification.consistency.estimator import Outcome
 from jaxid.identification.consistency.pseudo_inertia import (
     ball,
     consistency_margin,
@@ -42,3 +43,34 @@ def test_the_triangle_inequality_decides(moments, possible):
 def test_a_centre_of_mass_too_far_out_is_impossible():
     body = np.array([1.0, 0.5, 0.0, 0.0, 0.1, 0.2, 0.2, 0.0, 0.0, 0.0])
     assert consistency_margin(body) < 0
+
+
+BODY = inertial_parameters(ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.array(0.12)))
+
+
+def test_a_possible_body_stays():
+    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
+    assert consistency_margin(BODY) > 0
+    found = jid.consistent_body(BODY, 1e-4 * np.eye(10), bounds)
+    np.testing.assert_allclose(found.parameters, BODY, atol=1e-4)
+    assert found.distance < 0.05
+    assert found.outcome is Outcome.CERTIFIED
+
+
+def test_an_impossible_body_moves_as_little_as_its_errors_allow():
+    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
+    wrong = BODY.copy()
+    wrong[6] = -0.02
+    covariance = np.diag([1e-4, *[1e-4] * 3, *[1e-6] * 2, 1e-2, *[1e-6] * 3])
+    found = jid.consistent_body(wrong, covariance, bounds)
+    assert consistency_margin(found.parameters) > 0
+    assert abs(found.parameters[4] - wrong[4]) < 5e-3
+    assert found.parameters[6] > 0
+    shift = (found.parameters - wrong) / np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.distance, np.linalg.norm(shift), rtol=1e-6)
+
+
+def test_an_undetermined_body_is_refused():
+    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
+    with pytest.raises(ValueError, match="`covariance`"):
+        jid.consistent_body(BODY, np.diag([1.0] * 9 + [-1.0]), bounds)

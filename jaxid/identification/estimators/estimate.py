@@ -1,0 +1,199 @@
+"""Estimates, the influence of single rows on them, and the family of estimators."""
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
+from jaxid.identification.estimators.solutions import (
+    AbstractSolution,
+    AbstractSpectralSolution,
+    Complete,
+    Decomposition,
+)
+from jaxid.identification.factors import Blocks, RowChunk
+from jaxid.identification.problem import RegressionProblem
+
+
+class Channel(NamedTuple):
+    r"""One series of equations $u_t = \theta_t (p - \hat p)$ + disturbance, usually of one joint.
+
+    The estimate moves by $B \sum_t z_t u_t$. Rows that do not count are zero.
+
+    Attributes:
+        columns: Base parameters of the equations.
+        instruments: $z_t$ [rows, columns]: for least squares the equations themselves.
+        equations: $\theta_t$ [rows, columns], weighted.
+        disturbance: $u_t$ [rows]: residuals, weighted.
+        counted: Number of rows that count.
+    """
+
+    columns: tuple[int, ...]
+    instruments: np.ndarray
+    equations: np.ndarray
+    disturbance: np.ndarray
+    counted: int
+
+
+class AbstractInfluence(eqx.Module):
+    """Influence of rows on an estimate."""
+
+    @abstractmethod
+    def channels(
+        self, chunk: RowChunk, residuals: Float[np.ndarray, "rows joints"]
+    ) -> list[Channel]:
+        """Return the equations of some rows with their weights.
+
+        Args:
+            chunk: Rows.
+            residuals: Residuals of the estimate [N m or N].
+        """
+
+
+class JointRows(AbstractInfluence):
+    """Influence of rows that are weighted by joint.
+
+    Attributes:
+        weights: Weights of the joints' rows [1/(N m) or 1/N].
+    """
+
+    weights: Float[AnyArray, " joints"]
+
+    def channels(self, chunk, residuals):
+        """Return one channel for each joint."""
+        return [
+            Channel(own, theta, theta, w * r, count)
+            for (own, theta, w, count), r in zip(
+                weighted_joints(chunk, self.weights), residuals.T, strict=True
+            )
+        ]
+
+
+def weighted_joints(
+    chunk: RowChunk, weights: Float[AnyArray, " joints"]
+) -> Iterator[tuple[tuple[int, ...], np.ndarray, np.ndarray, int]]:
+    """Yield parameters, weighted columns, weights of the rows, and count of each joint."""
+    joints = zip(chunk.indices, chunk.columns, chunk.mask.T, np.asarray(weights), strict=True)
+    for own, theta, mask, weight in joints:
+        rows = np.where(mask, weight, 0.0)
+        yield tuple(own), rows[:, None] * theta, rows, int(mask.sum())
+
+
+class Estimate(eqx.Module):
+    r"""Estimate of an estimator, with what its uncertainty is computed from.
+
+    Near the estimate, a disturbance $e_t$ of the rows moves it by $B \sum_t Z_t^T u(e_t)$:
+    `inverse` is $B$, and `influence` returns $Z$ and $u$. Uncertainties follow from these alone, so
+    estimators never compute them.
+
+    Attributes:
+        base: Base parameters: those of the problem, unless the estimator has found constants of the
+            model's terms.
+        parameters: Estimated base parameters.
+        weights: Weights of the joints' rows [1/(N m) or 1/N].
+        blocks: Factors of the rows with their final weights.
+        inverse: Inverse of the information, or its substitute; zero for fixed parameters.
+        influence: Influence of the rows on the estimate.
+        solution: Solution of the weighted system.
+        standard: Standard parameters, of an estimator that finds a complete set of them.
+        notes: Sentences for the user.
+        consistency: `Consistency` of a physically consistent estimate, or None.
+        effective_parameters: Number of parameters that the rows determine, in fractions where the
+            solution is regularised; computed from `inverse` if None.
+    """
+
+    base: BaseParameters
+    parameters: Float[AnyArray, " base"]
+    weights: Float[AnyArray, " joints"]
+    blocks: Blocks
+    inverse: Float[AnyArray, "base base"]
+    influence: AbstractInfluence
+    solution: AbstractSpectralSolution = Complete()
+    standard: Float[AnyArray, " standard"] | None = None
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+    consistency: Any = None
+    effective_parameters: float | None = None
+
+    @classmethod
+    def solve(
+        cls,
+        problem: RegressionProblem,
+        weights: Float[AnyArray, " joints"],
+        solution: AbstractSolution,
+    ) -> "Estimate":
+        """Return the least-squares estimate of rows that are weighted by joint (Eqs. 28, 33)."""
+        chosen = solution.choose(problem.blocks, weights)
+        decomposition = Decomposition.of(*problem.factors.weighted(weights))
+        inverse = chosen.inverse(decomposition.values)
+        return cls(
+            base=problem.base,
+            parameters=decomposition.solve(inverse),
+            weights=np.asarray(weights),
+            blocks=problem.blocks,
+            inverse=decomposition.inverse_information(inverse),
+            influence=JointRows(weights),
+            solution=chosen,
+            effective_parameters=float(np.sum(inverse * np.asarray(decomposition.values) ** 2)),
+        )
+
+
+class AbstractEstimator(eqx.Module):
+    """An estimator of base parameters.
+
+    An estimator takes a `RegressionProblem` and returns an `Estimate`. The problem offers:
+
+    * `problem.base`, `problem.robot`: the base parameters, with the model and the robot;
+    * `problem.factors`: for each joint the R factor of its columns and forces, which is sufficient
+      for least squares with weights of the joints; `problem.blocks`: the same by contiguous blocks
+      of time, for cross-validation;
+    * `problem.chunks()`, `problem.residuals(p)`: passes over the rows, bounded in memory;
+      `problem.fold(...)`, `problem.reweighted(...)`: factors of transformed or weighted rows;
+    * `problem.with_base(base)`: the same recordings with other columns, for estimators that search
+      for constants of the model's terms; `problem.recordings`: motions and filters.
+
+    Problems of factors only (`problem.has_samples` is False) serve estimators that need no pass;
+    the others reject them by `problem.require_samples(...)`.
+
+    `Estimate.solve` returns the estimate of weighted least squares; use `dataclasses.replace` where
+    parts differ. A complete set of standard parameters goes to `standard`, base parameters of
+    another model to `base`. `identify` computes uncertainties, condition numbers and undetermined
+    directions from the estimate, alike for all estimators.
+    """
+
+    @abstractmethod
+    def __call__(self, problem: RegressionProblem) -> Estimate:
+        """Return the estimate of a regression problem.
+
+        Raises:
+            InputError: If weights are not known, or the estimator needs rows and only factors are
+                known.
+        """
+
+
+class EstimatorInWords(AbstractEstimator):
+    """Description of an estimator that held recordings or functions, in a model file.
+
+    Attributes:
+        words: Description of the estimator.
+    """
+
+    words: str = eqx.field(static=True)
+
+    def __call__(self, problem):
+        """Reject the problem: only a description is left.
+
+        Raises:
+            InputError: Always.
+        """
+        raise InputError(
+            "the `estimator` of this model file held recordings or functions and is only "
+            f"described: create it again to estimate again. It was {self.words:.200}"
+        )
+
+    def __str__(self):
+        return self.words

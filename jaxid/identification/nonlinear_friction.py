@@ -1,0 +1,334 @@
+"""Nonlinear friction: laws with unknown shapes beside the linear model, and their temperature."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.friction import TemperatureScaled
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import AbstractTerm
+from jaxid.errors import InputError
+from jaxid.identification.estimators.friction import (
+    NonlinearFriction,
+    ShapeSearch,
+    project,
+    search_shapes,
+)
+from jaxid.identification.estimators.friction_rows import SeparableProblem, Shapes, join_blocks
+from jaxid.identification.estimators.solutions import Complete, Decomposition
+from jaxid.identification.factors import Blocks
+from jaxid.identification.fit import Fit
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.observations import Observations, Progress
+
+
+class HeldOutErrors(eqx.Module):
+    """Errors on contiguous blocks of time that were left out in turn.
+
+    Attributes:
+        linear: Sums of the squared weighted errors of the linear model, for each block.
+        nonlinear: The same for nonlinear friction, its shapes found without the block.
+        forces: Sums of the squared weighted forces, for each block.
+    """
+
+    linear: Float[AnyArray, " folds"]
+    nonlinear: Float[AnyArray, " folds"]
+    forces: Float[AnyArray, " folds"]
+
+    @property
+    def errors(self) -> tuple[float, float]:
+        """Errors of the linear and the nonlinear model relative to the forces."""
+        total = float(np.sum(self.forces))
+        return (
+            float(np.sqrt(np.sum(self.linear) / total)),
+            float(np.sqrt(np.sum(self.nonlinear) / total)),
+        )
+
+    @property
+    def gain(self) -> float:
+        """Relative reduction of the squared error by nonlinear friction; negative if it grows."""
+        return 1.0 - float(np.sum(self.nonlinear) / np.sum(self.linear))
+
+    @property
+    def gain_deviation(self) -> float:
+        """Standard deviation of the gain, from the scatter between the blocks."""
+        saved = np.asarray(self.linear) - np.asarray(self.nonlinear)
+        return float(saved.std(ddof=1) * np.sqrt(len(saved)) / np.sum(self.linear))
+
+    @property
+    def pays(self) -> bool:
+        """Whether the gain exceeds its standard deviation and 1 %."""
+        return self.gain > max(self.gain_deviation, 0.01)
+
+    def __str__(self):
+        linear, nonlinear = (f"{100 * e:.2f} %" for e in self.errors)
+        verdict = "pays" if self.pays else "does not pay"
+        return (
+            f"nonlinear friction {verdict}: on held-out blocks of time its error is {nonlinear} of "
+            f"the forces, that of the linear model {linear} (squared error "
+            f"{-100 * self.gain:+.1f} ± {100 * self.gain_deviation:.1f} %)."
+        )
+
+
+class NonlinearFit(eqx.Module):
+    """Fit with nonlinear friction, beside the linear model.
+
+    Attributes:
+        fit: Fit with the shapes found; its covariance includes their uncertainty.
+        names: Names of the shapes, such as `vs3`.
+        units: Units of the shapes.
+        shapes: Values of the shapes.
+        shape_covariance: Covariance of the shapes.
+        linear: Fit of the linear model.
+        held_out: Errors of both on held-out blocks of time.
+    """
+
+    fit: Fit
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    shapes: Float[AnyArray, " shapes"]
+    shape_covariance: Float[AnyArray, "shapes shapes"]
+    linear: Fit
+    held_out: HeldOutErrors
+
+    @property
+    def shape_deviations(self) -> Float[np.ndarray, " shapes"]:
+        """Standard deviations of the shapes; infinite where nothing is known."""
+        return np.sqrt(np.diag(self.shape_covariance))
+
+    @property
+    def better(self) -> Fit:
+        """The nonlinear fit if it pays, otherwise the linear one, with notes that say why."""
+        if not self.held_out.pays:
+            return dataclasses.replace(self.linear, notes=(*self.linear.notes, str(self.held_out)))
+        return dataclasses.replace(
+            self.fit, notes=(*self.fit.notes, str(self.held_out), self.sentence)
+        )
+
+    @property
+    def sentence(self) -> str:
+        """Sentence with the shapes and their standard deviations."""
+        shown = ", ".join(
+            f"{name} = {value:.3g} ± {deviation:.2g} {unit}"
+            for name, unit, value, deviation in zip(
+                self.names, self.units, self.shapes, self.shape_deviations, strict=True
+            )
+        )
+        return f"shapes of friction: {shown}."
+
+
+def identify_nonlinear(
+    base: BaseParameters,
+    observations: Observations | Sequence[Observations],
+    estimator: NonlinearFriction | None = None,
+    *,
+    linear: BaseParameters | None = None,
+    progress: Progress | None = None,
+) -> NonlinearFit:
+    """Identify friction laws with their shapes, and compare them with the linear model.
+
+    Both models are fitted again without each of five blocks of time, and tested on it.
+
+    Args:
+        base: Base parameters of a model with shapes, such as those of `StribeckFriction`.
+        observations: Observations of one recording, or of several that are fitted together.
+        estimator: Estimator; by default weighted least squares and the shapes that terms propose.
+        linear: Base parameters of the linear model; by default the same model with its own shapes.
+        progress: Callback, called with the completed fraction (0 to 1).
+
+    Raises:
+        InputError: If the model has no shapes, or the observations do not fit to it.
+    """
+    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    estimator = NonlinearFriction() if estimator is None else estimator
+    linear_problem = RegressionProblem(base if linear is None else linear, recordings)
+    before = fit_problem(linear_problem, estimator.linear)
+    weights = np.asarray(before.weights)
+    separable, found = estimator.search(RegressionProblem(base, recordings), weights)
+    shapes = separable.shapes
+    shaped = shapes.set(base, found.x)
+    fit = fit_problem(RegressionProblem(shaped, recordings), estimator.linear)
+    linearised = _with_slopes(shaped, shapes, fit.parameters)
+    joint = fit_problem(RegressionProblem(linearised, recordings), estimator.linear)
+    covariance, size = np.asarray(joint.covariance), base.size
+    return NonlinearFit(
+        fit=dataclasses.replace(
+            fit,
+            uncertainty=joint.uncertainty.first(size),
+            estimator=estimator,
+            notes=(*fit.notes, *found.notes),
+        ),
+        names=tuple(name for name, _ in shapes.parameters),
+        units=tuple(unit for _, unit in shapes.parameters),
+        shapes=found.x,
+        shape_covariance=covariance[size:, size:],
+        linear=before,
+        held_out=_held_out_errors(linear_problem.blocks, separable, found, weights, progress),
+    )
+
+
+def _held_out_errors(
+    blocks: Blocks,
+    problem: SeparableProblem,
+    found: ShapeSearch,
+    weights: Float[np.ndarray, " joints"],
+    progress: Progress | None,
+) -> HeldOutErrors:
+    """Test both models on held-out blocks; searches begin at the shapes of all blocks."""
+    squares, errors = weights**2, []
+    start, count = problem.shapes.values(problem.base), len(blocks.parts)
+    folds = np.array_split(np.arange(count), min(5, count))
+    for fold, part in enumerate(folds):
+        out = part.tolist()
+        rest = [k for k in range(count) if k not in out]
+        decomposition = Decomposition.of(*join_blocks(blocks, rest).weighted(weights))
+        p = decomposition.solve(Complete().inverse(decomposition.values))
+        shaped = problem.blocks(search_shapes(problem, weights, start, found.x, rest).x)
+        c = project(problem, join_blocks(shaped, rest), weights).linear
+        test, linear_test = join_blocks(shaped, out), join_blocks(blocks, out)
+        errors.append(
+            (
+                squares @ linear_test.residual_squares(p),
+                squares @ test.residual_squares(np.append(c, np.zeros(test.size - len(c)))),
+                squares @ linear_test.force_squares,
+            )
+        )
+        if progress is not None:
+            progress((fold + 1) / len(folds))
+    return HeldOutErrors(*np.array(errors).T)
+
+
+class ShapeSlopes(AbstractTerm):
+    """Term of the forces of small changes of shapes: it makes the linearised problem ordinary.
+
+    Whatever computes the uncertainty of parameters then computes that of the shapes too.
+
+    Attributes:
+        terms: Terms of the model.
+        changing: Shapes that change.
+        x: Shapes at which forces are linearised.
+        p: Standard parameters of the model at which forces are linearised.
+    """
+
+    terms: tuple[AbstractTerm, ...]
+    changing: Shapes
+    x: Float[AnyArray, " shapes"]
+    p: Float[AnyArray, " standard"]
+
+    def parameters(self, robot):
+        """Return names and units of the shapes."""
+        return self.changing.parameters
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the derivatives of the shaped terms' forces."""
+        ends = np.cumsum([len(term.parameters(robot)) for term in self.terms])
+        p = np.split(np.arange(ends[-1]), ends[:-1])
+
+        def forces(x):
+            terms = self.changing.set_in(self.terms, x)
+            return sum(
+                terms[i].columns(robot, q, qd, qdd) @ jnp.asarray(self.p)[p[i]]
+                for i in self.changing.terms
+            )
+
+        return jax.jacfwd(forces)(jnp.asarray(self.x, q.dtype))
+
+
+def _with_slopes(
+    base: BaseParameters, shapes: Shapes, p: Float[AnyArray, " base"]
+) -> BaseParameters:
+    """Return base parameters with small changes of shapes as further parameters."""
+    model, n = base.model, base.model.size
+    standard = np.asarray(base.to_standard(np.asarray(p)))
+    slopes = ShapeSlopes(model.terms, shapes, shapes.values(base), standard)
+    kappa = np.asarray(base.kappa)
+    return dataclasses.replace(
+        base,
+        model=Model(model.robot, (*model.terms, slopes)),
+        indices=(*base.indices, *range(n, n + shapes.size)),
+        kappa=np.vstack([kappa, np.zeros((shapes.size, kappa.shape[1]))]),
+    )
+
+
+class TemperatureLaw(eqx.Module):
+    r"""Friction $f_0 e^{-a (T - T_0)}$ of each joint, with uncertainties.
+
+    Attributes:
+        names: Names of the friction parameters, one for each joint.
+        values: Values at the reference temperature, in the parameters' units.
+        value_deviations: Their standard deviations.
+        rates: Rates $a$ [1/K]; NaN where an estimate is not positive.
+        rate_deviations: Their standard deviations [1/K].
+        term: Friction term with these rates, for models at any temperature.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Float[AnyArray, " joints"]
+    value_deviations: Float[AnyArray, " joints"]
+    rates: Float[AnyArray, " joints"]
+    rate_deviations: Float[AnyArray, " joints"]
+    term: TemperatureScaled
+
+
+def temperature_law(
+    fits: Sequence[Fit],
+    temperatures: Sequence[float] | Float[AnyArray, " fits"],
+    term: AbstractTerm,
+    *,
+    reference: float = 25.0,
+) -> TemperatureLaw:
+    """Identify how friction falls with temperature, from fits at several temperatures.
+
+    The logarithms of the estimates lie on a line, each as uncertain as in its fit.
+
+    Args:
+        fits: Fits of one model, each to recordings at one temperature.
+        temperatures: Temperatures of the fits [°C].
+        term: Term with one parameter for each joint, such as `ViscousFriction()`.
+        reference: Temperature to which the values belong [°C].
+
+    Raises:
+        InputError: If there are fewer than two temperatures, or a fit has no such parameters.
+    """
+    warmer = np.asarray(temperatures, np.float64) - reference
+    if warmer.shape != (len(fits),) or len(np.unique(warmer)) < 2:
+        raise InputError(
+            "`temperatures` must hold one temperature for each fit, and at least two different "
+            f"ones, but there are {len(fits)} fits and temperatures of shape {warmer.shape}."
+        )
+    robot = fits[0].base.model.robot
+    names = tuple(name for name, _ in term.parameters(robot))
+    if len(names) != robot.joints or any(set(names) - set(fit.base.names) for fit in fits):
+        raise InputError(
+            f"`term` must have one parameter for each joint ({robot.joints}) that all fits have, "
+            f"but has {', '.join(names)}."
+        )
+    places = [[fit.base.names.index(name) for name in names] for fit in fits]
+    f = np.array([np.asarray(fit.parameters)[k] for fit, k in zip(fits, places, strict=True)])
+    s = np.array([fit.standard_deviations[k] for fit, k in zip(fits, places, strict=True)])
+    lines = np.full((len(names), 4), np.nan)
+    for j in range(len(names)):
+        if (f[:, j] > 0).all():
+            # Exact estimates of simulated logs get a tiny deviation.
+            lines[j] = _fit_line(warmer, np.log(f[:, j]), np.maximum(s[:, j] / f[:, j], 1e-12))
+    level, level_deviation, slope, slope_deviation = lines.T
+    values, rates = np.exp(level), -slope
+    known = np.where(np.isfinite(rates), rates, 0.0)
+    scaled = TemperatureScaled(term, known, reference, reference)
+    return TemperatureLaw(names, values, values * level_deviation, rates, slope_deviation, scaled)
+
+
+def _fit_line(x: np.ndarray, y: np.ndarray, deviations: np.ndarray) -> tuple[float, ...]:
+    """Return level and slope of a line, each with its standard deviation."""
+    A = np.column_stack([np.ones_like(x), x]) / deviations[:, None]
+    covariance = np.linalg.inv(A.T @ A)
+    level, slope = covariance @ A.T @ (y / deviations)
+    a, b = np.sqrt(np.diag(covariance))
+    return float(level), float(a), float(slope), float(b)

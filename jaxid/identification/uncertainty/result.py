@@ -1,0 +1,144 @@
+"""Uncertainty of estimates: the results, and the family of methods that compute them."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import numpy as np
+from scipy import special
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
+from jaxid.identification.estimators.estimate import Estimate
+from jaxid.identification.problem import RegressionProblem
+
+
+class Uncertainty(eqx.Module):
+    """Uncertainty of estimates.
+
+    Attributes:
+        covariance: Covariance of the estimates; infinite variances where nothing is known.
+        dof: Degrees of freedom of each variance: few of them make intervals wider.
+        naive_covariance: Covariance if the rows were independent, as in textbooks.
+        jackknife: Standard deviations by the block jackknife, as a cross-check; None where there
+            are not enough blocks.
+        notes: Sentences for the user.
+    """
+
+    covariance: Float[AnyArray, "base base"]
+    dof: Float[AnyArray, " base"]
+    naive_covariance: Float[AnyArray, "base base"]
+    jackknife: Float[AnyArray, " base"] | None = None
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def first(self, count: int) -> "Uncertainty":
+        """Return the uncertainty of the first parameters only."""
+        return Uncertainty(
+            np.asarray(self.covariance)[:count, :count],
+            np.asarray(self.dof)[:count],
+            np.asarray(self.naive_covariance)[:count, :count],
+            None if self.jackknife is None else np.asarray(self.jackknife)[:count],
+            self.notes,
+        )
+
+    @property
+    def standard_deviations(self) -> Float[np.ndarray, " base"]:
+        """Standard deviations of the estimates; infinite where nothing is known."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def naive_standard_deviations(self) -> Float[np.ndarray, " base"]:
+        """Standard deviations if the rows were independent."""
+        return np.sqrt(np.diag(self.naive_covariance))
+
+    @property
+    def ratios(self) -> Float[np.ndarray, " base"]:
+        """Standard deviations relative to the naive ones; NaN where nothing is known."""
+        naive = self.naive_standard_deviations
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(naive > 0, self.standard_deviations / naive, np.nan)
+
+    def half_widths(self, level: float = 0.95) -> Float[np.ndarray, " base"]:
+        """Return half the widths of confidence intervals, by the t distribution.
+
+        Args:
+            level: Probability (0 to 1) that an interval contains the truth.
+
+        Raises:
+            InputError: If `level` is not between 0 and 1.
+        """
+        if not 0 < level < 1:
+            raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
+        dof = np.clip(np.asarray(self.dof), 1.0, 1e6)
+        return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
+
+
+class ResidualSpectra(eqx.Module):
+    """Spectra of the residuals of each joint, after filters and decimation.
+
+    Whiteness is judged within the band of the filters, with their gain and the leverage of the fit
+    divided out: the cumulative periodogram is compared with a straight line (Bartlett's test).
+
+    Attributes:
+        frequency: Frequencies of the lines [Hz].
+        density: Smoothed power of each joint [N² m²/Hz or N²/Hz].
+        gain: Gain (0 to 1) of filter and decimation at each line.
+        departure: Largest distance (0 to 1) of the cumulative periodogram from a straight line.
+        limit: Departure that white residuals exceed once in twenty.
+        low_frequency: Fraction (0 to 1) of each joint's power below a tenth of the band; 0.1 if
+            white.
+        band: End of the band [Hz].
+    """
+
+    frequency: Float[AnyArray, " lines"]
+    density: Float[AnyArray, "joints lines"]
+    gain: Float[AnyArray, " lines"]
+    departure: Float[AnyArray, " joints"]
+    limit: float
+    low_frequency: Float[AnyArray, " joints"]
+    band: float
+
+    @property
+    def white(self) -> tuple[bool, ...]:
+        """Whether the residuals of each joint cannot be told from white noise."""
+        return tuple(bool(x <= self.limit) for x in np.asarray(self.departure))
+
+
+class AbstractUncertainty(eqx.Module):
+    """A method that computes the uncertainty of an estimate."""
+
+    @abstractmethod
+    def __call__(
+        self,
+        problem: RegressionProblem,
+        estimate: Estimate,
+        naive: Float[np.ndarray, "base base"],
+    ) -> tuple[Uncertainty, ResidualSpectra | None]:
+        """Return the uncertainty, and spectra of the residuals if the method computes them.
+
+        Args:
+            problem: Rows of the estimate.
+            estimate: Estimate.
+            naive: Covariance if the rows were independent.
+        """
+
+
+class IndependentRows(AbstractUncertainty):
+    """Textbook covariance for independent errors of the rows: far too small on filtered logs.
+
+    It costs nothing: no pass over the rows, and no cross-check.
+    """
+
+    def __call__(self, problem, estimate, naive):
+        """Return the naive covariance."""
+        dof = float(problem.factors.rows.sum()) - len(naive)
+        return Uncertainty(naive, np.full(len(naive), dof), naive), None
+
+
+def mark_unknown(
+    covariance: Float[np.ndarray, "base base"], naive: Float[np.ndarray, "base base"]
+) -> Float[np.ndarray, "base base"]:
+    """Return a covariance with infinite variances where the naive ones are infinite."""
+    covariance = covariance.copy()
+    unknown = np.isinf(np.diag(naive))
+    covariance[unknown, unknown] = np.inf
+    return covariance
