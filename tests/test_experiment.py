@@ -332,7 +332,7 @@ def test_estimators(load, text, estimator, solution):
     assert isinstance(experiment.estimation.estimator.solution, solution)
     assert experiment.estimation.regularised == (solution is not jid.Complete)
     if solution in (jid.Ridge, jid.Truncated):
-        assert experiment.estimation.estimator.solution.share == 0.02
+        assert experiment.estimation.estimator.solution.strength == 0.02
 
 
 @pytest.mark.parametrize(

@@ -24,29 +24,31 @@ from jaxid.experiment.decoder import (
 from jaxid.experiment.method_tables import pop_kind
 from jaxid.experiment.robot_tables import RobotSource
 from jaxid.identification.consistency import BodyBounds, EntropicPull, PhysicallyConsistent
-from jaxid.identification.correlated import GeneralisedLeastSquares
 from jaxid.identification.estimators import (
     AbstractEstimator,
-    LeastSquares,
-    WeightedLeastSquares,
-)
-from jaxid.identification.instruments import InstrumentalVariables
-from jaxid.identification.prior import RelativeTo
-from jaxid.identification.robust import Huber, IterativelyReweighted, Tukey
-from jaxid.identification.solutions import (
     AbstractSolution,
+    AbstractWeights,
     Complete,
     CrossValidated,
+    GeneralisedLeastSquares,
+    Huber,
+    InstrumentalVariables,
+    IterativelyReweighted,
+    LeastSquares,
+    MaximumForces,
+    RelativeTo,
+    ResidualVariances,
     Ridge,
     Truncated,
+    Tukey,
+    WeightedLeastSquares,
 )
-from jaxid.identification.uncertainty.methods import (
+from jaxid.identification.uncertainty import (
     AbstractUncertainty,
     BlockJackknife,
     IndependentRows,
     SpectralSandwich,
 )
-from jaxid.identification.weights import AbstractWeights, MaximumForces, ResidualVariances
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.files import load_trajectory
 

@@ -26,14 +26,18 @@ from jaxid.experiment.method_tables import (
 )
 from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
 from jaxid.identification.essential import essential_parameters
-from jaxid.identification.estimators import LeastSquares, WeightedLeastSquares
+from jaxid.identification.estimators import (
+    Complete,
+    CrossValidated,
+    LeastSquares,
+    NonlinearFriction,
+    WeightedLeastSquares,
+)
 from jaxid.identification.filter_choice import FilterCandidate
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
-from jaxid.identification.nonlinear.estimator import NonlinearFriction
-from jaxid.identification.nonlinear.verdict import identify_nonlinear
+from jaxid.identification.nonlinear_friction import identify_nonlinear
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.solutions import Complete, CrossValidated
 from jaxid.measurement.chunked_files import estimated_rows
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation

@@ -126,7 +126,7 @@ def choose(
             recordings,
             experiment.candidates,
             estimator=experiment.estimation.estimator,
-            slow=experiment.min_speed,
+            min_speed=experiment.min_speed,
             progress=stage.through(len(experiment.candidates) * sum(r.samples for r in recordings)),
         )
     notes = (*experiment.notes, str(choice))
