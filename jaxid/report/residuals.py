@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 
 from jaxid.arrays import Float
 from jaxid.errors import InputError
-from jaxid.identification.uncertainty.residuals import ResidualSpectra
+from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.style import (
     BLUE,
     GREY,
@@ -85,11 +85,11 @@ def _draw_spectrum(axes: Axes, spectra: ResidualSpectra, j: int, robot: Robot) -
         logarithmic(axes, "y")
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("(N m)²/Hz" if robot.force_unit(j) == "N m" else "N²/Hz")
+    verdict, low = "white" if spectra.white[j] else "not white", float(spectra.low_frequency[j])
     caption(
         axes,
         shortened(robot.joint_names[j], 24),
-        f"{'white' if spectra.white[j] else 'not white'}: {percent(float(spectra.slow[j]))} % of "
-        f"the power below {0.1 * spectra.band:.2g} Hz",
+        f"{verdict}: {percent(low)} % of the power below {0.1 * spectra.band:.2g} Hz",
     )
 
 

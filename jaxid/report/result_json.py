@@ -152,7 +152,7 @@ def _fit_record(fit: Fit) -> dict[str, Any]:
             "white": spectra.white,
             "departure": spectra.departure,
             "limit": spectra.limit,
-            "slow_share": spectra.slow,
+            "slow_share": spectra.low_frequency,
             "band": spectra.band,
             "frequency": spectra.frequency,
             "density": spectra.density,
@@ -211,7 +211,7 @@ def parameter_rows(fit: Fit) -> list[dict[str, Any]]:
             "relative": fit.relative_standard_deviations.tolist(),
             "low_95": low,
             "high_95": high,
-            "degrees_of_freedom": np.asarray(fit.uncertainty.freedom).tolist(),
+            "degrees_of_freedom": np.asarray(fit.uncertainty.dof).tolist(),
             "naive_standard_deviation": fit.naive_standard_deviations.tolist(),
             "ratio_to_naive": fit.uncertainty.ratios.tolist(),
         }

@@ -7,12 +7,12 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.identification.consistency.estimator import Consistency
+from jaxid.identification.estimators import AbstractSpectralSolution
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
 from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
 from jaxid.identification.runs.comparison import LEVEL, Comparison, Verdict
 from jaxid.identification.runs.estimates import Estimates
-from jaxid.identification.solutions import AbstractSpectralSolution
-from jaxid.identification.uncertainty.residuals import ResidualSpectra
+from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
 from jaxid.table import (
@@ -214,7 +214,10 @@ def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
         Column("white", ["yes" if white else "no" for white in spectra.white]),
         Column("departure", spectra.departure, "%", percent),
         Column(
-            f"power below {0.1 * spectra.band:.2g} Hz\n(white: 10 %)", spectra.slow, "%", percent
+            f"power below {0.1 * spectra.band:.2g} Hz\n(white: 10 %)",
+            spectra.low_frequency,
+            "%",
+            percent,
         ),
         status=[Status.GOOD if white else Status.DOUBTFUL for white in spectra.white],
     )
@@ -396,7 +399,7 @@ def alternative_table(
 
 def solution_name(solution: AbstractSpectralSolution) -> str:
     """Return a solution in words, such as `ridge 0.01`."""
-    strength = getattr(solution, "share", None)
+    strength = getattr(solution, "strength", getattr(solution, "rcond", None))
     if strength is None:
         return "plain least squares"
     return f"{type(solution).__name__.lower()} {strength:.2g}"

@@ -16,7 +16,7 @@ from report_samples import arm_of, errors_of
 
 import jaxid as jid
 from jaxid.identification.runs.comparison import compare
-from jaxid.identification.uncertainty.residuals import ResidualSpectra
+from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.errors import error_figure
 from jaxid.report.parameters import comparison_figure, parameter_figure
 from jaxid.report.residuals import autocorrelation, residual_figure

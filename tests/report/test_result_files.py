@@ -69,7 +69,7 @@ def test_numbers_come_back_exactly(tmp_path, fit, validation, quick):
         "standard_deviation": fit.standard_deviations.tolist(),
         "naive_standard_deviation": fit.naive_standard_deviations.tolist(),
         "ratio_to_naive": fit.uncertainty.ratios.tolist(),
-        "degrees_of_freedom": fit.uncertainty.freedom.tolist(),
+        "degrees_of_freedom": fit.uncertainty.dof.tolist(),
         "name": list(fit.base.names),
         "expression": list(fit.base.expressions),
         "unit": list(fit.base.units),

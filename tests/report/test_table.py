@@ -145,7 +145,7 @@ def test_parameters_have_estimate_deviation_unit_and_naive_deviation(fit):
 def test_residuals_are_white_or_not(fit):
     spectra = fit.residual_spectra
     rows = residual_table(spectra, fit.base.model.robot).rows
-    for row, white, slow in zip(rows, spectra.white, spectra.slow, strict=True):
+    for row, white, slow in zip(rows, spectra.white, spectra.low_frequency, strict=True):
         assert row[1] == ("yes" if white else "no")
         assert float(row[-1]) == pytest.approx(100 * slow, rel=0.06)
 
