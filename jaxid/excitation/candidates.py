@@ -1,7 +1,7 @@
 """Candidates of a search: brought into the limits of the joints, then evaluated exactly."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -148,5 +148,5 @@ def _scale_into_limits(problem: ExcitationProblem, growth: float, x: AnyArray) -
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _shrink(problem: ExcitationProblem, x: AnyArray, fraction: AnyArray | float) -> Array:
+def _shrink(problem: ExcitationProblem, x: Array, fraction: Any) -> Array:
     return problem.limits.grid().shrink(x, fraction)

@@ -5,7 +5,7 @@ near one. All rows are scaled alike: a motion keeps its limits if |R y - c| <= 1
 """
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -95,7 +95,7 @@ class Grid(NamedTuple):
         half = 0.5 * (q.max(axis=1) - q.min(axis=1))
         return motion, q, jnp.maximum(jnp.abs(rest).max(axis=1), half)
 
-    def _shifts(self, q: Array, s: Array, bound: Array | float) -> tuple[Array, Array]:
+    def _shifts(self, q: Array, s: Array, bound: Array | float) -> tuple[Any, Any]:
         """Return the least and largest shift that keep scaled positions in their range."""
         centre = self.c[:, 0]
         return centre - bound - s * q.min(axis=1), centre + bound - s * q.max(axis=1)

@@ -150,7 +150,7 @@ def _linearise(
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _linearised(problem: ExcitationProblem, x: AnyArray, instants: AnyArray) -> tuple:
+def _linearised(problem: ExcitationProblem, x: Array, instants: AnyArray) -> tuple:
     return problem.linearise(x, instants)
 
 

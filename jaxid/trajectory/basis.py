@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,7 +26,13 @@ class AbstractBasis(eqx.Module):
         duration: Time from the start of the motion to its end; the period of a periodic one [s].
     """
 
-    duration: eqx.AbstractVar[float]
+    if TYPE_CHECKING:
+
+        @property
+        def duration(self) -> Any:
+            """Duration [s]: a field or a property of each basis."""
+    else:
+        duration: eqx.AbstractVar[float]
 
     @abstractmethod
     def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:

@@ -33,7 +33,7 @@ class FourierBasis(AbstractBasis):
     """
 
     harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
 
     def __check_init__(self):
         _check_series(self.harmonics, self.omega, least=1)
@@ -88,7 +88,7 @@ class RestToRestBasis(AbstractBasis):
     """
 
     harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
     periods: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):

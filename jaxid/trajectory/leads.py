@@ -76,8 +76,8 @@ class LeadsBasis(AbstractBasis):
     """
 
     harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
-    lead: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
+    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    lead: Float[AnyArray, ""] = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
     periods: int = eqx.field(static=True, default=1, kw_only=True)
 
     def __check_init__(self):
@@ -169,8 +169,8 @@ class WithLeads(AbstractTrajectory):
     """
 
     inner: AbstractTrajectory
-    start: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
-    length: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+    start: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    length: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
     lead_in: Float[AnyArray, " joints"]
     lead_out: Float[AnyArray, " joints"]
 

@@ -31,7 +31,7 @@ class RestToRestSplineBasis(AbstractBasis):
     """
 
     points: int = eqx.field(static=True)
-    duration: Float[AnyArray, ""] | float = eqx.field(converter=as_scalar)
+    duration: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
 
     def __check_init__(self):
         if self.points < 2:
