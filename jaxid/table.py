@@ -137,7 +137,7 @@ class Column:
 
     Attributes:
         name: Header; may have several lines.
-        values: Numbers or texts, one for each row.
+        values: Sequence or array of numbers or texts, one for each row.
         unit: Unit of all values, shown in brackets below the name.
         format: Function that makes a text of a number.
         kind: Numbers are aligned at their decimal points; `code` is set in a fixed-width font on
@@ -145,7 +145,7 @@ class Column:
     """
 
     name: str
-    values: Sequence[Any] | np.ndarray
+    values: Any
     unit: str = ""
     format: Callable[[float], str] = significant
     kind: Literal["number", "text", "code", ""] = ""
@@ -291,7 +291,7 @@ class Table:
                 yield [("   " if k else f"{remark.status.value}  ", remark.status), (line, "")]
 
 
-def _listed(values: Sequence[Any] | np.ndarray) -> Sequence[Any]:
+def _listed(values: Any) -> Sequence[Any]:
     return values if isinstance(values, list | tuple) else np.asarray(values).tolist()
 
 

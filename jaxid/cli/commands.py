@@ -50,12 +50,9 @@ from jaxid.report.tables import (
     alternative_table,
     base_table,
     body_table,
-    determination_remarks,
-    fit_facts,
     log_table,
-    parameter_table,
+    motor_tables,
     residual_table,
-    robot_tables,
     solution_name,
 )
 from jaxid.report.terminal import show, show_files, show_remarks
@@ -184,11 +181,11 @@ def inspect(
         _ = loaded.base.expressions
         loaded, _ = choose(loaded, paths, stage)
         seen = [_look(loaded, path, stage) for path in paths]
-    show(console, *robot_tables(loaded.robot), base_table(loaded.base))
+    show(console, loaded.robot.summary(), *motor_tables(loaded.robot), base_table(loaded.base))
     show_remarks(console, loaded.notes)
     for log, fit, doubts in seen:
         show(console, log_table(log.recording, loaded.robot, log.check, doubts))
-        show(console, Table("", facts=fit_facts(fit), remarks=determination_remarks(fit)))
+        show(console, Table("", facts=fit.facts, remarks=fit.determination))
 
 
 def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fit, tuple[str, ...]]:
@@ -335,9 +332,9 @@ def identify(
         )
     tabulated = () if fit.consistency is None else fit.consistency.findings
     noted = [*loaded.notes, *logs_said, *(note for note in fit.notes if note not in tabulated)]
-    show(console, *robot_tables(loaded.robot))
+    show(console, loaded.robot.summary(), *motor_tables(loaded.robot))
     show_remarks(console, [*noted, *(Remark(text, Status.DOUBTFUL) for text in doubts)])
-    show(console, parameter_table(fit))
+    show(console, fit.summary())
     if fit.residual_spectra is not None:
         show(console, residual_table(fit.residual_spectra, loaded.robot))
     show_remarks(console, [Remark(text, Status.DOUBTFUL) for text in suspected])

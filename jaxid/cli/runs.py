@@ -21,8 +21,7 @@ from jaxid.identification.runs.payload import Payload, identify_payload
 from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.states import identify_states
 from jaxid.report.result_files import read_estimates, write_comparison, write_estimates
-from jaxid.report.tables import comparison_table, estimate_table, group_table
-from jaxid.report.terminal import show, show_files
+from jaxid.report.terminal import show, show_files, show_remarks
 from jaxid.table import Remark, Status, significant
 
 Unloaded = Annotated[
@@ -41,8 +40,6 @@ Loaded = Annotated[
 ]
 UNLIKELY = 0.01
 """Probability that the states agree on shared parameters, below which a remark is made."""
-UNUSUAL = 4.0
-"""Distance from a consistent body [standard deviations] from which a remark is made."""
 
 
 def compare(
@@ -74,7 +71,7 @@ def compare(
     with open_stages(1) as stage:
         stage("drawing")
         files = write_comparison(output, found, (first, second))
-    show(console, comparison_table(found), group_table(found))
+    show(console, found.summary(), found.group_summary())
     show_files(console, output, [p.name for p in files])
 
 
@@ -114,9 +111,8 @@ def payload(
     sources = {"unloaded": logs, "loaded": loaded}
     files = write_estimates(output, "payload", [found.estimates, found.central], content, sources)
     console = open_console()
-    said = f"payload on the body of `{name}`, in its frame; moments about the centre of mass"
-    remarks = [*(Remark(text, Status.DOUBTFUL) for text in doubts), _consistency_remark(found)]
-    show(console, estimate_table(found.central, said, remarks=remarks))
+    show(console, found.summary())
+    show_remarks(console, [Remark(text, Status.DOUBTFUL) for text in doubts])
     _show_lines(
         console, "to subtract it from other logs, in the experiment file:", _tool(found, name)
     )
@@ -149,9 +145,8 @@ def gains(
     sources = {"unloaded": logs, "loaded": loaded}
     files = write_estimates(output, "gains", [found.estimates], {key: values}, sources)
     console = open_console()
-    remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
-    title = "true forces over those of the logs"
-    show(console, estimate_table(found.estimates, title, remarks=remarks))
+    show(console, found.summary())
+    show_remarks(console, [Remark(text, Status.DOUBTFUL) for text in doubts])
     shown = ", ".join(significant(v, 5) for v in values)
     lines = ["[recording]", f"{key} = [{shown}]"]
     _show_lines(console, "to use them, in the experiment file:", lines)
@@ -200,12 +195,11 @@ def states(
             "the states do not agree on what they share (chance "
             f"{100 * chance:.2g} %): something else than friction and offsets differs"
         )
-    title = "parameters that all states share, then those of each state"
-    remarks = [Remark(text, Status.DOUBTFUL) for text in doubts]
-    show(console, estimate_table(found.estimates, title, remarks=remarks))
+    show(console, found.summary())
+    show_remarks(console, [Remark(text, Status.DOUBTFUL) for text in doubts])
     for other in names[1:]:
         comparison = found.compare(names[0], other)
-        show(console, comparison_table(comparison), group_table(comparison))
+        show(console, comparison.summary(), comparison.group_summary())
     show_files(console, output, [p.name for p in files])
 
 
@@ -247,22 +241,6 @@ def _body(experiment: Experiment, joint: str | None) -> int | None:
     if joint not in names:
         raise InputError(f"`--body` must be one of {', '.join(names)}, but is `{joint}`.")
     return names.index(joint)
-
-
-def _consistency_remark(found: Payload) -> Remark:
-    if not np.isfinite(found.distance):
-        text = (
-            "the logs do not determine all ten parameters of the payload: move the joints that "
-            "carry it in more poses, faster, and alike in both runs."
-        )
-        return Remark(text, Status.BAD)
-    if found.distance == 0:
-        return Remark("the payload is physically consistent.", Status.GOOD)
-    text = (
-        "the estimate itself is not physically consistent: these are the parameters of the nearest "
-        f"body that is, {found.distance:.2g} standard deviations away."
-    )
-    return Remark(text, Status.NEUTRAL if found.distance < UNUSUAL else Status.DOUBTFUL)
 
 
 def _tool(found: Payload, joint: str) -> list[str]:

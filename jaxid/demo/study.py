@@ -191,8 +191,9 @@ def run_study(
     cold, hot = jid.virtual_tx90l_on_rail(), jid.virtual_tx90l_on_rail(warm=True)
     robot, base = cold.robot, jid.base_parameters(cold.model)
     _ = base.expressions
-    plans = () if motion is not None else _design(base, seed, starts, progress)
+    plans: tuple[jid.ExcitationPlan, ...] = ()
     if motion is None:
+        plans = _design(base, seed, starts, progress)
         motion = jid.FourierBasis(HARMONICS, OMEGA).trajectory(plans[0].trajectory.coefficients)
     progress("adding the leads", 0.0)
     played = jid.with_leads(motion, robot, periods=periods)
@@ -254,8 +255,9 @@ def run_study(
 def verification_path() -> jid.TipPath:
     """Return the path of ISO 9283 of the demo; the tool points along the rail (Fig. 8)."""
     forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    limits = {"speed": SPEED, "acceleration": ACCELERATION}
-    return jid.iso9283_path(CUBE, EDGE, forward, leans_along=1, **limits)
+    return jid.iso9283_path(
+        CUBE, EDGE, forward, leans_along=1, speed=SPEED, acceleration=ACCELERATION
+    )
 
 
 def _observe(log: jid.Recording, robot: jid.Robot, filter: jid.AbstractFilter) -> jid.Observations:

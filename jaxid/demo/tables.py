@@ -223,7 +223,8 @@ def _definite(model: Model) -> str:
 
 def record(study: Study) -> dict[str, Any]:
     """Return all results of the demo for `demo.json`, in rad, m, s, N and N m."""
-    base, robot, series = study.base, study.base.model.robot, study.played.inner
+    base, robot = study.base, study.base.model.robot
+    series: Any = study.played.inner
     fits, timed = (study.weighted.fit, study.warm), study.timing
     speed, acceleration = study.tip_maxima
     return plain(

@@ -18,11 +18,20 @@ from jaxid.identification.estimators import (
     AbstractSpectralSolution,
     EstimatorInWords,
 )
-from jaxid.identification.identifiability import UndeterminedDirection
+from jaxid.identification.identifiability import LARGEST_UNCERTAINTY, UndeterminedDirection
 from jaxid.identification.model_file import checksum_of, read_model, write_model
 from jaxid.identification.uncertainty import ResidualSpectra, Uncertainty
 from jaxid.io import to_json
 from jaxid.measurement.observations import Observations
+from jaxid.table import (
+    Column,
+    Remark,
+    Status,
+    Table,
+    percent,
+    significant,
+    with_deviations,
+)
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
 """Relative standard deviations up to which an estimate is trusted, or doubtful, of 1."""
@@ -34,6 +43,11 @@ class Trust(enum.Enum):
     GOOD = "trusted"
     DOUBTFUL = "doubtful"
     NONE = "small, or not excited"
+
+    @property
+    def status(self) -> Status:
+        """Mark of the row of such an estimate."""
+        return {"GOOD": Status.GOOD, "DOUBTFUL": Status.DOUBTFUL, "NONE": Status.BAD}[self.name]
 
 
 class ConditionNumbers(eqx.Module):
@@ -159,6 +173,108 @@ class Fit(eqx.Module):
         full = np.zeros(self.base.model.size)
         full[list(self.base.indices)] = np.asarray(self.parameters)
         return full
+
+    @property
+    def facts(self) -> list[tuple[str, str]]:
+        """Rows, condition numbers and residual, each with its word."""
+        rows, numbers, trust = self.rows, self.condition_numbers, self.trust
+        good, fair, poor = (
+            trust.count(level) for level in (Trust.GOOD, Trust.DOUBTFUL, Trust.NONE)
+        )
+        return [
+            (
+                "rows per joint",
+                str(rows[0]) if len(set(rows)) == 1 else f"{min(rows)} to {max(rows)}",
+            ),
+            (
+                "condition number",
+                f"{significant(numbers.raw, 4)} in SI units, {significant(numbers.weighted, 4)} "
+                f"weighted, {significant(numbers.scaled, 4)} weighted with columns of length one",
+            ),
+            ("residual", f"{percent(self.residual, 3)} % of the forces (norms of all rows)"),
+            (
+                "estimates",
+                f"{good} of {self.base.size} known to {100 * TRUSTED:g} %, {fair} to "
+                f"{100 * DOUBTFUL:g} %, {poor} worse or undetermined",
+            ),
+        ]
+
+    @property
+    def determination(self) -> list[Remark]:
+        """Combinations that the logs do not determine, and what to do about them."""
+        base = self.base
+        if not self.undetermined:
+            return [Remark(f"These logs determine all {base.size} base parameters.", Status.GOOD)]
+        count = len(self.undetermined)
+        headline = (
+            f"NOT DETERMINED by these logs: {count} combination{'' if count == 1 else 's'} of the "
+            f"{base.size} base parameters."
+        )
+        remarks = [Remark(headline, Status.BAD)]
+        for direction in self.undetermined:
+            moved = np.isfinite(direction.uncertainty)
+            open_part = f"leaves {percent(direction.uncertainty)} % of the forces open"
+            remarks.append(
+                Remark(
+                    f"{direction.sentence(base)}.",
+                    Status.BAD,
+                    f"{open_part if moved else 'not moved at all'}; singular value "
+                    f"{direction.singular_value:.1e} of the largest",
+                )
+            )
+        advice = (
+            "A combination counts as not determined if it leaves more than "
+            f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of these "
+            "parameters mean nothing one by one, and the model may fail on other motions. Record "
+            "a motion that moves these joints in more poses, faster and in both directions, or "
+            'leave effects out in `[model]`; `ridge = "cross_validated"` in `[estimator]` keeps '
+            "small what the logs leave open."
+        )
+        return [*remarks, Remark(advice)]
+
+    def summary(self) -> Table:
+        """Return a table of the estimates with their standard deviations.
+
+        Estimates are shown with the digits that their standard deviations leave meaningful. Beside
+        them are the standard deviations that independent rows would have, and the ratio to these.
+        """
+        base, trust = self.base, self.trust
+        values, deviations = with_deviations(self.parameters, self.standard_deviations)
+        columns = [
+            Column("#", list(range(1, base.size + 1))),
+            Column("parameter", base.expressions, kind="code"),
+            Column("estimate", values, kind="number"),
+            Column("±", deviations, kind="number"),
+            Column("unit", base.units),
+            Column("±", self.relative_standard_deviations, "%", percent),
+        ]
+        ratios = self.uncertainty.ratios
+        finite = ratios[np.isfinite(ratios)]
+        remarks = [*self.determination]
+        if np.any(np.abs(finite - 1.0) > 1e-9):
+            columns += [
+                Column(
+                    "naive ±", self.naive_standard_deviations, format=lambda x: significant(x, 2)
+                ),
+                Column("ratio", ratios, format=lambda x: significant(x, 2)),
+            ]
+            remarks.append(
+                Remark(
+                    f"Standard deviations are {significant(float(np.median(finite)), 2)} times "
+                    "(median) those of independent rows, because errors of neighbouring rows are "
+                    "correlated."
+                )
+            )
+        return Table(
+            f"{base.model.robot.name}: {base.size} base parameters",
+            *columns,
+            facts=self.facts,
+            status=[level.status for level in trust],
+            remarks=remarks,
+        )
+
+    def __str__(self) -> str:
+        return str(self.summary())
 
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39).

@@ -133,7 +133,7 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         plan.interrupted and "The design was stopped: `--resume` goes on where it was",
     ):
         if text:
-            found.append(Remark(text, Status.DOUBTFUL))
+            found.append(Remark(str(text), Status.DOUBTFUL))
     if plan.undetermined:
         text = f"This motion does not determine: {', '.join(plan.undetermined)}"
         found.append(Remark(text, Status.BAD))

@@ -9,15 +9,11 @@ from matplotlib.figure import Figure
 from jaxid.identification.fit import Fit
 from jaxid.report.page import Section, block, facts, picture, provenance, render_page
 from jaxid.report.tables import (
-    TRUST,
     body_table,
-    determination_remarks,
     error_table,
-    fit_facts,
     lengths_sentence,
     motor_table,
     residual_table,
-    robot_table,
 )
 from jaxid.report.verdict import verdict
 from jaxid.robot.robot import Robot
@@ -108,14 +104,13 @@ def _settings_block(fit: Fit, settings: Mapping[str, Any]) -> str:
         ("decimation", settings.get("decimation")),
         ("estimator", fit.estimator),
         ("solution", fit.solution),
-        *fit_facts(fit)[:-1],
+        *fit.facts[:-1],
     ]
     return facts((word, text) for word, text in rows if text is not None)
 
 
 def _robot_blocks(robot: Robot) -> list[str]:
-    joints = robot_table(robot)
-    blocks = [block("table", Table("", *joints.columns))]
+    blocks = [block("table", Table("", *robot.summary().columns))]
     if not robot.drives.is_direct:
         blocks.append(block("table", motor_table(robot)))
     rows = [
@@ -142,7 +137,7 @@ def _torque_blocks(figures: Mapping[str, Figure], joints: int) -> list[str]:
 
 
 def _parameter_blocks(fit: Fit, figure: Figure) -> list[str]:
-    blocks = [block("remarks", determination_remarks(fit))] if fit.undetermined else []
+    blocks = [block("remarks", fit.determination)] if fit.undetermined else []
     blocks += [picture(figure), block("table", page_parameter_table(fit))]
     if fit.base.lengths:
         blocks.append(block("paragraph", lengths_sentence(fit.base)))
@@ -171,7 +166,7 @@ def page_parameter_table(fit: Fit) -> Table:
         Column("±", fit.relative_standard_deviations, "%", percent),
         Column("trust", [level.value for level in trust]),
         Column("combination", base.expressions, kind="code"),
-        status=[TRUST[level] for level in trust],
+        status=[level.status for level in trust],
     )
 
 

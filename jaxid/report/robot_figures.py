@@ -195,7 +195,7 @@ def _project(robot: Robot, q: np.ndarray, collision: CollisionModel | None) -> _
         _floor(points.reshape(-1, 3)) @ camera[:, :2],
         seen[:, moves],
         radii[moves],
-        [_outline(seen[0, i, :, :2], radii[i]) for i in np.flatnonzero(~moves)],
+        [_outline(seen[0, i, :, :2], float(radii[i])) for i in np.flatnonzero(~moves)],
         robot.revolute,
     )
 
@@ -243,7 +243,7 @@ def _pose_artists(
     z = 2.0 + strength
     capsules = view.moving[k]
     shapes = [
-        _outline(capsules[i, :, :2], view.moving_radii[i])
+        _outline(capsules[i, :, :2], float(view.moving_radii[i]))
         for i in np.argsort(capsules[:, :, 2].mean(axis=1), kind="stable")
     ]
     yield PolyCollection(

@@ -5,13 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxid.arrays import AnyArray
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators import AbstractSpectralSolution
-from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
-from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
-from jaxid.identification.runs.comparison import LEVEL, Comparison, Verdict
-from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
@@ -23,40 +20,8 @@ from jaxid.table import (
     Table,
     percent,
     significant,
-    with_deviations,
 )
 from jaxid.validation import TorqueErrors
-
-TRUST = {Trust.GOOD: Status.GOOD, Trust.DOUBTFUL: Status.DOUBTFUL, Trust.NONE: Status.BAD}
-
-
-def robot_table(robot: Robot) -> Table:
-    """Return the joints of a robot with what is known of their limits; dashes where it is not."""
-    limits = robot.limits
-
-    def known(values: np.ndarray) -> np.ndarray:
-        return np.where(np.isfinite(values), values, np.nan)
-
-    remarks = [*robot.notes]
-    if limits.assumed:
-        remarks.append(f"assumed: {', '.join(limits.assumed)}")
-    if robot.tool is not None:
-        where = robot.joint_names[robot.tool.body]
-        remarks.append(f"a known load of {float(robot.tool.mass):g} kg on the body of `{where}`")
-    joints = range(robot.joints)
-    return Table(
-        f"{robot.name}: {robot.joints} joints",
-        Column("joint", robot.joint_names),
-        Column("moves", ["turns" if revolute else "slides" for revolute in robot.revolute]),
-        Column("from", known(limits.position_min)),
-        Column("to", known(limits.position_max)),
-        Column("speed", known(limits.velocity), "unit/s"),
-        Column("acceleration", known(limits.acceleration), "unit/s²"),
-        Column("largest\nforce", known(robot.known_max_forces)),
-        Column("unit", [robot.joint_unit(j) for j in joints]),
-        Column("force\nunit", [robot.force_unit(j) for j in joints]),
-        remarks=remarks,
-    )
 
 
 def motor_table(robot: Robot) -> Table:
@@ -104,101 +69,6 @@ def lengths_sentence(base: BaseParameters) -> str:
         for name, value in base.lengths.items()
     )
     return f"In the combinations: {', '.join(values)}."
-
-
-def parameter_table(fit: Fit) -> Table:
-    """Return the estimates with their standard deviations, and how well they are determined.
-
-    Estimates stand with the digits that their standard deviations leave meaningful. Beside them
-    stand the standard deviations that independent rows would have, and the ratio to these.
-
-    Args:
-        fit: Identified parameters.
-    """
-    base, trust = fit.base, fit.trust
-    values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
-    columns = [
-        Column("#", list(range(1, base.size + 1))),
-        Column("parameter", base.expressions, kind="code"),
-        Column("estimate", values, kind="number"),
-        Column("±", deviations, kind="number"),
-        Column("unit", base.units),
-        Column("±", fit.relative_standard_deviations, "%", percent),
-    ]
-    ratios = fit.uncertainty.ratios
-    finite = ratios[np.isfinite(ratios)]
-    remarks = [*determination_remarks(fit)]
-    if np.any(np.abs(finite - 1.0) > 1e-9):
-        columns += [
-            Column("naive ±", fit.naive_standard_deviations, format=lambda x: significant(x, 2)),
-            Column("ratio", ratios, format=lambda x: significant(x, 2)),
-        ]
-        remarks.append(
-            Remark(
-                f"Standard deviations are {significant(float(np.median(finite)), 2)} times "
-                "(median) those of independent rows, because errors of neighbouring rows are "
-                "correlated."
-            )
-        )
-    return Table(
-        f"{base.model.robot.name}: {base.size} base parameters",
-        *columns,
-        facts=fit_facts(fit),
-        status=[TRUST[level] for level in trust],
-        remarks=remarks,
-    )
-
-
-def fit_facts(fit: Fit) -> list[tuple[str, str]]:
-    """Return rows, condition numbers and residual of a fit, each with its word."""
-    rows, numbers, trust = fit.rows, fit.condition_numbers, fit.trust
-    good, fair, poor = (trust.count(level) for level in (Trust.GOOD, Trust.DOUBTFUL, Trust.NONE))
-    return [
-        ("rows per joint", str(rows[0]) if len(set(rows)) == 1 else f"{min(rows)} to {max(rows)}"),
-        (
-            "condition number",
-            f"{significant(numbers.raw, 4)} in SI units, {significant(numbers.weighted, 4)} "
-            f"weighted, {significant(numbers.scaled, 4)} weighted with columns of length one",
-        ),
-        ("residual", f"{percent(fit.residual, 3)} % of the forces (norms of all rows)"),
-        (
-            "estimates",
-            f"{good} of {fit.base.size} known to {100 * TRUSTED:g} %, {fair} to "
-            f"{100 * DOUBTFUL:g} %, {poor} worse or undetermined",
-        ),
-    ]
-
-
-def determination_remarks(fit: Fit) -> list[Remark]:
-    """Return the combinations that the logs do not determine, and what to do about them."""
-    base = fit.base
-    if not fit.undetermined:
-        return [Remark(f"These logs determine all {base.size} base parameters.", Status.GOOD)]
-    count = len(fit.undetermined)
-    headline = (
-        f"NOT DETERMINED by these logs: {count} combination{'' if count == 1 else 's'} of the "
-        f"{base.size} base parameters."
-    )
-    remarks = [Remark(headline, Status.BAD)]
-    for direction in fit.undetermined:
-        moved = np.isfinite(direction.uncertainty)
-        open_part = f"leaves {percent(direction.uncertainty)} % of the forces open"
-        remarks.append(
-            Remark(
-                f"{direction.sentence(base)}.",
-                Status.BAD,
-                f"{open_part if moved else 'not moved at all'}; singular value "
-                f"{direction.singular_value:.1e} of the largest",
-            )
-        )
-    advice = (
-        "A combination counts as not determined if it leaves more than "
-        f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of these parameters "
-        "mean nothing one by one, and the model may fail on other motions. Record a motion that "
-        "moves these joints in more poses, faster and in both directions, or leave effects out in "
-        '`[model]`; `ridge = "cross_validated"` in `[estimator]` keeps small what they leave open.'
-    )
-    return [*remarks, Remark(advice)]
 
 
 def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
@@ -297,84 +167,6 @@ def body_table(consistency: Consistency, names: tuple[str, ...]) -> Table:
     )
 
 
-def comparison_table(comparison: Comparison) -> Table:
-    """Return every parameter in both fits, the difference with its interval, a verdict (Sec. 6).
-
-    Args:
-        comparison: Comparison of two fits.
-    """
-    first, second, verdicts = comparison.first, comparison.second, comparison.verdicts
-    half = comparison.half_widths
-    a, _ = with_deviations(first.parameters, half)
-    b, _ = with_deviations(second.parameters, half)
-    change, _ = with_deviations(comparison.difference, half)
-    _, width = with_deviations(np.zeros(len(half)), half)
-    groups, level = first.groups, comparison.level
-    tested = len(verdicts) - verdicts.count(Verdict.UNKNOWN)
-    return Table(
-        f"{first.label} and {second.label}: {len(first.names)} base parameters",
-        Column("#", list(range(1, len(half) + 1))),
-        Column("parameter", first.names),
-        Column("unit", first.units),
-        Column(first.label, a, kind="number"),
-        Column(second.label, b, kind="number"),
-        Column("difference", [x if x.startswith("-") else f"+{x}" for x in change], kind="number"),
-        Column(f"± ({100 * level:g} %)", width, kind="number"),
-        Column("verdict", [verdict.value for verdict in verdicts]),
-        status=[Status.DOUBTFUL if v is Verdict.CHANGED else Status.NEUTRAL for v in verdicts],
-        rules=[k for k in range(1, len(groups)) if groups[k] != groups[k - 1]],
-        remarks=[
-            f"{verdicts.count(Verdict.CHANGED)} of {tested} parameters have changed: if none had, "
-            f"the chance to call any of them so would be {100 * (1 - level):.3g} % at most (Holm)",
-            f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies outside the "
-            f"{100 * level:g} % interval of their difference; of {tested} parameters that never "
-            f"change, about {(1 - level) * tested:.2g} look so",
-        ],
-    )
-
-
-def group_table(comparison: Comparison) -> Table:
-    """Return the joint test of each kind of parameter.
-
-    Args:
-        comparison: Comparison of two fits.
-    """
-    groups = comparison.groups
-    verdicts = [Verdict.CHANGED if g.changed else Verdict.UNCHANGED for g in groups]
-    chances = ["< 1e-6" if g.p_value < 1e-6 else significant(g.p_value, 2) for g in groups]
-    return Table(
-        "all parameters of a kind at once",
-        Column("kind", [g.name for g in groups]),
-        Column("parameters", [g.size for g in groups]),
-        Column("statistic", [float(g.statistic) for g in groups]),
-        Column("chance\nwithout a change", chances, kind="number"),
-        Column("verdict", [v.value for v in verdicts]),
-        status=[Status.DOUBTFUL if g.changed else Status.NEUTRAL for g in groups],
-    )
-
-
-def estimate_table(
-    estimates: Estimates, title: str = "", level: float = LEVEL, remarks: Iterable[Remark] = ()
-) -> Table:
-    """Return estimates with the digits that their intervals leave meaningful.
-
-    Args:
-        estimates: Estimated parameters.
-        title: Title of the table.
-        level: Confidence of the intervals (0 to 1).
-        remarks: Remarks below the table.
-    """
-    values, halves = with_deviations(estimates.parameters, estimates.half_widths(level))
-    return Table(
-        title,
-        Column("parameter", estimates.names),
-        Column("estimate", values, kind="number"),
-        Column(f"± ({100 * level:g} %)", halves, kind="number"),
-        Column("unit", estimates.units),
-        remarks=remarks,
-    )
-
-
 def alternative_table(
     errors: Sequence[TorqueErrors], others: Sequence[TorqueErrors], names: tuple[str, str]
 ) -> Table:
@@ -417,7 +209,7 @@ def log_table(log: Any, robot: Robot, check: Any, doubts: Iterable[str]) -> Tabl
     limits, gaps = robot.limits, len(log.segments) - 1
     joints = range(robot.joints)
 
-    def beside(values: np.ndarray, limits: np.ndarray) -> list[str]:
+    def beside(values: np.ndarray, limits: AnyArray) -> list[str]:
         return [
             f"{significant(float(v))} ({_limit(x)})" for v, x in zip(values, limits, strict=True)
         ]
@@ -448,6 +240,6 @@ def _limit(value: float) -> str:
     return significant(float(value)) if np.isfinite(value) else MISSING
 
 
-def robot_tables(robot: Robot) -> list[Table]:
-    """Return the tables of a robot's joints and, where it has gears or couplings, its motors."""
-    return [robot_table(robot), *([] if robot.drives.is_direct else [motor_table(robot)])]
+def motor_tables(robot: Robot) -> list[Table]:
+    """Return the table of a robot's motors, if it has gears or couplings."""
+    return [] if robot.drives.is_direct else [motor_table(robot)]

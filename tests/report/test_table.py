@@ -12,12 +12,8 @@ from rich.console import Console
 from jaxid.identification.runs.comparison import compare
 from jaxid.report.tables import (
     body_table,
-    comparison_table,
     error_table,
-    group_table,
-    parameter_table,
     residual_table,
-    robot_table,
 )
 from jaxid.report.terminal import show
 from jaxid.table import (
@@ -124,7 +120,7 @@ def test_columns_of_different_lengths_are_refused():
 
 
 def test_parameters_have_estimate_deviation_unit_and_naive_deviation(fit):
-    lines = parameter_table(fit).text(140).splitlines()
+    lines = fit.summary().text(140).splitlines()
     start = next(k for k, line in enumerate(lines) if line.split()[:2] == ["#", "parameter"]) + 1
     for k, expression in enumerate(fit.base.expressions):
         row = lines[start + k]
@@ -139,7 +135,7 @@ def test_parameters_have_estimate_deviation_unit_and_naive_deviation(fit):
         ratio = pytest.approx(fit.uncertainty.ratios[k], rel=0.06)
         assert numbers[-2:] == [pytest.approx(naive), ratio]
     alone = dataclasses.replace(fit, uncertainty=type(fit.uncertainty).given(fit.covariance))
-    assert "naive" not in parameter_table(alone).text()
+    assert "naive" not in alone.summary().text()
 
 
 def test_residuals_are_white_or_not(fit):
@@ -164,15 +160,6 @@ def test_errors_have_joints_and_units(fit, validation):
         error_table(errors_of(3), arm_of(2))
 
 
-def test_joints_have_limits_and_units(fit):
-    rail, swing = (
-        line.split() for line in str(robot_table(fit.base.model.robot)).splitlines()[3:5]
-    )
-    assert rail == ["rail", "slides", MISSING, MISSING, "1.00", MISSING, "200", "m", "N"]
-    assert swing[1] == "turns"
-    assert swing[-2:] == ["N", "m"]
-
-
 def test_bodies_show_their_margins_and_the_active_bounds(consistent):
     robot = consistent.base.model.robot
     table = body_table(consistent.consistency, robot.joint_names)
@@ -183,10 +170,10 @@ def test_bodies_show_their_margins_and_the_active_bounds(consistent):
 
 def test_the_comparison_names_what_has_changed(fit, warm):
     found = compare(fit, warm)
-    lines = comparison_table(found).text(100).splitlines()
+    lines = found.summary().text(100).splitlines()
     (line,) = [x for x in lines if " fv1 " in x]
     assert "N s/m" in line
     assert line.endswith("changed")
     assert "\n".join(lines).count(" no change seen") == fit.base.size - 1
-    kinds = group_table(found).text().splitlines()
+    kinds = found.group_summary().text().splitlines()
     assert [x.endswith(" changed") for x in kinds[-3:]] == [0, 1, 0]

@@ -10,6 +10,7 @@ from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.errors import InputError
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import Estimates
+from jaxid.table import Column, Status, Table, significant, with_deviations
 
 LEVEL = 0.95
 """Confidence of intervals and tests."""
@@ -191,6 +192,58 @@ class Comparison(eqx.Module):
             np.asarray(self.covariance)[np.ix_(chosen, chosen)],
             float(np.min(np.asarray(self.freedom)[chosen])),
         )
+
+    def summary(self) -> Table:
+        """Return a table of both estimates, their differences with intervals, and verdicts."""
+        first, second, verdicts = self.first, self.second, self.verdicts
+        half = self.half_widths
+        a, _ = with_deviations(first.parameters, half)
+        b, _ = with_deviations(second.parameters, half)
+        change, _ = with_deviations(self.difference, half)
+        _, width = with_deviations(np.zeros(len(half)), half)
+        groups, level = first.groups, self.level
+        tested = len(verdicts) - verdicts.count(Verdict.UNKNOWN)
+        return Table(
+            f"{first.label} and {second.label}: {len(first.names)} base parameters",
+            Column("#", list(range(1, len(half) + 1))),
+            Column("parameter", first.names),
+            Column("unit", first.units),
+            Column(first.label, a, kind="number"),
+            Column(second.label, b, kind="number"),
+            Column(
+                "difference", [x if x.startswith("-") else f"+{x}" for x in change], kind="number"
+            ),
+            Column(f"± ({100 * level:g} %)", width, kind="number"),
+            Column("verdict", [verdict.value for verdict in verdicts]),
+            status=[Status.DOUBTFUL if v is Verdict.CHANGED else Status.NEUTRAL for v in verdicts],
+            rules=[k for k in range(1, len(groups)) if groups[k] != groups[k - 1]],
+            remarks=[
+                f"{verdicts.count(Verdict.CHANGED)} of {tested} parameters have changed: if none "
+                "had, the chance to call any of them so would be "
+                f"{100 * (1 - level):.3g} % at most (Holm)",
+                f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies outside "
+                f"the {100 * level:g} % interval of their difference; of {tested} parameters that "
+                f"never change, about {(1 - level) * tested:.2g} look so",
+            ],
+        )
+
+    def group_summary(self) -> Table:
+        """Return a table of the joint test of each kind of parameter."""
+        groups = self.groups
+        verdicts = [Verdict.CHANGED if g.changed else Verdict.UNCHANGED for g in groups]
+        chances = ["< 1e-6" if g.p_value < 1e-6 else significant(g.p_value, 2) for g in groups]
+        return Table(
+            "all parameters of a kind at once",
+            Column("kind", [g.name for g in groups]),
+            Column("parameters", [g.size for g in groups]),
+            Column("statistic", [float(g.statistic) for g in groups]),
+            Column("chance\nwithout a change", chances, kind="number"),
+            Column("verdict", [v.value for v in verdicts]),
+            status=[Status.DOUBTFUL if g.changed else Status.NEUTRAL for g in groups],
+        )
+
+    def __str__(self) -> str:
+        return f"{self.summary()}\n\n{self.group_summary()}"
 
 
 def joint_test(

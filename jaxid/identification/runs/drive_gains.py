@@ -24,6 +24,7 @@ from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Tool
+from jaxid.table import Table
 
 LARGEST = 100.0
 """Ratio of a true to an assumed force beyond which something else is wrong."""
@@ -60,6 +61,13 @@ class DriveGains(eqx.Module):
             covariance=self.covariance,
             freedom=np.full(n, self.freedom),
         )
+
+    def summary(self) -> Table:
+        """Return a table of the gains with their 95 % intervals."""
+        return self.estimates.summary("true forces over those of the logs")
+
+    def __str__(self) -> str:
+        return str(self.summary())
 
     def corrected(self, recording: Recording) -> Recording:
         """A recording with true forces in place of those of nominal gains.

@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -12,6 +12,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.identification.fit import Fit
 from jaxid.identification.uncertainty import Uncertainty
+from jaxid.table import Column, Remark, Table, with_deviations
 
 
 class Estimates(eqx.Module):
@@ -89,6 +90,26 @@ class Estimates(eqx.Module):
         """
         quantile = stats.t.ppf(0.5 + 0.5 * level, np.asarray(self.freedom))
         return quantile * self.standard_deviations
+
+    def summary(
+        self, title: str = "", remarks: Iterable[Remark] = (), level: float = 0.95
+    ) -> Table:
+        """Return a table of the estimates with their intervals.
+
+        Args:
+            title: Title of the table.
+            remarks: Remarks below the table.
+            level: Confidence of the intervals (0 to 1).
+        """
+        values, halves = with_deviations(self.parameters, self.half_widths(level))
+        return Table(
+            title,
+            Column("parameter", self.names),
+            Column("estimate", values, kind="number"),
+            Column(f"± ({100 * level:g} %)", halves, kind="number"),
+            Column("unit", self.units),
+            remarks=remarks,
+        )
 
 
 def groups(base: BaseParameters) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot, Tool
+from jaxid.table import Remark, Status, Table
 
 TEN = len(INERTIAL_NAMES)
 LOOSE = 1e-2
@@ -61,6 +62,29 @@ class Payload(eqx.Module):
         """Inertia tensor about the centre of mass, along the body's axes [kg m²]."""
         A, B, C, D, E, F = np.asarray(_central(jnp.asarray(self.parameters)))[4:]
         return np.array([[A, -F, -E], [-F, B, -D], [-E, -D, C]])
+
+    def summary(self) -> Table:
+        """Return a table of mass, centre of mass and moments about it, and of their consistency."""
+        title = "payload in the frame of its body; moments about the centre of mass"
+        return self.central.summary(title, [self._consistency()])
+
+    def __str__(self) -> str:
+        return str(self.summary())
+
+    def _consistency(self) -> Remark:
+        if not np.isfinite(self.distance):
+            text = (
+                "the logs do not determine all ten parameters of the payload: move the joints that "
+                "carry it in more poses, faster, and alike in both runs."
+            )
+            return Remark(text, Status.BAD)
+        if self.distance == 0:
+            return Remark("the payload is a body that could exist.", Status.GOOD)
+        text = (
+            "the estimate itself belongs to no body: these are the parameters of the nearest one "
+            f"that could exist, {self.distance:.2g} standard deviations away."
+        )
+        return Remark(text, Status.NEUTRAL if self.distance < 4.0 else Status.DOUBTFUL)
 
     @property
     def tool(self) -> Tool:

@@ -14,6 +14,7 @@ from jaxid.identification.runs.comparison import LEVEL, Comparison, joint_test
 from jaxid.identification.runs.estimates import Estimates, groups, with_covariance
 from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.tied import Tied, tied
+from jaxid.table import Table
 
 POSES = 3
 """Random poses in which energies are looked at."""
@@ -50,6 +51,14 @@ class StatesFit(eqx.Module):
         names = self.base.names
         own = (f"{names[k]} ({state})" for state in self.states for k in self.varying)
         return (*(names[k] for k in self.shared), *own)
+
+    def summary(self) -> Table:
+        """Return a table of all estimates with their 95 % intervals."""
+        title = "parameters that all states share, then those of each state"
+        return self.estimates.summary(title)
+
+    def __str__(self) -> str:
+        return str(self.summary())
 
     @property
     def estimates(self) -> Estimates:
