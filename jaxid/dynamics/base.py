@@ -1,7 +1,8 @@
-"""Base parameters: what forces can tell apart of the standard parameters (Eqs. 20-24)."""
+"""Base parameters: the combinations of standard parameters that forces determine (Eqs. 20-24)."""
 
 import enum
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,28 +12,27 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Numbers, as_array
 from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
-from jaxid.dynamics.machine import columns_of, on_samples
+from jaxid.dynamics.dispatch import compiled_method, in_numpy, on_samples, program_of
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.observation import observation_matrix
-from jaxid.dynamics.packed import PackedRegressor
 from jaxid.dynamics.rank import (
     AbstractRankMethod,
     Dependence,
     GramSchmidt,
     SingularValues,
+    random_regressor,
     regrouping,
 )
+from jaxid.dynamics.regressor import JointRegressor, PackedRegressor, rows_in_numpy
 from jaxid.errors import InputError
+from jaxid.program import Program, select_outputs
+from jaxid.table import Column, Table
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
-CLEAR_GAP = 1e3
-BARELY = 1e-4
-
 
 class Identifiability(enum.Enum):
-    """What measured forces can say about one standard parameter."""
+    """Identifiability of one standard parameter from measured forces."""
 
     ALONE = "identifiable"
     COMBINED = "only in combination"
@@ -45,10 +45,11 @@ class BaseParameters(Hashable):
     Attributes:
         model: The model with all its standard parameters.
         indices: Columns of the independent standard parameters, in order (the paper's numbering).
-        dependent: Columns of the others.
-        kappa: How the dependent columns follow from the independent ones.
-        smallest_independent: Share of the least independent column that is new, of 1.
-        largest_dependent: Share of the most doubtful dependent column that is new, of 1.
+        dependent: Columns of the other standard parameters, in order.
+        kappa: Matrix by which the dependent columns follow from the independent ones.
+        smallest_independent: Fraction of the least independent column that earlier columns do not
+            explain, from 0 to 1.
+        largest_dependent: Fraction of the most doubtful dependent column that they do not explain.
         notes: Doubts about the rank, in sentences; empty if there are none.
     """
 
@@ -67,7 +68,7 @@ class BaseParameters(Hashable):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name of the standard parameter that leads each base parameter."""
+        """Names of the standard parameters that lead the base parameters."""
         names = self.model.parameter_names
         return tuple(names[k] for k in self.indices)
 
@@ -79,12 +80,12 @@ class BaseParameters(Hashable):
 
     @functools.cached_property
     def closed_forms(self) -> ClosedForms:
-        """The base parameters in letters, found when they are first asked for (Eq. 24)."""
+        """Base parameters in letters, computed when they are first needed (Eq. 24)."""
         return closed_forms(self.model, self.indices, self.dependent, np.asarray(self.kappa))
 
     @property
     def expressions(self) -> tuple[str, ...]:
-        """Each base parameter as a readable combination, like `mx2 + l2x*m3` (Eq. 24)."""
+        """Base parameters as readable combinations, like `mx2 + l2x*m3` (Eq. 24)."""
         return tuple(str(e) for e in self.closed_forms.expressions)
 
     @property
@@ -92,38 +93,82 @@ class BaseParameters(Hashable):
         """Values of the letters in the expressions: lengths [m], and `g` [m/s²]."""
         return dict(self.closed_forms.lengths)
 
-    @columns_of(lambda base: (base.model, base.model.columns, base.indices))
     def columns(self, q, qd, qdd) -> Float[AnyArray, "joints base"]:
-        """The base regressor of one sample, as it is defined (Eq. 23)."""
+        """Return the base regressor of one sample by definition (Eq. 23)."""
         return self.model.columns(q, qd, qdd)[:, np.array(self.indices)]
 
     def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
-        """The generalized forces of one sample, as they are defined (Eq. 39)."""
+        """Return the generalised forces of one sample by definition (Eq. 39)."""
         return self.model.forces(self.to_standard(p), q, qd, qdd)
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
-        """The mass matrix of one sample, as it is defined (Eq. 38)."""
+        """Return the mass matrix of one sample by definition (Eq. 38)."""
         return self.model.inertia(self.to_standard(p), q)
 
+    def derived_program(self, name: str, *shapes: tuple[int, ...]) -> Program | None:
+        """Return the program of `columns`, which selects columns of the model's; else None."""
+        if name != "columns":
+            return None
+        program = program_of(self.model, self.model.columns, *shapes)
+        (shape,) = program.output_shapes
+        entries = np.arange(math.prod(shape)).reshape(shape)
+        return select_outputs(program, entries[:, np.array(self.indices, int)])
+
+    @property
+    def _shapes(self) -> tuple[tuple[int], ...]:
+        return ((self.model.robot.joints,),) * 3
+
+    @property
+    def joint_regressor(self) -> JointRegressor:
+        """Base regressor for many samples, joint by joint, for programs in JAX (Eq. 23)."""
+        return JointRegressor(self, self.columns, *self._shapes)
+
+    @property
+    def acting_columns(self) -> list[tuple[int, ...]]:
+        """For each joint the base parameters that can act on it."""
+        return list(compiled_method(self, self.columns, *self._shapes).acting)
+
+    def regressor_rows(self, motion: Motion) -> list[Float[np.ndarray, "samples columns"]]:
+        """Return each joint's row of the base regressor in its `acting_columns`, in NumPy (Eq. 23).
+
+        Args:
+            motion: Joint motion [samples, joints].
+        """
+        method = compiled_method(self, self.columns, *self._shapes)
+        arrays = [np.asarray(x, np.float64).T for x in (motion.q, motion.qd, motion.qdd)]
+        return [rows.T for rows in rows_in_numpy(method.program, method.acting, *arrays)]
+
+    def forces_in_numpy(
+        self, p: Float[AnyArray, " base"], motion: Motion
+    ) -> Float[np.ndarray, "samples joints"]:
+        r"""Return the generalised forces $\Theta_B p_B$ [N m or N] in float64 (Eq. 39)."""
+        return in_numpy(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
+
+    def tool_forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
+        """Return the forces of the known tool [N m or N] in float64; zero without a tool."""
+        if self.model.robot.tool is None:
+            return np.zeros(motion.q.shape)
+        return in_numpy(self.model, self.model.known_forces, motion.q, motion.qd, motion.qdd)
+
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
-        r"""The base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
+        r"""Return the base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
         self.model.check(motion.q)
         return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
-        r"""The stacked base regressor of many samples without its zeros (Eqs. 23, 26).
+        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26).
 
         Raises:
             InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 robot's geometry.
         """
         self.model.check(motion.q)
-        return PackedRegressor.of(self, self.columns, motion)
+        return PackedRegressor(self, self.columns, motion)
 
     def from_standard(
         self, p: Float[AnyArray, "*batch standard"] | Sequence[Any]
     ) -> Float[AnyArray, "*batch base"]:
-        r"""The base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
+        r"""Return the base parameters $p_B = p_1 + \kappa p_2$ (Eq. 22)."""
         p = _one_each("standard", p, self.model.size)
         first, second = np.array(self.indices), np.array(self.dependent, dtype=int)
         return p[..., first] + p[..., second] @ self.kappa.T
@@ -131,7 +176,7 @@ class BaseParameters(Hashable):
     def to_standard(
         self, p: Float[AnyArray, "*batch base"] | Sequence[Any]
     ) -> Float[AnyArray, "*batch standard"]:
-        """The standard parameters with the same forces whose dependent ones are zero.
+        """Return the standard parameters with the same forces whose dependent ones are zero.
 
         They are no physical masses and inertias, but give the same forces and mass matrix.
         """
@@ -144,17 +189,17 @@ class BaseParameters(Hashable):
         return jnp.zeros(shape, p.dtype).at[..., places].set(p)
 
     def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
-        r"""The generalized forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
+        r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
         self.model.check(motion.q)
         return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
 
     def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
-        """The mass matrix, which base parameters determine completely (Eq. 38)."""
+        """Return the mass matrix, which base parameters determine completely (Eq. 38)."""
         return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
 
     @property
     def identifiability(self) -> tuple[Identifiability, ...]:
-        """For every standard parameter whether forces determine it, alone or in combination."""
+        """Identifiability of every standard parameter: alone, in combination, or not at all."""
         verdict = [Identifiability.NONE] * self.model.size
         mixed = np.asarray(self.kappa) != 0.0
         for row, k in enumerate(self.indices):
@@ -164,6 +209,25 @@ class BaseParameters(Hashable):
             if mixed[:, column].any():
                 verdict[k] = Identifiability.COMBINED
         return tuple(verdict)
+
+    def summary(self) -> Table:
+        """Return a table of the base parameters, with their combinations and units."""
+        lengths = ", ".join(f"{name} = {value:.4g}" for name, value in self.lengths.items())
+        facts = [("standard parameters", self.model.size), ("base parameters", self.size)]
+        if lengths:
+            facts.append(("lengths", f"{lengths} (m; m/s² for g)"))
+        return Table(
+            f"Base parameters of {self.model.robot.name}",
+            Column("no.", list(range(1, self.size + 1))),
+            Column("parameter", self.names),
+            Column("combination", self.expressions, kind="code"),
+            Column("unit", self.units),
+            facts=facts,
+            remarks=self.notes,
+        )
+
+    def __str__(self) -> str:
+        return str(self.summary())
 
 
 def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch parameters"]:
@@ -180,22 +244,23 @@ def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch param
 def base_parameters(
     model: Model, *, method: AbstractRankMethod | None = None, seed: int = 0
 ) -> BaseParameters:
-    r"""Finds which combinations of parameters the forces determine (Eqs. 20-22).
+    r"""Find the combinations of parameters that forces determine (Eqs. 20-22).
 
     The regressor is evaluated at random motions and stacked. Columns that earlier ones replace are
     found by Gram-Schmidt in column order, and counted again by singular values.
 
     Args:
         model: The model.
-        method: How dependence is decided; the other way is always the cross-check.
-        seed: Of the random motions.
+        method: Method by which dependence is decided, `GramSchmidt` if None; the other method is
+            always the cross-check.
+        seed: Seed of the random motions.
 
     Returns:
-        The base parameters; a disagreement or a small gap stands in their `notes`.
+        The base parameters; a disagreement or a small gap is reported in their `notes`.
     """
     method = GramSchmidt() if method is None else method
     check = GramSchmidt() if isinstance(method, SingularValues) else SingularValues()
-    W, scale = observation_matrix(model, seed)
+    W, scale = random_regressor(model, seed)
     found = method(W)
     other = check(W)
     kappa, left = regrouping(W, found)
@@ -216,7 +281,7 @@ def base_parameters(
 def _least_independent(
     W: Float[np.ndarray, "rows standard"], model: Model, found: Dependence
 ) -> str:
-    """Name of the parameter whose column earlier independent ones replace best."""
+    """Return the name of the parameter whose column earlier independent ones explain best."""
     if not found.independent:
         return ""
     chosen = W[:, found.independent]
@@ -236,13 +301,13 @@ def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> 
             "the two ways to count base parameters agree on their number but not on which columns "
             "lead them; the geometry is nearly degenerate."
         )
-    if found.smallest_independent < BARELY:
+    if found.smallest_independent < 1e-4:
         notes.append(
             f"`{weakest}` is barely a base parameter of its own: only "
             f"{found.smallest_independent:.1e} of its column is new. Lengths that are almost zero, "
             "or rounded angles such as 1.5708, do that; forces cannot determine it well."
         )
-    if found.dependent and found.gap < CLEAR_GAP:
+    if found.dependent and found.gap < 1e3:
         notes.append(
             f"independent and dependent columns are not clearly apart: the smallest independent "
             f"share is {found.smallest_independent:.1e}, the largest dependent one "

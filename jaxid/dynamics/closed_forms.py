@@ -1,39 +1,57 @@
-r"""Finds the coefficients of base parameters in letters, from how $\kappa$ follows the geometry.
+r"""Closed forms of base parameters: their coefficients in letters, from the geometry (Eq. 24).
 
 The paper calls the symbolic analysis of base parameters manual and thus time-consuming (Sec. 3).
-Here every length is changed on its own first, which tells with which powers it occurs in a
+Here every length is varied on its own first, which gives the powers with which it occurs in a
 coefficient. The products of such powers that have the right dimension are then fitted at random
-geometries, and what fits is checked at other random geometries and at the robot's own.
+geometries, and the result is checked at other random geometries and at the robot's own.
+
+A length is one component of the offset between two neighbouring bodies: `l3z` is the z component,
+in the frame of body 3, from its origin to the origin of the body after it. Bodies count from 1, the
+ground is 0; a body with several children has `l3_4z`, `l3_7z`. Gravity is `g`.
 """
 
 import itertools
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.dynamics.dimensions import dimension
-from jaxid.dynamics.expressions import ONE, Coefficient, Expression, Monomial
-from jaxid.dynamics.lengths import Length, Regrouping, changing_lengths, draws
+from jaxid.dynamics.expressions import Coefficient, Dimension, Expression, Monomial, dimension
 from jaxid.dynamics.model import Model
+from jaxid.dynamics.rank import (
+    characteristic_length,
+    column_units,
+    random_motion,
+    row_units,
+    solve_from_earlier,
+)
+from jaxid.program import FREE, Program, evaluate, trace
+from jaxid.robot.inertia import AXES
+from jaxid.robot.robot import Robot
 
-MOST_TERMS = 6
-LARGEST_DENOMINATOR = 12
 _POWERS = np.arange(-2, 3)
+"""Exponents of a length that are tried."""
 _SCALES = np.array([0.55, 0.75, 1.3, 1.7])
+"""Factors of a length that is varied alone."""
 _FITTED, _CHECKED = 40, 8
-_MOST_CANDIDATES = 24
+"""Numbers of random geometries for fits and for checks."""
 _FITS = 1e-9
+"""Relative error up to which a closed form fits."""
 _SMALL = 1e-7
+"""Relative size below which a power or a factor is nothing but rounding."""
+_NOTHING = 1e-12
+"""Relative size below which a length, gravity or a column counts as zero."""
 
 
 @dataclass(frozen=True)
 class ClosedForms:
-    """All base parameters in letters.
+    """Base parameters in letters.
 
     Attributes:
-        expressions: One for each base parameter.
+        expressions: Expression of each base parameter.
         lengths: Values of the lengths that occur in them [m]; of `g` [m/s²].
     """
 
@@ -43,7 +61,7 @@ class ClosedForms:
 
 @dataclass(frozen=True)
 class _Samples:
-    """The matrix at many geometries, with the lengths in their units."""
+    r"""Matrix $\kappa$ at many geometries, with the lengths in their units."""
 
     lengths: Float[np.ndarray, "cases lengths"]
     kappa: Float[np.ndarray, "cases base dependent"]
@@ -55,20 +73,20 @@ def closed_forms(
     dependent: tuple[int, ...],
     kappa: Float[np.ndarray, "base dependent"],
 ) -> ClosedForms:
-    r"""Writes base parameters as combinations of standard parameters with readable coefficients.
+    r"""Express base parameters as combinations of standard parameters with readable coefficients.
 
     Args:
         model: The model.
         independent: Columns that lead the base parameters.
-        dependent: The other columns.
-        kappa: Of the robot as it is; what has no short form is taken from here.
+        dependent: Other columns.
+        kappa: Matrix $\kappa$ of the robot, from which coefficients without a short form are taken.
     """
     kappa = np.asarray(kappa, np.float64)
     names, units = model.parameter_names, [dimension(u) for u in model.parameter_units]
     finder = _Finder(model, independent, dependent)
     expressions = []
     for row, first in enumerate(independent):
-        terms = [(first, ONE)]
+        terms = [(first, Coefficient((Monomial(Fraction(1)),)))]
         for column, second in enumerate(dependent):
             own, other = units[first], units[second]
             difference = None
@@ -85,7 +103,7 @@ def closed_forms(
 
 
 class _Finder:
-    """Evaluates the matrix where it is needed, then finds one coefficient at a time."""
+    """Values of the matrix at all geometries, from which one coefficient is found at a time."""
 
     def __init__(self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]):
         regrouping = Regrouping(model, independent, dependent)
@@ -112,7 +130,7 @@ class _Finder:
         self._exponents = self._exponents_of_all()
 
     def _exponents_of_all(self) -> Float[np.ndarray, "lengths powers base dependent"]:
-        """For each length and power the share of that power when this length alone changes."""
+        """Return for each length and power its fraction when this length alone varies."""
         kappa, shares = self._swept.kappa, []
         for k in range(len(self.lengths)):
             rows = [0, *range(1 + k * len(_SCALES), 1 + (k + 1) * len(_SCALES))]
@@ -125,20 +143,20 @@ class _Finder:
     def coefficient(
         self, row: int, column: int, difference: tuple[int, ...] | None, value: float
     ) -> Coefficient | None:
-        """The coefficient of one dependent column in one base parameter, or None if it is zero.
+        """Return the coefficient of a dependent column in a base parameter, or None if it is zero.
 
         Args:
-            row: Of the base parameter.
-            column: Of the dependent column.
+            row: Index of the base parameter.
+            column: Index of the dependent column.
             difference: Dimension of the coefficient, if it is known.
-            value: Of the robot as it is.
+            value: Coefficient of the robot.
         """
         y = self._fitted.kappa[:, row, column]
         number = _number(value)
         if not self.right or not y.any():
             return number
         powers = self._candidates(row, column, difference)
-        if not 0 < len(powers) <= _MOST_CANDIDATES:
+        if not 0 < len(powers) <= 24:
             return number
         found = _fit(self._fitted.lengths, y, powers)
         if found is None:
@@ -167,7 +185,7 @@ class _Finder:
         return np.array(found, int).reshape(len(found), len(self.lengths))
 
     def _written(self, numbers: np.ndarray, powers: np.ndarray, unit: float) -> Coefficient:
-        """Numbers of the robot's own units in SI units; simple fractions where they are."""
+        """Return numbers in the robot's own units in SI units, as simple fractions if they are."""
         monomials = []
         for number, exponents in zip(numbers, powers, strict=True):
             symbols = tuple(
@@ -181,19 +199,19 @@ class _Finder:
 
 
 def _number(value: float) -> Coefficient | None:
-    """What stands for a coefficient without a short form."""
+    """Return a coefficient without a short form: a number."""
     whole = Fraction(round(value)) if abs(abs(value) - 1.0) < _FITS else float(value)
     return Coefficient((Monomial(whole),)) if value else None
 
 
 def _fit(x: np.ndarray, y: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Factors of products of powers, without those that are not needed."""
+    """Return factors of products of powers, without those that are not needed."""
     factors, needed = np.zeros(0), np.zeros(1, bool)
     while not needed.all():
         factors = np.linalg.lstsq(_products(x, powers), y, rcond=None)[0]
         needed = np.abs(factors) > _SMALL * np.abs(factors).max()
         powers = powers[needed]
-    if len(powers) > MOST_TERMS:
+    if len(powers) > 6:
         return None
     return np.array([float(_simple(f)) for f in factors]), powers
 
@@ -203,5 +221,208 @@ def _products(x: np.ndarray, powers: np.ndarray) -> np.ndarray:
 
 
 def _simple(number: float) -> Fraction | float:
-    nearest = Fraction(number).limit_denominator(LARGEST_DENOMINATOR)
+    nearest = Fraction(number).limit_denominator(12)
     return nearest if nearest and abs(number - float(nearest)) < _FITS else number
+
+
+@dataclass(frozen=True)
+class Length:
+    """A number of the geometry that can vary on its own.
+
+    Attributes:
+        name: Name, such as `l3z`.
+        value: Signed value for the robot [m]; for `g` [m/s²].
+        entries: Numbers of the geometry that it sets, each with its multiple of the value.
+        dimension: Dimension of a length, or of an acceleration.
+    """
+
+    name: str
+    value: float
+    entries: tuple[tuple[int, float], ...]
+    dimension: Dimension
+
+
+class Regrouping:
+    r"""The matrix $\kappa$ of a fixed choice of columns, as a function of the geometry (Eq. 22).
+
+    It is in the robot's own units (see `column_units`). The geometry is the vector of all offsets
+    and of gravity. The regressor is traced once and evaluated at many geometries together.
+    """
+
+    def __init__(self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]):
+        self.independent, self.dependent = np.array(independent, int), np.array(dependent, int)
+        robot = model.robot
+        self.size = characteristic_length(model)
+        self.gravity = float(np.linalg.norm(np.asarray(robot.gravity)))
+        offset, gravity = (np.array(x, np.float64) for x in (robot.offset, robot.gravity))
+        offset[np.abs(offset) < _NOTHING * self.size] = 0.0
+        gravity[np.abs(gravity) < _NOTHING * max(self.gravity, _NOTHING)] = 0.0
+        self.geometry = np.concatenate([offset.ravel(), gravity])
+        self.units = column_units(model)
+        self._rows = row_units(model)
+        samples = math.ceil(1.5 * model.size / robot.joints) + 2
+        motion = random_motion(model, samples, seed=1)
+        self._motion = [np.asarray(x).T for x in (motion.q, motion.qd, motion.qdd)]
+        self._program = _program_of_geometry(model, self.geometry)
+
+    def unit(self, length: Length) -> float:
+        """Return a value of typical size: the robot's size, or gravity."""
+        return self.gravity if length.dimension.second else self.size
+
+    def place(
+        self, lengths: tuple[Length, ...], values: Float[np.ndarray, "cases lengths"]
+    ) -> Float[np.ndarray, "cases geometry"]:
+        """Return geometries in which some lengths have other values and all else is the same."""
+        geometry = np.repeat(self.geometry[None], len(values), axis=0)
+        for column, length in enumerate(lengths):
+            for entry, factor in length.entries:
+                geometry[:, entry] = factor * values[:, column]
+        return geometry
+
+    def __call__(
+        self, geometries: Float[np.ndarray, "cases geometry"]
+    ) -> tuple[Float[np.ndarray, "cases base dependent"], bool]:
+        """Return the matrix at each geometry, and whether the choice of columns is right at all.
+
+        It is if the dependent columns follow from earlier independent ones, and those are
+        independent.
+        """
+        found, right = [], True
+        joints, samples = self._motion[0].shape
+        columns = len(self.units)
+        at_once = max(1, 20_000_000 // (joints * samples * columns))
+        for start in range(0, len(geometries), at_once):
+            block = geometries[start : start + at_once]
+            kappa, good = self._solve(self._matrices(block))
+            found.append(kappa)
+            right = right and good
+        return np.concatenate(found), right
+
+    def _matrices(self, geometries):
+        cases, samples = len(geometries), self._motion[0].shape[1]
+        motion = [np.tile(x, cases) for x in self._motion]
+        theta = evaluate(self._program, *motion, np.repeat(geometries.T, samples, axis=1))
+        theta = theta * self._rows[:, None, None] * self.units[:, None]
+        theta = theta.reshape(*theta.shape[:2], cases, samples)
+        return theta.transpose(2, 0, 3, 1).reshape(cases, -1, len(self.units))
+
+    def _solve(self, W):
+        norms = np.linalg.norm(W, axis=1)
+        live = norms > _NOTHING * norms.max(axis=1, keepdims=True)
+        scale = np.where(live, norms, 1.0)
+        W = np.where(live[:, None], W / scale[:, None], 0.0)
+        W1, W2 = W[..., self.independent], W[..., self.dependent]
+        diagonal = np.diagonal(np.linalg.qr(W1, mode="r"), axis1=1, axis2=2)
+        if np.abs(diagonal).min(initial=1.0) < _FITS:
+            return np.zeros((len(W), len(self.independent), len(self.dependent))), False
+        columns = (self.independent, self.dependent)
+        kappa = np.array([solve_from_earlier(*x, *columns) for x in zip(W1, W2, strict=True)])
+        left = np.linalg.norm(W2 - W1 @ kappa, axis=1).max(initial=0.0)
+        kappa = np.where(np.abs(kappa) > _FITS, kappa, 0.0)
+        kappa = kappa * scale[:, None, self.dependent] / scale[:, self.independent, None]
+        return kappa, bool(left < _FITS)
+
+
+def _program_of_geometry(model: Model, geometry: np.ndarray) -> Program:
+    n = model.robot.joints
+    varying = np.zeros(len(geometry), object)
+    varying[geometry != 0.0] = FREE
+
+    def columns(q, qd, qdd, x):
+        robot = model.robot.replace(offset=x[: 3 * n].reshape(n, 3), gravity=x[3 * n :])
+        return Model(robot, model.terms).columns(q, qd, qdd)
+
+    return trace(columns, (n,), (n,), (n,), varying)
+
+
+def draws(
+    regrouping: Regrouping, lengths: tuple[Length, ...], cases: int, rng: np.random.Generator
+) -> Float[np.ndarray, "cases lengths"]:
+    """Return random values of lengths, all of the robot's size, so that small ones have effect."""
+    units = np.array([math.copysign(regrouping.unit(x), x.value) for x in lengths])
+    return rng.uniform(0.5, 1.5, (cases, len(lengths))) * units
+
+
+def changing_lengths(robot: Robot, regrouping: Regrouping) -> tuple[Length, ...]:
+    """Return the lengths that can vary without changing which columns are independent.
+
+    Where single ones cannot, the geometry has a coincidence, such as two equal lengths that make
+    axes meet: then those of one offset, equal ones, or all of them vary together. Lengths that
+    cannot vary at all get no name.
+    """
+    rng = np.random.default_rng(2)
+    single = named_lengths(robot, regrouping)
+
+    def possible(lengths: tuple[Length, ...]) -> bool:
+        return regrouping(regrouping.place(lengths, draws(regrouping, lengths, 2, rng)))[1]
+
+    if possible(single):
+        return single
+    free: tuple[Length, ...] = ()
+    rigid: list[Length] = []
+    for length in single:
+        if possible((*free, length)):
+            free += (length,)
+        elif not length.dimension.second:
+            rigid.append(length)
+    for tie in (_by_offset, _by_magnitude, _all_of_them):
+        for together in tie(rigid):
+            if len(together) > 1 and possible((*free, _tied(together, robot))):
+                free += (_tied(together, robot),)
+                rigid = [x for x in rigid if x not in together]
+    return tuple(sorted(free, key=lambda x: x.entries))
+
+
+def named_lengths(robot: Robot, regrouping: Regrouping) -> tuple[Length, ...]:
+    """Return every component of an offset that is not zero, and gravity."""
+    n = robot.joints
+    lengths = []
+    for entry in np.flatnonzero(regrouping.geometry[: 3 * n]):
+        body, axis = divmod(int(entry), 3)
+        value = float(regrouping.geometry[entry])
+        name = offset_name(robot, body) + AXES[axis]
+        lengths.append(Length(name, value, ((int(entry), 1.0),), Dimension(0, 1, 0)))
+    if regrouping.gravity > 0.0:
+        direction = regrouping.geometry[3 * n :] / regrouping.gravity
+        entries = tuple((3 * n + k, float(x)) for k, x in enumerate(direction) if x)
+        lengths.append(Length("g", regrouping.gravity, entries, Dimension(0, 1, -2)))
+    return tuple(lengths)
+
+
+def offset_name(robot: Robot, body: int) -> str:
+    """Return the name of the offset of a body: `l3`, or `l3_5` if body 3 has several children."""
+    parent = robot.parent[body]
+    alone = robot.parent.count(parent) == 1
+    return f"l{parent + 1}" if alone else f"l{parent + 1}_{body + 1}"
+
+
+def _by_offset(lengths: list[Length]) -> Iterator[tuple[Length, ...]]:
+    yield from _groups(lengths, lambda x: x.entries[0][0] // 3)
+
+
+def _by_magnitude(lengths: list[Length]) -> Iterator[tuple[Length, ...]]:
+    yield from _groups(lengths, lambda x: f"{abs(x.value):.9e}")
+
+
+def _all_of_them(lengths: list[Length]) -> Iterator[tuple[Length, ...]]:
+    yield tuple(lengths)
+
+
+def _groups(lengths: list[Length], key: Callable) -> Iterator[tuple[Length, ...]]:
+    for _, members in itertools.groupby(sorted(lengths, key=key), key):
+        yield tuple(members)
+
+
+def _tied(lengths: tuple[Length, ...], robot: Robot) -> Length:
+    """Return several lengths that vary together: a whole offset, or multiples of the first."""
+    values = np.array([x.value for x in lengths])
+    bodies = {x.entries[0][0] // 3 for x in lengths}
+    whole = len(bodies) == 1
+    name = offset_name(robot, bodies.pop()) if whole else lengths[0].name
+    if whole and len(lengths) == 2:
+        name += "".join(x.name[-1] for x in lengths)
+    value = float(np.linalg.norm(values)) if whole else lengths[0].value
+    entries = tuple(
+        (x.entries[0][0], float(v / value)) for x, v in zip(lengths, values, strict=True)
+    )
+    return Length(name, value, entries, Dimension(0, 1, 0))

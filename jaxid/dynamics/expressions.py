@@ -1,7 +1,7 @@
-"""Base parameters in letters: `mx2 + l2x*m3 - l2x*mz4/l3z` (Eq. 24).
+"""Expressions of base parameters in letters, `mx2 + l2x*m3 - l2x*mz4/l3z`, and units (Eq. 24).
 
 An expression is a sum of standard parameters; the coefficient of each is a short sum of products of
-lengths. What has no short form is a number.
+lengths, or a number where there is no short form.
 """
 
 import math
@@ -9,6 +9,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
 
 Number = Fraction | float
 Powers = tuple[tuple[str, int], ...]
@@ -16,25 +19,29 @@ Powers = tuple[tuple[str, int], ...]
 
 @dataclass(frozen=True)
 class Monomial:
-    """A number times powers of lengths, such as `2*l2x/l3z`."""
+    """A number times powers of lengths, such as `2*l2x/l3z`.
+
+    Attributes:
+        number: Number.
+        powers: Names of the lengths and their exponents, which are not zero.
+    """
 
     number: Number
     powers: Powers = ()
-    """Names of the lengths and their exponents, which are not zero."""
 
     def evaluate(self, lengths: Mapping[str, float]) -> float:
-        """The value for given lengths [m]."""
+        """Return the value for given lengths [m]."""
         return float(self.number) * math.prod(lengths[name] ** e for name, e in self.powers)
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A sum of monomials: what one standard parameter is multiplied with."""
+    """A sum of monomials: the factor of one standard parameter."""
 
     monomials: tuple[Monomial, ...]
 
     def evaluate(self, lengths: Mapping[str, float]) -> float:
-        """The value for given lengths [m]."""
+        """Return the value for given lengths [m]."""
         return sum(m.evaluate(lengths) for m in self.monomials)
 
     @property
@@ -43,7 +50,7 @@ class Coefficient:
         return tuple(dict.fromkeys(name for m in self.monomials for name, _ in m.powers))
 
     def factored(self) -> tuple[bool, Monomial, tuple[Monomial, ...]]:
-        """Whether it is negative, its common factor, and the sum that is left (one monomial: 1)."""
+        """Return whether it is negative, its common factor, and the remaining sum."""
         numbers = [m.number for m in self.monomials]
         common = Fraction(1)
         if all(isinstance(x, Fraction) for x in numbers):
@@ -67,16 +74,13 @@ class Coefficient:
         return negative, Monomial(common, tuple((s, e) for s, e in least.items() if e)), rest
 
 
-ONE = Coefficient((Monomial(Fraction(1)),))
-
-
 @dataclass(frozen=True)
 class Expression:
     """A base parameter as a combination of standard parameters; `str` makes it readable.
 
     Attributes:
-        terms: Standard parameters, in the order of their columns, and their coefficients. The
-            first one leads the base parameter and has the coefficient 1.
+        terms: Standard parameters in the order of their columns, with their coefficients. The first
+            one leads the base parameter and has the coefficient 1.
     """
 
     terms: tuple[tuple[str, Coefficient], ...]
@@ -87,19 +91,19 @@ class Expression:
         return tuple(dict.fromkeys(s for _, c in self.terms for s in c.symbols))
 
     def evaluate(self, lengths: Mapping[str, float]) -> dict[str, float]:
-        """The coefficient of each standard parameter for given lengths [m]."""
+        """Return the coefficient of each standard parameter for given lengths [m]."""
         return {name: c.evaluate(lengths) for name, c in self.terms}
 
     def __str__(self):
         return _written(self, _Plain())
 
     def latex(self) -> str:
-        r"""The expression for a formula, such as `m_{1} - \frac{1}{l_{3z}}\, mz_{4}`."""
+        r"""Return the expression as LaTeX, such as `m_{1} - \frac{1}{l_{3z}}\, mz_{4}`."""
         return _written(self, _Latex())
 
 
 class _Plain:
-    """How the pieces are put down in plain text."""
+    """Notation of expressions in plain text."""
 
     def name(self, name: str) -> str:
         return name
@@ -122,7 +126,7 @@ class _Plain:
 
 
 class _Latex(_Plain):
-    """How the pieces are put down in LaTeX."""
+    """Notation of expressions in LaTeX."""
 
     def name(self, name: str) -> str:
         moment = re.fullmatch(r"m([xyz])(\d+)", name)
@@ -152,7 +156,7 @@ class _Latex(_Plain):
 
 
 def _factors(monomial: Monomial, style: _Plain) -> tuple[list[str], list[str]]:
-    """What stands above and below the fraction bar; the number must not be negative."""
+    """Return numerator and denominator; the number must not be negative."""
     above, below = [], []
     if isinstance(monomial.number, Fraction):
         above += [str(monomial.number.numerator)] if monomial.number.numerator != 1 else []
@@ -174,7 +178,7 @@ def _sum(parts: list[tuple[bool, str]]) -> str:
 
 
 def _written(expression: Expression, style: _Plain) -> str:
-    # Parameters that share a factor stand in one bracket, where the first of them would stand.
+    # Parameters that share a factor are put in one bracket, at the place of the first of them.
     groups: dict[tuple, tuple[Monomial, tuple[Monomial, ...], list[tuple[bool, str]]]] = {}
     for name, coefficient in expression.terms:
         negative, factor, rest = coefficient.factored()
@@ -187,7 +191,7 @@ def _written(expression: Expression, style: _Plain) -> str:
 def _part(
     factor: Monomial, rest: tuple[Monomial, ...], members: list[tuple[bool, str]], style: _Plain
 ) -> tuple[bool, str]:
-    """Whether a group of parameters with one factor stands with a minus, and its text."""
+    """Return whether a group of parameters with one factor is negative, and its text."""
     negative = members[0][0]
     names = _sum([(sign != negative, name) for sign, name in members])
     above, below = _factors(factor, style)
@@ -198,3 +202,43 @@ def _part(
     return negative, style.product(
         above, below, style.bracket(names) if len(members) > 1 else names
     )
+
+
+class Dimension(NamedTuple):
+    """Exponents of kilogram, metre and second in a unit."""
+
+    kilogram: int
+    metre: int
+    second: int
+
+
+_KNOWN = {
+    "1": Dimension(0, 0, 0),
+    "rad": Dimension(0, 0, 0),
+    "kg": Dimension(1, 0, 0),
+    "m": Dimension(0, 1, 0),
+    "s": Dimension(0, 0, 1),
+    "N": Dimension(1, 1, -2),
+    "J": Dimension(1, 2, -2),
+    "W": Dimension(1, 2, -3),
+}
+_SUPERSCRIPTS = {"²": 2, "³": 3, "⁴": 4}
+
+
+def dimension(unit: str) -> Dimension | None:
+    """Return the dimension of a unit such as `N m s/rad`, or None if it is not known."""
+    total = np.zeros(3, int)
+    for position, part in enumerate(unit.split("/")):
+        for factor in part.replace("(", " ").replace(")", " ").split():
+            power = _SUPERSCRIPTS.get(factor[-1], 1)
+            name = factor[:-1] if factor[-1] in _SUPERSCRIPTS else factor
+            if name not in _KNOWN:
+                return None
+            total += (power if position == 0 else -power) * np.array(_KNOWN[name])
+    return Dimension(*(int(x) for x in total))
+
+
+def length_power(unit: str) -> int:
+    """Return the power of length in a unit: 2 in kg m² and in N m; 0 if it is not known."""
+    found = dimension(unit)
+    return 0 if found is None else found.metre

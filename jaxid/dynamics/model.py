@@ -1,4 +1,4 @@
-"""A model: a robot and the terms of its equations of motion, linear in the parameters."""
+"""Model: a robot and the terms of its equations of motion, linear in the parameters."""
 
 from collections.abc import Sequence
 from functools import reduce
@@ -10,10 +10,9 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, as_array, namespace
 from jaxid.dynamics import projection
-from jaxid.dynamics.machine import on_samples
+from jaxid.dynamics.dispatch import on_samples, solve_symmetric
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.packed import PackedRegressor
-from jaxid.dynamics.solve import solve_symmetric
+from jaxid.dynamics.regressor import PackedRegressor
 from jaxid.dynamics.terms import (
     AbstractTerm,
     CoulombFriction,
@@ -40,8 +39,8 @@ class Model(Hashable):
     `jax.jit(model.regressor)` rather than pass the model to what is compiled.
 
     Attributes:
-        robot: What is known.
-        terms: What is linear in unknown parameters.
+        robot: Known geometry, limits and drives.
+        terms: Effects that are linear in unknown parameters.
     """
 
     robot: Robot
@@ -78,7 +77,7 @@ class Model(Hashable):
         return len(self.parameters)
 
     def split(self, p: Float[AnyArray, " standard"]) -> list[Float[AnyArray, " columns"]]:
-        """The parameters of each term.
+        """Return the parameters of each term.
 
         Raises:
             InputError: If there is not one number for each standard parameter.
@@ -93,34 +92,34 @@ class Model(Hashable):
         return [p[e - s : e] for s, e in zip(sizes, ends, strict=True)]
 
     def columns(self, q, qd, qdd) -> Float[AnyArray, "joints standard"]:
-        r"""The regressor $\Theta$ of one sample, as it is defined (Eqs. 16, 18)."""
+        r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
         return jnp.concatenate([t.columns(self.robot, q, qd, qdd) for t in self.terms], axis=1)
 
     def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
-        """The generalized forces of one sample, as they are defined (Eqs. 11, 15)."""
+        """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
         parts = zip(self.terms, self.split(p), strict=True)
         return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in parts))
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
-        """The mass matrix of one sample, as it is defined (Eq. 38)."""
+        """Return the mass matrix of one sample by definition (Eq. 38)."""
         parts = zip(self.terms, self.split(p), strict=True)
         return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in parts))
 
     def bias(self, p, q, qd) -> Float[AnyArray, " joints"]:
-        """The bias forces of one sample, as they are defined (Eq. 38)."""
+        """Return the bias forces of one sample by definition (Eq. 38)."""
         return self.forces(p, q, qd, jnp.zeros_like(q))
 
     def acceleration(self, p, q, qd, forces) -> Float[AnyArray, " joints"]:
-        """The accelerations of one sample that forces cause (Eq. 38)."""
+        """Return the accelerations of one sample that forces cause (Eq. 38)."""
         return solve_symmetric(self.inertia(p, q), forces - self.bias(p, q, qd))
 
     def potential(self, p, q) -> Float[AnyArray, ""]:
-        """The potential energy of one sample, as it is defined."""
+        """Return the potential energy of one sample by definition."""
         parts = zip(self.terms, self.split(p), strict=True)
         return reduce(add, (t.potential_columns(self.robot, q) @ x for t, x in parts))
 
     def known_forces(self, q, qd, qdd) -> Float[AnyArray, " joints"]:
-        """The generalized forces of the known tool at one sample [N m or N]."""
+        """Return the generalised forces of the known tool at one sample [N m or N]."""
         tool = self.robot.tool
         if tool is None:
             return jnp.zeros_like(q)
@@ -130,7 +129,7 @@ class Model(Hashable):
         return projection.rigid_body_forces(self.robot, p, q, qd, qdd)
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
-        r"""The regressor $\Theta(q, \dot q, \ddot q)$ (Eqs. 16, 18).
+        r"""Return the regressor $\Theta(q, \dot q, \ddot q)$ (Eqs. 16, 18).
 
         Args:
             motion: Joint motion at any number of instants.
@@ -139,9 +138,9 @@ class Model(Hashable):
         return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
-        r"""The stacked regressor $\bar\Theta$ of many samples without its zeros (Eq. 26).
+        r"""Return the stacked regressor $\bar\Theta$ of many samples without its zeros (Eq. 26).
 
-        Several times as fast as `regressor`, whose dense matrix costs more than what is in it.
+        Several times as fast as `regressor`, whose dense matrix costs more than its entries.
 
         Args:
             motion: Joint motion [samples, joints].
@@ -151,10 +150,10 @@ class Model(Hashable):
                 robot's geometry.
         """
         self.check(motion.q)
-        return PackedRegressor.of(self, self.columns, motion)
+        return PackedRegressor(self, self.columns, motion)
 
     def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
-        r"""The generalized forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
+        r"""Return the generalised forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
             p: Standard parameters.
@@ -164,7 +163,7 @@ class Model(Hashable):
         return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
 
     def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
-        r"""The mass matrix $M(q)$, rotors included (Eq. 38).
+        r"""Return the mass matrix $M(q)$, rotors included (Eq. 38).
 
         Args:
             p: Standard parameters.
@@ -178,7 +177,7 @@ class Model(Hashable):
         q: Coordinates,
         qd: Coordinates,
     ) -> Float[AnyArray, "*batch joints"]:
-        r"""The forces $h(q, \dot q)$ that are left without accelerations [N m or N] (Eq. 38).
+        r"""Return the forces $h(q, \dot q)$ at zero acceleration [N m or N] (Eq. 38).
 
         Args:
             p: Standard parameters.
@@ -190,13 +189,13 @@ class Model(Hashable):
     def forward_dynamics(
         self, p: Parameters, q: Coordinates, qd: Coordinates, forces: Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
-        r"""The accelerations $M^{-1} (Q_m - h)$ that forces cause, the other way round (Eq. 38).
+        r"""Return the accelerations $M^{-1} (Q_m - h)$ that forces cause (Eq. 38).
 
         Args:
-            p: Standard parameters, of bodies that could exist.
+            p: Standard parameters of bodies that can exist.
             q: Joint coordinates [rad or m].
             qd: Joint velocities [rad/s or m/s].
-            forces: Generalized forces of the drives [N m or N].
+            forces: Generalised forces of the drives [N m or N].
         """
         samples = (self.check(x) for x in (q, qd, forces))
         return on_samples(self, self.acceleration, *samples, shared=(p,))
@@ -207,29 +206,29 @@ class Model(Hashable):
         q: Coordinates,
         qd: Coordinates,
     ) -> Float[AnyArray, "*batch"]:
-        r"""The kinetic energy $\frac12 \dot q^T M \dot q$ [J]."""
+        r"""Return the kinetic energy $\frac12 \dot q^T M \dot q$ [J]."""
         M, qd = self.mass_matrix(p, q), self.check(qd)
         return 0.5 * jnp.einsum("...i,...ij,...j->...", qd, M, qd)
 
     def potential_energy(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch"]:
-        """The potential energy of gravity and springs [J], zero at the ground's origin."""
+        """Return the potential energy of gravity and springs [J], zero at the ground's origin."""
         return on_samples(self, self.potential, self.check(q), shared=(p,))
 
     def tool_forces(self, motion: Motion) -> Float[AnyArray, "*batch joints"]:
-        """What the known tool adds to the measured forces [N m or N]; zero without a tool."""
+        """Return the forces of the known tool [N m or N]; zero without a tool."""
         self.check(motion.q)
         return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
 
     def check(self, q: Coordinates) -> Float[AnyArray, "*batch joints"]:
-        """Coordinates as an array; refuses those that are not of the robot's joints.
+        """Return coordinates as an array with one number for each joint along the last axis.
 
         Raises:
-            InputError: If the last axis is not one for each joint.
+            InputError: If the last axis has another length.
         """
         q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
             raise InputError(
-                f"the motion must have one coordinate for each joint ({self.robot.joints}) along "
+                f"`motion` must have one coordinate for each joint ({self.robot.joints}) along "
                 f"its last axis, but has shape {q.shape}."
             )
         return q

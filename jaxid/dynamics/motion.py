@@ -1,4 +1,4 @@
-"""The currency between the rooms: joint angles, velocities and accelerations, always together."""
+"""Joint motion: coordinates, velocities and accelerations."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ class Motion(eqx.Module):
     qdd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
 
     def __getitem__(self, index) -> "Motion":
-        """The motion at some of its instants: indexes the leading axis."""
+        """Return the motion at some of its instants, by an index of the leading axis."""
         return Motion(self.q[index], self.qd[index], self.qdd[index])
 
     @property

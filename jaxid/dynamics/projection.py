@@ -26,7 +26,7 @@ def body_motions(
     qd: Float[AnyArray, " joints"],
     qdd: Float[AnyArray, " joints"],
 ) -> list[tuple[Vector, Vector, Vector]]:
-    r"""Motion of every body in its own frame: $(a, \omega, \dot\omega)$ (Eqs. 6, 8).
+    r"""Return the motion of every body in its own frame: $(a, \omega, \dot\omega)$ (Eqs. 6, 8).
 
     Args:
         robot: The kinematic tree.
@@ -60,7 +60,7 @@ def partial_velocities(
     qd: Float[AnyArray, " joints"],
     qdd: Float[AnyArray, " joints"],
 ):
-    r"""The map $\ddot q \to (a, \dot\omega)$ of every body; its slope is $F_{o,i}$ (Eqs. 5, 7)."""
+    r"""Return the map $\ddot q \to (a, \dot\omega)$, whose slope is $F_{o,i}$ (Eqs. 5, 7)."""
 
     def accelerations(x):
         return [jnp.concatenate([a, wd]) for a, _, wd in body_motions(robot, q, qd, x)]
@@ -69,14 +69,14 @@ def partial_velocities(
 
 
 def momentum_matrix(w: Vector) -> Float[AnyArray, "3 6"]:
-    r"""The matrix $[\Omega\;|\;-\hat\Omega]$ that makes $J^o\omega$ of $(A, ..., F)$ (Eq. 9)."""
+    r"""Return $[\Omega\;|\;-\hat\Omega]$, which maps $(A, ..., F)$ to $J^o\omega$ (Eq. 9)."""
     x, y, z = w[0], w[1], w[2]
     o = 0.0 * x
     return jnp.array([[x, o, o, o, -z, -y], [o, y, o, -z, o, -x], [o, o, z, -y, -x, o]])
 
 
 def body_regressor(a: Vector, w: Vector, wd: Vector) -> Float[AnyArray, "6 10"]:
-    r"""The regressor $\bar\Theta_i$ of one free body (Eq. 10).
+    r"""Return the regressor $\bar\Theta_i$ of one free body (Eq. 10).
 
     Multiplied with the body's parameters $p_i = (m, m r_c, A, B, C, D, E, F)$ it gives the force
     [N] and the moment [N m] that the motion asks for at the body's origin, in the body's frame.
@@ -97,7 +97,7 @@ def rigid_body_regressor(
     qd: Float[AnyArray, " joints"],
     qdd: Float[AnyArray, " joints"],
 ) -> Float[AnyArray, "joints joints 10"]:
-    r"""$\Theta_i = F_{o,i}^T \bar\Theta_i$ of every body, side by side (Eq. 11).
+    r"""Return $\Theta_i = F_{o,i}^T \bar\Theta_i$ of every body (Eq. 11).
 
     Returns:
         For each joint (first axis) the columns of each body (second axis).
@@ -114,7 +114,7 @@ def rigid_body_forces(
     qd: Float[AnyArray, " joints"],
     qdd: Float[AnyArray, " joints"],
 ) -> Float[AnyArray, " joints"]:
-    r"""The generalized forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
+    r"""Return the generalised forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
 
     The projection is the transpose of the map that gives the accelerations: it is applied, and the
     Jacobian is never built.
@@ -128,9 +128,9 @@ def rigid_body_forces(
 def rigid_body_mass_matrix(
     robot: Robot, p: Float[AnyArray, "joints 10"], q: Float[AnyArray, " joints"]
 ) -> Float[AnyArray, "joints joints"]:
-    r"""The mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38) by composite bodies.
+    r"""Return the mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38) by composite bodies.
 
-    What hangs on a joint moves as one body when that joint alone moves. Mass, first moment and
+    All bodies beyond a joint move as one when that joint alone moves. Mass, first moment and
     inertia of these composite bodies are summed from the tips to the ground; the wrench that one
     of them needs for a unit acceleration of its joint is carried to the ground and felt by every
     joint on the way.
@@ -168,7 +168,7 @@ def rigid_body_mass_matrix(
 def potential_energy_columns(
     robot: Robot, q: Float[AnyArray, " joints"]
 ) -> Float[AnyArray, "joints 10"]:
-    r"""Potential energy of unit parameters: $-g^T (m r_o + R m r_c)$ [J], zero at the ground."""
+    r"""Return the potential energy $-g^T (m r_o + R m r_c)$ of unit parameters [J]."""
     rotations, origins = placements(robot, q)
     mass = -origins @ robot.gravity
     moment = -jnp.einsum("bij,i->bj", rotations, jnp.asarray(robot.gravity))

@@ -1,10 +1,11 @@
-"""Which columns of a matrix depend on those before them (Eqs. 20-22).
+"""Rank of the regressor: columns that depend on those before them (Eqs. 20-22).
 
-Two independent ways to the same answer: Gram-Schmidt in column order, which is a QR decomposition
+Two independent methods: Gram-Schmidt in column order, which is a QR decomposition
 whose dependent columns use up no direction, and the singular values of the whole matrix. Column
-order decides what is chosen, so that the choice is the same for every sample of motions.
+order decides which columns are independent, so that the choice is the same for all motions.
 """
 
+import math
 from abc import abstractmethod
 
 import equinox as eqx
@@ -12,17 +13,21 @@ import numpy as np
 import scipy.linalg
 
 from jaxid.arrays import AnyArray, Float, Int
+from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.expressions import length_power
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.motion import Motion
 
 ROUNDING = 1e-12
-"""A column below this share of the largest one is nothing but rounding."""
+"""Fraction of the largest column below which a column is nothing but rounding."""
 
 
 class Dependence(eqx.Module):
-    """Which columns are independent, and how clearly.
+    """Independent and dependent columns of a matrix, and how clear the distinction is.
 
     Attributes:
         independent: Columns that no earlier ones can replace, in order.
-        dependent: The others, in order.
+        dependent: Other columns, in order.
         smallest_independent: Smallest measure of independence among the first.
         largest_dependent: Largest measure among the second.
     """
@@ -34,16 +39,16 @@ class Dependence(eqx.Module):
 
     @property
     def gap(self) -> float:
-        """How many times the smallest independent measure exceeds the largest dependent one."""
+        """Ratio of the smallest independent measure to the largest dependent one."""
         return self.smallest_independent / max(self.largest_dependent, np.finfo(float).tiny)
 
 
 class AbstractRankMethod(eqx.Module):
-    """A way to decide which columns depend on earlier ones."""
+    """Method to decide which columns depend on earlier ones."""
 
     @abstractmethod
     def __call__(self, W: Float[AnyArray, "rows columns"]) -> Dependence:
-        """Decides it for a matrix whose columns are of comparable size or zero."""
+        """Decide for a matrix whose columns are of comparable size or zero."""
 
 
 class GramSchmidt(AbstractRankMethod):
@@ -54,13 +59,13 @@ class GramSchmidt(AbstractRankMethod):
     apart: an elbow offset of a micrometre.
 
     Attributes:
-        tolerance: A column is dependent if less than this share of it is new.
+        tolerance: Fraction of a column, from 0 to 1, below which its new part counts as none.
     """
 
     tolerance: float = 1e-9
 
     def __call__(self, W):
-        """Goes through the columns in order."""
+        """Orthogonalise the columns in order."""
         rows, columns = W.shape
         W = np.asarray(W, np.float64)
         norms = np.linalg.norm(W, axis=0)
@@ -96,15 +101,15 @@ class SingularValues(AbstractRankMethod):
     QR decomposition with its columns reversed.
 
     Attributes:
-        tolerance: Singular values above this share of the largest are never zero.
-        rounding: Those below this share always are.
+        tolerance: Fraction of the largest singular value above which none counts as zero.
+        rounding: Fraction of the largest singular value below which all count as zero.
     """
 
     tolerance: float = 1e-6
     rounding: float = 1e-14
 
     def __call__(self, W):
-        """Finds rank, null space, and where its vectors end."""
+        """Find the rank, the null space, and the columns in which its vectors end."""
         W = np.asarray(W, np.float64)
         columns = W.shape[1]
         norms = np.linalg.norm(W, axis=0)
@@ -134,19 +139,23 @@ class SingularValues(AbstractRankMethod):
             dependent.append(k)
             Q = np.linalg.qr(pivot[:, None], mode="complete").Q
             null = (Q.T @ null)[1:]
-        chosen = tuple(sorted(dependent))
-        independent = tuple(k for k in range(columns) if k not in set(chosen))
+        independent = tuple(k for k in range(columns) if k not in set(dependent))
         small = s[rank] if rank < columns else 0.0
-        return Dependence(independent, chosen, float(s[rank - 1]) if rank else np.inf, float(small))
+        return Dependence(
+            independent,
+            tuple(sorted(dependent)),
+            float(s[rank - 1]) if rank else np.inf,
+            float(small),
+        )
 
 
 def regrouping(
     W: Float[AnyArray, "rows columns"], dependence: Dependence
 ) -> tuple[Float[AnyArray, "base dependent"], float]:
-    r"""The matrix $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and what it leaves (Eq. 22).
+    r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and its error (Eq. 22).
 
     Returns:
-        $\kappa$, and the largest share of a dependent column that it does not explain.
+        $\kappa$, and the largest fraction of a dependent column that it does not explain.
     """
     W = np.asarray(W, np.float64)
     norms = np.linalg.norm(W, axis=0)
@@ -167,13 +176,13 @@ def solve_from_earlier(
     first: Int[np.ndarray, " base"],
     second: Int[np.ndarray, " dependent"],
 ) -> Float[np.ndarray, "base dependent"]:
-    """The combinations of independent columns closest to dependent ones, of earlier ones only.
+    """Return the combinations of earlier independent columns that are closest to dependent ones.
 
     Args:
         W1: Independent columns.
         W2: Dependent columns.
-        first: Where the independent columns stand, in ascending order.
-        second: Where the dependent columns stand.
+        first: Places of the independent columns, in ascending order.
+        second: Places of the dependent columns.
     """
     if not first.size:
         return np.zeros((0, len(second)))
@@ -183,3 +192,51 @@ def solve_from_earlier(
     # One step of refinement takes out most of the rounding that poor conditioning amplifies.
     left = np.where(earlier, Q.T @ (W2 - W1 @ kappa), 0.0)
     return kappa + scipy.linalg.solve_triangular(R, left)
+
+
+def random_regressor(
+    model: Model, seed: int
+) -> tuple[Float[np.ndarray, "rows standard"], Float[np.ndarray, " standard"]]:
+    r"""Return the regressor at random motions, stacked and free of units: $\Theta_{QR}$ (Eq. 20).
+
+    Lengths are measured in the robot's own size, so that metres or millimetres make no difference.
+    It is computed in float64, whatever the precision in which JAX runs.
+
+    Returns:
+        The matrix, and for each parameter the factor by which its column was multiplied.
+    """
+    samples = max(25, math.ceil(3.0 * model.size / model.robot.joints))
+    motion = random_motion(model, samples, seed)
+    theta = in_numpy(model, model.columns, motion.q, motion.qd, motion.qdd)
+    rows, columns = row_units(model), column_units(model)
+    return (theta * rows[:, None] * columns).reshape(-1, model.size), columns
+
+
+def random_motion(model: Model, samples: int, seed: int) -> Motion:
+    """Return uniformly random coordinates, velocities and accelerations.
+
+    Every second sample is slow, by a random factor down to 1e-3: some friction is visible only
+    there.
+    """
+    rng = np.random.default_rng(seed)
+    shape = (samples, model.robot.joints)
+    q, qd, qdd = (rng.uniform(-s, s, shape) * row_units(model) for s in (3.0, 3.0, 6.0))
+    qd[1::2] *= 1e-3 ** rng.uniform(0.0, 1.0, qd[1::2].shape)
+    return Motion(q, qd, qdd)
+
+
+def row_units(model: Model) -> Float[np.ndarray, " joints"]:
+    """Return the unit of each joint's coordinate: 1 rad, or the size of the robot [m]."""
+    return np.where(np.array(model.robot.revolute), 1.0, characteristic_length(model))
+
+
+def column_units(model: Model) -> Float[np.ndarray, " standard"]:
+    """Return the unit of each parameter: the robot's size to the power of length in its unit."""
+    size = characteristic_length(model)
+    return np.array([size ** length_power(unit) for unit in model.parameter_units])
+
+
+def characteristic_length(model: Model) -> float:
+    """Return the size of the robot: the largest distance between neighbouring joints [m], or 1."""
+    distances = np.linalg.norm(np.asarray(model.robot.offset), axis=-1)
+    return float(distances.max()) if distances.any() else 1.0

@@ -1,4 +1,4 @@
-"""Robots from tables of Denavit-Hartenberg parameters, in either convention."""
+"""Robots from tables of Denavit-Hartenberg parameters, modified or standard."""
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from jaxid.robot.plausibility import SNAP_TOLERANCE, angle_notes, check_toleranc
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 
 _X, _, _Z = np.eye(3)
-CONVENTIONS = ("modified", "standard")
 
 
 def from_dh(
@@ -33,7 +32,7 @@ def from_dh(
     source: str = "",
     notes: tuple[str, ...] = (),
 ) -> Robot:
-    r"""Builds a serial robot from one row (alpha, a, d) or (alpha, a, d, theta) for each joint.
+    r"""Build a serial robot from one row (alpha, a, d) or (alpha, a, d, theta) for each joint.
 
     In the **modified** convention (Craig, Khalil) row $i$ holds $\alpha_{i-1}, a_{i-1}, d_i$ and
     $\theta_i$: $T_i = R_x(\alpha) D_x(a) R_z(\theta + q) D_z(d)$. Body $i$ has the frame $i$.
@@ -49,25 +48,25 @@ def from_dh(
     Args:
         rows: Twist alpha [rad], length a [m], offset d [m], and the angle theta [rad] at q = 0.
         convention: `"modified"` or `"standard"`.
-        name: Of the robot.
-        revolute: Whether each joint turns (otherwise it slides); all turn if None.
-        joint_names: `joint1`, `joint2`, … if None.
+        name: Name of the robot.
+        revolute: For each joint whether it turns or slides; all turn if None.
+        joint_names: Names of the joints; `joint1`, `joint2`, … if None.
         base_rotation: Attitude of the table's base frame on the ground; upright if None.
         base_position: Origin of that frame on the ground [m].
         tip_rotation: Attitude of the end-effector in the last frame of the table.
         tip_offset: Origin of the end-effector in the last frame of the table [m].
-        gravity: In the frame of the ground [m/s²].
-        limits: Infinite if None.
-        drives: Direct drives if None.
-        tool: A known load, in the frame of its body.
+        gravity: Acceleration of gravity in the frame of the ground [m/s²].
+        limits: Joint limits; infinite if None.
+        drives: Motors and gears; direct drives if None.
+        tool: Known load, in the frame of its body.
         snap_tolerance: Angles this close to a multiple of 90 degrees become exact [rad]; 0 is off.
-        source: Where the numbers come from.
-        notes: What was changed or assumed on the way.
+        source: Origin of the numbers.
+        notes: Changes and assumptions that were made, one sentence each.
 
     Raises:
         InputError: If the convention has another name, or the table has the wrong shape.
     """
-    if convention not in CONVENTIONS:
+    if convention not in ("modified", "standard"):
         raise InputError(
             f'`convention` must be "modified" or "standard", but is "{convention}": the modified '
             "one lists alpha and a of the link before the joint, the standard one of the link "

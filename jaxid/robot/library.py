@@ -1,7 +1,7 @@
-"""Robots whose geometry is published, ready to use: `jid.robots.tx90l_on_rail()` and others.
+"""Library of robots whose geometry is published: `jid.robots.tx90l_on_rail()` and others.
 
-Each says in `source` where its numbers come from; in `limits.assumed` and `notes`, which of them
-nobody published. What is not listed is infinite (limits) or direct (drives).
+`source` holds the origin of their numbers, `limits.assumed` and `notes` those that nobody
+published. Limits that are not listed are infinite, drives are direct.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ _X, _Y, _Z = np.eye(3)
 
 
 def tx90l_on_rail() -> Robot:
-    """The seven-axes manipulator of the paper: a Stäubli TX90L on a horizontal rail along x.
+    """Return the seven-axis manipulator of the paper: a Stäubli TX90L on a horizontal rail along x.
 
     The bodies' frames are those in which the paper's base parameters come out (Eq. 24): the z axis
     of the bodies 3, 4 and 6 is turned onto their joints' axes, and body 5, the forearm, has its
@@ -74,7 +74,7 @@ def tx90l_on_rail() -> Robot:
 
 
 def tx90l_on_rail_collision() -> CollisionModel:
-    """Capsules of the TX90L on its rail, and the ground: assumed, for nobody published them.
+    """Return capsules of the TX90L on its rail, and the ground; they are assumed.
 
     The shoulder's column moves with the rail; the wrist's capsule has a tool of 0.2 m beyond the
     flange's joint.
@@ -99,7 +99,7 @@ def tx90l_on_rail_collision() -> CollisionModel:
 
 
 def tx40() -> Robot:
-    """The Stäubli TX40, six axes, whose sixth motor turns with the fifth joint.
+    """Return the Stäubli TX40, six axes, whose sixth motor turns with the fifth joint.
 
     Its drives take the encoders' angles and motors' torques as they were recorded. Coordinates are
     those of the published kinematic model, in which the arm lies flat at q = 0: joint 2 counts from
@@ -138,7 +138,7 @@ def tx40() -> Robot:
 
 
 def ur10() -> Robot:
-    """The Universal Robots UR10, six axes."""
+    """Return the Universal Robots UR10, six axes."""
     return from_dh(
         [
             (_HALF, 0.0, 0.1273),
@@ -163,7 +163,7 @@ def ur10() -> Robot:
 
 
 def ur10e() -> Robot:
-    """The Universal Robots UR10e, six axes."""
+    """Return the Universal Robots UR10e, six axes."""
     return from_dh(
         [
             (_HALF, 0.0, 0.1807),
@@ -188,7 +188,7 @@ def ur10e() -> Robot:
 
 
 def panda() -> Robot:
-    """The Franka Emika Panda, seven axes; the end-effector is the flange."""
+    """Return the Franka Emika Panda, seven axes; the end-effector is the flange."""
     return from_dh(
         [
             (0.0, 0.0, 0.333),
@@ -216,7 +216,7 @@ def panda() -> Robot:
 
 
 def iiwa14() -> Robot:
-    """The KUKA LBR iiwa 14 R820, seven axes; frames as in its URDF, all upright at q = 0."""
+    """Return the KUKA LBR iiwa 14 R820, seven axes; frames as in its URDF, all upright at q = 0."""
     reach = np.array([2.9668, 2.0942, 2.9668, 2.0942, 2.9668, 2.0942, 3.0541])
     return Robot(
         "LBR iiwa 14",
@@ -250,7 +250,7 @@ def iiwa14() -> Robot:
 
 
 def kr300() -> Robot:
-    """The KUKA KR300 R2500 ultra, six axes.
+    """Return the KUKA KR300 R2500 ultra, six axes.
 
     Coordinates are the link-side angles of the published recordings, as they stand in the files:
     the angles that its authors add for their kinematic model, (0, -90, 90, 0, 0, 0) degrees, are in
@@ -294,11 +294,13 @@ def kr300() -> Robot:
 
 
 def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
-    """A textbook arm in a vertical plane: axes along z, gravity along -y, links along x at q = 0.
+    """Return a textbook arm in a vertical plane.
+
+    Axes are along z, gravity along -y, and links along x at q = 0.
 
     Args:
         joints: Number of joints.
-        length: Length of the links [m], one for all or one for each.
+        length: Lengths of the links [m], one for all or one for each.
 
     Raises:
         InputError: If there is no joint, or the lengths do not fit.

@@ -9,8 +9,7 @@ from trees import mixed_tree, random_tree
 from jaxid.dynamics.base import BaseParameters, Identifiability, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.observation import observation_matrix
-from jaxid.dynamics.rank import SingularValues
+from jaxid.dynamics.rank import SingularValues, random_regressor
 from jaxid.dynamics.terms import (
     ConstantOffset,
     CoulombFriction,
@@ -183,7 +182,7 @@ def test_both_methods_agree_with_lapack_on_random_trees(seed):
     found = base_parameters(model, seed=seed)
     assert found.notes == ()
     assert found.indices == base_parameters(model, method=SingularValues()).indices
-    W, _ = observation_matrix(model, seed + 100)
+    W, _ = random_regressor(model, seed + 100)
     norms = np.linalg.norm(W, axis=0)
     live = norms > 1e-12 * norms.max()
     assert np.linalg.matrix_rank(W[:, live] / norms[live], tol=1e-9) == found.size

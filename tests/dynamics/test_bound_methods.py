@@ -8,8 +8,7 @@ import pytest
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.terms import LinearSpring
-from jaxid.dynamics.transitions import Tanh
+from jaxid.dynamics.terms import LinearSpring, Tanh
 from jaxid.robot.drives import Drives
 from jaxid.robot.library import planar_arm
 from jaxid.trajectory.fourier import random_fourier_series

@@ -7,8 +7,14 @@ import pytest
 from trees import mixed_tree, random_tree
 
 from jaxid.dynamics.base import BaseParameters, base_parameters
-from jaxid.dynamics.dimensions import Dimension, dimension, length_power
-from jaxid.dynamics.expressions import Coefficient, Expression, Monomial
+from jaxid.dynamics.expressions import (
+    Coefficient,
+    Dimension,
+    Expression,
+    Monomial,
+    dimension,
+    length_power,
+)
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import (
     AsymmetricCoulombFriction,

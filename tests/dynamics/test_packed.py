@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.dynamics.machine import FEW
+from jaxid.dynamics.dispatch import FEW
 
 TERMS = (jid.RigidBodies(), jid.ViscousFriction(), jid.ConstantOffset(), jid.RotorInertia())
 

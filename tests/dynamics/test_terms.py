@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 import trees
 
-from jaxid.dynamics import friction, terms
+from jaxid.dynamics import terms
 from jaxid.dynamics.base import base_parameters
-from jaxid.dynamics.friction import (
-    AsymmetricViscousFriction,
-    LoadFriction,
-    StribeckFriction,
-    TemperatureScaled,
-)
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import (
     AbstractTerm,
     AsymmetricCoulombFriction,
+    AsymmetricViscousFriction,
     ConstantOffset,
     CoulombFriction,
     CoupledDrives,
+    HardSign,
     LinearSpring,
+    LoadFriction,
     RigidBodies,
     RotorInertia,
+    StribeckFriction,
+    Tanh,
+    TemperatureScaled,
     ViscousFriction,
 )
-from jaxid.dynamics.transitions import HardSign, Tanh
+from jaxid.errors import InputError
 from jaxid.robot.drives import Drives
 from jaxid.robot.library import tx40
 
@@ -125,8 +125,7 @@ class TestContract:
 def test_the_contract_covers_every_term():
     members = {
         c
-        for module in (terms, friction)
-        for _, c in inspect.getmembers(module, inspect.isclass)
+        for _, c in inspect.getmembers(terms, inspect.isclass)
         if issubclass(c, AbstractTerm) and not inspect.isabstract(c)
     }
     assert members == {type(t) for t in ALL}, "add the new term to the list `ALL` of this file"
@@ -289,10 +288,10 @@ def test_friction_under_load_is_a_share_of_the_weight(robot):
     weight = RigidBodies().forces(
         robot, jnp.asarray(p), *(jnp.asarray(x) for x in (Q, 0 * Q, 0 * Q))
     )
-    found = np.diag(_columns(LoadFriction.of(robot, p, HardSign()), robot))
+    found = np.diag(_columns(LoadFriction(p, HardSign()), robot))
     np.testing.assert_allclose(found, np.abs(weight) * np.sign(QD), rtol=1e-12)
-    with pytest.raises(ValueError, match="`standard_parameters` must begin with ten"):
-        LoadFriction.of(robot, p[:5])
+    with pytest.raises(InputError, match="`bodies`"):
+        Model(robot, (LoadFriction(p[:5]),))
 
 
 def test_warm_friction_is_smaller(robot):
@@ -303,15 +302,15 @@ def test_warm_friction_is_smaller(robot):
     np.testing.assert_allclose(_columns(warm, robot), np.diag(np.exp(-20 * rates) * QD), rtol=1e-12)
 
 
-def test_every_shape_is_found_in_its_term():
-    """Names are unique, and changing the leaf that a shape names changes the columns."""
+def test_every_nonlinear_parameter_is_found_in_its_term():
+    """Names are unique, and changing the value changes the columns."""
     wrapped = TemperatureScaled(StribeckFriction(), temperature=40.0)
-    assert [s.name for s in wrapped.shapes] == ["eps", "vs", "delta", "rate"]
+    assert [s.name for s in wrapped.nonlinear_parameters] == ["eps", "vs", "delta", "rate"]
     before = np.asarray(wrapped.columns(TREE.robot(), Q, 0.1 * QD, QDD))
-    for shape in wrapped.shapes:
-        other = eqx.tree_at(shape.leaf, wrapped, 1.5 * shape.leaf(wrapped))
+    for shape in wrapped.nonlinear_parameters:
+        other = eqx.tree_at(shape.value, wrapped, 1.5 * shape.value(wrapped))
         assert np.any(np.asarray(other.columns(TREE.robot(), Q, 0.1 * QD, QDD)) != before)
-    assert CoulombFriction(HardSign()).shapes == ViscousFriction().shapes == ()
+    assert CoulombFriction(HardSign()).nonlinear_parameters == ()
 
 
 def test_base_parameters_see_friction_near_standstill():

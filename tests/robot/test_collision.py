@@ -202,34 +202,3 @@ def test_pairs_are_found_where_none_are_named():
     model = CollisionModel(robot, fat)
     assert "link 0 and link 3" not in model.pair_names
     assert any("link 0 and link 3" in note for note in model.notes)
-
-
-ROD = {"start": (0, 0, 0), "end": (1, 0, 0), "radius": 0.1}
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda r: Capsule("a", 0, start=(0, 0), radius=0.1), "three finite numbers"),
-        (lambda r: Capsule("a", 0, start=(0, 0, 0), radius=0.0), "radius of capsule `a`"),
-        (lambda r: Box("b", centre=(0, 0, 0), size=(1, 0, 1)), "edges of box `b`"),
-        (lambda r: HalfSpace("h", normal=(0, 0, 0)), "`h` needs a normal"),
-        (lambda r: CollisionModel(r, [Capsule("a", 7, **ROD)]), "body from 0 to 6"),
-        (
-            lambda r: CollisionModel(r, [Capsule("a", 0, **ROD)] * 2),
-            "two shapes are named `a`",
-        ),
-        (lambda r: CollisionModel(r, [Capsule("a", 0, **ROD)]), "at least one pair"),
-        (
-            lambda r: CollisionModel(r, [Capsule("a", 0, **ROD)], pairs=[("a", "c")]),
-            "`c` is none of the shapes `a`",
-        ),
-        (
-            lambda r: CollisionModel(r, [], [HalfSpace("f"), HalfSpace("g")], pairs=[("f", "g")]),
-            "both obstacles",
-        ),
-    ],
-)
-def test_refuses(make, message):
-    with pytest.raises(ValueError, match=message):
-        make(library.panda())

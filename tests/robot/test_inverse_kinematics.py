@@ -119,18 +119,3 @@ def test_says_what_cannot_be_reached():
     line = np.linspace([0.0, 0.6, 0.6], [0.0, 2.5, 0.6], 60)
     with pytest.raises(ValueError, match=r"pose \d+ of 60, .* out of reach"):
         inverse_kinematics_along(RAIL, line)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "options", "named"),
-    [
-        (([1.0, 0.0],), {}, "position"),
-        (([1.0, 0.0, 0.0], np.eye(2)), {}, "rotations"),
-        (([1.0, 0.0, 0.0], 2 * np.eye(3)), {}, "rotation matrices"),
-        (([1.0, 0.0, 0.0],), {"posture": [0.0]}, "posture"),
-        (([1.0, 0.0, 0.0],), {"starts": 0}, "starts"),
-    ],
-)
-def test_refuses(arguments, options, named):
-    with pytest.raises(ValueError, match=named):
-        inverse_kinematics(RAIL, *arguments, **options)

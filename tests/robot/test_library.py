@@ -194,10 +194,3 @@ def test_planar_arm_is_a_chain_of_angles_in_a_vertical_plane(joints, length):
     expected = [lengths @ np.cos(angles), lengths @ np.sin(angles), 0.0]
     np.testing.assert_allclose(tip_transform(robot, q)[:3, 3], expected, atol=1e-14)
     assert robot.gravity.tolist() == [0.0, -9.81, 0.0]
-
-
-def test_planar_arm_refuses_what_is_no_arm():
-    with pytest.raises(ValueError, match="`joints` must be at least 1, but is 0"):
-        library.planar_arm(0)
-    with pytest.raises(ValueError, match="`length` must be one length or one for each joint"):
-        library.planar_arm(2, (1.0, 2.0, 3.0))

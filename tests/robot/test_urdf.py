@@ -221,8 +221,8 @@ def test_a_rounded_quarter_turn_costs_no_base_parameter(write):
     assert size(rounded, 1e-4) == size(exact, 0.0) == 4
     assert size(rounded, 0.0) > 4
     assert load_urdf(rounded).notes[:2] == (
-        "joint `mount`: roll 1.5708 rad snapped to pi/2 (1.57079632679).",
-        "joint `j2`: roll -1.5708 rad snapped to -pi/2 (-1.57079632679).",
+        "joint `mount`: roll 1.5708 rad snapped to 90 degrees.",
+        "joint `j2`: roll -1.5708 rad snapped to -90 degrees.",
     )
     assert not [n for n in load_urdf(rounded, snap_tolerance=0.0).notes if "snapped" in n]
     assert not [n for n in load_urdf(exact).notes if "snapped" in n]
@@ -316,9 +316,9 @@ def test_parameters_of_a_chain_hold_what_is_fixed_to_it_and_no_more(write):
 
 def test_a_body_without_mass_is_noted_and_counts_as_massless(write):
     path = write(arm())
-    assert load_urdf(path).notes == (
-        "joint `j1`: the file gives what it moves no mass; `urdf_parameters` takes zero.",
-    )
+    (note,) = load_urdf(path).notes
+    assert "`j1`" in note
+    assert "`urdf_parameters`" in note
     assert urdf_parameters(path).tolist() == [0.0] * 10
 
 

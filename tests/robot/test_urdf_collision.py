@@ -129,27 +129,3 @@ def test_a_mesh_is_held_whole(tmp_path):
     (meshes / "tool.stl").rename(meshes / "other.stl")
     with pytest.raises(FileNotFoundError, match=r"line 25: the mesh .* `packages`"):
         fit_capsules(path)
-
-
-@pytest.mark.parametrize(
-    ("tool", "message"),
-    [
-        ('<cone radius="1"/>', "line 25: a collision geometry must be .* `cone`"),
-        ("", "is empty"),
-        ('<sphere radius="big"/>', "`radius` must be 1 finite number, but is 'big'"),
-        ('<box size="1 2"/>', "`size` must be 3 finite numbers"),
-    ],
-)
-def test_errors_name_file_and_line(tmp_path, tool, message):
-    with pytest.raises(ValueError, match=message):
-        fit_capsules(written(tmp_path, tool))
-
-
-def test_a_file_without_geometry_is_refused(tmp_path):
-    path = tmp_path / "bare.urdf"
-    path.write_text(
-        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">'
-        '<parent link="a"/><child link="b"/></joint></robot>'
-    )
-    with pytest.raises(ValueError, match="no collision geometry"):
-        fit_capsules(path)

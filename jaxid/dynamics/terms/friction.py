@@ -1,0 +1,416 @@
+"""Friction terms: viscous, Coulomb, Stribeck, by load, by temperature, of coupled drives."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float, Hashable, matching, one_or_each
+from jaxid.dynamics import projection
+from jaxid.dynamics.terms.term import AbstractTerm, NonlinearParameter, each_joint
+from jaxid.errors import InputError
+from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.robot.robot import Robot
+
+EachJoint = float | Float[AnyArray, "..."]
+"""One number for all joints, or one for each."""
+
+
+class AbstractTransition(Hashable):
+    """Transition of dry friction from one direction of motion to the other."""
+
+    @abstractmethod
+    def __call__(self, qd: Float[AnyArray, " joints"]) -> Float[AnyArray, " joints"]:
+        """Return a number between -1 and 1 for each speed [rad/s or m/s]."""
+
+    @property
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """Parameters that `identify_nonlinear` can identify."""
+        return ()
+
+
+class Tanh(AbstractTransition):
+    r"""The smooth transition $\tanh(\dot q / \epsilon_c)$ (Eq. 14).
+
+    Attributes:
+        epsilon: Speed of the transition, one for all joints or one for each, in the joint's own
+            unit [rad/s or m/s].
+        dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
+    """
+
+    epsilon: EachJoint = eqx.field(converter=one_or_each, default=0.01)
+    dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
+
+    def __check_init__(self):
+        if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
+            raise InputError(
+                f"`epsilon` must be a positive speed, but is {self.epsilon}: "
+                "use `HardSign` for a transition without width."
+            )
+
+    def __call__(self, qd):
+        """Return the smooth sign of the speed."""
+        sign = jnp.tanh(qd / matching("epsilon", self.epsilon, qd))
+        return _outside_dead_zone(self.dead_zone, qd, sign)
+
+    @property
+    def nonlinear_parameters(self):
+        """`eps1`, … [rad/s or m/s]."""
+        return (NonlinearParameter("eps", ("rad/s", "m/s"), ("epsilon",)),)
+
+
+class HardSign(AbstractTransition):
+    """The sign of the speed, which is undefined at standstill: use a dead zone there.
+
+    Attributes:
+        dead_zone: Speed below which there is no force [rad/s or m/s].
+    """
+
+    dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
+
+    def __call__(self, qd):
+        """Return the sign of the speed."""
+        return _outside_dead_zone(self.dead_zone, qd, jnp.sign(qd))
+
+
+class Reversal(AbstractTransition):
+    """Another transition that keeps one direction near standstill, for bounds of forces.
+
+    At a reversal dry friction jumps, at an instant that no grid of samples contains. Between the
+    two sides of this class lies every force on the way, and both change smoothly.
+
+    Attributes:
+        own: Transition elsewhere.
+        side: Direction that is kept near standstill, 1 or -1.
+        width: Speeds up to which it is kept; at twice these it has faded [rad/s or m/s].
+    """
+
+    own: AbstractTransition
+    side: float
+    width: Float[AnyArray, " joints"]
+
+    def __call__(self, qd):
+        """Return the other transition, drawn to the side."""
+        one = jnp.ones_like(qd)
+        near = jnp.minimum(one, jnp.maximum(0 * one, 2 * one - jnp.abs(qd) / self.width))
+        near = near**2 * (3 - 2 * near)
+        value = self.own(qd)
+        return value + near * (self.side - value)
+
+
+def _outside_dead_zone(dead_zone: Any, qd: Any, value: Any) -> Any:
+    if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
+        return value
+    moves = jnp.abs(qd) > matching("dead_zone", dead_zone, qd)
+    return jnp.where(moves, value, jnp.zeros_like(value))
+
+
+class AbstractDryFriction(AbstractTerm):
+    """Friction with a transition from one direction of motion to the other."""
+
+    transition: eqx.AbstractVar[AbstractTransition]
+
+    @property
+    def nonlinear_parameters(self):
+        """Those of the transition."""
+        return tuple(x.inside("transition") for x in self.transition.nonlinear_parameters)
+
+
+class ViscousFriction(AbstractTerm):
+    r"""Friction that grows with speed, $\mathrm{diag}\{\dot q_i\}$ (Eq. 13)."""
+
+    roles = ("viscous",)
+
+    def parameters(self, robot):
+        """Return `fv1`, … [N m s/rad or N s/m]."""
+        return each_joint(robot, "fv", "N m s", "N s/m")
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrix of speeds."""
+        return jnp.diag(qd)
+
+
+class AsymmetricViscousFriction(AbstractTerm):
+    """Friction that grows with speed, at one rate for each direction of motion.
+
+    It takes the place of `ViscousFriction`.
+    """
+
+    roles = ("viscous", "viscous")
+
+    def parameters(self, robot):
+        """Return `fvp1`, … for positive, then `fvn1`, … for negative speeds [N m s or N s/m]."""
+        return (
+            *each_joint(robot, "fvp", "N m s", "N s/m"),
+            *each_joint(robot, "fvn", "N m s", "N s/m"),
+        )
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrices of speeds in either direction."""
+        size = jnp.abs(qd)
+        return jnp.concatenate([jnp.diag(0.5 * (qd + size)), jnp.diag(0.5 * (qd - size))], axis=1)
+
+
+class CoulombFriction(AbstractDryFriction):
+    r"""Dry friction, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14).
+
+    Attributes:
+        transition: Transition from one direction of motion to the other.
+    """
+
+    transition: AbstractTransition = Tanh()
+    roles = ("dry",)
+
+    def parameters(self, robot):
+        """Return `fc1`, … [N m or N]."""
+        return each_joint(robot, "fc", "N m", "N")
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrix of smooth signs."""
+        return jnp.diag(self.transition(qd))
+
+
+class AsymmetricCoulombFriction(AbstractDryFriction):
+    """Dry friction with one level for each direction of motion.
+
+    It takes the place of `CoulombFriction` together with `ConstantOffset`, whose columns its own
+    columns span.
+
+    Attributes:
+        transition: Transition from one direction of motion to the other.
+    """
+
+    transition: AbstractTransition = Tanh()
+    roles = ("dry", "dry")
+
+    def parameters(self, robot):
+        """Return `fcp1`, … for positive, then `fcn1`, … for negative speeds [N m or N]."""
+        return (*each_joint(robot, "fcp", "N m", "N"), *each_joint(robot, "fcn", "N m", "N"))
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the fractions of the two directions."""
+        s = self.transition(qd)
+        dead_zone = getattr(self.transition, "dead_zone", 0.0)
+        moving: Any = 1.0
+        if isinstance(dead_zone, jax.Array) or np.any(dead_zone):
+            # Within a dead zone both fractions vanish, as the force does.
+            moving = jnp.where(s == 0.0, s, jnp.ones_like(s))
+        return jnp.concatenate([jnp.diag(0.5 * (moving + s)), jnp.diag(0.5 * (s - moving))], axis=1)
+
+
+class StribeckFriction(AbstractDryFriction):
+    r"""Dry friction that falls from a static level to Coulomb's as a joint gets moving.
+
+    $(f_c + f_s e^{-|\dot q / v_s|^\delta}) \tanh(\dot q / \epsilon)$ with $f_c$ and $f_s$ unknown.
+    It takes the place of `CoulombFriction`. (Armstrong-Hélouvry, Dupont and Canudas de Wit, 1994.)
+
+    Attributes:
+        speed: Stribeck's speed $v_s$, one for all joints or one for each [rad/s or m/s].
+        exponent: Exponent $\delta$, likewise [1].
+        transition: Transition from one direction of motion to the other.
+    """
+
+    speed: EachJoint = eqx.field(converter=one_or_each, default=0.1)
+    exponent: EachJoint = eqx.field(converter=one_or_each, default=2.0)
+    transition: AbstractTransition = Tanh()
+    roles = ("dry", None)
+
+    def parameters(self, robot):
+        """Return `fc1`, … at speed, then `fs1`, … that is added near standstill [N m or N]."""
+        return (*each_joint(robot, "fc", "N m", "N"), *each_joint(robot, "fs", "N m", "N"))
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrices of smooth signs, and of those that fade with speed."""
+        sign = self.transition(qd)
+        relative = qd / matching("speed", self.speed, qd)
+        # The small number keeps the logarithm finite at standstill.
+        power = 0.5 * matching("exponent", self.exponent, qd) * jnp.log(relative**2 + 1e-30)
+        return jnp.concatenate([jnp.diag(sign), jnp.diag(sign * jnp.exp(-jnp.exp(power)))], axis=1)
+
+    @property
+    def nonlinear_parameters(self):
+        """Those of the transition, `vs1`, … [rad/s or m/s], and `delta1`, … if chosen."""
+        return (
+            *super().nonlinear_parameters,
+            NonlinearParameter("vs", ("rad/s", "m/s"), ("speed",)),
+            NonlinearParameter("delta", ("1", "1"), ("exponent",), default=False),
+        )
+
+
+class LoadFriction(AbstractDryFriction):
+    r"""Dry friction in proportion to the weight on a joint, $|g_i(q)| \tanh(\dot q_i / \epsilon)$.
+
+    It is used beside `CoulombFriction`. The load is that of gravity alone, so that forces stay
+    linear in the accelerations; it follows from bodies that are known roughly: from CAD, or from an
+    earlier fit without this term.
+
+    Attributes:
+        bodies: Parameters of the bodies, ten each in the paper's order: one row for each body, or
+            standard parameters that begin with them, as those of a fit whose model begins with
+            `RigidBodies`.
+        transition: Transition from one direction of motion to the other.
+    """
+
+    bodies: Float[AnyArray, "..."]
+    transition: AbstractTransition = Tanh()
+    roles = ("load",)
+
+    def parameters(self, robot):
+        """Return `fl1`, …: friction for each unit of load [1].
+
+        Raises:
+            InputError: If `bodies` holds fewer than ten numbers for each body.
+        """
+        self._bodies(robot)
+        return each_joint(robot, "fl", "1", "1")
+
+    def _bodies(self, robot: Robot) -> AnyArray:
+        size = robot.joints * len(INERTIAL_NAMES)
+        if np.size(self.bodies) < size:
+            raise InputError(
+                f"`bodies` must begin with ten numbers for each body ({size}), but has shape "
+                f"{np.shape(self.bodies)}."
+            )
+        return self.bodies.ravel()[:size].reshape(robot.joints, -1)
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrix of loads with the signs of the speeds."""
+        rest = jnp.zeros_like(q)
+        bodies = jnp.asarray(self._bodies(robot), q.dtype)
+        load = projection.rigid_body_forces(robot, bodies, q, rest, rest)
+        return jnp.diag(jnp.abs(load) * self.transition(qd))
+
+    @property
+    def nonlinear_parameters(self):
+        """Those of the transition, if chosen: `CoulombFriction` determines them better."""
+        return tuple(x._replace(default=False) for x in super().nonlinear_parameters)
+
+
+class TemperatureScaled(AbstractTerm):
+    r"""Friction that falls as the joints get warm: another term times $e^{-a (T - T_0)}$.
+
+    The parameters are those at the temperature $T_0$.
+
+    Attributes:
+        term: Friction at $T_0$.
+        rate: Rate $a$, one for all joints or one for each [1/K].
+        temperature: Temperature $T$ at which the model is used, likewise [°C].
+        reference: Temperature $T_0$ [°C].
+    """
+
+    term: AbstractTerm
+    rate: EachJoint = 0.01
+    temperature: EachJoint = 25.0
+    reference: float = eqx.field(static=True, default=25.0)
+
+    @property
+    def roles(self):
+        """Those of the term."""
+        return self.term.roles
+
+    def parameters(self, robot):
+        """Return those of the term."""
+        return self.term.parameters(robot)
+
+    def columns(self, robot, q, qd, qdd):
+        """Return those of the term, scaled joint by joint."""
+        warmer = jnp.asarray(self.temperature, qd.dtype) - self.reference
+        scale = jnp.broadcast_to(jnp.exp(-self.rate * warmer), qd.shape)
+        return scale[:, None] * self.term.columns(robot, q, qd, qdd)
+
+    def lower_bounds(self, robot):
+        """Return those of the term."""
+        return self.term.lower_bounds(robot)
+
+    def drive_matrices(self, robot):
+        """Return those of the term: temperature scales them by a positive number."""
+        return self.term.drive_matrices(robot)
+
+    @property
+    def nonlinear_parameters(self):
+        """Those of the term, and `rate1`, … [1/K] if chosen: it takes more than one recording."""
+        inner = (x.inside("term") for x in self.term.nonlinear_parameters)
+        return (*inner, NonlinearParameter("rate", ("1/K", "1/K"), ("rate",), default=False))
+
+
+class CoupledDrives(AbstractTerm):
+    r"""Contributions beside the diagonal of motors that turn more than one axis.
+
+    A motor whose row of the reduction has further entries beside that of its own joint feels
+    its rotor inertia and friction on all of these axes. The diagonal parts belong to
+    `RotorInertia`, `ViscousFriction` and `CoulombFriction` of the axes; this term has the parts
+    beside the diagonal, and the Coulomb friction of the motor's own motion.
+
+    Attributes:
+        transition: Transition of the Coulomb friction, at speeds measured on the side of the
+            motor's own joint [rad/s or m/s].
+    """
+
+    transition: AbstractTransition = Tanh()
+
+    def couplings(self, robot: Robot) -> tuple[tuple[int, np.ndarray], ...]:
+        """Return the motors that turn several axes, with ratios relative to their own joint.
+
+        Raises:
+            InputError: If the motors are not in the order of their joints.
+        """
+        A = np.asarray(robot.drives.reduction)
+        scale = np.abs(A).max()
+        if not np.diag(A).all():
+            motor = int(np.flatnonzero(np.diag(A) == 0)[0]) + 1
+            raise InputError(
+                f"`drives.reduction` of `{robot.name}` must name the motors in the order of their "
+                f"joints, but motor {motor} does not turn joint {motor}: reorder its rows."
+            )
+        return tuple(
+            (i, A[i] / A[i, i])
+            for i in range(robot.joints)
+            if (np.abs(np.delete(A[i], i)) > 1e-12 * scale).any()
+        )
+
+    def parameters(self, robot):
+        """Return `Iam6`, `fvm6`, `fcm6` for a coupled motor 6."""
+        kinds = (("Iam", "kg m²", "kg"), ("fvm", "N m s", "N s/m"), ("fcm", "N m", "N"))
+        couplings = self.couplings(robot)
+        if not couplings:
+            raise InputError(
+                f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` out, or give "
+                "`drives.reduction` as a matrix with entries beside its diagonal."
+            )
+        return tuple(
+            (f"{name}{i + 1}", unit_r if robot.revolute[i] else unit_p)
+            for name, unit_r, unit_p in kinds
+            for i, _ in couplings
+        )
+
+    def columns(self, robot, q, qd, qdd):
+        """Return inertia and viscous parts beside the diagonal, and Coulomb parts of motors."""
+        inertia, viscous, dry = [], [], []
+        for i, ratios in self.couplings(robot):
+            beside = np.outer(ratios, ratios)
+            np.fill_diagonal(beside, 0.0)
+            inertia.append(beside.astype(qdd.dtype) @ qdd)
+            viscous.append(beside.astype(qd.dtype) @ qd)
+            r = ratios.astype(qd.dtype)
+            # The motor's speed takes the place of its joint's, whose transition width it has.
+            speeds = jnp.stack([jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))])
+            dry.append(r * self.transition(speeds)[i])
+        return jnp.stack([*inertia, *viscous, *dry], axis=1)
+
+    def lower_bounds(self, robot):
+        """Return zeros: inertia and friction of the motors are positive."""
+        return np.zeros(len(self.parameters(robot)))
+
+    def drive_matrices(self, robot):
+        """Return the matrices beside the diagonals of the coupled motors."""
+        couplings = self.couplings(robot)
+        n, found = robot.joints, len(couplings)
+        matrices = np.zeros((2, n, n, 3 * found))
+        for place, (_, ratios) in enumerate(couplings):
+            beside = np.outer(ratios, ratios)
+            np.fill_diagonal(beside, 0.0)
+            matrices[0, :, :, place] = matrices[1, :, :, found + place] = beside
+        return matrices

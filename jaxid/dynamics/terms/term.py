@@ -1,0 +1,246 @@
+"""Abstract term of a model, and the terms of bodies, rotors, springs and offsets."""
+
+import functools
+from abc import abstractmethod
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float, matching, one_or_each
+from jaxid.dynamics import projection
+from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.robot.robot import Robot
+
+PRINCIPAL = 7
+"""Number of inertial parameters of a body without products of inertia (Eq. 12)."""
+
+Role = Literal["inertia", "viscous", "dry", "load"] | None
+
+
+class NonlinearParameter(NamedTuple):
+    """Positive number of a friction law in which forces are not linear, one for each joint.
+
+    Attributes:
+        name: Name without the joint's number.
+        units: Units for a revolute and a prismatic joint.
+        path: Attributes that lead to it, from the term (or transition) that declares it.
+        default: Whether it is identified unless a user chooses otherwise.
+    """
+
+    name: str
+    units: tuple[str, str]
+    path: tuple[str, ...]
+    default: bool = True
+
+    def value(self, owner: Any) -> Any:
+        """Return the current value in its term: a scalar, or one number for each joint."""
+        return functools.reduce(getattr, self.path, owner)
+
+    @property
+    def leaf(self) -> Any:
+        """The method `value`; the former name."""
+        return self.value
+
+    @property
+    def wanted(self) -> bool:
+        """The field `default`; the former name."""
+        return self.default
+
+    def inside(self, attribute: str) -> "NonlinearParameter":
+        """Return the parameter as seen from a term that holds its owner as an attribute."""
+        return self._replace(path=(attribute, *self.path))
+
+
+class AbstractTerm(eqx.Module):
+    """One effect in the equations of motion that is linear in unknown parameters.
+
+    A new effect is one class with two methods; regressor, inverse dynamics, mass matrix, base
+    parameters and compiled forms follow from them.
+
+    Attributes:
+        roles: Physical role of each block of parameters, if the term has one or more blocks with
+            one parameter for each joint: rotor inertia, viscous or dry friction, or friction by
+            load. Parameters with a role cannot be negative.
+    """
+
+    roles: ClassVar[tuple[Role, ...]] = ()
+
+    @abstractmethod
+    def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
+        """Return name and unit of each parameter, in the order of the columns."""
+
+    @abstractmethod
+    def columns(
+        self,
+        robot: Robot,
+        q: Float[AnyArray, " joints"],
+        qd: Float[AnyArray, " joints"],
+        qdd: Float[AnyArray, " joints"],
+    ) -> Float[AnyArray, "joints columns"]:
+        """Return the generalised forces [N m or N] of unit parameters, for one sample."""
+
+    def forces(
+        self,
+        robot: Robot,
+        p: Float[AnyArray, " columns"],
+        q: Float[AnyArray, " joints"],
+        qd: Float[AnyArray, " joints"],
+        qdd: Float[AnyArray, " joints"],
+    ) -> Float[AnyArray, " joints"]:
+        """Return the generalised forces [N m or N] of given parameters, for one sample."""
+        return self.columns(robot, q, qd, qdd) @ p
+
+    def mass_matrix(
+        self, robot: Robot, p: Float[AnyArray, " columns"], q: Float[AnyArray, " joints"]
+    ) -> Float[AnyArray, "joints joints"]:
+        """Return the factor of the accelerations in these forces (Eq. 38)."""
+        rest = jnp.zeros_like(q)
+        return jax.jacfwd(lambda qdd: self.forces(robot, p, q, rest, qdd))(rest)
+
+    def potential_columns(
+        self, robot: Robot, q: Float[AnyArray, " joints"]
+    ) -> Float[AnyArray, " columns"]:
+        """Return the potential energy [J] of unit parameters; zero unless energy is stored."""
+        return jnp.zeros(len(self.parameters(robot)), q.dtype)
+
+    @property
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """Parameters that `identify_nonlinear` can identify; none for most terms."""
+        return ()
+
+    @property
+    def shapes(self) -> tuple[NonlinearParameter, ...]:
+        """The property `nonlinear_parameters`; the former name."""
+        return self.nonlinear_parameters
+
+    @property
+    def body_parameters(self) -> int:
+        """Number of inertial parameters of each body in this term; zero unless it has bodies."""
+        return 0
+
+    def lower_bounds(self, robot: Robot) -> Float[np.ndarray, " columns"]:
+        """Return lower bounds of the parameters: 0, or -inf where both signs are possible."""
+        bounds = np.full(len(self.parameters(robot)), -np.inf)
+        for k, role in enumerate(self.roles):
+            if role is not None:
+                bounds[k * robot.joints : (k + 1) * robot.joints] = 0.0
+        return bounds
+
+    def drive_matrices(self, robot: Robot) -> Float[np.ndarray, "2 joints joints columns"]:
+        """Return the drives' inertia and viscous friction of unit parameters.
+
+        Both are symmetric and cannot be negative for any motion.
+        """
+        n = robot.joints
+        matrices = np.zeros((2, n, n, len(self.parameters(robot))))
+        for k, role in enumerate(self.roles):
+            if role in ("inertia", "viscous"):
+                own = np.arange(n)
+                kind = int(role == "viscous")
+                matrices[kind, own, own, k * n + own] = 1.0 / self.roles.count(role)
+        return matrices
+
+
+def each_joint(robot: Robot, name: str, unit_r: str, unit_p: str) -> tuple[tuple[str, str], ...]:
+    """Return one parameter for each joint, with the unit of a revolute or a prismatic one."""
+    return tuple((f"{name}{i + 1}", unit_r if r else unit_p) for i, r in enumerate(robot.revolute))
+
+
+class RigidBodies(AbstractTerm):
+    r"""Inertia and gravity of the bodies by the Projection Equation (Eqs. 1-12).
+
+    Ten parameters for each body: mass $m$ [kg], first moment $m r_c$ [kg m], and the moments
+    $A, B, C, D, E, F$ [kg m²] of $J^o$ about the origin of the body's frame (Eq. 9).
+
+    Attributes:
+        principal_axes: Whether $D, E, F$ are left out, as in the paper (Eq. 12), which leaves seven
+            for each body.
+    """
+
+    principal_axes: bool = eqx.field(static=True, default=False)
+
+    @property
+    def body_parameters(self) -> int:
+        """Number of inertial parameters of each body: ten, or seven."""
+        return PRINCIPAL if self.principal_axes else len(INERTIAL_NAMES)
+
+    def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
+        """Return `m1`, `mx1`, … `F1`, then those of the next body."""
+        each = list(zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True))[: self.body_parameters]
+        return tuple((f"{name}{i + 1}", unit) for i in range(robot.joints) for name, unit in each)
+
+    def columns(self, robot, q, qd, qdd):
+        r"""Return the columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
+        theta = projection.rigid_body_regressor(robot, q, qd, qdd)
+        return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
+
+    def all_ten(self, robot: Robot, p: Float[AnyArray, " columns"]) -> Float[AnyArray, "joints 10"]:
+        """Return ten parameters of all bodies, with zeros for those that are left out."""
+        bodies = p.reshape(robot.joints, self.body_parameters)
+        if not self.principal_axes:
+            return bodies
+        zeros = np.zeros((robot.joints, len(INERTIAL_NAMES) - PRINCIPAL))
+        return jnp.concatenate([bodies, zeros.astype(bodies.dtype)], axis=1)
+
+    def forces(self, robot, p, q, qd, qdd):
+        """Return the projected wrenches of all bodies, without forming the regressor (Eq. 11)."""
+        return projection.rigid_body_forces(robot, self.all_ten(robot, p), q, qd, qdd)
+
+    def mass_matrix(self, robot, p, q):
+        """Return the mass matrix of the bodies (Eq. 38)."""
+        return projection.rigid_body_mass_matrix(robot, self.all_ten(robot, p), q)
+
+    def potential_columns(self, robot, q):
+        """Return the potential energy of masses and first moments."""
+        return projection.potential_energy_columns(robot, q)[:, : self.body_parameters].ravel()
+
+
+class RotorInertia(AbstractTerm):
+    r"""Inertia of the motors' rotors, felt through the gear: $i_{Gk}^2 C_{M,k}$ (Eq. 17)."""
+
+    roles = ("inertia",)
+
+    def parameters(self, robot):
+        """Return `Ia1`, … [kg m² or kg]."""
+        return each_joint(robot, "Ia", "kg m²", "kg")
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrix of accelerations."""
+        return jnp.diag(qdd)
+
+
+class ConstantOffset(AbstractTerm):
+    """A constant force at each joint: a torque sensor's or current's offset, or uneven friction."""
+
+    def parameters(self, robot):
+        """Return `fo1`, … [N m or N]."""
+        return each_joint(robot, "fo", "N m", "N")
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the identity."""
+        return jnp.eye(robot.joints, dtype=q.dtype)
+
+
+class LinearSpring(AbstractTerm):
+    """A spring at each joint that pulls it to a rest position, such as a counterbalance.
+
+    Attributes:
+        rest: Position without force [rad or m]; an unknown one appears as a `ConstantOffset`.
+    """
+
+    rest: float | Float[AnyArray, " joints"] = eqx.field(converter=one_or_each, default=0.0)
+
+    def parameters(self, robot):
+        """Return `ks1`, … [N m/rad or N/m]."""
+        return each_joint(robot, "ks", "N m/rad", "N/m")
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrix of deflections."""
+        return jnp.diag(q - matching("rest", self.rest, q))
+
+    def potential_columns(self, robot, q):
+        """Return half the squares of the deflections."""
+        return 0.5 * (q - self.rest) ** 2
