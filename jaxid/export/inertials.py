@@ -51,7 +51,8 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
         names = [name for name, _ in term.parameters(robot)]
         rotors += [name for k, name in enumerate(names) if held[0, :, k].any()]
         left_out += [name for k, name in enumerate(names) if not held[:, :, k].any()]
-    return JointDynamics(*total, tuple(rotors), tuple(left_out))
+    armature, damping, friction = total
+    return JointDynamics(armature, damping, friction, tuple(rotors), tuple(left_out))
 
 
 def _joint_coefficients(term: AbstractTerm, robot: Robot) -> Float[np.ndarray, "3 joints columns"]:
