@@ -117,11 +117,8 @@ from jaxid.identification.runs.drive_gains import identify_drive_gains as identi
 from jaxid.identification.runs.estimates import Estimates as Estimates
 from jaxid.identification.runs.payload import Payload as Payload
 from jaxid.identification.runs.payload import identify_payload as identify_payload
-from jaxid.identification.runs.run import Run as Run
 from jaxid.identification.runs.states import StatesFit as StatesFit
 from jaxid.identification.runs.states import identify_states as identify_states
-from jaxid.identification.runs.update import load_run as load_run
-from jaxid.identification.runs.update import save_run as save_run
 from jaxid.identification.runs.update import update as update
 from jaxid.identification.uncertainty import AbstractUncertainty as AbstractUncertainty
 from jaxid.identification.uncertainty import BlockJackknife as BlockJackknife

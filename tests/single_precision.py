@@ -62,7 +62,7 @@ def rounded():
 
 
 def runs():
-    return [jid.Run.of(base, o) for o in (cold, warm)]
+    return [jid.identify(base, o) for o in (cold, warm)]
 
 
 def consistent():
@@ -119,7 +119,7 @@ CASES = {
     ),
     "essential_parameters": lambda: jid.essential_parameters(plain(), cold).fit.parameters,
     "identify_states": lambda: jid.identify_states(runs()).found.parameters,
-    "update": lambda: jid.update(*runs()).fit.parameters,
+    "update": lambda: jid.update(*runs()).parameters,
     "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,
     "validate": lambda: [e.relative for e in validate(plain(), [warm]).errors],
     "predict": lambda: plain().predict(cold.motion),

@@ -160,17 +160,12 @@ def test_a_urdf_that_is_not_there(folder, run):  # noqa: F811
 
 
 def test_results_that_cannot_run_code(folder, run):  # noqa: F811
-    import numpy as np
-
     assert run("identify", "experiment.toml", "a.csv", "-o", "r")[0] == 0
-    path = folder / "r" / "run.npz"
+    path = folder / "r" / "model.json"
     for content in (b"", b"PK", path.read_bytes()[:900]):
         path.write_bytes(content)
         result = run("identify", "experiment.toml", "r", "b.csv", "-o", "s")
-        assert refused(result, "must hold a run (`jaxid-run/1`)")
-    np.savez(path, head=np.array([{"a": 1}], dtype=object))
-    result = run("identify", "experiment.toml", "r", "b.csv", "-o", "s")
-    assert refused(result, "must hold a run (`jaxid-run/1`)")
+        assert refused(result, "is no model file")
     assert not (folder / "s").exists()
 
 

@@ -121,7 +121,6 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
 def test_reports_stand_for_their_logs(shop, run):  # noqa: F811
     for name in ("empty", "loaded"):
         assert run("identify", "experiment.toml", f"{name}.csv", "-o", name)[0] == 0
-        assert "run.npz" in result(shop, name)["files"]
     assert run("payload", "experiment.toml", "empty", "--loaded", "loaded", "-o", "p")[0] == 0
     assert run("payload", "experiment.toml", "empty.csv", "--loaded=loaded.csv", "-o", "q")[0] == 0
     one, other = (
@@ -195,7 +194,7 @@ def test_folders_that_hold_no_run_are_refused(folder, run):  # noqa: F811
     assert run("identify", "experiment.toml", "a.csv", "-o", "first")[0] == 0
     (folder / "other").mkdir()
     assert refused(
-        run("identify", "experiment.toml", "other", "b.csv"), "`other`", "holds no `run.npz`"
+        run("identify", "experiment.toml", "other", "b.csv"), "`other`", "holds no `model.json`"
     )
     assert refused(run("identify", "experiment.toml", "first"), "at least one log")
     (folder / "ridge.toml").write_text(EXPERIMENT + "[estimator]\nridge = 0.1\n")
@@ -229,7 +228,9 @@ def test_states_share_inertia(folder, run):  # noqa: F811
     described = load_experiment(folder / "experiment.toml")
     base, read = described.base, lambda log: described.observe(described.read(folder / log))
     runs = [
-        jid.Run.of(base, read(log), weights=described.plain.weights, name=name)
+        jid.identify(
+            base, read(log), estimator=jid.WeightedLeastSquares(described.plain.weights), name=name
+        )
         for log, name in (("a.csv", "a"), ("warm.csv", "warm"))
     ]
     expected = jid.identify_states(runs)
@@ -255,7 +256,6 @@ def test_essential_parameters_on_the_command_line(folder, run):  # noqa: F811
     said = " ".join(out.split())
     assert f"{few} of {every} base parameters are essential" in said
     assert "left out, and taken as zero: " in said
-    assert "`run.npz`, with which later logs" in said
     assert refused(run("identify", "essential.toml", "all", "b.csv"), "for essential parameters")
 
 

@@ -40,7 +40,6 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.twice import share_data
 from jaxid.identification.runs.update import update
 from jaxid.program.cache import keep_compiled
@@ -60,11 +59,6 @@ from jaxid.table import Remark, Status, Table
 from jaxid.validation import torque_errors, validate
 
 DISTRIBUTION = "jaxid-robotics"
-
-KEPT = (
-    "`run.npz`, with which later logs, `payload` and `gains` go on, keeps weighted least squares "
-    "of the file's model, not this estimate."
-)
 
 DELAYS = (
     "whether the forces stand later in the logs than the angles takes longer to tell: `jaxid "
@@ -280,13 +274,10 @@ def identify(
         stage("factorising the rows")
         rows = RegressionProblem(base, fitted, stage.through(sum(o.samples for o in fitted)))
         fit = loaded.fit(rows, stage.through(sum(o.samples for o in fitted)))
-        run = Run.of_rows(rows, fit)
-        if not run.tells(fit):
-            said.append(KEPT)
         if reports:
-            fit, run = _together(loaded, reports, fit, run)
+            fit = _together(loaded, reports, fit)
             for o in checked:
-                if share_data(run.blocks, RegressionProblem(base, [o]).blocks):
+                if share_data(fit.blocks, RegressionProblem(base, [o]).blocks):
                     raise InputError(
                         f"a report that was given has seen the data of `{o.name}`: a model that "
                         "has seen a log is not verified by it; verify with another."
@@ -326,7 +317,6 @@ def identify(
             (*loaded.notes, *dict.fromkeys(logs_said), *doubts),
             alternative,
             choice,
-            run,
             (*doubts, *suspected),
             pdf,
         )
@@ -346,9 +336,9 @@ def identify(
     show_files(console, output, [p.name for p in files])
 
 
-def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -> tuple[Fit, Run]:
+def _together(experiment: Experiment, reports: list[Path], fit: Fit) -> Fit:
     """A run with what earlier reports know, as if all logs had been fitted at once."""
-    if not run.tells(fit):
+    if fit.base.names != experiment.base.names or not fit.is_least_squares:
         essential = experiment.estimation.essential is not None
         kind = "for essential parameters" if essential else fit.estimator
         raise InputError(
@@ -356,8 +346,7 @@ def _together(experiment: Experiment, reports: list[Path], fit: Fit, run: Run) -
             f"but the estimator is {kind}: leave `[estimator]` out, or give the logs "
             "themselves."
         )
-    whole = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), run])
-    return whole.fit, whole
+    return functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), fit])
 
 
 app.command()(demo)

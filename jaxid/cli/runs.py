@@ -15,10 +15,10 @@ from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import refuse_foreign_folder
 from jaxid.experiment.loading import choose
 from jaxid.experiment.runs import is_report, read_run, require_plain
+from jaxid.identification.fit import Fit
 from jaxid.identification.runs.comparison import Comparison
 from jaxid.identification.runs.drive_gains import identify_drive_gains
 from jaxid.identification.runs.payload import Payload, identify_payload
-from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.states import identify_states
 from jaxid.report.result_files import read_estimates, write_comparison, write_estimates
 from jaxid.report.terminal import show, show_files, show_remarks
@@ -205,7 +205,7 @@ def states(
 
 def _pair(
     experiment: Experiment, logs: list[Path], loaded: list[Path]
-) -> tuple[tuple[Run, Run], list[str]]:
+) -> tuple[tuple[Fit, Fit], list[str]]:
     twice = {p.resolve() for p in logs} & {p.resolve() for p in loaded}
     if twice:
         raise InputError(
@@ -217,7 +217,7 @@ def _pair(
 
 def _runs(
     experiment: Experiment, each: list[list[Path]], names: list[str]
-) -> tuple[list[Run], list[str]]:
+) -> tuple[list[Fit], list[str]]:
     """Return a run of the logs and reports of each state, and findings on the logs."""
     doubts = [*require_plain(experiment)]
     files = [p for paths in each for p in paths if not is_report(p)]

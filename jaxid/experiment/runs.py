@@ -1,5 +1,6 @@
 """Runs as a command needs them: from logs, or from what reports keep of theirs."""
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,11 +10,12 @@ from jaxid.experiment.doctor import slips_of
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.loading import doubts_of, load_log
 from jaxid.experiment.progress import Stages
+from jaxid.identification.fit import Fit, load
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.runs.run import Run
-from jaxid.identification.runs.update import load_run, update
-from jaxid.report.result_files import RUN
+from jaxid.identification.runs.least_squares import require_same_base
+from jaxid.identification.runs.update import update
+from jaxid.report.result_files import MODEL
 
 
 def is_report(path: Path) -> bool:
@@ -21,7 +23,7 @@ def is_report(path: Path) -> bool:
     return path.is_dir()
 
 
-def earlier_run(experiment: Experiment, folder: Path) -> Run:
+def earlier_run(experiment: Experiment, folder: Path) -> Fit:
     """What a report keeps of the logs that it was made of.
 
     Args:
@@ -31,13 +33,18 @@ def earlier_run(experiment: Experiment, folder: Path) -> Run:
     Raises:
         InputError: If it keeps nothing, or of another robot or model.
     """
-    path = folder / RUN
+    path = folder / MODEL
     if not path.is_file():
         raise InputError(
-            f"`{folder}` is a folder, but holds no `{RUN}`: name a log, or the folder of a report "
-            "that `jaxid identify` has written."
+            f"`{folder}` is a folder, but holds no `{MODEL}`: name a log, or the folder of a "
+            "report that `jaxid identify` has written."
         )
-    return load_run(path, experiment.base)
+    fit = load(path)
+    try:
+        require_same_base((fit, dataclasses.replace(fit, base=experiment.base, name="these logs")))
+    except InputError as error:
+        raise InputError(f"`{path}` does not fit `{experiment.path.name}`: {error}") from error
+    return fit
 
 
 def require_plain(experiment: Experiment) -> tuple[str, ...]:
@@ -64,7 +71,7 @@ def require_plain(experiment: Experiment) -> tuple[str, ...]:
 
 def read_run(
     experiment: Experiment, paths: Sequence[Path], stage: Stages, name: str
-) -> tuple[Run, list[str]]:
+) -> tuple[Fit, list[str]]:
     """Logs, and reports that stand for theirs, as one run; and doubts about the logs.
 
     Args:
@@ -86,5 +93,5 @@ def read_run(
         rows = RegressionProblem(experiment.base, observed, through)
         fit = fit_problem(rows, experiment.estimation.plain)
         doubts += slips_of(logs, fit)
-        earlier.append(Run.of_rows(rows, fit))
+        earlier.append(fit)
     return functools.reduce(update, earlier), doubts

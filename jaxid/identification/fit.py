@@ -16,8 +16,11 @@ from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators import (
     AbstractEstimator,
     AbstractSpectralSolution,
+    Complete,
     EstimatorInWords,
 )
+from jaxid.identification.estimators.solutions import Decomposition
+from jaxid.identification.factors import Blocks
 from jaxid.identification.identifiability import LARGEST_UNCERTAINTY, UndeterminedDirection
 from jaxid.identification.model_file import checksum_of, read_model, write_model
 from jaxid.identification.uncertainty import ResidualSpectra, Uncertainty
@@ -86,6 +89,9 @@ class Fit(eqx.Module):
         residual_spectra: Of each joint's residuals, and whether they are white; None where only
             factors of the rows were known.
         date: Day on which the fit was made, like 2026-01-31; empty if it is not known.
+        blocks: Factors of the rows by contiguous blocks of time, with which later functions go on;
+            None if they are not known.
+        name: Name of the fit, such as `cold`; by default the names of its recordings.
     """
 
     base: BaseParameters
@@ -105,6 +111,8 @@ class Fit(eqx.Module):
     full_parameters: Float[AnyArray, " standard"] | None = None
     residual_spectra: ResidualSpectra | None = None
     date: str = eqx.field(static=True, default="")
+    blocks: Blocks | None = None
+    name: str = eqx.field(static=True, default="")
 
     @property
     def covariance(self) -> Float[AnyArray, "base base"]:
@@ -156,6 +164,26 @@ class Fit(eqx.Module):
             else Trust.DOUBTFUL
             for k, share in enumerate(self.relative_standard_deviations)
         )
+
+    @property
+    def factor(self) -> tuple[Float[np.ndarray, "height base"], Float[np.ndarray, " height"]]:
+        """Matrix and right-hand side with the norms of all weighted rows (Eq. 29).
+
+        Raises:
+            InputError: If the fit does not hold its factors.
+        """
+        if self.blocks is None:
+            raise InputError(f"the fit `{self.name}` does not hold its factors: identify again.")
+        return self.blocks.total.weighted(self.weights)
+
+    @property
+    def is_least_squares(self) -> bool:
+        """Whether the estimates are weighted least squares of the rows, up to rounding."""
+        R, z = self.factor
+        decomposition = Decomposition.of(R, z)
+        plain = decomposition.solve(Complete().inverse(decomposition.values))
+        apart = np.linalg.norm(R @ (np.asarray(self.parameters) - plain))
+        return bool(apart <= 1e-7 * np.linalg.norm(z))
 
     @property
     def condition_number(self) -> float:

@@ -1,5 +1,6 @@
 """Identification: from observations to parameters with their uncertainty (Eqs. 26-33)."""
 
+import dataclasses
 import datetime
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -29,6 +30,8 @@ def identify(
     estimator: AbstractEstimator | None = None,
     progress: Progress | None = None,
     uncertainty: AbstractUncertainty | None = None,
+    *,
+    name: str | None = None,
 ) -> Fit:
     """Estimate the base parameters from one or several recordings (Eqs. 26-33).
 
@@ -39,6 +42,7 @@ def identify(
         estimator: Estimator; by default least squares weighted by the largest forces.
         progress: Callback, called with the completed fraction (0 to 1) of a pass over a long log.
         uncertainty: Method for the standard deviations; by default the spectral sandwich.
+        name: Name of the fit, such as `cold`; by default the names of its recordings.
 
     Returns:
         The estimates; `undetermined` names what these recordings do not determine.
@@ -50,7 +54,8 @@ def identify(
     """
     recordings = tuple(observations) if isinstance(observations, Iterable) else (observations,)
     _check(base, recordings)
-    return fit_problem(RegressionProblem(base, recordings, progress), estimator, uncertainty)
+    fit = fit_problem(RegressionProblem(base, recordings, progress), estimator, uncertainty)
+    return fit if name is None else dataclasses.replace(fit, name=name)
 
 
 def fit_problem(
@@ -114,6 +119,8 @@ def fit_problem(
             *errors.notes,
         ),
         date=datetime.date.today().isoformat(),
+        blocks=plain.blocks,
+        name=", ".join(problem.names),
     )
 
 

@@ -15,8 +15,6 @@ from jaxid.identification.filter_choice import FilterChoice
 from jaxid.identification.fit import Fit, load
 from jaxid.identification.runs.comparison import LEVEL, Comparison
 from jaxid.identification.runs.estimates import Estimates
-from jaxid.identification.runs.run import Run
-from jaxid.identification.runs.update import save_run
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.report.errors import error_figure
 from jaxid.report.identification import identification_page
@@ -38,8 +36,6 @@ from jaxid.validation import Definiteness, TorqueErrors
 
 MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""
-RUN = "run.npz"
-"""File of a report that keeps the factors of its logs, to add and combine later."""
 
 
 def write_report(
@@ -52,11 +48,10 @@ def write_report(
     notes: Sequence[str] = (),
     alternative: Alternative | None = None,
     choice: FilterChoice | None = None,
-    run: Run | None = None,
     doubts: Sequence[str] = (),
     pdf: bool = False,
 ) -> list[Path]:
-    """Write `report.html`, `result.json`, `parameters.csv`, `model.json`, `run.npz` and figures.
+    """Write `report.html`, `result.json`, `parameters.csv`, `model.json` and figures.
 
     A folder that exists keeps its other files; files of an earlier report in it are replaced.
 
@@ -70,7 +65,6 @@ def write_report(
         notes: Notes for the reader, in sentences.
         alternative: Another solution of the same equations.
         choice: Choice of the filter, where it was left to the logs.
-        run: Factors of the recordings, for later runs; no `run.npz` if None.
         doubts: Doubts about the logs, in sentences.
         pdf: Whether figures are written as PDF too.
 
@@ -90,14 +84,11 @@ def write_report(
     suffixes = (".png", ".pdf") if pdf else (".png",)
     names = ["report.html", "result.json", "parameters.csv", MODEL]
     names += [f"{stem}{suffix}" for stem in figures for suffix in suffixes]
-    names += [RUN] if run is not None else []
     with atomic_folder(folder, _earlier_files) as staging:
         write_json(staging / "result.json", {**record, "files": names})
         write_csv(staging / "parameters.csv", parameter_rows(fit))
         fit.save(staging / MODEL)
         (staging / "report.html").write_text(page, encoding="utf-8")
-        if run is not None:
-            save_run(staging / RUN, run)
         for stem, figure in figures.items():
             for suffix in suffixes:
                 save(figure, staging / f"{stem}{suffix}")

@@ -131,7 +131,7 @@ def solved(factors):
 @given(seed=seeds, share=st.floats(0.3, 0.7))
 def test_an_update_is_the_joint_fit(seed, share):
     parts = observed(seed, samples=400).split(share)
-    runs = [jid.Run.of(BASE, part) for part in parts]
+    runs = [jid.identify(BASE, part) for part in parts]
     joint = jid.identify(BASE, parts, jid.WeightedLeastSquares())
     close(jid.update(*runs).fit.parameters, joint.parameters)
     close(jid.update(*runs[::-1]).fit.parameters, joint.parameters)

@@ -186,7 +186,7 @@ def changed(path, change, sealed=True):
         (
             lambda d: d["model"]["base"]["model"]["robot"].update(parent=[3, 0]),
             True,
-            "`parent` must name",
+            "`parent`",
         ),
     ],
 )

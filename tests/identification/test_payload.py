@@ -47,7 +47,7 @@ def runs(base, noise=0.0, seed=0, friction=1.2, **options):
 
 
 def of(base, pair):
-    return [jid.Run.of(base, o, name=name) for o, name in zip(pair, "ab", strict=True)]
+    return [jid.identify(base, o, name=name) for o, name in zip(pair, "ab", strict=True)]
 
 
 def test_a_load_adds_its_columns_to_the_last_body(base):

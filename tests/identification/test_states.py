@@ -44,7 +44,7 @@ def observed(base, truths, seed=0, **options):
 
 def test_shared_and_own_parameters_equal_dense_least_squares(base, truths):
     two = observed(base, truths)
-    found = jid.identify_states([jid.Run.of(base, o) for o in two])
+    found = jid.identify_states([jid.identify(base, o) for o in two])
     assert found.states == ("cold", "warm")
     assert {base.names[k] for k in found.varying} == {"fv1", "fv2", "fc1", "fc2", "fo1", "fo2"}
     rows, forces = [], []
@@ -74,7 +74,7 @@ def test_shared_and_own_parameters_equal_dense_least_squares(base, truths):
 def test_covariance_is_that_of_many_noise_draws(base, truths):
     draws, variances = [], []
     for seed in range(40):
-        runs = [jid.Run.of(base, o) for o in observed(base, truths, seed, samples=200)]
+        runs = [jid.identify(base, o) for o in observed(base, truths, seed, samples=200)]
         found = jid.identify_states(runs)
         draws.append(found.found.parameters)
         variances.append(np.diag(found.found.covariance))
@@ -86,7 +86,7 @@ def test_covariance_is_that_of_many_noise_draws(base, truths):
 
 
 def test_what_changed_is_found_and_what_is_shared_is_tested(base, truths):
-    found = jid.identify_states([jid.Run.of(base, o) for o in observed(base, truths)])
+    found = jid.identify_states([jid.identify(base, o) for o in observed(base, truths)])
     verdicts = dict(
         zip(*(lambda c: (c.first.names, c.verdicts))(found.compare("cold", "warm")), strict=True)
     )
@@ -96,16 +96,16 @@ def test_what_changed_is_found_and_what_is_shared_is_tested(base, truths):
     cold, _ = truths
     heavier = cold.copy()
     heavier[11] += 1.0
-    other = jid.identify_states([jid.Run.of(base, o) for o in observed(base, (cold, heavier))])
+    other = jid.identify_states([jid.identify(base, o) for o in observed(base, (cold, heavier))])
     assert other.sharing[1] < 1e-6
 
 
 def test_a_difference_between_states_knows_that_they_share(base, truths):
     """Between states of one fit it is more precise than between two fits."""
-    runs = [jid.Run.of(base, o) for o in observed(base, truths)]
+    runs = [jid.identify(base, o) for o in observed(base, truths)]
     found = jid.identify_states(runs)
     together = found.compare("cold", "warm").standard_deviations
-    apart = jid.compare(runs[0].fit, runs[1].fit).standard_deviations[list(found.varying)]
+    apart = jid.compare(*runs).standard_deviations[list(found.varying)]
     assert (together <= 1.05 * apart).all()
     assert (together < 0.9 * apart).any()
 
@@ -126,16 +126,16 @@ def test_an_update_equals_the_joint_fit(base, truths):
     cold, _ = truths
     two = [observations(base.model, cold, noise=NOISE, seed=s, noise_seed=s) for s in (1, 2)]
     together = jid.identify(base, two)
-    one, other = (jid.Run.of(base, o) for o in two)
+    one, other = (jid.identify(base, o) for o in two)
     updated = jid.update(one, other)
     np.testing.assert_allclose(updated.parameters, together.parameters, rtol=1e-11)
     np.testing.assert_allclose(
         np.sqrt(np.diag(updated.covariance)), together.standard_deviations, rtol=0.2
     )
-    assert updated.fit.rows == together.rows
-    np.testing.assert_allclose(updated.fit.residual_rms, together.residual_rms, rtol=1e-9)
+    assert updated.rows == together.rows
+    np.testing.assert_allclose(updated.residual_rms, together.residual_rms, rtol=1e-9)
     third = observations(base.model, cold, noise=NOISE, seed=3, noise_seed=3)
-    again = jid.update(updated, jid.Run.of(base, third))
+    again = jid.update(updated, jid.identify(base, third))
     np.testing.assert_allclose(
         again.parameters, jid.identify(base, [*two, third]).parameters, rtol=1e-11
     )
@@ -144,14 +144,16 @@ def test_an_update_equals_the_joint_fit(base, truths):
 def test_runs_with_weights_of_their_own_keep_them(base, truths):
     two = observed(base, truths)
     weights = jid.ResidualVariances()
-    one, other = (jid.Run.of(base, o, weights=weights) for o in two)
+    one, other = (jid.identify(base, o, estimator=jid.WeightedLeastSquares(weights)) for o in two)
     assert np.abs(one.weights / other.weights - 1).max() > 1e-6
     E = np.eye(base.size)
     updated = jid.update(one, other)
     np.testing.assert_allclose(updated.parameters, tied((one, other), (E, E)).parameters)
-    np.testing.assert_allclose(updated.fit.parameters, updated.parameters, rtol=1e-9)
+    np.testing.assert_allclose(updated.parameters, updated.parameters, rtol=1e-9)
     third = observations(base.model, truths[0], noise=NOISE, seed=3, noise_seed=3)
-    again = jid.update(updated, jid.Run.of(base, third, weights=weights))
+    again = jid.update(
+        updated, jid.identify(base, third, estimator=jid.WeightedLeastSquares(weights))
+    )
     with pytest.raises(ValueError, match="have seen the same data, which would count twice"):
         jid.update(again, one)
     with pytest.raises(ValueError, match=r"the two runs `.*` have seen the same data"):
@@ -164,7 +166,7 @@ def test_a_run_that_leaves_something_open_still_helps(base, truths):
     cold, _ = truths
     full = observations(base.model, cold, noise=NOISE, seed=1, noise_seed=1)
     still = observations(base.model, cold, noise=NOISE, seed=2, noise_seed=2, still=(1,))
-    one, poor = jid.Run.of(base, full), jid.Run.of(base, still)
+    one, poor = jid.identify(base, full), jid.identify(base, still)
     assert np.isinf(np.diag(poor.covariance)).any()
     updated = jid.update(one, poor)
     together = jid.identify(base, [full, still])
@@ -177,38 +179,29 @@ def test_a_run_that_leaves_something_open_still_helps(base, truths):
     assert np.median(after / before) < 1.25
 
 
-def test_a_run_comes_back_from_its_file_exactly(base, truths, tmp_path):
-    run = jid.Run.of(base, observed(base, truths)[0], name="cold")
-    path = tmp_path / "runs" / "cold.npz"
-    jid.save_run(path, run)
-    jid.save_run(path, run)
-    assert [p.name for p in path.parent.iterdir()] == ["cold.npz"]
-    again = jid.load_run(path, base)
-    assert again.name == "cold"
-    assert again.recordings == ("cold",)
-    for key in ("weights", "parameters", "covariance", "freedom"):
-        np.testing.assert_array_equal(getattr(again, key), getattr(run, key))
-    for a, b in zip(again.factor, run.factor, strict=True):
+def test_a_fit_from_a_file_goes_on_exactly(base, truths, tmp_path):
+    one, other = (jid.identify(base, o) for o in observed(base, truths))
+    again = jid.load(one.save(tmp_path / "cold.json"))
+    for a, b in zip(again.factor, one.factor, strict=True):
         np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(
+        jid.update(again, other).parameters, jid.update(one, other).parameters
+    )
 
 
-def test_files_that_do_not_fit_are_refused(base, truths, tmp_path):
-    path = tmp_path / "run.npz"
-    jid.save_run(path, jid.Run.of(base, observed(base, truths)[0]))
-    longer = base.model.robot.replace(offset=1.1 * np.asarray(base.model.robot.offset))
-    other = jid.base_parameters(jid.Model(longer, base.model.terms))
-    with pytest.raises(ValueError, match="with another geometry"):
-        jid.load_run(path, other)
-    fewer = jid.base_parameters(jid.Model(base.model.robot, base.model.terms[:2]))
-    with pytest.raises(ValueError, match="other base parameters than `base`: names differ"):
-        jid.load_run(path, fewer)
-    path.write_text("nothing")
-    with pytest.raises(ValueError, match=r"must hold a run \(`jaxid-run/1`\)"):
-        jid.load_run(path, base)
+def test_other_estimates_are_solved_anew_from_their_factors(base, truths):
+    one, other = observed(base, truths)
+    robust = jid.identify(base, one, jid.IterativelyReweighted())
+    assert not robust.is_least_squares
+    np.testing.assert_allclose(
+        jid.update(robust, jid.identify(base, other)).parameters,
+        jid.update(jid.identify(base, one), jid.identify(base, other)).parameters,
+        rtol=1e-9,
+    )
 
 
 def test_refusals(base, truths):
-    one, other = (jid.Run.of(base, o) for o in observed(base, truths))
+    one, other = (jid.identify(base, o) for o in observed(base, truths))
     with pytest.raises(ValueError, match="two or more with different names, but are cold, cold"):
         jid.identify_states([one, one])
     with pytest.raises(ValueError, match="`fv9` is no base parameter"):
@@ -219,4 +212,4 @@ def test_refusals(base, truths):
         jid.identify_states([one, other], shared=["fv2"]).of("hot")
     bare = jid.base_parameters(jid.Model(base.model.robot, base.model.terms[:3]))
     with pytest.raises(ValueError, match="`cold` and `bare` have different base parameters"):
-        jid.update(one, jid.Run.of(bare, observed(base, truths)[0], name="bare"))
+        jid.update(one, jid.identify(bare, observed(base, truths)[0], name="bare"))

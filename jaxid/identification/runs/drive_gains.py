@@ -16,10 +16,11 @@ from jaxid.errors import InputError
 from jaxid.identification.estimators import Complete
 from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
 from jaxid.identification.factors import Factors
+from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import Estimates
+from jaxid.identification.runs.least_squares import least_squares_of, require_same_base
 from jaxid.identification.runs.left_out import Block, block_covariance
 from jaxid.identification.runs.payload import body_columns
-from jaxid.identification.runs.run import Run, require_same_base
 from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
 from jaxid.measurement.recording import Recording
@@ -88,7 +89,7 @@ class DriveGains(eqx.Module):
 
 
 def identify_drive_gains(
-    unloaded: Run, loaded: Run, load: Tool, *, varying: Sequence[str] | None = None
+    unloaded: Fit, loaded: Fit, load: Tool, *, varying: Sequence[str] | None = None
 ) -> DriveGains:
     r"""Identifies drive gains from a run without and a run with a load that is known.
 
@@ -110,6 +111,7 @@ def identify_drive_gains(
     """
     runs = (unloaded, loaded)
     require_same_base(runs)
+    runs = tuple(map(least_squares_of, runs))
     base = unloaded.base
     robot = base.model.robot
     A = np.asarray(robot.drives.reduction)

@@ -11,8 +11,9 @@ from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds, consistency_margin, consistent_body
+from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import Estimates
-from jaxid.identification.runs.run import Run, require_same_base
+from jaxid.identification.runs.least_squares import least_squares_of, require_same_base
 from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
@@ -128,8 +129,8 @@ class Payload(eqx.Module):
 
 
 def identify_payload(
-    unloaded: Run,
-    loaded: Run,
+    unloaded: Fit,
+    loaded: Fit,
     *,
     body: int | None = None,
     varying: Sequence[str] | None = None,
@@ -157,6 +158,7 @@ def identify_payload(
     """
     runs = (unloaded, loaded)
     require_same_base(runs)
+    runs = tuple(map(least_squares_of, runs))
     base = unloaded.base
     body = base.model.robot.tip_body if body is None else body
     own = own_parameters(base, varying, None)

@@ -12,7 +12,7 @@ from jaxid.errors import InputError
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.comparison import LEVEL, Comparison, joint_test
 from jaxid.identification.runs.estimates import Estimates, groups, with_covariance
-from jaxid.identification.runs.run import Run, require_same_base
+from jaxid.identification.runs.least_squares import least_squares_of, require_same_base
 from jaxid.identification.runs.tied import Tied, tied
 from jaxid.table import Table
 
@@ -30,7 +30,7 @@ class StatesFit(eqx.Module):
         found: Estimates: the shared ones, then those of each state.
     """
 
-    runs: tuple[Run, ...]
+    runs: tuple[Fit, ...]
     shared: tuple[int, ...] = eqx.field(static=True)
     varying: tuple[int, ...] = eqx.field(static=True)
     found: Tied
@@ -113,7 +113,7 @@ class StatesFit(eqx.Module):
         """
         own = self.of(state)
         run = self.runs[self.states.index(state)]
-        return with_covariance(run.fit, own.parameters, own.covariance, own.freedom)
+        return with_covariance(run, own.parameters, own.covariance, own.freedom)
 
     def compare(self, first: str, second: str, level: float = LEVEL) -> Comparison:
         """Decides which of the parameters that vary have changed between two states.
@@ -151,12 +151,12 @@ class StatesFit(eqx.Module):
         for i, block in enumerate(blocks):
             own = slice(i * size, (i + 1) * size)
             covariance[own, own] += block
-        freedom = min(float(np.min(np.asarray(run.freedom)[k])) for run in self.runs)
+        freedom = min(float(np.min(np.asarray(run.uncertainty.dof)[k])) for run in self.runs)
         return joint_test(difference, covariance, freedom)
 
 
 def identify_states(
-    runs: Sequence[Run], varying: Sequence[str] | None = None, shared: Sequence[str] | None = None
+    runs: Sequence[Fit], varying: Sequence[str] | None = None, shared: Sequence[str] | None = None
 ) -> StatesFit:
     """Identifies a robot in several states at once: inertia is shared, friction is each state's.
 
@@ -177,6 +177,7 @@ def identify_states(
     """
     runs = tuple(runs)
     require_same_base(runs)
+    runs = tuple(map(least_squares_of, runs))
     states = [run.name for run in runs]
     if len(runs) < 2 or len(set(states)) < len(states):
         raise InputError(

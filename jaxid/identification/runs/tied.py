@@ -1,6 +1,6 @@
 r"""Least squares over several runs whose parameters depend on common unknowns.
 
-Run $s$ has the base parameters $p_s = E_s x + c_s$: shared and own ones of several states, a
+Fit $s$ has the base parameters $p_s = E_s x + c_s$: shared and own ones of several states, a
 payload on top, known loads. Its rows enter by their factors only. The common estimate is linear in
 those of the single runs, $x = \sum_s A_s (\hat p_s - c_s)$ with
 $A_s = (\sum E^T G E)^{-1} E_s^T G_s$ and the information $G_s$ of each run, and so is its error:
@@ -16,8 +16,8 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.identification.estimators import Complete
 from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
+from jaxid.identification.fit import Fit
 from jaxid.identification.runs.left_out import Block, block_covariance
-from jaxid.identification.runs.run import Run
 from jaxid.identification.runs.twice import refuse_shared
 
 
@@ -40,7 +40,7 @@ class Tied(eqx.Module):
 
 
 def tied(
-    runs: Sequence[Run],
+    runs: Sequence[Fit],
     maps: Sequence[Float[AnyArray, "base unknowns"]],
     known: Sequence[Float[AnyArray, " base"]] | None = None,
 ) -> Tied:
@@ -83,10 +83,10 @@ def tied(
 
 
 def _carried(
-    run: Run, onto: Float[np.ndarray, "unknowns height"], own: Float[np.ndarray, "height base"]
+    run: Fit, onto: Float[np.ndarray, "unknowns height"], own: Float[np.ndarray, "height base"]
 ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
     """What a run's errors make of the unknowns' covariance, and its degrees of freedom."""
-    C, own_freedom = np.asarray(run.covariance), np.asarray(run.freedom)
+    C, own_freedom = np.asarray(run.covariance), np.asarray(run.uncertainty.dof)
     if not np.isfinite(C).all():
         # The run alone does not determine everything, so not all of its estimates have a variance.
         # What its errors do to others follows from blocks of time.
@@ -100,7 +100,7 @@ def _carried(
     return A @ C @ A.T, np.where(whole > 0, freedom, np.inf)
 
 
-def _blocks(run: Run) -> tuple[list[Block], Float[np.ndarray, "base base"]]:
+def _blocks(run: Fit) -> tuple[list[Block], Float[np.ndarray, "base base"]]:
     """What the run's estimates leave of each block of time, and the inverse of its information."""
     decomposition = Decomposition.of(*run.factor)
     inverse = Complete().inverse(decomposition.values)
