@@ -134,7 +134,9 @@ def test_parameters_have_estimate_deviation_unit_and_naive_deviation(fit):
         naive = float(f"{fit.naive_standard_deviations[k]:.1e}")
         ratio = pytest.approx(fit.uncertainty.ratios[k], rel=0.06)
         assert numbers[-2:] == [pytest.approx(naive), ratio]
-    alone = dataclasses.replace(fit, uncertainty=type(fit.uncertainty).given(fit.covariance))
+    naive = fit.uncertainty.naive_covariance
+    known = dataclasses.replace(fit.uncertainty, covariance=naive)
+    alone = dataclasses.replace(fit, uncertainty=known)
     assert "naive" not in alone.summary().text()
 
 
