@@ -1,0 +1,268 @@
+"""Measure what damage, kills and long use do: damaged files, SIGKILL, an hour of jobs in one process.
+
+    python benchmarks/faults.py [fuzz kill soak] [--quick] [--minutes 8] [--json FILE]
+
+The files are those of `jaxid example`, the random numbers seeded.
+
+fuzz: a log (CSV, NPZ, Parquet), an experiment file, a URDF and a model file are damaged at random
+(bytes changed, inserted, removed, cut off, words replaced) and read again. Right is a result, or
+an `InputError` or `OSError`; any other exception or a warning counts as a crash.
+
+kill: `jaxid identify` writes into the folder of an earlier report and gets SIGKILL at a random
+moment of the time that it takes undisturbed. Right is: every file equals that of one of the two
+reports, `result.json` is absent or all files belong to it, and the same command then ends well.
+
+soak: logs are identified, batches fitted and motions designed for robots that change every round.
+Printed: resident memory after the first sixth of the time and at the end, and open files.
+"""
+
+import argparse
+import contextlib
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from pathlib import Path
+
+from timing import Row, hand_over
+
+URDF = """<robot name="r"><link name="a"/><link name="b"><inertial>
+<origin xyz="0 0 .1" rpy="0 0 0"/>
+<mass value="2"/><inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/></inertial></link>
+<link name="c"/><joint name="j" type="revolute"><parent link="a"/><child link="b"/>
+<origin xyz="0 0 .3" rpy="0 1.5708 0"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" effort="50" velocity="3"/></joint>
+<joint name="k" type="prismatic"><parent link="b"/><child link="c"/><axis xyz="1 0 0"/>
+<limit upper="1" effort="5" velocity="1"/></joint></robot>"""
+WORDS = (b"nan", b"inf", b"1e999", b"-0", b"9" * 30, b"true", b"null", b"\xc3\xa9", b"\0", b"{", b'"')
+
+
+def jaxid(*words, **options):
+    """Start a command of the package in a process of its own."""
+    command = [sys.executable, "-m", "jaxid", *map(str, words)]
+    return subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **options
+    )
+
+
+def example(folder):
+    """Write the files of `jaxid example`."""
+    if jaxid("example", folder).wait():
+        raise SystemExit("`jaxid example` failed")
+    return folder
+
+
+# Damaged files
+
+
+def damaged(data, chance):
+    """Return bytes with one to four random changes."""
+    data = bytearray(data)
+    for _ in range(chance.randint(1, 4)):
+        place = chance.randrange(len(data) + 1)
+        length = chance.choice((1, 1, 2, 8, 64))
+        kind = chance.randrange(5)
+        if kind == 0 and place < len(data):
+            data[place] ^= 1 << chance.randrange(8)
+        elif kind == 1:
+            data[place:place] = chance.choice(WORDS)
+        elif kind == 2:
+            del data[place : place + length]
+        elif kind == 3:
+            data[place:place] = data[:length]
+        elif chance.random() < 0.2:
+            del data[place:]
+    return bytes(data)
+
+
+def readers(folder):
+    """Return for each kind of file a good sample and a function that reads one."""
+    import numpy as np
+    import polars as pl
+
+    import jaxid as jid
+
+    columns = jid.Columns(angles="q{}", forces="tau{}", time="time")
+    table = pl.read_csv(folder / "identification.csv")[:300]
+    table.write_csv(folder / "log.csv")
+    table.write_parquet(folder / "log.parquet")
+    arrays = {name: table[name].to_numpy() for name in table.columns}
+    np.savez(folder / "log.npz", **arrays)
+    (folder / "arm.urdf").write_text(URDF, encoding="utf-8")
+    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2)))
+    q = np.random.default_rng(0).normal(size=(4, 200, 2))
+    jid.identify(base, jid.Observations.of(*q, sample_time=0.01)).save(folder / "model.json")
+
+    def log(path):
+        return jid.read_recording(path, columns)
+
+    def experiment(path):
+        code = jaxid("inspect", path).wait()
+        if code not in (0, 2):
+            raise RuntimeError(f"`jaxid inspect` ended with {code}")
+
+    return {
+        "log.csv": log,
+        "log.npz": log,
+        "log.parquet": log,
+        "arm.urdf": jid.load_urdf,
+        "model.json": jid.load,
+        "experiment.toml": experiment,
+    }
+
+
+def fuzz(folder, minutes, quick):
+    """Count executions and crashes of every reader."""
+    import jaxid as jid
+
+    rows = []
+    for name, read in readers(folder).items():
+        good, chance = (folder / name).read_bytes(), random.Random(name)
+        target, crashes, count = folder / f"damaged-{name}", {}, 0
+        end = time.process_time() + (2.0 if quick else 10.0 * minutes)
+        while time.process_time() < end and count < (3 if name.endswith("toml") else 10**6):
+            target.write_bytes(damaged(good, chance))
+            count += 1
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error")
+                    read(target)
+            except (jid.InputError, OSError):
+                pass
+            except Exception as error:
+                line = traceback.extract_tb(error.__traceback__)[-1]
+                crashes[f"{type(error).__name__} at {Path(line.filename).name}:{line.lineno}"] = 1
+        said = f"{count} executions, {len(crashes)} crashes {' '.join(crashes)}"
+        rows.append(Row("fuzz", name, "faults.py fuzz", "0 crashes", said, not crashes))
+    return rows
+
+
+# Kills
+
+
+def contents(folder):
+    """Return digests of the files of a report, its dates and times left out."""
+    found = {}
+    for path in folder.iterdir():
+        data = path.read_bytes()
+        if path.suffix == ".json":
+            values = json.loads(data)
+            values.pop("made", None)
+            values.pop("date", None)
+            data = json.dumps(values.get("base_parameters", values.get("parameters"))).encode()
+        if path.suffix != ".html":
+            found[path.name] = hashlib.sha256(data).hexdigest()
+    return found
+
+
+def kill(folder, minutes, quick):
+    """Kill `jaxid identify` at random moments and count reports that are not whole."""
+    target, chance, wrong = folder / "report", random.Random(0), []
+    words = ("identify", folder / "experiment.toml")
+
+    def identify(log):
+        return jaxid(*words, folder / f"{log}.csv", "-o", target)
+
+    states, took = {}, 0.0
+    for log in ("verification", "identification"):
+        begun = time.monotonic()
+        if identify(log).wait():
+            raise SystemExit("`jaxid identify` failed")
+        states[log], took = contents(target), time.monotonic() - begun
+    count, end = 0, time.monotonic() + (4 * took if quick else 60 * minutes)
+    while time.monotonic() < end:
+        log = chance.choice(tuple(states))
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process = identify(log)
+            process.wait(chance.uniform(0.5, 1.02) * took)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        count += 1
+        found = contents(target)
+        known = [{**state, **found} == state for state in states.values()]
+        if "result.json" in found and not any(known):
+            wrong.append(f"after {count} kills: a mixture of two reports")
+        if identify(log).wait() or contents(target) != states[log]:
+            wrong.append(f"after {count} kills: the next run is not the same")
+    said = f"{count} kills, {len(wrong)} wrong {' '.join(wrong)}"
+    return [Row("kill", "jaxid identify", "faults.py kill", "0 wrong", said, not wrong)]
+
+
+# Long use
+
+
+def resident():
+    """Return the resident memory of this process [MiB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def round_of_jobs(seed):
+    """Identify, fit a batch and design a motion for a robot that no other round has."""
+    import jax
+    import numpy as np
+
+    import jaxid as jid
+
+    lengths = np.random.default_rng(seed).uniform(0.3, 0.6, 2)
+    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, lengths)))
+    series = jid.random_fourier_series(base.model.robot, omega=0.8, seed=seed)
+    motion = series.motion(0.002 * np.arange(4000))
+    forces = np.asarray(base.model.inverse_dynamics(np.ones(base.model.size), motion))
+    noise = np.random.default_rng(seed).normal(0.0, 0.1, (8, *forces.shape))
+    log = jid.Recording.of(motion.q, forces + noise[0], sample_time=0.002)
+    rows = jid.observe(log, base.model.robot, jid.ZeroPhaseButterworth(10.0), jid.Subsample(10))
+    jid.identify(base, rows)
+    with contextlib.suppress(jid.InputError):
+        jid.identify(base, rows.split(0.99)[1])
+    jid.identify_batch(base, motion[::10], (forces + noise)[:, ::10])
+    settings = {"harmonics": 2, "starts": 2, "generations": 0, "polish": 0, "samples": 100}
+    jid.design_excitation(base, key=jax.random.key(seed), **settings)
+
+
+def soak(folder, minutes, quick):
+    """Repeat jobs of changing robots and compare memory at the beginning and the end."""
+    begun, rounds, early = time.monotonic(), 0, None
+    length = 60.0 * minutes
+    while rounds < 2 or (not quick and time.monotonic() - begun < length):
+        round_of_jobs(rounds)
+        rounds += 1
+        if early is None and (quick or time.monotonic() - begun > length / 6):
+            early = resident()
+    files = len(os.listdir("/proc/self/fd"))
+    late = resident()
+    said = f"{rounds} rounds, {early:.0f} MiB after a sixth, {late:.0f} at the end, {files} files"
+    flat = quick or late < 1.05 * early
+    return [Row("soak", "memory", "faults.py soak", "at most 1.05 times", said, flat)]
+
+
+def main():
+    """Run the chosen parts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parts = {"fuzz": fuzz, "kill": kill, "soak": soak}
+    parser.add_argument("parts", nargs="*", choices=[*parts, []], default=list(parts))
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--minutes", type=float, default=8.0)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    rows = []
+    for part in options.parts:
+        with tempfile.TemporaryDirectory() as folder:
+            place = example(Path(folder) / "example")
+            rows += parts[part](place, options.minutes, options.quick)
+    hand_over(rows, options.json)
+    return not all(row.holds for row in rows)
+
+
+if __name__ == "__main__":
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    raise SystemExit(main())
