@@ -2,6 +2,9 @@
 
 from typing import TYPE_CHECKING, Any
 
+from jaxid import simulation as simulation
+from jaxid import trajectory as trajectories
+from jaxid.dynamics import terms as terms
 from jaxid.dynamics.base import BaseParameters as BaseParameters
 from jaxid.dynamics.base import Identifiability as Identifiability
 from jaxid.dynamics.base import base_parameters as base_parameters
@@ -26,6 +29,9 @@ from jaxid.dynamics.terms import ViscousFriction as ViscousFriction
 from jaxid.dynamics.transitions import AbstractTransition as AbstractTransition
 from jaxid.dynamics.transitions import HardSign as HardSign
 from jaxid.dynamics.transitions import Tanh as Tanh
+from jaxid.errors import InputError as InputError
+from jaxid.excitation import constraints as constraints
+from jaxid.excitation import criteria as criteria
 from jaxid.excitation.constraints import AbstractConstraint as AbstractConstraint
 from jaxid.excitation.constraints import Clearance as Clearance
 from jaxid.excitation.constraints import JointForces as JointForces
@@ -52,6 +58,10 @@ from jaxid.export.inertials import export_pinocchio as export_pinocchio
 from jaxid.export.inertials import pinocchio_parameters as pinocchio_parameters
 from jaxid.export.mjcf import export_mjcf as export_mjcf
 from jaxid.export.urdf import export_urdf as export_urdf
+from jaxid.identification import consistency as consistency
+from jaxid.identification import devices as devices
+from jaxid.identification import estimators as estimators
+from jaxid.identification import uncertainty as uncertainty
 from jaxid.identification.batches import identify_batch as identify_batch
 from jaxid.identification.bootstrap import bootstrap as bootstrap
 from jaxid.identification.consistency import BodyBounds as BodyBounds
@@ -126,6 +136,8 @@ from jaxid.identification.uncertainty import IndependentRows as IndependentRows
 from jaxid.identification.uncertainty import ResidualSpectra as ResidualSpectra
 from jaxid.identification.uncertainty import SpectralSandwich as SpectralSandwich
 from jaxid.identification.uncertainty import Uncertainty as Uncertainty
+from jaxid.measurement import filters as filters
+from jaxid.measurement import units as units
 from jaxid.measurement.columns import Columns as Columns
 from jaxid.measurement.decimation import Decimation as Decimation
 from jaxid.measurement.decimation import Subsample as Subsample
@@ -140,6 +152,7 @@ from jaxid.measurement.recording import Recording as Recording
 from jaxid.measurement.recording import read_recording as read_recording
 from jaxid.measurement.recording import remove_delay as remove_delay
 from jaxid.program.cache import keep_compiled as keep_compiled
+from jaxid.robot import collision as collision
 from jaxid.robot import library as robots  # noqa: F401
 from jaxid.robot.collision import AbstractObstacle as AbstractObstacle
 from jaxid.robot.collision import Box as Box
