@@ -535,13 +535,13 @@ def test_long_logs_give_what_short_ones_give(folder, run, monkeypatch, kind, com
 
 def test_slips_are_found_in_a_part_of_a_long_log(folder, run, monkeypatch):
     monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
-    monkeypatch.setattr("jaxid.experiment.excerpt.EXAMINED", 800)
+    monkeypatch.setattr("jaxid.diagnose.diagnosis._EXAMINED", 800)
     log = pl.read_csv("a.csv")
     log.with_columns(-pl.col("tau2")).write_csv("turned.csv")
     code, out, _ = run("inspect", "experiment.toml", "turned.csv")
     said = " ".join(out.split())
     assert code == 0
-    assert f"800 of the {len(log)} samples were examined for slips" in said
+    assert f"800 of the {len(log)} samples were examined for mistakes" in said
     assert "the sign of the force of joint `joint2` seems to be wrong" in said
     held = pl.when(pl.col("t") < 2.0).then(pl.col("q2")).otherwise(0.1)
     log.with_columns(held.alias("q2")).write_csv("held.csv")

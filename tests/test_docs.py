@@ -14,15 +14,14 @@ import polars as pl
 import pytest
 
 import jaxid as jid
+from jaxid.diagnose.mislabelled import BAD, SURE
 from jaxid.dynamics.machine import in_numpy
 from jaxid.experiment.decoder import check_tables, decode
 from jaxid.experiment.estimator_table import KINDS, choose_uncertainty
 from jaxid.experiment.excitation_tables import Collision, Excitation
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.method_tables import FILTERS, SIDES, Effects, Logs, build_rows
-from jaxid.experiment.mistakes import BAD
 from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
-from jaxid.experiment.sanity import SURE
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
 from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
 from jaxid.measurement.columns import Columns

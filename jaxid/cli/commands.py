@@ -24,15 +24,15 @@ from jaxid.cli.options import (
     open_stages,
     require_one_log_per_option,
 )
+from jaxid.diagnose.diagnosis import mistakes_in_logs
+from jaxid.diagnose.mislabelled import BAD
 from jaxid.errors import InputError
-from jaxid.experiment.doctor import fitted_doubts, slips_of
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.folder import (
     output_folder,
     refuse_foreign_folder,
 )
 from jaxid.experiment.loading import Loaded, choose, doubts_of, load_log, load_logs
-from jaxid.experiment.mistakes import BAD
 from jaxid.experiment.progress import Stages
 from jaxid.experiment.runs import earlier_run, is_report
 from jaxid.experiment.template import write_template
@@ -178,7 +178,7 @@ def inspect(
     show(console, loaded.robot.summary(), *motor_tables(loaded.robot), base_table(loaded.base))
     show_remarks(console, loaded.notes)
     for log, fit, doubts in seen:
-        show(console, log_table(log.recording, loaded.robot, log.check, doubts))
+        show(console, log_table(log.recording, log.diagnosis, doubts))
         show(console, Table("", facts=fit.facts, remarks=fit.determination))
 
 
@@ -187,8 +187,8 @@ def _look(experiment: Experiment, path: Path, stage: Stages) -> tuple[Loaded, Fi
     stage(f"factorising {path.name}")
     progress = stage.through(log.recording.samples)
     fit = estimate(experiment.base, log.observations, experiment.estimation.plain, progress)
-    stage(f"looking for slips in {path.name}")
-    return log, fit, fitted_doubts(log, fit)
+    stage(f"looking for mistakes in {path.name}")
+    return log, fit, log.diagnosis.fit_findings(fit)
 
 
 app.command()(excite)
@@ -292,7 +292,7 @@ def identify(
             names = (solution_name(fit.solution), solution_name(other.solution))
             errors = [torque_errors(other, o) for o in (*fitted, *checked)]
             alternative = Alternative(other, errors, names)
-        suspected = slips_of(read[: len(logs)], fit)
+        suspected = mistakes_in_logs([log.diagnosis for log in read[: len(logs)]], fit)
         if fit.residual > BAD and not suspected:
             said.append(DELAYS)
         stage("writing the report")

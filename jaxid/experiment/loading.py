@@ -4,12 +4,11 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxid.diagnose import Diagnosis, diagnose
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import within
-from jaxid.experiment.excerpt import excerpt
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.progress import Stages
-from jaxid.experiment.sanity import LogCheck, check_log, check_long_log
 from jaxid.identification.filter_choice import FilterChoice, choose_filter
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
@@ -24,23 +23,14 @@ class Loaded:
     Attributes:
         recording: As it was read.
         observations: What the filter makes of it.
-        check: What it holds beside the robot's limits.
-        examined: What slips are looked for in: of a long log, a part; None if that tells nothing.
+        diagnosis: Statistics of the log beside the limits of its robot, and findings.
         notes: How it was read, in sentences.
     """
 
     recording: Recording | Observations
     observations: Observations
-    check: LogCheck
-    examined: Observations | None
+    diagnosis: Diagnosis
     notes: tuple[str, ...] = ()
-
-    @property
-    def sides(self) -> tuple[bool, bool]:
-        """Whether its angles and forces are taken for the motors'."""
-        recording = self.recording
-        held = recording if isinstance(recording, Recording) else recording.source.columns
-        return held.angles_on_motor_side, held.forces_on_motor_side
 
 
 def load_log(experiment: Experiment, path: Path, stage: Stages, name: str | None = None) -> Loaded:
@@ -67,8 +57,8 @@ def load_log(experiment: Experiment, path: Path, stage: Stages, name: str | None
         recording = dataclasses.replace(recording, name=name)
     stage(f"filtering {path.name}")
     observations = experiment.observe(recording)
-    check = check_log(experiment.robot, recording, observations)
-    return Loaded(recording, observations, check, observations, notes)
+    diagnosis = diagnose(recording, experiment.robot, observations=observations)
+    return Loaded(recording, observations, diagnosis, notes)
 
 
 def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None) -> Loaded:
@@ -76,20 +66,15 @@ def _opened(experiment: Experiment, path: Path, stage: Stages, name: str | None)
     log = experiment.open(path)
     log = log if name is None else log.replace(name=name)
     stage(f"looking through {path.name}")
-    part = excerpt(log)
-    check = check_long_log(experiment.robot, log, part, stage.through(log.samples))
-    try:
-        examined, why = experiment.observe(part), ""
-    except ValueError as error:
-        examined, why = None, f" of single channels only: {error}"
-    if part.samples < log.samples or examined is None:
-        note = f"{part.samples} of the {log.samples} samples were examined for slips{why}"
-        log = log.replace(notes=(*log.notes, note))
+    diagnosis = diagnose(
+        log, experiment.robot, min_speed=experiment.min_speed, progress=stage.through(log.samples)
+    )
+    log = log.replace(notes=(*log.notes, *diagnosis.notes))
     every = comparison_step(log)
     if every == 1:
-        return Loaded(log, log, check, examined)
+        return Loaded(log, log, diagnosis)
     note = f"{log.name}: torque errors and figures take one of every {every} of its {log.rows} rows"
-    return Loaded(log, log, check, examined, (note,))
+    return Loaded(log, log, diagnosis, (note,))
 
 
 def choose(
@@ -156,4 +141,4 @@ def load_logs(experiment: Experiment, paths: Sequence[Path], stage: Stages) -> l
 
 def doubts_of(logs: Sequence[Loaded]) -> list[str]:
     """What is strange about the channels of logs, by their names."""
-    return [f"{log.recording.name}: {said}" for log in logs for said in log.check.warnings]
+    return [f"{log.recording.name}: {said}" for log in logs for said in log.diagnosis.findings]

@@ -5,8 +5,8 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+from jaxid.diagnose.diagnosis import mistakes_in_logs
 from jaxid.errors import InputError
-from jaxid.experiment.doctor import slips_of
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.loading import doubts_of, load_log
 from jaxid.experiment.progress import Stages
@@ -92,6 +92,6 @@ def read_run(
         through = stage.through(sum(o.samples for o in observed))
         rows = RegressionProblem(experiment.base, observed, through)
         fit = fit_problem(rows, experiment.estimation.plain)
-        doubts += slips_of(logs, fit)
+        doubts += mistakes_in_logs([log.diagnosis for log in logs], fit)
         earlier.append(fit)
     return functools.reduce(update, earlier), doubts

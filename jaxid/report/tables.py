@@ -12,6 +12,7 @@ from jaxid.identification.estimators import AbstractSpectralSolution
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
+from jaxid.diagnose import Diagnosis
 from jaxid.table import (
     MISSING,
     Column,
@@ -197,15 +198,15 @@ def solution_name(solution: AbstractSpectralSolution) -> str:
     return f"{type(solution).__name__.lower()} {strength:.2g}"
 
 
-def log_table(log: Any, robot: Robot, check: Any, doubts: Iterable[str]) -> Table:
+def log_table(log: Any, diagnosis: Diagnosis, doubts: Iterable[str]) -> Table:
     """Return the ranges, speeds and forces of a log beside the robot's limits, and all doubts.
 
     Args:
         log: Recording or log on disk.
-        robot: Robot of the log.
-        check: Ranges, speeds and forces of the log, and warnings.
+        diagnosis: Diagnosis of the log.
         doubts: Further doubts about the log, in sentences.
     """
+    robot, check = diagnosis.robot, diagnosis.statistics
     limits, gaps = robot.limits, len(log.segments) - 1
     joints = range(robot.joints)
 
@@ -231,7 +232,7 @@ def log_table(log: Any, robot: Robot, check: Any, doubts: Iterable[str]) -> Tabl
         ],
         remarks=[
             *log.notes,
-            *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys((*check.warnings, *doubts))),
+            *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys((*diagnosis.findings, *doubts))),
         ],
     )
 

@@ -1,13 +1,13 @@
-"""The doctor names the one slip that was made, in the columns of the log, and nothing else."""
+"""A diagnosis names the one mistake that was made, in the columns of the log, and nothing else."""
 
 import numpy as np
 import pytest
 
+from jaxid.diagnose import diagnose
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction
-from jaxid.experiment.mistakes import likely_mistake
-from jaxid.experiment.sanity import check_log
+from jaxid.identification.identify import identify
 from jaxid.measurement.decimation import Subsample
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
@@ -46,13 +46,33 @@ def said(angles, forces, angles_on_motor_side=True, forces_on_motor_side=True):
         angles_on_motor_side=angles_on_motor_side,
         forces_on_motor_side=forces_on_motor_side,
     )
-    seen = observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5))
-    sides = angles_on_motor_side, forces_on_motor_side
-    return likely_mistake(BASE, seen, *sides), check_log(ROBOT, log, seen).warnings
+    o = observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5))
+    fit = identify(BASE, o)
+    diagnosis = diagnose(log, ROBOT, observations=o)
+    return diagnosis.mistakes(fit), diagnosis.findings
 
 
-def test_a_good_log_is_left_in_peace(motors):
-    assert said(*motors)[0] == ()
+def test_a_good_log_has_no_findings_and_prints_its_limits(motors):
+    assert said(*motors) == ((), ())
+    log = Recording.of(
+        *motors, sample_time=DT, angles_on_motor_side=True, forces_on_motor_side=True
+    )
+    fit = identify(BASE, observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5)))
+    for diagnosis in (diagnose(log, ROBOT, fit), diagnose(log, ROBOT)):
+        assert diagnosis.findings == ()
+        text = str(diagnosis)
+        assert all(name in text for name in ROBOT.joint_names)
+        assert "Nothing suspicious" in text
+
+
+def test_observations_are_examined_without_their_recording(motors):
+    angles, forces = motors
+    log = Recording.of(angles, forces, sample_time=DT, angles_on_motor_side=True)
+    o = observe(log, ROBOT, ZeroPhaseButterworth(8.0))
+    findings = diagnose(o, ROBOT).findings
+    recorded = diagnose(log, ROBOT, observations=o).findings
+    assert findings == recorded
+    assert str(diagnose(o, ROBOT)).count("!") >= len(findings)
 
 
 @pytest.mark.parametrize("joint", [0, 5, 6])
