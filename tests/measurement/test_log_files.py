@@ -1,0 +1,357 @@
+"""Log files: what is read back is what was written; errors name file, column and line."""
+
+import re
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.io import savemat
+
+from jaxid.measurement import units
+from jaxid.measurement.chunked_files import open_log_file
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.recording import read_recording
+from jaxid.measurement.units import Quantity, Unit
+
+COLUMNS = Columns(angles="q{}", forces="tau{}", velocities="dq{}", time="t")
+PLAIN = Columns(angles="q{}", forces="tau{}", time="t")
+FINITE = st.floats(-1e6, 1e6, allow_subnormal=False)
+
+
+def a_log(joints=2, samples=12):
+    rng = np.random.default_rng(7)
+    log = {"t": 0.004 * np.arange(samples)}
+    for group in ("q", "dq", "tau"):
+        log |= {f"{group}{j + 1}": rng.normal(size=samples) for j in range(joints)}
+    return log
+
+
+def write_csv(path, log, separator=",", header=True):
+    pl.DataFrame(log).write_csv(path, separator=separator, include_header=header)
+    return path
+
+
+def stack(log, group):
+    return np.stack([log[f"{group}{j}"] for j in (1, 2)], axis=1)
+
+
+def check(recording, log):
+    np.testing.assert_array_equal(recording.angles, stack(log, "q"))
+    np.testing.assert_array_equal(recording.velocities, stack(log, "dq"))
+    np.testing.assert_array_equal(recording.forces, stack(log, "tau"))
+    assert recording.sample_time == 0.004
+    assert recording.segments == ((0, len(log["t"])),)
+    assert recording.notes == ()
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+@pytest.mark.parametrize("header", [True, False])
+def test_text_files_of_any_separator(tmp_path, separator, header):
+    path = write_csv(tmp_path / "log.csv", a_log(), separator, header)
+    places = Columns(angles=(1, 2), velocities=(3, 4), forces=(5, 6), time=0)
+    check(read_recording(path, COLUMNS if header else places), a_log())
+
+
+def test_decimal_commas_and_headers_of_savetxt(tmp_path):
+    log = a_log()
+    cells = ["; ".join(f"{v:.17g}" for v in row) for row in zip(*log.values(), strict=True)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["; ".join(log), *cells]).replace(".", ","))
+    check(read_recording(path, COLUMNS), log)
+    np.savetxt(tmp_path / "log.txt", np.stack(list(log.values()), 1), header=" ".join(log))
+    recording = read_recording(tmp_path / "log.txt", COLUMNS)
+    np.testing.assert_allclose(recording.forces, stack(log, "tau"), rtol=1e-15)
+
+
+@settings(max_examples=15)
+@given(data=st.data(), joints=st.integers(1, 4), samples=st.integers(10, 20))
+def test_round_trip_of_all_formats(tmp_path_factory, data, joints, samples):
+    folder = tmp_path_factory.mktemp("logs")
+    q, tau = (data.draw(arrays(np.float64, (samples, joints), elements=FINITE)) for _ in "ab")
+    table = {f"q{j + 1}": q[:, j] for j in range(joints)}
+    table |= {f"tau{j + 1}": tau[:, j] for j in range(joints)}
+    pl.DataFrame(table).write_csv(folder / "a.csv")
+    pl.DataFrame(table).write_parquet(folder / "a.parquet")
+    np.savez(folder / "a.npz", **table)
+    savemat(folder / "a.mat", {"log": table})
+    whole = {"q": q, "tau": tau}
+    np.savez(folder / "b.npz", **whole)
+    savemat(folder / "b.mat", whole)
+    pl.DataFrame({k: v.tolist() for k, v in whole.items()}).write_parquet(folder / "b.parquet")
+    for file in ("a.csv", "a.parquet", "a.npz", "a.mat", "b.npz", "b.mat", "b.parquet"):
+        pattern = "" if file[0] == "b" else "{}"
+        prefix = "log." if file == "a.mat" else ""
+        names = f"{prefix}q{pattern}", f"{prefix}tau{pattern}"
+        recording = read_recording(folder / file, Columns(*names, sample_time=0.01))
+        np.testing.assert_array_equal(recording.angles, q)
+        np.testing.assert_array_equal(recording.forces, tau)
+
+
+def test_units_signs_offsets_and_constants(tmp_path):
+    log = a_log()
+    path = write_csv(tmp_path / "log.csv", log | {"t": 4000 * np.arange(12)})
+    columns = Columns(
+        angles="q{}",
+        forces="tau{}",
+        velocities="dq{}",
+        time="t",
+        time_unit=units.US,
+        angle_unit=(units.MM, units.DEG),
+        velocity_unit=(units.MM_PER_S, units.RPM),
+        force_unit=units.A,
+        torque_constants=(2.0, 0.5),
+        angle_signs=(1, -1),
+        force_signs=(-1, 1),
+        angle_offsets=(0.1, np.pi),
+    )
+    r = read_recording(path, columns)
+    q, dq, tau = (stack(log, g) for g in ("q", "dq", "tau"))
+    np.testing.assert_allclose(r.angles[:, 0], 1e-3 * q[:, 0] + 0.1, rtol=1e-14)
+    np.testing.assert_allclose(r.angles[:, 1], np.pi - np.deg2rad(q[:, 1]), rtol=1e-14)
+    np.testing.assert_allclose(r.velocities[:, 0], 1e-3 * dq[:, 0], rtol=1e-14)
+    np.testing.assert_allclose(r.velocities[:, 1], -dq[:, 1] * 2 * np.pi / 60, rtol=1e-14)
+    np.testing.assert_allclose(r.forces, tau * [-2.0, 0.5], rtol=1e-14)
+    assert r.sample_time == 0.004
+    path = write_csv(tmp_path / "log.csv", log)
+    degrees = Columns("q{}", "tau{}", velocities="dq{}", time="t", angle_unit=units.DEG)
+    np.testing.assert_allclose(read_recording(path, degrees).velocities, np.deg2rad(dq), rtol=1e-14)
+
+
+def test_numbering_from_zero_and_leading_zeros(tmp_path):
+    log = a_log()
+    groups = {f"{g}_{j:02d}": log[f"{g}{j + 1}"] for g in ("q", "tau") for j in range(2)}
+    path = write_csv(tmp_path / "log.csv", {"t": log["t"]} | groups)
+    r = read_recording(path, Columns(angles="q_{}", forces="tau_{}", time="t"))
+    np.testing.assert_array_equal(r.angles, stack(log, "q"))
+
+
+def test_nanoseconds_since_1970_keep_their_precision(tmp_path):
+    ticks = 1_700_000_000_123_456_789 + 1_000_000 * np.arange(50)
+    frame = pl.DataFrame({"t": ticks, "q1": np.arange(50.0), "tau1": np.arange(50.0)})
+    frame.write_csv(tmp_path / "log.csv")
+    frame.write_parquet(tmp_path / "log.parquet")
+    dates = frame.with_columns(pl.col("t").cast(pl.Datetime("ns")))
+    dates.write_parquet(tmp_path / "dates.parquet")
+    nanoseconds = Columns(angles="q1", forces="tau1", time="t", time_unit=units.NS)
+    for file in ("log.csv", "log.parquet", "dates.parquet"):
+        r = read_recording(tmp_path / file, PLAIN if "dates" in file else nanoseconds)
+        assert r.sample_time == 1e-3
+        assert not [note for note in r.notes if "jitter" in note]
+
+
+def test_several_files(tmp_path):
+    log = a_log()
+    for group, name in {"q": "Joint_", "tau": "Joint_", "dq": "v"}.items():
+        write_csv(tmp_path / f"{group}.csv", {f"{name}{j}": log[f"{group}{j}"] for j in (1, 2)})
+    columns = Columns(angles="Joint_{}", forces="Joint_{}", velocities="v{}", sample_time=0.004)
+    paths = {"forces_path": tmp_path / "tau.csv", "velocities_path": tmp_path / "dq.csv"}
+    r = read_recording(tmp_path / "q.csv", columns, "run", **paths)
+    check(r, log)
+    assert r.name == "run"
+
+
+def refused(path, columns, *parts, **kwargs):
+    with pytest.raises(ValueError) as caught:
+        read_recording(path, columns, **kwargs)
+    message = str(caught.value)
+    for part in parts:
+        assert part in message, message
+    assert message.endswith((".", "?")), message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("cell", "complaint"),
+    [("", "is empty"), ("abc", "is `abc`, no number"), ("nan", "not"), ("inf", "not finite")],
+)
+def test_bad_cells_are_named_with_file_column_and_line(tmp_path, cell, complaint):
+    rows = ["t,q1,tau1", *(f"{0.01 * i:.2f},{i},{-i}" for i in range(20))]
+    rows[8] = f"0.07,{cell},-7"
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    refused(tmp_path / "log.csv", PLAIN, "`log.csv`", "`q1`", "line 9", complaint)
+    ignored = Columns(angles="t", forces="tau1", sample_time=0.01)
+    assert read_recording(tmp_path / "log.csv", ignored).samples == 20
+
+
+def spoilt(row, value, dtype=np.float64):
+    q = np.zeros((20, 2), dtype)
+    q[row] = value
+    return q
+
+
+SIGNALLING = np.array([0x7F800001], np.uint32).view(np.float32)[0]
+
+
+@pytest.mark.parametrize(
+    ("q", "complaint"),
+    [
+        (spoilt(5, np.nan), "row 6"),
+        (spoilt(3, (np.inf, -np.inf)), "row 4"),
+        (spoilt(3, 1e200), "row 4"),
+        (np.full((20, 2), SIGNALLING), "row 1"),
+        (np.zeros((20, 0)), "no columns"),
+        (np.array(["a"] * 20), "real numbers"),
+        (np.zeros((20, 2, 2)), "axes"),
+    ],
+)
+def test_arrays_that_no_sensor_measures(tmp_path, q, complaint):
+    np.savez(tmp_path / "log.npz", q=q, tau=np.zeros((20, 2)))
+    columns = Columns(angles="q", forces="tau", sample_time=0.1)
+    refused(tmp_path / "log.npz", columns, "`q`", "`log.npz`", complaint)
+
+
+@pytest.mark.parametrize("cell", [b"\xff", [b"1.0"], [[1.0]]])
+def test_columns_of_no_numbers_are_named(tmp_path, cell):
+    path = tmp_path / "log.parquet"
+    log = {"t": 0.1 * np.arange(20), "q1": [cell] * 20, "tau1": np.zeros(20)}
+    pl.DataFrame(log).write_parquet(path)
+    refused(path, PLAIN, "`q1`", "`log.parquet`", "no numbers")
+    ragged = {"q": [[1.0, 2.0]] * 5 + [[1.0]] * 6, "tau": [[1.0, 2.0]] * 11}
+    pl.DataFrame(ragged).write_parquet(path)
+    refused(path, Columns("q", "tau", sample_time=0.1), "`q`", "row 6")
+
+
+def test_missing_columns_name_the_others_and_the_closest(tmp_path):
+    path = write_csv(tmp_path / "log.csv", a_log())
+    wrong = Columns(angles="q{}", forces="tua{}", time="t")
+    refused(path, wrong, "`log.csv`", "`tua1`", "`forces`", "`tau1`", "`dq2`")
+    refused(path, Columns(angles="q{}", forces="tau{}", time="time"), "`time`", "`t`")
+    refused(path, Columns(angles=(1, 9), forces="tau{}", time="t"), "column 9", "from 0 to 6")
+    refused(path, Columns("q{}", "q{}", time="t"), "`q1`", "`angles`", "`forces`")
+    log = a_log(3)
+    del log["q2"]
+    path = write_csv(tmp_path / "hole.csv", log)
+    refused(path, COLUMNS, "`q2`", "`q3`")
+    refused(path, Columns(angles=("q1", "q3"), forces="tau{}", time="t"), "3 joints", "have 2")
+    path = write_csv(tmp_path / "double.csv", a_log() | {"q01": np.zeros(12)})
+    refused(path, COLUMNS, "`q1`", "`q01`", "`angles`")
+    path = write_csv(tmp_path / "bare.csv", a_log(), header=False)
+    refused(path, COLUMNS, "no header", "from 0 to 6")
+    path.write_text("t,q1674407370955165,q2,tau1,tau2\n" + "0,1,2,3,4\n" * 30)
+    refused(path, PLAIN, "`q1`")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "complaint"),
+    [
+        ("log.xlsx", b"x", "`log.xlsx`"),
+        ("log.csv", b"", "empty"),
+        ("log.csv", b"q,tau\n", "no rows"),
+        ("log.csv", b"q,q,tau\n1,2,3\n", "`q` twice"),
+        ("log.csv", b"q,tau\n" + b"1,2\n" * 9 + b"1,2,3\n" + b"1,2\n" * 9, "2 columns"),
+        ("log.csv", "q,tau\n1,2\n".encode("utf-16"), "UTF-16"),
+        ("log.csv", b"q,tau\r1,2\r1,2\r", "carriage returns"),
+        ("log.csv", b"q,tau\n" + b"1,2\n" * 9 + b'1,"2\n' + b"1,2\n" * 9, "line 11"),
+        ("log.parquet", b"not parquet", "damaged"),
+        ("log.npz", b"not npz", "`log.npz`"),
+        ("log.mat", b"not mat at all" * 30, "damaged"),
+        ("log.mat", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x00" * 512, "-v7"),
+    ],
+)
+def test_damaged_files(tmp_path, name, content, complaint):
+    path = tmp_path / name
+    path.write_bytes(content)
+    refused(path, Columns(angles="q", forces="tau", sample_time=0.1), f"`{name}`", complaint)
+
+
+def test_quotations_may_hold_separators(tmp_path):
+    rows = ["t,q1,tau1,note", *(f'{0.01 * k:.2f},{k},1,"a ""still"", held"' for k in range(60))]
+    (tmp_path / "log.csv").write_text("\r\n".join(rows))
+    assert read_recording(tmp_path / "log.csv", PLAIN).samples == 60
+
+
+def test_damage_that_polars_takes_for_a_bug_of_its_own(tmp_path, monkeypatch):
+    """Its panics are no `Exception`, and depend on which bytes are damaged."""
+    path = tmp_path / "log.parquet"
+    pl.DataFrame(a_log()).write_parquet(path)
+    file = open_log_file(path, lambda table: tuple(table.columns))
+
+    def panic(*_, **__):
+        raise pl.exceptions.PanicException("called `Result::unwrap()` on an `Err` value")
+
+    monkeypatch.setattr(pl, "read_parquet", panic)
+    refused(path, COLUMNS, "`log.parquet`", "damaged")
+    monkeypatch.setattr(pl, "scan_parquet", panic)
+    with pytest.raises(ValueError, match=r"`log.parquet`"):
+        file.read(0, 3)
+
+
+@settings(max_examples=60)
+@given(places=st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(0, 255)), max_size=4))
+def test_mat_files_with_damaged_bytes(tmp_path_factory, places):
+    path = tmp_path_factory.mktemp("mat") / "log.mat"
+    t = 0.01 * np.arange(30)
+    q = np.sin(np.outer(t, [1.0, 2.0]))
+    savemat(path, {"t": t, "q": q, "tau": 3 * q})
+    data = bytearray(path.read_bytes())
+    for share, byte in places:
+        data[int(share * (len(data) - 1))] = byte
+    path.write_bytes(data)
+    try:
+        log = read_recording(path, Columns(angles="q", forces="tau", time="t"))
+    except ValueError:
+        return
+    assert np.isfinite(log.angles).all()
+    assert np.isfinite(log.forces).all()
+
+
+def test_lengths_and_shapes_must_agree(tmp_path):
+    log = a_log()
+    path = write_csv(tmp_path / "q.csv", log)
+    forces = write_csv(tmp_path / "tau.csv", {k: v[:-1] for k, v in log.items()})
+    refused(path, COLUMNS, "11 samples", "have 12", forces_path=forces)
+    refused(path, PLAIN, "`Columns.velocities`", velocities_path=forces)
+    refused(path, Columns("q{}", "tau{}", time="t", angle_offsets=(1.0,)), "`angle_offsets`")
+    short = write_csv(tmp_path / "short.csv", {k: v[:8] for k, v in log.items()})
+    refused(short, COLUMNS, "8 samples", "at least 10")
+    np.savez(tmp_path / "lying.npz", t=np.arange(50.0), q=np.zeros((2, 50)), tau=np.zeros((2, 50)))
+    lying = Columns(angles="q", forces="tau", time="t")
+    refused(tmp_path / "lying.npz", lying, "50 stamps for 2 samples")
+    refused(tmp_path / "none.csv", COLUMNS, "is no file")
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"time": None}, "`time`"),
+        ({"sample_time": 0.1}, "`sample_time`"),
+        ({"time": None, "sample_time": -1.0}, "`sample_time`"),
+        ({"angle_unit": units.NM}, "`angle_unit`"),
+        ({"time_unit": units.DEG}, "`time_unit`"),
+        ({"force_unit": units.A}, "`torque_constants`"),
+        ({"torque_constants": (1.0,)}, "`torque_constants`"),
+        ({"angle_signs": (2,)}, "`angle_signs`"),
+    ],
+)
+def test_columns_that_contradict_themselves(change, name):
+    with pytest.raises(ValueError, match=re.escape(name)):
+        Columns(**({"angles": "q{}", "forces": "tau{}", "time": "t"} | change))
+
+
+def test_units_by_symbol():
+    assert all(units.unit(known.symbol) is known for known in units.ALL)
+    for wrong, near in (("degrees", "deg"), ("rads/s", "rad/s"), ("Nm", "N m")):
+        with pytest.raises(ValueError, match=rf"`{wrong}`.*`{near}`"):
+            units.unit(wrong)
+    with pytest.raises(ValueError, match="`factor`"):
+        Unit("nothing", 0.0, Quantity.FORCE)
+
+
+def test_measured_robots(shared_data):
+    tx40 = read_recording(
+        shared_data / "tx40" / "motor_position.csv",
+        Columns(angles="Joint_{}", forces="Joint_{}", sample_time=2e-4),
+        forces_path=shared_data / "tx40" / "motor_torque.csv",
+    )
+    assert tx40.angles.shape == (45000, 6)
+    assert tx40.duration == pytest.approx(9.0)
+    assert (tx40.angles[0, 2], tx40.forces[1, 1]) == (-70.685, -0.84434)
+    ur10 = read_recording(shared_data / "ur10" / "exciting_measured.csv", COLUMNS)
+    assert (*ur10.angles.shape, ur10.sample_time) == (3441, 6, 0.008)
+    motors = Columns(angles="q_mot{}", forces="tau_motor{}", velocities="dq_mot{}", time="t")
+    kr300 = read_recording(shared_data / "kr300" / "traj_A.csv", motors)
+    assert (*kr300.angles.shape, kr300.sample_time) == (2501, 6, 0.004)
+    assert kr300.notes == ()
