@@ -11,8 +11,6 @@ from jaxid.robot.robot import Robot
 
 STANDING = 0.01
 """Fraction of a joint's largest speed below which it stands."""
-_SLACK = 0.02
-"""Fraction of a joint's range by which a log may leave it without a remark."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,11 +173,12 @@ def unit_findings(
     if not known.any():
         return []
     low, width = low[known], (high - low)[known]
+    slack = 0.02 * width
 
     def used_fraction(ends: np.ndarray) -> float:
         """Return the largest used fraction of a range; zero if some range is left."""
         a, b = np.sort(ends, axis=0)[:, known]
-        inside = (a >= low - _SLACK * width) & (b <= low + width + _SLACK * width)
+        inside = (a >= low - slack) & (b <= low + width + slack)
         return float(((b - a) / width).max()) if inside.all() else 0.0
 
     ends = np.stack([lowest, highest])
@@ -210,7 +209,7 @@ def unit_findings(
 def _range(robot: Robot, j: int, statistics: LogStatistics) -> list[str]:
     name, unit, limits = robot.joint_names[j], robot.joint_unit(j), robot.limits
     low, high = float(limits.position_min[j]), float(limits.position_max[j])
-    slack = _SLACK * (high - low) if np.isfinite(high - low) else 0.0
+    slack = 0.02 * (high - low) if np.isfinite(high - low) else 0.0
     if statistics.lowest[j] >= low - slack and statistics.highest[j] <= high + slack:
         return []
     return [
@@ -242,13 +241,9 @@ def _joint(robot: Robot, j: int, statistics: LogStatistics) -> list[str]:
     return findings
 
 
-_STRONG = 1.2
-"""Ratio of a force to its limit above which it is reported."""
-
-
 def _force(robot: Robot, j: int, statistics: LogStatistics) -> list[str]:
     name, unit, known = robot.joint_names[j], robot.force_unit(j), float(robot.known_max_forces[j])
-    if statistics.force[j] <= _STRONG * known:
+    if statistics.force[j] <= 1.2 * known:
         return []
     return [
         f"joint `{name}` needs {statistics.force[j]:.3g} {unit}, but its limit is {known:.3g} "
@@ -262,7 +257,7 @@ def _all_forces(robot: Robot, statistics: LogStatistics) -> list[str]:
     ratio = statistics.force / np.where(np.isfinite(known), known, np.nan)
     ratio = ratio[np.isfinite(ratio)]
     cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
-    if ratio.size > 1 and ratio.min() > _STRONG:
+    if ratio.size > 1 and ratio.min() > 1.2:
         return [
             f"all joints need more than their largest forces, {ratio.min():.2g} to "
             f"{ratio.max():.2g} times as much: {cure}"

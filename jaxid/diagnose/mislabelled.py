@@ -26,8 +26,6 @@ BAD = 0.03
 """Fraction (0 to 1) of the forces left unexplained from which mistakes are looked for."""
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
-_FRICTION = ("fv", "fc")
-"""Parameters that are negative on no robot."""
 
 
 class Hypothesis(NamedTuple):
@@ -187,7 +185,7 @@ def _unexplained(
     R = np.asarray(np.linalg.qr(theta, mode="r"))
     length = np.linalg.norm(R, axis=0)
     R, target = R[:, :-1] / np.where(length[:-1] > 0, length[:-1], 1.0), R[:, -1]
-    named = {f"{kind}{j + 1}" for kind in _FRICTION for j in range(joints)}
+    named = {f"{kind}{j + 1}" for kind in ("fv", "fc") for j in range(joints)}
     used = np.ones(base.size, bool)
     braking = np.array([name in named for name in base.names])
     while True:
@@ -209,7 +207,7 @@ def negative_friction(fit: Fit) -> tuple[str, ...]:
         f"friction of joint `{label}` comes out negative ({' and '.join(found)}): check the signs "
         "of its angles and forces (`recording.angle_signs`, `force_signs`)."
         for j, label in enumerate(robot.joint_names)
-        if (found := [f"{kind}{j + 1}" for kind in _FRICTION if f"{kind}{j + 1}" in wrong])
+        if (found := [f"{kind}{j + 1}" for kind in ("fv", "fc") if f"{kind}{j + 1}" in wrong])
     )
 
 

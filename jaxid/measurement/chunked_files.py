@@ -24,8 +24,6 @@ from jaxid.measurement.files import (
     require_parquet,
 )
 
-FIRST = 4096
-"""Rows from which the columns of a long file are known."""
 BLOCK = 2**26
 """Bytes of a text file that are converted at once."""
 
@@ -107,11 +105,9 @@ class ArrayFile(AbstractLogFile):
         return ArrayFile(self.source, {name: self.arrays[name] for name in names})
 
 
-Selector = Callable[[LogTable], tuple[str, ...]]
-"""Function that returns the names of the columns that are needed, given the first rows."""
-
-
-def open_log_file(path: str | Path, select: Selector) -> AbstractLogFile:
+def open_log_file(
+    path: str | Path, select: Callable[[LogTable], tuple[str, ...]]
+) -> AbstractLogFile:
     """Open a file of which any rows can be read: Parquet, uncompressed NPZ, or CSV.
 
     A CSV file is converted to Parquet once, in a temporary folder that is removed at exit.
@@ -129,10 +125,10 @@ def open_log_file(path: str | Path, select: Selector) -> AbstractLogFile:
         return _converted(path, select)
     if suffix == ".parquet":
         file = ParquetFile(path, path.name)
-        return file.only(select(file.read(0, FIRST)))
+        return file.only(select(file.read(0, 4096)))
     if suffix == ".npz":
         file = ArrayFile(path.name, _mapped_arrays(path))
-        return file.only(select(file.read(0, min(file.rows, FIRST))))
+        return file.only(select(file.read(0, min(file.rows, 4096))))
     raise InputError(
         f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet or .npz to be read in parts: "
         "convert it to one of them."
@@ -158,7 +154,7 @@ def estimated_rows(path: str | Path) -> int:
 _conversions: dict[tuple, ParquetFile] = {}
 
 
-def _converted(path: Path, select: Selector) -> ParquetFile:
+def _converted(path: Path, select: Callable[[LogTable], tuple[str, ...]]) -> ParquetFile:
     """Convert the needed columns of a text file to Parquet, unless this has been done."""
     with path.open("rb") as file:
         text = detect_csv_format(path.name, file.read(HEAD))

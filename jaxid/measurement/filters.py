@@ -22,8 +22,6 @@ SETTLED = 1e-4
 
 At a hundredth, the accelerations near the ends move estimates by several standard deviations.
 """
-Sections = tuple[tuple[float, ...], ...]
-"""Second-order sections of a recursive filter, as in scipy, hashable."""
 
 
 def integer(name: str) -> Callable[[float | int], int]:
@@ -49,7 +47,7 @@ class LowPass(eqx.Module):
         cutoff: Frequency at which the gain of both directions falls below 1/2 [Hz].
     """
 
-    sections: Sections = eqx.field(static=True)
+    sections: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
 
     def __call__(
@@ -133,8 +131,8 @@ def _lag(omega: float, sample_time: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array([half, half]) / (1 + half), np.array([1.0, (half - 1) / (half + 1)])
 
 
-def unit_gain_sections(sos: np.ndarray) -> Sections:
-    """Return second-order sections scaled to gain one for constants."""
+def unit_gain_sections(sos: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    """Return second-order sections scaled to gain one for constants, hashable."""
     gain = np.prod(sos[:, :3].sum(axis=1) / sos[:, 3:].sum(axis=1))
     sos = sos.copy()
     sos[0, :3] /= gain

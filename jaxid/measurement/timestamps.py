@@ -15,8 +15,6 @@ REPEATED = 0.1
 """Distance of two stamps, in sample times, up to which their rows are one sample, logged twice."""
 FEWEST = 10
 """Smallest number of samples that can be filtered."""
-FEWEST_IN_SEGMENT = 4
-"""Smallest number of rows between two gaps that are kept."""
 
 
 class NeedsMemory(InputError):  # noqa: N818 (the name says what to do)
@@ -129,7 +127,7 @@ def find_grid(
         rows = row + len(t)
     sample_time = _rounded(total / count, rows)
     lengths = np.diff([*starts, rows])
-    kept = lengths >= FEWEST_IN_SEGMENT
+    kept = lengths >= 4
     if not kept.any():
         raise InputError(
             f"`{source}` has no four rows in sequence: its time stamps are {typical:.6g} s apart "

@@ -10,7 +10,7 @@ import pytest
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import Decimation, Subsample
 from jaxid.measurement.filters import PaperFilter, PeriodicFourier, ZeroPhaseButterworth
-from jaxid.measurement.observations import observe
+from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.recording import Recording, read_recording
 from jaxid.robot.drives import Drives
 from jaxid.robot.robot import Robot
@@ -243,3 +243,25 @@ def test_measured_velocities_that_are_not_used_are_mentioned(filter, ignored):
     assert list(observe(r, a_robot(), filter).notes) == (expected if ignored else [])
     without = dataclasses.replace(r, velocities=None)
     assert observe(without, a_robot(), filter).notes == ()
+
+
+def test_arrays_that_are_filtered_already_become_observations():
+    o = observe(a_recording(), a_robot(), ZeroPhaseButterworth(20.0, margin=0.0), Subsample(5))
+    m = o.motion
+    same = Observations.of(
+        *(m.q, m.qd, m.qdd, o.forces),
+        sample_time=DT,
+        filter=o.filter,
+        decimation=o.decimation,
+        mask=o.mask,
+    )
+    np.testing.assert_array_equal(same.reduced_forces, o.reduced_forces)
+    np.testing.assert_allclose(same.reduced_time, o.reduced_time, atol=1e-12)
+    plain = Observations.of(m.q, m.qd, m.qdd, o.forces, sample_time=DT)
+    assert plain.mask.all()
+    np.testing.assert_array_equal(plain.reduced_forces, o.forces)
+    np.testing.assert_array_equal(plain.replace(forces=2 * o.forces).forces, 2 * o.forces)
+    for wrong in ({"sample_time": 0.0}, {"mask": np.ones((3, 2), bool)}, {"qd": m.qd[:5]}):
+        arrays = {"q": m.q, "qd": m.qd, "qdd": m.qdd, "forces": o.forces, "sample_time": DT}
+        with pytest.raises(ValueError, match=f"`{next(iter(wrong))}`"):
+            Observations.of(**(arrays | wrong))
