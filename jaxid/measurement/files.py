@@ -201,7 +201,8 @@ class LogTable:
         array = np.array(array.reshape(len(array), -1), np.float64)
         with np.errstate(invalid="ignore"):
             shown = array.min(axis=1) + array.max(axis=1)
-        self._refuse_first(name, ~np.isfinite(array).all(axis=1), shown, "is not finite ({})")
+        bad = np.asarray(~np.isfinite(array).all(axis=1))
+        self._refuse_first(name, bad, shown, "is not finite ({})")
         size = np.abs(array).max(axis=1)
         self._refuse_first(name, size > LARGEST, size, "is {} in size, which nothing measures")
         return array

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -180,7 +181,7 @@ class Recording(eqx.Module):
         )
 
 
-def _real(name: str, key: str, value: ArrayLike | None) -> np.ndarray:
+def _real(name: str, key: str, value: Any) -> np.ndarray:
     if np.iscomplexobj(value):
         raise InputError(f"`{key}` of `{name}` holds complex numbers: give real ones.")
     return np.array(value, np.float64)
