@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import AnyArray
+from jaxid.diagnose import Diagnosis
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators import AbstractSpectralSolution
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
-from jaxid.diagnose import Diagnosis
 from jaxid.table import (
     MISSING,
     Column,
@@ -232,7 +232,10 @@ def log_table(log: Any, diagnosis: Diagnosis, doubts: Iterable[str]) -> Table:
         ],
         remarks=[
             *log.notes,
-            *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys((*diagnosis.findings, *doubts))),
+            *(
+                Remark(text, Status.DOUBTFUL)
+                for text in dict.fromkeys((*diagnosis.findings, *doubts))
+            ),
         ],
     )
 

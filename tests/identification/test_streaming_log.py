@@ -10,7 +10,6 @@ from virtual import motion, standard_parameters
 import jaxid as jid
 from jaxid.dynamics.machine import in_numpy
 from jaxid.identification import streaming
-from jaxid.identification.factors import factorise
 from jaxid.measurement import chunked_files, units
 from jaxid.measurement.log_on_disk import filter_memory, scan_log
 from jaxid.measurement.timestamps import NeedsMemory
@@ -66,7 +65,7 @@ def in_memory(base, path, decimation, filter=SMOOTH):
 
 
 def agree(base, log, o):
-    a, b = (factorise(base, [x]) for x in (log, o))
+    a, b = (jid.RegressionProblem(base, [x]).blocks for x in (log, o))
     np.testing.assert_array_equal(a.total.rows, b.total.rows)
     for x, y in zip(a.parts, b.parts, strict=True):
         A, B = (np.column_stack(f.weighted(np.ones(2))) for f in (x, y))
@@ -77,14 +76,14 @@ def agree(base, log, o):
 
 @pytest.mark.parametrize("decimation", [jid.Subsample(1), EVERY])
 def test_parquet_in_numpy(base, parquet, decimation, monkeypatch):
-    monkeypatch.setattr("jaxid.identification.factors.CHUNK", 3000)
+    monkeypatch.setattr(jid.RegressionProblem, "samples_per_chunk", 3000)
     log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, decimation)
     agree(base, log, in_memory(base, parquet, decimation))
 
 
 def test_parquet_compiled(base, parquet, monkeypatch):
     monkeypatch.setattr(streaming, "LONG", 1000)
-    monkeypatch.setattr("jaxid.identification.kernel.PIECE", 4096)
+    monkeypatch.setattr("jaxid.identification.compiled.PIECE", 4096)
     log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, EVERY)
     agree(base, log, in_memory(base, parquet, EVERY))
     fractions = []
