@@ -16,9 +16,9 @@ from jaxid.arrays import Float
 from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.identification.estimators import GivenWeights
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.delay import estimate_delay
-from jaxid.identification.weights import GivenWeights
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 
