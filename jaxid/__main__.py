@@ -1,5 +1,5 @@
 """Runs the command line as `python -m jaxid`."""
 
-from jaxid.cli.commands import main
+from jaxid.cli.main import main
 
 main()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from test_cli import EXPERIMENT, folder, refused, run  # noqa: F401
 
-from jaxid.cli.commands import main
+from jaxid.cli.main import main
 from jaxid.trajectory.files import load_trajectory
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxid.cli.options import refuse_foreign_folder, refuse_foreign_table
 from jaxid.errors import InputError
-from jaxid.experiment.folder import refuse_foreign_folder, refuse_foreign_table
 from jaxid.io import atomic_folder, read_arrays, read_json, require_writable, write_text
 
 

@@ -1,4 +1,4 @@
-"""The command line: what `jaxid …` does."""
+"""Command line of jaxid."""
 
-from jaxid.cli.commands import app as app
-from jaxid.cli.commands import main as main
+from jaxid.cli.main import app as app
+from jaxid.cli.main import main as main

@@ -7,12 +7,11 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from jaxid.cli.options import ExperimentFile, open_console
+from jaxid.cli.options import ExperimentFile, open_console, refuse_foreign_table
 from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import load_experiment
-from jaxid.experiment.folder import refuse_foreign_table
 from jaxid.experiment.progress import designing
 from jaxid.report.excitation import ordered, plan_remarks, plan_tables, side_by_side_table
 from jaxid.report.terminal import show, show_files, show_remarks

@@ -1,7 +1,9 @@
-"""Options that commands share, the terminal, and errors as sentences."""
+"""Options of the commands, the terminal, errors as sentences, and folders of results."""
 
 import errno
+import os
 import shlex
+import stat
 import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -12,6 +14,9 @@ from rich.console import Console
 
 from jaxid.errors import InputError
 from jaxid.experiment.progress import Stages, stages
+from jaxid.io import read_json, require_writable
+from jaxid.report.result_json import SCHEMAS
+from jaxid.trajectory.files import load_trajectory
 
 WIDTH = 100
 """Width of the output where there is no terminal."""
@@ -103,3 +108,83 @@ def command_line(
     words += ["--split", f"{split:g}"] if split is not None else []
     words += ["-o", str(output), *(["--pdf"] if pdf else [])]
     return shlex.join(words)
+
+
+def refuse_foreign_folder(target: Path, force: bool) -> None:
+    """Reject a folder that holds other things than an earlier report.
+
+    Args:
+        target: Folder of the report.
+        force: Whether the report may stand beside other files.
+
+    Raises:
+        OSError: If nothing can be written there.
+        InputError: If there is something else in its place.
+    """
+    if target.exists() and not target.is_dir():
+        raise InputError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
+    if force or not target.is_dir() or not any(target.iterdir()) or _holds_report(target):
+        require_writable(target)
+        return
+    raise InputError(
+        f"`{target}` holds files but no report: choose another folder with -o, or add --force to "
+        "put the report beside them."
+    )
+
+
+def refuse_foreign_table(target: Path) -> None:
+    """Reject a table of a motion in whose place are other files than an earlier motion.
+
+    Args:
+        target: Table, beside which the trajectory lies with the suffix `.json`, the message for
+            ROS, and a folder of pictures.
+
+    Raises:
+        OSError: If nothing can be written there.
+        InputError: If the name is not that of a table, or something else is in its place.
+    """
+    if target.suffix.lower() != ".csv":
+        raise InputError(f"`{target}` must end in .csv: choose another -o.")
+    beside, pictures = target.with_suffix(".json"), target.with_suffix("")
+    if _is_trajectory(beside):
+        return
+    ros = (target.with_suffix(f".ros.{kind}") for kind in ("yaml", "json"))
+    drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
+    foreign = next((path for path in (target, beside, *ros, *drawn) if path.exists()), None)
+    if foreign is not None:
+        raise InputError(
+            f"`{foreign}` is there already, and no motion of `jaxid excite`: choose another -o."
+        )
+    require_writable(target.parent)
+
+
+def _is_trajectory(path: Path) -> bool:
+    try:
+        load_trajectory(path)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _holds_report(folder: Path) -> bool:
+    return any(_has_schema(folder / file, schema) for file, schema in SCHEMAS.items())
+
+
+def _has_schema(path: Path, schema: str) -> bool:
+    try:
+        content = read_json(path)
+        return str(content["schema"]).startswith(schema.split("/")[0])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def output_folder() -> Path | None:
+    """Return this folder, or None if the output is redirected into a file of another one."""
+    try:
+        status = os.fstat(sys.stdout.fileno())
+    except (OSError, ValueError):
+        return Path()
+    if not stat.S_ISREG(status.st_mode):
+        return Path()
+    here = (entry.stat(follow_symlinks=False) for entry in os.scandir())
+    return Path() if any(os.path.samestat(status, one) for one in here) else None

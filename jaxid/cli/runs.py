@@ -9,12 +9,16 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.cli.options import ExperimentFile, Force, open_console, open_stages
+from jaxid.cli.options import (
+    ExperimentFile,
+    Force,
+    open_console,
+    open_stages,
+    refuse_foreign_folder,
+)
 from jaxid.errors import InputError
 from jaxid.experiment.experiment import Experiment, load_experiment
-from jaxid.experiment.folder import refuse_foreign_folder
-from jaxid.experiment.loading import choose
-from jaxid.experiment.runs import is_report, read_run, require_plain
+from jaxid.experiment.session import is_report, read_run, require_plain, select_filter
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.comparison import Comparison
 from jaxid.identification.runs.drive_gains import identify_drive_gains
@@ -226,7 +230,7 @@ def _runs(
     with open_stages(1 + len(each) + choices + 2 * len(files)) as stage:
         stage("finding base parameters")
         _ = experiment.base
-        experiment, _ = choose(experiment, files, stage)
+        experiment, _ = select_filter(experiment, files, stage)
         for paths, name in zip(each, names, strict=True):
             run, said = read_run(experiment, paths, stage, name)
             runs.append(dataclasses.replace(run, name=name))
