@@ -213,7 +213,8 @@ class BaseParameters(Hashable):
     def summary(self) -> Table:
         """Return a table of the base parameters, with their combinations and units."""
         lengths = ", ".join(f"{name} = {value:.4g}" for name, value in self.lengths.items())
-        facts = [("standard parameters", self.model.size), ("base parameters", self.size)]
+        facts: list[tuple[str, Any]] = [("standard parameters", self.model.size)]
+        facts.append(("base parameters", self.size))
         if lengths:
             facts.append(("lengths", f"{lengths} (m; m/s² for g)"))
         return Table(

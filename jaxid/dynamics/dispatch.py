@@ -63,7 +63,7 @@ class CompiledMethod:
 
         return jax.jit(run)
 
-    def packed(self, compiled: bool, *arrays: AnyArray) -> tuple[AnyArray, ...]:
+    def packed(self, compiled: bool, *arrays: AnyArray) -> tuple[Any, ...]:
         """Return the values that vary, each once, by NumPy or compiled; the batch comes last."""
         if compiled:
             return tuple(self._packed(*arrays))

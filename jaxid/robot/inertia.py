@@ -63,8 +63,7 @@ class Inertia(eqx.Module):
         """Return the inertia of a pseudo-inertia about the origin of the frame."""
         xp = namespace(pseudo)
         S = pseudo[..., :3, :3]
-        trace = xp.trace(S, axis1=-2, axis2=-1)
-        J = trace[..., None, None] * np.eye(3) - S
+        J = xp.trace(S, axis1=-2, axis2=-1)[..., None, None] * _eye(S) - S
         m, h = pseudo[..., 3, 3], pseudo[..., :3, 3]
         return cls.from_parameters(xp.concatenate([m[..., None], h, _moments(J)], axis=-1))
 
@@ -119,7 +118,7 @@ class Inertia(eqx.Module):
         xp = namespace(self.mass, self.centre, self.tensor)
         J, h = self.about_origin, (self.mass[..., None] * self.centre)[..., None]
         trace = xp.trace(J, axis1=-2, axis2=-1)[..., None, None]
-        upper = xp.concatenate([0.5 * trace * np.eye(3) - J, h], axis=-1)
+        upper = xp.concatenate([0.5 * trace * _eye(J) - J, h], axis=-1)
         m = self.mass[..., None, None]
         lower = xp.concatenate([xp.swapaxes(h, -1, -2), m], axis=-1)
         return xp.concatenate([upper, lower], axis=-2)
@@ -208,4 +207,9 @@ def _moments_of_points(r: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batc
     """Return the inertia tensors of unit masses at points, about the origin [m²]."""
     xp = namespace(r)
     squares = xp.sum(r * r, axis=-1)[..., None, None]
-    return squares * np.eye(3) - r[..., :, None] * r[..., None, :]
+    products = r[..., :, None] * r[..., None, :]
+    return squares * _eye(products) - products
+
+
+def _eye(like: AnyArray) -> np.ndarray:
+    return np.broadcast_to(np.eye(3), like.shape)

@@ -6,6 +6,7 @@ path of the joints, as smooth as the pose. All starts, and all poses of a path, 
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -105,7 +106,8 @@ def inverse_kinematics_along(
     )
 
 
-class _Poses(NamedTuple):
+@dataclass(frozen=True)
+class _Poses:
     """Positions [m] and, if they matter, attitudes of the end-effector."""
 
     position: Float[np.ndarray, "poses 3"]

@@ -38,7 +38,8 @@ def rotation_about(
 
 def axis_rotation(axis: Numbers, angle: float) -> Float[np.ndarray, "3 3"]:
     """Return the rotation about a unit vector by an angle [rad], exact for quarter turns."""
-    return remove_rounding(rotation_about(np.asarray(axis, np.float64), np.asarray(angle)))
+    R = rotation_about(np.asarray(axis, np.float64), np.asarray(angle))
+    return remove_rounding(np.asarray(R))
 
 
 def rpy_rotation(rpy: Numbers) -> Float[np.ndarray, "3 3"]:

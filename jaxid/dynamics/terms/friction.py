@@ -306,11 +306,6 @@ class TemperatureScaled(AbstractTerm):
     temperature: EachJoint = 25.0
     reference: float = eqx.field(static=True, default=25.0)
 
-    @property
-    def roles(self):
-        """Those of the term."""
-        return self.term.roles
-
     def parameters(self, robot):
         """Return those of the term."""
         return self.term.parameters(robot)
