@@ -56,7 +56,7 @@ class Inertia(eqx.Module):
     @classmethod
     def from_pinocchio(cls, p: Float[AnyArray, "*batch 10"]) -> "Inertia":
         """Return the inertia of Pinocchio's ten dynamic parameters."""
-        return cls.from_parameters((p * _SIGNS)[..., np.argsort(_PINOCCHIO)])
+        return cls.from_parameters((p * _signs(p))[..., np.argsort(_PINOCCHIO)])
 
     @classmethod
     def from_pseudo_inertia(cls, pseudo: Float[AnyArray, "*batch 4 4"]) -> "Inertia":
@@ -105,7 +105,8 @@ class Inertia(eqx.Module):
     @property
     def pinocchio(self) -> Float[AnyArray, "*batch 10"]:
         """Dynamic parameters $(m, m r_c, I_{xx}, I_{xy}, I_{yy}, I_{xz}, I_{yz}, I_{zz})$."""
-        return self.parameters[..., np.array(_PINOCCHIO)] * _SIGNS
+        p = self.parameters[..., np.array(_PINOCCHIO)]
+        return p * _signs(p)
 
     @property
     def moments(self) -> Float[AnyArray, "*batch 6"]:
@@ -209,6 +210,10 @@ def _moments_of_points(r: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batc
     squares = xp.sum(r * r, axis=-1)[..., None, None]
     products = r[..., :, None] * r[..., None, :]
     return squares * _eye(products) - products
+
+
+def _signs(like: AnyArray) -> np.ndarray:
+    return np.broadcast_to(_SIGNS, like.shape)
 
 
 def _eye(like: AnyArray) -> np.ndarray:
