@@ -93,7 +93,7 @@ class DryFriction:
                 "direction has no Stribeck effect here."
             )
         speed = _speed(robot, "coulomb.stribeck", self.stribeck)
-        return StribeckFriction(speed, transition=transition)
+        return StribeckFriction(speed=speed, transition=transition)
 
 
 def _speed(robot: Robot, name: str, value: float | list[float]) -> Speed:
@@ -194,7 +194,7 @@ class Logs:
     start: float = -np.inf
     stop: float = np.inf
 
-    def files(self, log: Path) -> dict[str, Path | None]:
+    def files(self, log: Path) -> dict[str, Any]:
         """Return the paths of the files beside a log, as the readers take them.
 
         Args:

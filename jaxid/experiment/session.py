@@ -365,7 +365,7 @@ def _add_reports(experiment: Experiment, reports: Sequence[Path], fit: Fit) -> F
 
 def _refuse_seen(fit: Fit, base: BaseParameters, unseen: Sequence[Observations]) -> None:
     for log in unseen:
-        if share_data(fit.blocks, RegressionProblem(base, [log]).blocks):
+        if fit.blocks is not None and share_data(fit.blocks, RegressionProblem(base, [log]).blocks):
             raise InputError(
                 f"a report that was given has seen the data of `{log.name}`: a model that has seen "
                 "a log is not verified by it; verify with another."
