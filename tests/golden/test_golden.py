@@ -217,6 +217,8 @@ def test_identification_of_the_demo():
     motion = jid.random_fourier_series(robot, omega=0.8, reach=0.7, seed=1)
     study = run_study(0, lambda name, fraction: None, draws=1, periods=1, motion=motion)
     fit = study.weighted.fit
+    # A servo on quantised encoders with stiction amplifies rounding: a coefficient of the motion
+    # changed by 4e-16 moves these parameters by 1e-4 (relative to the largest of their kind).
     compare(
         "demo",
         {
@@ -224,4 +226,5 @@ def test_identification_of_the_demo():
             "deviations": list(map(float, fit.standard_deviations)),
             "errors": [study.weighted.mean_errors(k) for k in (0, 1)],
         },
+        max(TOLERANCE, 2e-3),
     )
