@@ -4,11 +4,10 @@
 
 The loop does for each data set what a careful user of NumPy does: regressor rows of the base
 parameters, weights, `numpy.linalg.lstsq`. Its rows come once from Pinocchio, called for each sample
-from Python, and once from this package's evaluation in NumPy. One turn takes the whole batch and a
-few data sets of each loop; what is compared is the time for one data set. BLAS has one thread.
+from Python, and once from this package (in NumPy). One turn takes the whole batch and a few data
+sets of each loop; the time for one data set is compared. BLAS has one thread.
 """
 
-import argparse
 import os
 
 import timing
@@ -16,11 +15,11 @@ from timing import Row, hand_over, interleaved
 
 ASKED = 20.0
 EPSILON = 0.01
-"""Of the smooth sign of Coulomb friction [rad/s]."""
+"""Width of the smooth sign of Coulomb friction [rad/s]."""
 
 
 def motions(datasets, samples, joints):
-    """Fourier series of five harmonics, other coefficients for each data set."""
+    """Return Fourier series of five harmonics, with other coefficients for each data set."""
     import numpy as np
 
     import jaxid as jid
@@ -35,6 +34,7 @@ def motions(datasets, samples, joints):
 
 
 def seven_axes():
+    """Return the base parameters of a Panda with friction."""
     import jaxid as jid
 
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
@@ -42,16 +42,14 @@ def seven_axes():
 
 
 def by_evaluation(base):
-    """Rows by this package's evaluation in NumPy, [samples, joints, base]."""
+    """Return the rows of this package, evaluated in NumPy, [samples, joints, base]."""
     import numpy as np
 
-    from jaxid.dynamics.machine import in_numpy
-
-    return lambda m: np.ascontiguousarray(in_numpy(base, base.columns, m.q, m.qd, m.qdd))
+    return lambda m: np.asarray(base.regressor(m))
 
 
 def by_pinocchio(base):
-    """Rows by Pinocchio, sample by sample, with friction columns beside them."""
+    """Return the rows of Pinocchio, sample by sample, with friction columns beside them."""
     import numpy as np
     import pinocchio as pin
     from pinocchio_loop import Bodies, in_our_order, pinocchio_model
@@ -59,8 +57,8 @@ def by_pinocchio(base):
     n = base.model.robot.joints
     model = pinocchio_model(base.model.robot, Bodies(n))
     data = model.createData()
-    chosen = np.array(base.indices)
-    bodies, friction = chosen[chosen < 10 * n], chosen[chosen >= 10 * n] - 10 * n
+    columns = np.array(base.indices)
+    bodies, friction = columns[columns < 10 * n], columns[columns >= 10 * n] - 10 * n
 
     def rows(m):
         found = np.empty((len(m.q), n, 10 * n))
@@ -75,7 +73,7 @@ def by_pinocchio(base):
 
 
 def solved(rows, motion, forces, weights):
-    """Weighted least squares of one data set, columns scaled to length one."""
+    """Solve weighted least squares of one data set, with columns of length one."""
     import numpy as np
 
     theta = (rows(motion) * weights[:, None]).reshape(forces.size, -1)
@@ -84,10 +82,11 @@ def solved(rows, motion, forces, weights):
 
 
 def against_loops(datasets, samples, turns):
+    """Measure row 15."""
     import jax
     import numpy as np
 
-    from jaxid.identification.batches import identify_batch
+    import jaxid as jid
 
     base = seven_axes()
     n = base.model.robot.joints
@@ -99,7 +98,7 @@ def against_loops(datasets, samples, turns):
     some = range(min(4, datasets))
 
     def batch():
-        return jax.block_until_ready(identify_batch(base, motion, forces).parameters)
+        return jax.block_until_ready(jid.identify_batch(base, motion, forces).parameters)
 
     ours, first = timing.elapsed(batch)
     ways = {"NumPy + this package's rows": by_evaluation(base)}
@@ -134,10 +133,8 @@ def against_loops(datasets, samples, turns):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer data sets and samples")
-    parser.add_argument("--json", help="where to write the rows")
-    options = parser.parse_args()
+    """Measure row 15 on two cores."""
+    options = timing.parser(__doc__, "fewer data sets").parse_args()
     timing.pin_to(2)
     for name in timing.THREADS:
         os.environ[name] = "1"

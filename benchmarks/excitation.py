@@ -1,352 +1,268 @@
-"""What designs of excitation motions reach, and what they cost.
+"""Designs of excitation motions: quality and cost, without and with constraints.
+
+    python benchmarks/excitation.py [PART ...] [--quick] [--keys 3] [--polish 0 4] ...
 
 Robot: rail + TX90L, rigid bodies (seven parameters each: 44 base parameters; ten: 57), viscous and
-Coulomb friction, rotors; joint limits as in `jid.robots.tx90l_on_rail()`. Five harmonics at
-0.8 rad/s, 800 samples of one period without its end point, noise 1 % of the largest forces, 32
-starts. Violation: largest relative excess of position, velocity and acceleration on 8000 points.
+Coulomb friction, rotors; joint limits of `jid.robots.tx90l_on_rail()`. Five harmonics at 0.8 rad/s,
+800 samples of one period without its end point, noise 1 % of the largest forces, 32 starts. The
+violation is the largest relative excess of position, velocity and acceleration on 8000 points. The
+gain of a motion is the geometric mean, over the parameters, of the standard deviations of weighted
+least squares in a random motion over those in this motion, and of that the mean over 15 random
+motions (`random_fourier_series`, seeds 0 to 14, at full reach).
 
-* cond: the condition number of the unweighted information (Eq. 36), by JAX alone and polished.
-* gain: standard deviations of weighted least squares of random motions over those of the designed
-  one: geometric mean over the parameters, mean over 15 random motions (`random_fourier_series`,
-  seeds 0 to 14, at full reach).
-* panda: D-optimal designs of the Panda, limits of its library entry.
-* gradients, constraints: by scaled numbers at a random motion, against central differences of
-  fourth order of values that NumPy computes from singular values (criteria, at the step of 1e-4,
-  5e-5, 2.5e-5 and 1.25e-5 that agrees best with the one before it) or of the same values
-  (constraints, each value by itself at 7 instants): norm of the difference over the gradient's.
-  Values whose quotients of two steps disagree have a kink there, and are counted apart.
+* cond: condition number of the unweighted information (Eq. 36). d7, d10: D-optimal designs for 44
+  and 57 parameters. panda: both criteria for the Panda.
+* capsules-cond, capsules-d: at least 0.03 m between the robot's capsules and shapes; 8 starts, 4
+  generations, 2 polished.
+* rest: motions that start and stop at rest; 8 starts, 8 generations, 2 polished.
+* forces: forces of the nominal parameters below, with a payload of 6 kg, at most 90 % of the
+  limits; free: the same without this constraint.
 * step: one value and gradient against forward differences of the same function, 800 samples.
-* batch: starts per second of one evaluation of value and gradient, and of a whole search.
+* batch: starts per second of a whole search.
 
-Statistics over the keys: median and best. CPU seconds are those of the process; the first key's
-compile, the others find what was compiled.
-
-    python benchmarks/excitation.py cond d7 d10 panda gradients constraints step batch [--quick]
+Median and best of the keys. CPU seconds are those of the process; the first key's compile.
 """
 
-import argparse
-import itertools
 import time
 
 import jax
 import numpy as np
+import timing
 
 import jaxid as jid
-from jaxid.dynamics.compiled import acting_columns, regressor_rows
-from jaxid.excitation.information import information
-from jaxid.excitation.limits import JointLimits
-from jaxid.excitation.plan import CRITERIA, deviations
-from jaxid.excitation.problem import CHECKED, Context, Problem
-from jaxid.excitation.search import LAST, LEGS, Search, random_starts
-from jaxid.excitation.spectral import log_condition, log_largest_inverse
-from jaxid.trajectory.basis import FourierBasis
 
-RANDOM = range(15)
-H = 1e-4
-"""Step of difference quotients, in scaled numbers."""
-STEPS = (H, H / 2, H / 4, H / 8)
-"""Of criteria: the smaller of the two neighbours that agree best is taken."""
-KINK = 1e-4
-"""Relative difference of the quotients of two steps from which there is no derivative."""
-
-
-def base_of(principal_axes):
-    terms = (
-        jid.RigidBodies(principal_axes=principal_axes),
-        jid.ViscousFriction(),
-        jid.CoulombFriction(),
-        jid.RotorInertia(),
-    )
-    return jid.base_parameters(jid.Model(jid.robots.tx90l_on_rail(), terms=terms))
+POINTS = 8000
+MASSES = (250.0, 16.93, 14.35, 7.50, 6.42, 0.569, 0.031)
+"""Masses of the carriage with its column (assumed) and of the six links (CAD) [kg]."""
+RODS = (
+    ((0.0, 0.0, 0.05), (0.0, 0.0, 0.45), 0.19),
+    ((0.0, 0.0, -0.1), (0.0, 0.0, 0.1), 0.13),
+    ((0.0, 0.0, 0.0), (0.0, -0.5, 0.0), 0.13),
+    ((0.0, -0.05, 0.0), (0.0, 0.05, 0.0), 0.12),
+    ((0.0, 0.0, 0.0), (0.0, 0.0, 0.55), 0.12),
+    ((0.0, -0.03, 0.0), (0.0, 0.03, 0.0), 0.05),
+    ((0.0, 0.0, -0.02), (0.0, 0.0, 0.0), 0.03),
+)
+"""The bodies as uniform cylinders: ends of the axis and radius [m]."""
+VISCOUS, COULOMB, ROTOR = 0.13, 0.05, 0.01
+"""Friction and rotors as fractions of the largest force, per rad/s and per rad/s²."""
+PAYLOAD = {"mass": 6.0, "centre_of_mass": (0.0, 0.0, 0.1)}
+MARGIN, DISTANCE = 0.1, 0.03
 
 
-def violation(plan):
-    own, duration = plan.limits.limits, plan.limits.basis.duration
-    motion = plan.trajectory.motion(np.arange(8000) * duration / 8000)
-    q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
-    half = (own.position_max - own.position_min) / 2
-    return max(
-        ((q - own.position_max) / half).max(),
-        ((own.position_min - q) / half).max(),
-        (np.abs(qd) / own.velocity - 1).max(),
-        (np.abs(qdd) / own.acceleration - 1).max(),
-    )
+def base_of(principal_axes, payload=False):
+    """Return the base parameters of the TX90L on its rail: 44 with principal axes, else 57."""
+    robot = jid.robots.tx90l_on_rail()
+    robot = robot.with_tool(**PAYLOAD) if payload else robot
+    friction = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia())
+    bodies = jid.RigidBodies(principal_axes=principal_axes)
+    return jid.base_parameters(jid.Model(robot, (bodies, *friction)))
 
 
-def gain_over_random(plan):
-    base, weights = plan.base, 1 / np.asarray(plan.noise)
-    logs = []
-    for seed in RANDOM:
-        series = jid.random_fourier_series(base.model.robot, omega=0.8, reach=1.0, seed=seed)
-        motion = series.motion(plan.limits.basis.times(plan.samples))
-        random = deviations(information(base, motion, weights).weighted)
-        logs.append(np.mean(np.log(random / plan.standard_deviations)))
-    return float(np.exp(np.mean(logs)))
+def nominal_parameters(robot):
+    """Return standard parameters, seven for each body: cylinders, friction, rotors."""
+    bodies = []
+    for mass, (start, end, radius) in zip(MASSES, RODS, strict=True):
+        start, end = np.array(start), np.array(end)
+        centre, axis = 0.5 * (start + end), (end - start) / np.linalg.norm(end - start)
+        along = np.diag(np.outer(axis, axis))
+        across = radius**2 / 4 + np.sum((end - start) ** 2) / 12
+        inertia = mass * (across + along * (radius**2 / 2 - across))
+        inertia += mass * (centre @ centre - centre**2)
+        bodies.append([mass, *(mass * centre), *inertia])
+    force = np.asarray(robot.limits.force)
+    return np.concatenate([np.ravel(bodies), VISCOUS * force, COULOMB * force, ROTOR * force])
 
 
-def designed(base, criterion, keys, measure, polish, asked):
+class Evaluation:
+    """Gains against random motions, and violations on a fine grid.
+
+    Args:
+        bases: Base parameters of one robot, which may differ in their terms.
+    """
+
+    def __init__(self, bases):
+        self.robot, self.bases = bases[0].model.robot, bases
+        random = (
+            jid.random_fourier_series(self.robot, omega=0.8, harmonics=5, reach=1.0, seed=seed)
+            for seed in range(15)
+        )
+        self.random = [[self.deviations(base, t) for base in bases] for t in random]
+
+    def motion(self, trajectory, points=800):
+        """Return one period without its end point."""
+        return trajectory.motion(np.arange(points) * float(trajectory.duration) / points)
+
+    def deviations(self, base, trajectory):
+        """Return the standard deviations of weighted least squares."""
+        noise = 0.01 * np.asarray(self.robot.max_forces)
+        theta = np.asarray(base.regressor(self.motion(trajectory))) / noise[:, None]
+        theta = theta.reshape(-1, base.size)
+        scale = np.linalg.norm(theta, axis=0)
+        R = np.linalg.qr(theta / scale, mode="r")
+        return np.linalg.norm(np.linalg.inv(R), axis=1) / scale
+
+    def gains(self, trajectory):
+        """Return the gain for each of the base parameters."""
+        own = [self.deviations(base, trajectory) for base in self.bases]
+        return [
+            float(np.mean([np.exp(np.mean(np.log(r[k] / own[k]))) for r in self.random]))
+            for k in range(len(own))
+        ]
+
+    def violation(self, trajectory):
+        """Return the largest relative excess of a joint's limit."""
+        m, limits = self.motion(trajectory, POINTS), self.robot.limits
+        middle = 0.5 * (limits.position_max + limits.position_min)
+        half = 0.5 * (limits.position_max - limits.position_min)
+        uses = (np.abs(m.q - middle) / half, np.abs(m.qd) / limits.velocity)
+        return float(max(np.max(use) for use in (*uses, np.abs(m.qdd) / limits.acceleration)) - 1)
+
+
+def condition(plan):
+    """Return the condition number of the unweighted information."""
+    return float(np.linalg.cond(plan.information.plain))
+
+
+def design(name, base, figures, keys, options, **settings):
+    """Design a motion for each key, and print its figures and the median and best of all."""
     found = []
+    settings = {"starts": options.starts, "generations": options.generations} | settings
+    if options.quick:
+        settings |= {"starts": 2, "generations": 1, "polish": min(1, settings["polish"])}
     for key in keys:
         wall, cpu = time.perf_counter(), time.process_time()
-        plan = jid.design_excitation(
-            base,
-            criterion=criterion,
-            starts=asked.starts,
-            generations=asked.generations,
-            polish=polish,
-            key=jax.random.key(key),
-        )
+        plan = jid.design_excitation(base, key=jax.random.key(key), throw=False, **settings)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        found.append(measure(plan))
-        print(
-            f"  key {key}, polish {polish}: {found[-1]:.6g}, "
-            f"criterion {criterion.value(plan.information):.5g}, violation {violation(plan):.1e}, "
-            f"wall {wall:.1f} s, CPU {cpu:.1f} s",
-            flush=True,
-        )
-    return found
+        found.append(figures(plan) | {"wall": wall, "CPU": cpu})
+        print(f"  key {key}: {words(found[-1])}", flush=True)
+    medians = {k: np.median([f[k] for f in found]) for k in found[0]}
+    print(f"{name}, {settings['polish']} polished: median {words(medians)}")
+    for best, function in (("least", min), ("most", max)):
+        print(f"  {best} {words({k: function(f[k] for f in found) for k in found[0]})}")
 
 
-def report(name, found, best):
-    print(f"{name}: median {np.median(found):.5g}, best {best(found):.5g}", flush=True)
+def words(figures):
+    """Return figures by name in words."""
+    return ", ".join(f"{name} {value:.5g}" for name, value in figures.items())
 
 
-def cond(keys, asked):
-    base = base_of(True)
-    for polish in asked.polish:
-        found = designed(
-            base,
-            jid.ConditionNumber(),
-            keys,
-            lambda p: np.linalg.cond(p.information.plain),
-            polish,
-            asked,
-        )
-        report(f"cond, {asked.generations} generations, polish {polish}", found, min)
+def unconstrained(part, keys, options):
+    """Design without constraints, with and without polishing."""
+    if part == "panda":
+        base = jid.base_parameters(jid.Model(jid.robots.panda()))
+        for criterion in (jid.criteria.DOptimal(), jid.criteria.ConditionNumber()):
+            value = lambda plan, c=criterion: {c.name: c.value(plan.information)}  # noqa: E731
+            design("Panda", base, value, keys, options, criterion=criterion, polish=0)
+        return
+    base = base_of(part != "d10")
+    evaluation = Evaluation([base])
+    criteria = jid.criteria.ConditionNumber() if part == "cond" else jid.criteria.DOptimal()
+
+    def figures(plan):
+        found = {"cond": condition(plan), "gain": evaluation.gains(plan.trajectory)[0]}
+        return found | {"violation": evaluation.violation(plan.trajectory)}
+
+    for polish in options.polish:
+        design(part, base, figures, keys, options, criterion=criteria, polish=polish)
 
 
-def d_optimal(principal_axes, keys, asked):
-    base = base_of(principal_axes)
-    for polish in asked.polish:
-        found = designed(base, jid.DOptimal(), keys, gain_over_random, polish, asked)
-        what = f"D gain, {base.size} base parameters, {asked.generations} generations"
-        report(f"{what}, polish {polish}", found, max)
+def constrained(part, keys, options):
+    """Design with clearances, rest at the ends, or limited forces."""
+    bases = [base_of(axes, payload=part in ("forces", "free")) for axes in (True, False)]
+    evaluation, robot = Evaluation(bases), bases[0].model.robot
+    settings = {"starts": 8, "generations": 8 if part == "rest" else 4, "polish": 2}
+    p = nominal_parameters(robot)
+    shapes = jid.robots.tx90l_on_rail_collision()
+    if part.startswith("capsules"):
+        settings["constraints"] = (jid.constraints.Clearance(shapes, DISTANCE),)
+    if part == "capsules-cond":
+        settings["criterion"] = jid.criteria.ConditionNumber()
+    if part == "rest":
+        settings["basis"] = jid.trajectories.RestToRestBasis(5, 0.8)
+    if part == "forces":
+        nominal = jid.constraints.NominalForces(bases[0], bases[0].from_standard(p))
+        settings["constraints"] = (jid.constraints.JointForces(nominal, margin=MARGIN),)
 
+    def figures(plan):
+        t = plan.trajectory
+        m = evaluation.motion(t, POINTS)
+        gains = dict(zip(("gain 44", "gain 57"), evaluation.gains(t), strict=True))
+        found = gains | {"cond": condition(plan), "violation": evaluation.violation(t)}
+        if part.startswith("capsules"):
+            found["clearance"] = float(np.min(shapes.clearance(robot, m.q)))
+        if part == "rest":
+            ends = evaluation.motion(t)[[0, -1]]
+            found["speed at ends"] = float(np.abs(ends.qd[0]).max())
+        if part in ("forces", "free"):
+            model = bases[0].model
+            forces = np.abs(np.asarray(model.inverse_dynamics(p, m) + model.tool_forces(m)))
+            use = forces.max(axis=0) / ((1 - MARGIN) * np.asarray(robot.limits.force))
+            found |= {"use of forces": use.max(), "joints over by 30 %": int((use > 1.3).sum())}
+        return found
 
-def panda(keys, asked):
-    base = jid.base_parameters(jid.Model(jid.robots.panda()))
-    for criterion in (jid.DOptimal(), jid.ConditionNumber()):
-        found = designed(
-            base, criterion, keys, lambda p, c=criterion: c.value(p.information), 0, asked
-        )
-        report(f"Panda, {criterion.name}, JAX alone", found, min)
-
-
-def problem_of(base, criterion, constraints=()):
-    robot = base.model.robot
-    limits = JointLimits.of(robot, FourierBasis(5, 0.8))
-    random = limits.numbers(np.asarray(random_starts(limits, jax.random.key(0), 1))[0])
-    motion = limits.basis.trajectory(random).motion(limits.basis.times(800))
-    weights = 100 / np.asarray(robot.max_forces)
-    return Problem(
-        base,
-        limits,
-        criterion,
-        constraints,
-        weights=weights,
-        prior=np.zeros((base.size, base.size)),
-        sizes=1 / np.sqrt(np.diag(information(base, motion, weights).weighted)),
-        measured=800,
-    )
-
-
-def differences(value, y, h):
-    """Central differences of fourth order: neither rounding nor truncation matters."""
-    slopes = []
-    for k in range(len(y)):
-        e = np.zeros_like(y)
-        e[k] = h
-        near, far = (value(y + m * e) - value(y - m * e) for m in (1, 2))
-        slopes.append((8 * near - far) / (12 * h))
-    return np.array(slopes).T
-
-
-def steadiest(value, y):
-    """Quotients of the step at which truncation and rounding matter least, by themselves."""
-    found = [differences(value, y, h) for h in STEPS]
-    changes = [np.linalg.norm(b - a) for a, b in itertools.pairwise(found)]
-    best = int(np.argmin(changes))
-    return found[best + 1], changes[best] / np.linalg.norm(found[best + 1])
-
-
-def logs_of(problem, criterion, y, samples):
-    """Logarithms of the eigenvalues that a criterion looks at: from singular values, in NumPy.
-
-    The information has the square of the regressor's condition number, so that differences of its
-    own eigenvalues would drown in rounding.
-    """
-    motion = problem.basis.trajectory(problem.limits.numbers(y)).motion(
-        problem.basis.times(samples)
-    )
-    rows = regressor_rows(problem.base, motion)
-    theta = np.zeros((len(rows), samples, problem.base.size))
-    for joint, (own, part) in enumerate(zip(acting_columns(problem.base), rows, strict=True)):
-        theta[joint, :, list(own)] = part.T
-    if criterion.weighted:
-        theta = problem.weights[:, None, None] * theta
-    theta = np.sqrt(problem.measured / samples) * theta.reshape(-1, problem.base.size)
-    lengths = np.ones(problem.base.size)
-    if criterion in (jid.ScaledConditionNumber(), jid.DOptimal()):
-        lengths = np.linalg.norm(theta, axis=0)
-        theta = theta / lengths
-    if criterion in (jid.AOptimal(), jid.EOptimal()):
-        theta = theta * problem.sizes
-    logs = 2 * np.log(np.linalg.svd(theta, compute_uv=False)[::-1])
-    # The determinant factors, and keeps more digits without the columns' lengths.
-    return logs + 2 * np.mean(np.log(lengths)) if criterion == jid.DOptimal() else logs
-
-
-def of_logs(criterion, logs, sharpness):
-    if criterion == jid.DOptimal():
-        return -0.5 * np.mean(logs)
-    if criterion == jid.AOptimal():
-        return 0.5 * np.log(np.mean(np.exp(-logs)))
-    if criterion == jid.EOptimal():
-        return 0.5 * float(log_largest_inverse(logs, sharpness))
-    return float(log_condition(logs, sharpness))
-
-
-def gradients():
-    base, worst = base_of(True), 0.0
-    for criterion in CRITERIA:
-        for sharpness in (8.0, None) if criterion.extreme else (None,):
-            problem = problem_of(base, criterion)
-            evaluate = jax.jit(problem.objective(64))
-            y = np.asarray(random_starts(problem.limits, jax.random.key(1), 1))
-            context = Context(sharpness, np.zeros((1, 0), int))
-            g = np.asarray(evaluate(y, context)[1])[0]
-
-            def value(z, problem=problem, criterion=criterion, sharpness=sharpness):
-                return of_logs(criterion, logs_of(problem, criterion, z, 64), sharpness)
-
-            slopes, unsteady = steadiest(value, y[0])
-            error = np.linalg.norm(slopes - g) / np.linalg.norm(g)
-            worst = max(worst, error)
-            print(
-                f"{criterion.name}, sharpness {sharpness}: {error:.1e}, quotients of two steps "
-                f"differ by {unsteady:.1e}",
-                flush=True,
-            )
-    print(f"worst: {worst:.1e}")
-
-
-def constraint_gradients():
-    base = base_of(True)
-    nominal = jid.NominalForces.of(base, np.random.default_rng(0).uniform(0.5, 2.0, base.size))
-    for constraint in (
-        jid.Clearance(jid.robots.tx90l_on_rail_collision()),
-        jid.TipSpeed(1.0),
-        jid.TipAcceleration(5.0),
-        jid.Workspace.of([-1.0, -1.0, 0.0], [1.0, 1.0, 1.5]),
-        jid.JointForces(nominal),
-    ):
-        problem = problem_of(base, jid.DOptimal(), (constraint,))
-        y = np.asarray(random_starts(problem.limits, jax.random.key(1), 1))[0]
-        evaluate, instants = jax.jit(problem.constrained), np.arange(0, CHECKED, CHECKED // 7)
-        exact = np.asarray(evaluate(y, instants)[1]).reshape(-1, len(y))
-
-        def value(z, f=evaluate, t=instants):
-            return np.asarray(f(z, t)[0]).ravel()
-
-        found, closer = differences(value, y, H), differences(value, y, H / 4)
-        sizes = np.linalg.norm(exact, axis=1)
-        # What a motion does not change has no gradient to compare with.
-        sizes = np.maximum(sizes, 1e-6 * sizes.max())
-        # Where quotients of two steps disagree there is a kink between them: axes that cross.
-        smooth = np.linalg.norm(found - closer, axis=1) < KINK * sizes
-        errors = (np.linalg.norm(found - exact, axis=1) / sizes)[smooth]
-        print(
-            f"{type(constraint).__name__}, {len(errors)} values, {np.sum(~smooth)} more at kinks: "
-            f"{errors.max():.1e}",
-            flush=True,
-        )
+    design(part, bases[0], figures, keys, options, **settings)
 
 
 def step():
-    problem = problem_of(base_of(True), jid.ConditionNumber())
-    evaluate = jax.jit(problem.objective(800))
-    context = Context(8.0, np.zeros((1, 0), int))
-    value = jax.jit(lambda y: problem.objective(800)(y, context)[0])
-    y = random_starts(problem.limits, jax.random.key(1), 1)
-    size = y.shape[1]
-
-    def exact():
-        return jax.block_until_ready(evaluate(y, context))
+    """Time one value and gradient, and forward differences of the same function."""
+    problem = jid.ExcitationProblem(base_of(True), criterion=jid.criteria.ConditionNumber())
+    x = problem.random(jax.random.key(1))
+    gradient = jax.jit(jax.value_and_grad(lambda x: problem.value(x, 8.0)))
+    value = jax.jit(lambda x: problem.value(x, 8.0))
 
     def forward():
-        f = value(y)
-        return [float((value(y.at[0, k].add(1e-6)) - f)[0]) for k in range(size)]
+        f = value(x)
+        return [float(value(x.at[k].add(1e-6)) - f) for k in range(problem.size)]
 
-    times = {}
-    for run in (exact, forward):
-        run()
-        times[run.__name__] = []
-    for _ in range(7):
-        for run in (exact, forward):
-            start = time.perf_counter()
-            run()
-            times[run.__name__].append(time.perf_counter() - start)
-    a, b = (np.median(times[k]) for k in ("exact", "forward"))
-    print(f"step: exact {1e3 * a:.2f} ms, forward differences {1e3 * b:.1f} ms: {b / a:.0f}x")
+    exact = lambda: jax.block_until_ready(gradient(x))  # noqa: E731
+    times = timing.interleaved({"exact": exact, "forward": forward}, 7)
+    a, b = (1e3 * times[k].median for k in ("exact", "forward"))
+    print(f"step: exact {a:.2f} ms, forward differences {b:.1f} ms: {b / a:.0f}x")
 
 
 def batch(sizes):
-    problem = problem_of(base_of(True), jid.DOptimal())
-    iterations = sum(leg.stage.iterations for leg in (*LEGS, LAST))
+    """Time a whole search of several starts, without generations and polishing."""
+    from jaxid.excitation.design import minimise  # private: solve one problem twice
+
+    problem = jid.ExcitationProblem(base_of(True))
     for starts in sizes:
-        search = Search(problem, starts, 0)
         for _ in range(2):  # the first one compiles
             wall, cpu = time.perf_counter(), time.process_time()
-            state = search.begin(jax.random.key(0))
-            while state.leg < search.legs:
-                state = search.advance(state, jax.random.key(0))
+            minimise(problem, starts=starts, generations=0, polish=0)
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        print(
-            f"batch of {starts}: {starts / wall:.2f} starts per second of {iterations} iterations "
-            f"({wall:.2f} s, CPU {cpu:.2f} s)",
-            flush=True,
-        )
+        rate = f"{starts / wall:.2f} starts per second"
+        print(f"batch of {starts}: {rate} ({wall:.2f} s, CPU {cpu:.2f} s)", flush=True)
+
+
+FREE = ("cond", "d7", "d10", "panda")
+KEPT = ("capsules-cond", "capsules-d", "rest", "forces", "free")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("parts", nargs="*", default=["cond", "d7"])
+    """Run the selected parts."""
+    parser = timing.parser(__doc__, "d7 and rest with two starts, step")
+    parser.add_argument("parts", nargs="*", default=[*FREE, *KEPT, "step", "batch"])
     parser.add_argument("--keys", type=int, default=3)
     parser.add_argument("--first", type=int, default=0, help="the first key")
     parser.add_argument("--starts", type=int, default=32)
     parser.add_argument("--generations", type=int, default=12)
     parser.add_argument("--polish", type=int, nargs="+", default=[0, 4], help="0: JAX alone")
-    parser.add_argument("--quick", action="store_true")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jid.keep_compiled()
-    if asked.quick:
-        asked.parts, asked.keys = ["d7"], 1
-        asked.starts, asked.generations, asked.polish = 2, 1, [0, 1]
-    keys = range(asked.first, asked.first + asked.keys)
-    sizes = (1, 8, 64) if jax.default_backend() == "cpu" else (64, 512, 4096)
-    parts = {
-        "cond": lambda: cond(keys, asked),
-        "d7": lambda: d_optimal(True, keys, asked),
-        "d10": lambda: d_optimal(False, keys, asked),
-        "panda": lambda: panda(keys, asked),
-        "gradients": gradients,
-        "constraints": constraint_gradients,
-        "step": step,
-        "batch": lambda: batch(sizes),
-    }
-    for part in asked.parts:
-        parts[part]()
+    if options.quick:
+        options.parts, options.keys, options.polish = ["d7", "rest", "step"], 1, [1]
+    keys = range(options.first, options.first + options.keys)
+    for part in options.parts:
+        if part in FREE:
+            unconstrained(part, keys, options)
+        elif part in KEPT:
+            constrained(part, keys, options)
+        elif part == "step":
+            step()
+        else:
+            batch((1, 8, 64) if jax.default_backend() == "cpu" else (64, 512, 4096))
 
 
 if __name__ == "__main__":

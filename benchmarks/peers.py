@@ -1,17 +1,19 @@
 """Regressor and inverse dynamics of a seven-joint arm against other packages.
 
     python benchmarks/peers.py [--quick] [--json FILE]
+    python benchmarks/peers.py --gpu            # on the first GPU of JAX, without peers
 
-It starts itself twice: on one core, then on two. What is compared runs in turn in one process, on
-the same motion, and is compared number by number before it is timed. Peers that are not installed
-are skipped by name.
+The script starts itself twice: on one core, then on two. What is compared runs in turn in one
+process, on the same motion, and is compared number by number before it is timed. Peers that are
+not installed are skipped by name.
 """
 
-import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +24,7 @@ NS = 1e9
 
 
 def motion(joints, samples):
+    """Return random positions, velocities and accelerations [samples, joints]."""
     import numpy as np
 
     random = np.random.default_rng(0)
@@ -29,7 +32,7 @@ def motion(joints, samples):
 
 
 def compiled(function, *arrays):
-    """A function of JAX arrays, compiled for these, as a call that blocks."""
+    """Compile a function for some arrays; return a call that blocks."""
     import jax
 
     arrays = [jax.numpy.asarray(x) for x in arrays]
@@ -37,36 +40,45 @@ def compiled(function, *arrays):
     return lambda: jax.block_until_ready(run(*arrays))
 
 
-def packed_columns(model, motion):
-    """The varying entries of the regressor, compiled however few the samples, and their program."""
-    from jaxid.dynamics.machine import program_of
-    from jaxid.program import lower
+def compiled_regressor(model, state):
+    """Compile the packed regressor, also for few samples; return a call that blocks."""
+    import jaxid as jid
 
-    n = (model.robot.joints,)
-    program = program_of(model, model.columns, n, n, n)
-    lowered = lower(program)
-
-    def entries(*x):
-        return [y for y in lowered(*x) if not isinstance(y, float)]
-
-    return program, compiled(entries, *(x.T for x in motion))
+    return compiled(lambda *x: model.packed_regressor(jid.Motion(*x)).values, *state)
 
 
-def packed_regressor(model, motion):
-    """The regressor without its zeros, as a call that blocks."""
+def packed_regressor(model, state):
+    """Return a call of the packed regressor that blocks."""
     import jax
 
     import jaxid as jid
 
-    rows = jid.Motion(*map(jax.numpy.asarray, motion))
+    rows = jid.Motion(*map(jax.numpy.asarray, state))
     return lambda: jax.block_until_ready(model.packed_regressor(rows))
 
 
+def inverse_dynamics(model, p, state):
+    """Compile the inverse dynamics; return a call that blocks."""
+    import jaxid as jid
+
+    return compiled(lambda p, *x: model.inverse_dynamics(p, jid.Motion(*x)), p, *state)
+
+
+def count_operations(model):
+    """Return the counts of operations of a model's regressor."""
+    from jaxid.dynamics.dispatch import program_of  # private: counts of operations
+
+    n = (model.robot.joints,)
+    return program_of(model, model.columns, n, n, n).counts
+
+
 def per_sample(times, samples):
+    """Return the median time for one sample in words."""
     return f"{times.median / samples * NS:.0f} ns"
 
 
 def compare(number, what, recipe, asked, ours, peer, samples, target):
+    """Return the row of a ratio to a peer."""
     ratio = peer / ours
     measured = (
         f"{ratio:.1f}x ({per_sample(ours, samples)} against {per_sample(peer, samples)}); "
@@ -77,7 +89,7 @@ def compare(number, what, recipe, asked, ours, peer, samples, target):
 
 
 def with_friction(samples, turns):
-    """Row 1: against FIGAROH, on two cores."""
+    """Measure row 1: against FIGAROH, on two cores."""
     import jax
     import numpy as np
     from pinocchio_loop import Bodies, in_our_order, pinocchio_model
@@ -92,7 +104,7 @@ def with_friction(samples, turns):
     absent = timing.missing("figaroh") or timing.missing("pinocchio")
     robot = jid.robots.panda()
     n = robot.joints
-    friction = jid.CoulombFriction(jid.HardSign())
+    friction = jid.CoulombFriction(jid.terms.HardSign())
     terms = (jid.RigidBodies(), jid.ViscousFriction(), friction, jid.RotorInertia())
     model = jid.Model(robot, terms)
     q, qd, qdd = state = motion(n, samples)
@@ -135,12 +147,11 @@ def with_friction(samples, turns):
 
 
 def one_core(samples, turns):
-    """Rows 2, 3 and 4: against Pinocchio in C++, frax and the memory."""
+    """Measure rows 2 to 4: against Pinocchio in C++, frax and the memory."""
     import numpy as np
     from pinocchio_loop import Bodies, Loop, in_our_order
 
     import jaxid as jid
-    from jaxid.dynamics.machine import program_of
 
     robot = jid.robots.panda()
     n = robot.joints
@@ -149,8 +160,8 @@ def one_core(samples, turns):
     bodies = Bodies(n)
     packed = packed_regressor(model, state)
     nonzero = len(packed().values)
-    counts = program_of(model, model.columns, (n,), (n,), (n,)).counts
-    forces = forces_of(model, bodies.parameters.ravel(), state)
+    counts = count_operations(model)
+    forces = inverse_dynamics(model, bodies.parameters.ravel(), state)
     cases = {"regressor": packed, "forces": forces, "fill": fill(nonzero, samples)}
     notes = []
     try:
@@ -158,7 +169,7 @@ def one_core(samples, turns):
         matrix = packed().matrix()
         theirs = in_our_order(loop.regressors(), n).swapaxes(0, 1).reshape(n * samples, -1)
         np.testing.assert_allclose(matrix, theirs, atol=1e-9)
-        np.testing.assert_allclose(np.stack(forces()).T, loop.torques(), atol=1e-9)
+        np.testing.assert_allclose(forces(), loop.torques(), atol=1e-9)
         cases |= {"C++ regressor": loop.regressors, "C++ forces": loop.torques}
     except (RuntimeError, ImportError) as problem:
         notes.append(f"Pinocchio in C++ skipped: {problem}")
@@ -201,16 +212,8 @@ def one_core(samples, turns):
     return rows
 
 
-def forces_of(model, p, state):
-    from jaxid.dynamics.machine import program_of
-    from jaxid.program import lower
-
-    n = (model.robot.joints,)
-    lowered = lower(program_of(model, model.forces, p.shape, n, n, n))
-    return compiled(lambda *x: lowered(*x), p, *(x.T for x in state))
-
-
 def frax_forces(state):
+    """Compile the inverse dynamics of frax; return a call that blocks."""
     import jax
     import numpy as np
     from frax.robots.franka_panda import load_panda
@@ -221,16 +224,53 @@ def frax_forces(state):
     return compiled(each, *state)
 
 
+def on_gpu(quick):
+    """Measure regressor, inverse dynamics and the criterion of a design on a GPU."""
+    os.environ["JAX_ENABLE_X64"] = "1"
+    import jax
+    from compile import design_function
+    from pinocchio_loop import Bodies
+
+    import jaxid as jid
+
+    if jax.default_backend() != "gpu":
+        return [Row("G", "figures of a GPU", "-", "-", "no GPU at hand")]
+    samples, turns = (2**12, 5) if quick else (2**20, 15)
+    robot = jid.robots.panda()
+    model, state = jid.Model(robot, (jid.RigidBodies(),)), motion(robot.joints, samples)
+    regressor, compiling = timing.elapsed(lambda: compiled_regressor(model, state))
+    function, x = design_function()
+    times = interleaved(
+        {
+            "regressor": regressor,
+            "inverse dynamics": inverse_dynamics(
+                model, Bodies(robot.joints).parameters.ravel(), state
+            ),
+            "criterion of a design and its gradient": compiled(function, x),
+        },
+        turns,
+    )
+    recipe = (
+        f"{jax.devices()[0].device_kind}, jax {jax.__version__}, Panda, float64, N = {samples}, "
+        f"median of {turns} turns, compile of the regressor {compiling:.1f} s"
+    )
+    *dynamics, (name, design) = times.items()
+    rows = [Row("G", f"{key}, GPU", recipe, "-", per_sample(t, samples)) for key, t in dynamics]
+    return [*rows, Row("G", f"{name}, GPU", recipe, "-", f"{1e3 * design.median:.2f} ms")]
+
+
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer samples and turns")
+    """Measure on one core and on two, each in a process of its own."""
+    parser = timing.parser(__doc__, "fewer samples and turns")
     parser.add_argument("--cores", type=int, choices=(1, 2), help="only the rows of so many cores")
-    parser.add_argument("--json", help="where to write the rows")
+    parser.add_argument("--gpu", action="store_true", help="only the figures of a GPU")
     options = parser.parse_args()
-    turns = 5 if options.quick else 25
+    if options.gpu:
+        hand_over(on_gpu(options.quick), options.json)
+        return
     if options.cores is not None:
         timing.pin_to(options.cores)
-        samples = 1024 if options.quick else 16384
+        samples, turns = (1024, 5) if options.quick else (16384, 25)
         rows = with_friction(samples, turns) if options.cores == 2 else one_core(samples, turns)
         hand_over(rows, options.json)
         return
@@ -242,8 +282,6 @@ def main():
             subprocess.run([*again, *["--quick"] * options.quick], check=True)
             rows += [Row(**row) for row in json.loads(path.read_text())]
     if options.json:
-        from dataclasses import asdict
-
         Path(options.json).write_text(json.dumps([asdict(row) for row in rows]))
 
 

@@ -1,16 +1,17 @@
-"""Runs the benchmarks, each in a process of its own, and rewrites the tables of `README.md`.
+"""Run the benchmarks, each in a process of its own, and keep what they measure.
 
     python benchmarks/run.py                    # all figures of speed, about 25 minutes
-    python benchmarks/run.py peers streaming    # these; the other tables stay as they are
-    python benchmarks/run.py --resume           # what this machine has not measured today
-    python benchmarks/run.py --methods          # also how good the methods are, which takes longer
-    python benchmarks/run.py --tables           # measures nothing, writes the tables again
-    python benchmarks/run.py --quick            # small, writes nothing: does it still run?
+    python benchmarks/run.py peers streaming    # only these scripts
+    python benchmarks/run.py --methods          # also the quality of the methods: hours
+    python benchmarks/run.py --resume           # only what this machine has not measured today
+    python benchmarks/run.py --check            # everything small: does it still run?
 
-What a script has measured is kept in `measured/NAME.json` as soon as it ends, with the machine, the
-versions and the date, so an interrupted run goes on with `--resume`, and figures of a machine with
-a GPU stand beside those of another without. A script that fails or takes too long keeps its old
-table, is named at the end, and makes the run end with 1; so is every figure that does not hold.
+Each script leaves its figures in `measured/NAME.json`, with machine, versions and date, as soon as
+it ends; all of them are written as tables to `results/measured.md`. A script that fails or takes
+too long keeps its old figures, is named at the end, and the exit code is 1.
+
+`--check` runs every script with `--quick`, and the notebooks. It prints a table of results, writes
+it to `results/check.md`, and exits with 1 if something failed. It measures nothing.
 """
 
 import argparse
@@ -20,238 +21,208 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from typing import NamedTuple
 
-from timing import HERE, Row, machine
+from timing import HERE, REPOSITORY, Row, machine
 
-README, MEASURED = HERE / "README.md", HERE / "measured"
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+RESULTS, MEASURED = HERE / "results", HERE / "measured"
 HEAD = ("row", "what", "asked", "measured", "holds", "recipe")
-LONGER = 3.0
-"""How many times longer than expected a script may take."""
-NO_GPU = "G"
-"""Number of the row that says so."""
-BUSY = 0.5
-"""Load of each core above which times say more about the load."""
 
 
 class Script(NamedTuple):
-    """A script of this folder.
+    """Script of this folder.
 
     Attributes:
-        name: Of its file.
-        minutes: What it takes on two quiet cores, about.
-        arguments: With which it is called.
-        rows: Whether it hands over rows; what others print is kept as it is.
+        name: Name of its file.
+        minutes: Approximate duration on two quiet cores.
+        arguments: Arguments of a whole run.
     """
 
     name: str
     minutes: float
     arguments: tuple[str, ...] = ()
-    rows: bool = True
+
+    @property
+    def command(self):
+        """Command without arguments."""
+        return [sys.executable, "-u", str(HERE / f"{self.name}.py")]
 
 
 SPEED = (
     Script("peers", 2),
     Script("fences", 2),
     Script("compile", 2),
-    Script("humanoid", 2),
-    Script("small", 1),
     Script("streaming", 6),
     Script("batches", 2),
-    Script("scaling", 6),
-    Script("gpu", 2),
+    Script("scaling", 8),
 )
 METHODS = (
-    Script("excitation", 20, ("cond", "d7", "d10", "panda", "gradients", "step", "batch"), False),
-    Script("excitation_rivals", 15, (), False),
-    Script("constrained_excitation", 60, (), False),
-    Script("consistency", 15),
-    Script("weighting", 5),
+    Script("consistency", 25),
     Script("coverage", 20),
-    Script("robustness", 10, (), False),
-    Script("held_out", 10, (), False),
-    Script("stepwise", 10, (), False),
+    Script("robustness", 10),
+    Script("held_out", 10),
+    Script("stepwise", 10),
+    Script("states", 5),
+    Script("excitation", 60),
+    Script("rivals", 15),
+    Script("export", 10),
+    Script("virtual_robot", 5),
+    Script("demo", 10),
+    Script("doctor", 20),
+    Script("faults", 30),
 )
-SCRIPTS = tuple(s for s in (*SPEED, *METHODS) if (HERE / f"{s.name}.py").exists())
+SCRIPTS = SPEED + METHODS
 
 
-def measured(script, quick):
-    """What a script measures: its rows or its text, or None if it fails."""
+def run(command, limit, show=True):
+    """Return what a command prints, and whether it ended well within some seconds."""
+    with tempfile.TemporaryFile("w+", errors="replace") as file:
+        process = subprocess.Popen(
+            command, stdout=file, stderr=subprocess.STDOUT, start_new_session=True, cwd=REPOSITORY
+        )
+        try:
+            code = process.wait(limit)
+        except BaseException as error:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            code = f"it took more than {limit / 60:.0f} minutes"
+        file.seek(0)
+        text = file.read()
+    if show or code:
+        print(text, end="", flush=True)
+    return text, code == 0
+
+
+def measure(script):
+    """Return the rows of a script, or its text if it has none; None if it fails."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rows.json"
-        command = [sys.executable, "-u", str(HERE / f"{script.name}.py")]
-        command += ["--quick"] if quick else script.arguments
-        command += ["--json", str(path)] if script.rows else []
-        text = printed(command, 60 * LONGER * script.minutes)
-        if text is None:
+        command = [*script.command, *script.arguments, "--json", str(path)]
+        text, good = run(command, 180 * script.minutes)
+        if not good:
             return None
-        if not script.rows:
-            return {"text": text}
-        if not path.exists():
-            print("   it ended well, but handed over no rows")
-            return None
-        return {"rows": json.loads(path.read_text())}
-
-
-def printed(command, limit):
-    """What a command prints, here too while it runs; None if it fails or takes longer than that."""
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, errors="replace", start_new_session=True
-    ) as process:
-        late = threading.Event()
-
-        def stop():
-            if process.poll() is None:
-                late.set()
-                end(process)
-
-        watch = threading.Timer(limit, stop)
-        watch.start()
-        lines = []
-        try:
-            for line in process.stdout:
-                print("   " + line, end="", flush=True)
-                lines.append(line)
-            process.wait()
-        except BaseException:
-            end(process)
-            raise
-        finally:
-            watch.cancel()
-    if late.is_set():
-        print(f"   stopped: it took more than {limit / 60:.0f} minutes")
-        return None
-    return None if process.returncode else "".join(lines)
-
-
-def end(process):
-    """Ends a script and the processes that it has started."""
-    if hasattr(os, "killpg"):
-        os.killpg(process.pid, signal.SIGKILL)
-    else:
-        process.kill()
+        return {"rows": json.loads(path.read_text())} if path.exists() else {"text": text}
 
 
 def stored(name):
-    """What was measured last, or None."""
+    """Return what was measured last, or None."""
     path = MEASURED / f"{name}.json"
     return json.loads(path.read_text()) if path.exists() else None
 
 
-def store(name, facts, seconds, found):
-    MEASURED.mkdir(exist_ok=True)
-    path = MEASURED / f"{name}.json"
+def write(path, text):
+    """Write a file as a whole."""
+    path.parent.mkdir(exist_ok=True)
     draft = path.with_suffix(".part")
-    text = json.dumps({"facts": facts, "seconds": round(seconds), **found}, indent=1)
-    draft.write_text(text + "\n")
+    draft.write_text(text, encoding="utf-8")
     draft.replace(path)
 
 
 def is_fresh(name, facts):
-    """Whether it was measured today with the same machine and versions."""
+    """Return whether a script was measured today with the same machine and versions."""
     found = stored(name)
     same = ("date", "machine", "versions")
     return found is not None and all(found["facts"].get(k) == facts[k] for k in same)
 
 
-def cells(values):
-    return "| " + " | ".join(v.replace("|", "/").replace("\n", " ") for v in values) + " |"
+def table(head, rows):
+    """Return a table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    cells = [[str(x).replace("|", "/").replace("\n", " ") for x in line] for line in lines]
+    return "".join(f"| {' | '.join(line)} |\n" for line in cells)
 
 
-def table(found, gpu):
-    """The section of a script, with a column for a GPU where figures of one are at hand."""
-    stamp = "; ".join(f"{name}: {value}" for name, value in found["facts"].items())
-    stamp += f"; took {found['seconds']} s" if found["seconds"] else ""
+def section(name, found):
+    """Return the section of a script: facts of the machine, and its rows or its text."""
+    facts = "; ".join(f"{key}: {value}" for key, value in found["facts"].items())
+    lines = f"## {name}\n\n{facts}; took {found['seconds']} s.\n\n"
     if "text" in found:
-        return f"{stamp}.\n\n```\n{found['text'].strip()}\n```\n"
+        return f"{lines}```\n{found['text'].strip()}\n```\n"
+    holds = {True: "yes", False: "**no**", None: ""}
     rows = [Row(**row) for row in found["rows"]]
-    beside = any(row.number in gpu for row in rows)
-    head = (*HEAD[:4], "on a GPU", *HEAD[4:]) if beside else HEAD
-    lines = [cells(head), "|---" * len(head) + "|"]
-    for row in rows:
-        holds = {True: "yes", False: "**no**", None: ""}[row.holds]
-        on_gpu = [gpu.get(row.number, "")] if beside else []
-        lines.append(
-            cells([row.number, row.what, row.asked, row.measured, *on_gpu, holds, row.recipe])
-        )
-    return f"{stamp}.\n\n" + "\n".join(lines) + "\n"
+    cells = [(r.number, r.what, r.asked, r.measured, holds[r.holds], r.recipe) for r in rows]
+    return lines + table(HEAD, cells)
 
 
 def write_tables():
-    """Writes all that is stored between the marks of the README."""
-    on_gpu = stored("gpu")
-    gpu = {row["number"]: row["measured"] for row in (on_gpu or {"rows": []})["rows"]}
-    sections = []
-    for script in SCRIPTS:
-        found = stored(script.name)
-        if found is not None:
-            sections.append(f"### {script.name}\n\n{table(found, gpu)}\n")
-    before, rest = README.read_text().split(BEGIN)
-    draft = README.with_suffix(".part")
-    draft.write_text(f"{before}{BEGIN}\n\n{''.join(sections)}{END}{rest.split(END)[1]}")
-    draft.replace(README)
+    """Write all stored figures as tables."""
+    parts = [section(s.name, found) for s in SCRIPTS if (found := stored(s.name))]
+    head = "# Measured figures\n\nWritten by `python benchmarks/run.py`.\n\n"
+    write(RESULTS / "measured.md", head + "\n".join(parts))
 
 
-def chosen(options):
-    known = {s.name: s for s in SCRIPTS}
-    unknown = [name for name in options.scripts if name not in known]
-    if unknown:
-        sys.exit(f"no such script: {', '.join(unknown)}; there are {', '.join(known)}")
-    if options.scripts:
-        return [known[name] for name in options.scripts]
-    return [s for s in SCRIPTS if options.methods or s in SPEED]
-
-
-def warn_of_load():
-    load, cores = os.getloadavg()[0], os.cpu_count() or 1
-    if load > BUSY * cores:
-        print(
-            f"Other programs are running (load {load:.1f} on {cores} cores): ratios of what only "
-            "computes carry over to a quiet machine, times and compile times do not.\n"
-        )
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scripts", nargs="*", help="only these")
-    parser.add_argument("--quick", action="store_true", help="small, and write nothing")
-    parser.add_argument("--resume", action="store_true", help="skip what was measured today")
-    parser.add_argument("--methods", action="store_true", help="also how good the methods are")
-    parser.add_argument("--tables", action="store_true", help="only write the tables again")
-    options = parser.parse_args()
-    if options.tables:
-        write_tables()
-        return
-    scripts, facts = chosen(options), machine()
-    if options.resume:
-        scripts = [s for s in scripts if not is_fresh(s.name, facts)]
-    warn_of_load()
-    failed, lost, began = [], [], time.perf_counter()
+def measure_all(scripts, resume):
+    """Run scripts and keep what they measure; return the names of those that failed."""
+    failed, lost = [], []
     for number, script in enumerate(scripts, 1):
         start, facts = time.perf_counter(), machine()
-        expected = "" if options.quick else f", about {script.minutes:g} min on two quiet cores"
-        print(f"== {number}/{len(scripts)} {script.name}{expected}", flush=True)
-        found = measured(script, options.quick)
-        seconds = time.perf_counter() - start
-        whole = (time.perf_counter() - began) / 60
-        print(f"   {script.name}: {seconds:.0f} s; {whole:.1f} min in all\n", flush=True)
+        if resume and is_fresh(script.name, facts):
+            continue
+        print(f"== {number}/{len(scripts)} {script.name}, about {script.minutes:g} min", flush=True)
+        found = measure(script)
         if found is None:
             failed.append(script.name)
             continue
-        if [row["number"] for row in found.get("rows", [])] == [NO_GPU]:
-            # Figures of a machine that has one stay.
-            continue
-        lost += [Row(**r) for r in found.get("rows", []) if r["holds"] is False]
-        if not options.quick:
-            store(script.name, facts, seconds, found)
-            write_tables()
-    if not options.quick:
-        for row in lost:
-            print(f"DOES NOT HOLD [{row.number}] {row.what}: {row.measured}; asked {row.asked}")
+        seconds = round(time.perf_counter() - start)
+        content = {"facts": facts, "seconds": seconds, **found}
+        write(MEASURED / f"{script.name}.json", json.dumps(content, indent=1) + "\n")
+        write_tables()
+        lost += [Row(**row) for row in found.get("rows", []) if row["holds"] is False]
+    for row in lost:
+        print(f"DOES NOT HOLD [{row.number}] {row.what}: {row.measured}; asked {row.asked}")
+    return failed
+
+
+def check(scripts, notebooks):
+    """Run everything small, write the table of results, and return the names of what failed."""
+    jobs = {f"benchmarks/{s.name}.py --quick": [*s.command, "--quick"] for s in scripts}
+    if notebooks:
+        jobs["notebooks/run_all.py"] = [sys.executable, str(REPOSITORY / "notebooks/run_all.py")]
+    rows, begun = [], time.perf_counter()
+    for name, command in jobs.items():
+        start = time.perf_counter()
+        _, good = run(command, 3600, show=False)
+        rows.append((name, f"{time.perf_counter() - start:.0f}", "ok" if good else "**failed**"))
+        print(f"{name}: {rows[-1][1]} s, {'ok' if good else 'failed'}", flush=True)
+    failed = [name for name, _, result in rows if result != "ok"]
+    facts = "; ".join(f"{key}: {value}" for key, value in machine().items())
+    result = (
+        f"# Result of `python benchmarks/run.py --check`\n\n{facts}.\n\n"
+        f"{table(('what', 'seconds', 'result'), rows)}\n"
+        f"{len(rows) - len(failed)} of {len(rows)} ok, "
+        f"{(time.perf_counter() - begun) / 60:.0f} minutes.\n"
+    )
+    write(RESULTS / "check.md", result)
+    print(f"\n{result}")
+    return failed
+
+
+def main():
+    """Run the selected scripts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    known = {script.name: script for script in SCRIPTS}
+    parser.add_argument("scripts", nargs="*", help=f"only these: {', '.join(known)}")
+    parser.add_argument("--check", action="store_true", help="everything small, and the notebooks")
+    parser.add_argument("--resume", action="store_true", help="skip what was measured today")
+    parser.add_argument("--methods", action="store_true", help="also the quality of the methods")
+    parser.add_argument("--tables", action="store_true", help="only write the tables again")
+    options = parser.parse_args()
+    unknown = [name for name in options.scripts if name not in known]
+    if unknown:
+        parser.error(f"no such script: {', '.join(unknown)}; there are {', '.join(known)}")
+    every = SCRIPTS if options.methods or options.check else SPEED
+    scripts = [known[name] for name in options.scripts] or every
+    if options.tables:
+        write_tables()
+        return
+    if options.check:
+        failed = check(scripts, notebooks=not options.scripts)
+    else:
+        failed = measure_all(scripts, options.resume)
     if failed:
         sys.exit(f"failed: {', '.join(failed)}")
 

@@ -1,20 +1,20 @@
-"""What a sample costs, against the number of samples, of joints, and of devices.
+"""Cost of the regressor and of `identify` against the numbers of samples, joints and devices.
 
     python benchmarks/scaling.py [--quick] [--json FILE]
 
-Writes `benchmarks/scaling.png` (with `--quick`, nothing). Samples and joints: the regressor on one
+Writes `benchmarks/scaling.png` (nothing with `--quick`). Samples and joints: the regressor on one
 core, ten parameters for each body, in a process of its own; from 16 384 samples on, ours goes
-through chunks of that size, as one would through a long recording. Devices: `identify` of one log
-with every sample a row, on as many of JAX's CPU devices, a process for each number; a core for each
-device as far as there are cores. Medians.
+through chunks of that size. A tree: the humanoid Talos with 32 joints (with `--quick` one arm).
+Devices: `identify` of one log with every sample a row, on several CPU devices of JAX, one process
+for each number, with a core for each device as far as there are cores. Medians.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 
 import timing
@@ -29,7 +29,7 @@ PYTHON_UP_TO, CPP_UP_TO = 1000, 131_072
 
 
 def chain(joints):
-    """A serial arm: every second axis turned by a quarter, links of 0.3 m."""
+    """Return a serial arm: every second axis turned by 90 degrees, links of 0.3 m."""
     import numpy as np
 
     import jaxid as jid
@@ -39,7 +39,7 @@ def chain(joints):
 
 
 def cases_of(robot, samples, packed):
-    """What runs on so many samples: by name, a call and the number of samples that it does."""
+    """Return by name a call on some samples, and the number of samples that it computes."""
     import numpy as np
     from peers import motion
     from pinocchio_loop import Bodies, Loop, pinocchio_model
@@ -83,7 +83,7 @@ def cases_of(robot, samples, packed):
 
 
 def curves(points, turns):
-    """Nanoseconds per sample by name: {name: [(x, ns)]}."""
+    """Return nanoseconds per sample by name: {name: [(x, ns)]}."""
     out = {}
     for x, cases in points:
         times = interleaved({name: call for name, (call, _) in cases.items()}, turns)
@@ -93,63 +93,79 @@ def curves(points, turns):
 
 
 def by_samples(sizes, turns):
+    """Measure the regressor of a Panda against the number of samples."""
     import jaxid as jid
-    from jaxid.dynamics.machine import program_of
-    from jaxid.program import evaluate_packed
 
-    robot = jid.robots.panda()
-    model = jid.Model(robot, (jid.RigidBodies(),))
-    n = (robot.joints,)
-    program = program_of(model, model.columns, n, n, n)
-
+    model = jid.Model(jid.robots.panda(), (jid.RigidBodies(),))
     ready = {}
 
     def points():
-        from peers import motion, packed_columns
+        from peers import compiled_regressor, motion
 
         def packed(state):
             size = len(state[0])
             if size not in ready:
-                ready[size] = packed_columns(model, state)[1]
+                ready[size] = compiled_regressor(model, state)
             return ready[size]
 
         for samples in sizes:
-            cases = cases_of(robot, samples, packed)
-            if samples <= CHUNK:
-                arrays = [x.T.copy() for x in motion(robot.joints, samples)]
-                numpy = lambda x=arrays: evaluate_packed(program, *x)  # noqa: E731
-                cases["jaxid, NumPy"] = (numpy, samples)
+            cases = cases_of(model.robot, samples, packed)
+            if samples <= 4096:
+                rows = jid.Motion(*motion(model.robot.joints, samples))
+                cases["jaxid, NumPy"] = (lambda m=rows: model.packed_regressor(m), samples)
             yield samples, cases
 
     return curves(points(), turns)
 
 
-def by_joints(sizes, samples, turns):
+def by_joints(robots, samples, turns):
+    """Measure the regressor and its compile time against the number of joints."""
     import jaxid as jid
-    from jaxid.dynamics.machine import program_of
 
     compiling = []
 
     def points():
-        from peers import packed_columns
+        from peers import compiled_regressor, count_operations
 
-        for joints in sizes:
-            model = jid.Model(chain(joints), (jid.RigidBodies(),))
+        for robot in robots:
+            model = jid.Model(robot, (jid.RigidBodies(),))
 
-            def packed(state, model=model, joints=joints):
-                (_, call), seconds = timing.elapsed(lambda: packed_columns(model, state))
-                compiling.append((joints, seconds))
+            def packed(state, model=model):
+                call, seconds = timing.elapsed(lambda: compiled_regressor(model, state))
+                compiling.append((model.robot.joints, seconds))
                 return call
 
-            yield joints, cases_of(model.robot, samples, packed)
-            n = (joints,)
-            print(f"{joints} joints: {program_of(model, model.columns, n, n, n).counts.total}")
+            yield robot.joints, cases_of(robot, samples, packed)
+            print(f"{robot.joints} joints: {count_operations(model).total} operations")
 
     return curves(points(), turns), compiling
 
 
+def humanoid(quick):
+    """Measure a tree of 32 joints, or an arm of it (row 7)."""
+    for module in ("pinocchio", "cmeel"):
+        if timing.missing(module):
+            return [Row("7", "tree", "-", "-", timing.missing(module))]
+    import cmeel
+
+    import jaxid as jid
+
+    shared = Path(next(iter(cmeel.__path__))).parent / "cmeel.prefix/share/example-robot-data"
+    name = "talos_left_arm" if quick else "talos_reduced"
+    robot = jid.load_urdf(shared / f"robots/talos_data/robots/{name}.urdf")
+    n, samples = robot.joints, 512 if quick else 2048
+    found, ((_, seconds),) = by_joints([robot], samples, 5)
+    said = ", ".join(f"{name} {points[0][1]:.0f} ns" for name, points in found.items())
+    recipe = f"{robot.name}, {n} joints, {10 * n} columns, N = {samples}, one core"
+    what, limit = f"{n}-joint tree, compile", "<= 60 s"
+    return [
+        Row("7a", what, recipe, limit, f"{seconds:.1f} s", seconds <= 60),
+        Row("7b", f"{n}-joint tree, regressor by sample", recipe, "-", said),
+    ]
+
+
 def identified(samples, turns):
-    """Of one log on this process's devices: devices, seconds, scaled estimates."""
+    """Return the number of devices of this process, seconds for one log, scaled estimates."""
     import jax
     import numpy as np
     from batches import motions, seven_axes
@@ -161,19 +177,12 @@ def identified(samples, turns):
     random = np.random.default_rng(1)
     forces = np.asarray(base.inverse_dynamics(random.normal(size=base.size), motion))
     forces = forces + 0.1 * random.normal(size=forces.shape)
-    log = jid.Observations(
-        time=np.arange(samples) * 1e-3,
-        motion=motion,
-        forces=forces,
-        mask=np.ones(forces.shape, bool),
-        filter=jid.ZeroPhaseButterworth(400.0, force_cutoff=np.inf, margin=0.0),
-        decimation=jid.Subsample(1),
-        segments=((0, samples),),
-        sample_time=1e-3,
-    )
+    arrays = motion.q, motion.qd, motion.qdd, forces
+    log = jid.Observations.of(*arrays, sample_time=1e-3)
+    naive = jid.uncertainty.IndependentRows()
 
     def identify():
-        return jid.identify(base, log, jid.LeastSquares(), uncertainty=jid.IndependentRows())
+        return jid.identify(base, log, jid.estimators.LeastSquares(), uncertainty=naive)
 
     fit = identify()
     seconds = interleaved({"identify": identify}, turns)["identify"].median
@@ -182,7 +191,7 @@ def identified(samples, turns):
 
 
 def by_devices(numbers, samples, turns):
-    """Nanoseconds per sample for each number of devices, and how far estimates are apart."""
+    """Return nanoseconds per sample for each number of devices, and the distance of estimates."""
     import numpy as np
 
     found, scaled = [], []
@@ -199,7 +208,7 @@ def by_devices(numbers, samples, turns):
     return found, float(away)
 
 
-# Colours that people with any colour vision tell apart (Okabe and Ito), and marks beside them.
+# Colours that people with any colour vision can distinguish (Okabe and Ito), and markers.
 STYLES = {
     "jaxid, compiled": ("#0072B2", "o-"),
     "jaxid, NumPy": ("#56B4E9", "v--"),
@@ -209,6 +218,7 @@ STYLES = {
 
 
 def plot(samples, joints, compiling, devices, path):
+    """Draw the four curves."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -247,14 +257,15 @@ def plot(samples, joints, compiling, devices, path):
 
 
 def on_one_core(quick):
-    """Cost against samples and joints, and compile times."""
-    if quick:
-        return by_samples((1, 100), 5), *by_joints((2, 3), 256, 5)
-    return by_samples(SAMPLES, 5), *by_joints(JOINTS, 2048, 5)
+    """Measure cost against samples and joints, and compile times, in a process of one core."""
+    sizes, joints = ((1, 100), (2, 3)) if quick else (SAMPLES, JOINTS)
+    by_size = by_samples(sizes, 5)
+    by_joint, compiling = by_joints(map(chain, joints), 256 if quick else 2048, 5)
+    return by_size, by_joint, compiling, [asdict(row) for row in humanoid(quick)]
 
 
 def elsewhere(quick):
-    """The same from a process of its own, since it is pinned to one core."""
+    """Return the same from a process of its own, since it is pinned to one core."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "curves.json"
         given = ["--one-core", str(path), *["--quick"] * quick]
@@ -264,7 +275,7 @@ def elsewhere(quick):
 
 
 def table(samples, joints, compiling, devices, away):
-    """The rows of all curves."""
+    """Return the rows of all curves."""
     ten = "ten parameters per body, one core, median of 5 turns"
 
     def line(points, unit="ns"):
@@ -302,9 +313,8 @@ def table(samples, joints, compiling, devices, away):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="few points, no plot")
-    parser.add_argument("--json", help="where to write the rows")
+    """Measure rows 7 and 9, and draw the plot."""
+    parser = timing.parser(__doc__, "few points, no plot")
     parser.add_argument("--one-core", help=argparse.SUPPRESS)
     parser.add_argument("--devices", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--samples", type=int, help=argparse.SUPPRESS)
@@ -322,13 +332,14 @@ def main():
         timing.pin_to(1)
         Path(options.one_core).write_text(json.dumps(on_one_core(options.quick)))
         return
-    samples, joints, compiling = elsewhere(options.quick)
+    samples, joints, compiling, trees = elsewhere(options.quick)
     if options.quick:
         devices, away = by_devices((1, 2), 110_000, 3)
     else:
         devices, away = by_devices(DEVICES, LOG, 5)
         plot(samples, joints, compiling, devices, HERE / "scaling.png")
-    hand_over(table(samples, joints, compiling, devices, away), options.json)
+    rows = [Row(**row) for row in trees] + table(samples, joints, compiling, devices, away)
+    hand_over(rows, options.json)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,15 @@
-"""How fast, how small and how accurate is the identification from long logs?
+"""Identification from long logs: time, memory and accuracy.
 
     python benchmarks/streaming.py [--quick] [--disk SAMPLES] [--json FILE]
 
 A seven-axis arm at 1 kHz in float64: every sample a row; forces and columns filtered (zero phase,
 20 Hz) and every 25th a row; the first against a loop over Pinocchio's regressor in NumPy,
 interleaved with it; the second from a Parquet file, whose reading overlaps with the computing.
-Medians of warm runs; compiling is told apart. Memory is the growth of the process's resident set
-during warm runs. The log on disk is one motion of 500 000 samples again and again. Ratios count;
-absolute times depend on the machine.
+Medians of warm runs; compile times are given apart. Memory is the growth of the process's resident
+set during warm runs. The log on disk is one motion of 500 000 samples again and again. Ratios
+count; absolute times depend on the machine.
 """
 
-import argparse
 import math
 import os
 import statistics
@@ -19,7 +18,7 @@ import threading
 import time
 from pathlib import Path
 
-# Before NumPy is imported: chunks run in parallel, and threads of BLAS would get in their way.
+# Before NumPy is imported: chunks run in parallel, and threads of BLAS would compete with them.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["JAX_PLATFORMS"] = "cpu"
 
@@ -30,16 +29,13 @@ import timing
 from timing import Row, hand_over
 
 import jaxid as jid
-from jaxid.dynamics.machine import in_numpy
-from jaxid.identification.factors import Blocks, streamed
-from jaxid.identification.opening import open_log
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
 RATE = 1000.0
 
 
 class Peak:
-    """The largest growth of the resident set inside of a `with` block [MB]."""
+    """Largest growth of the resident set inside of a `with` block [MB]."""
 
     def __enter__(self):
         self._start, self.megabytes, self._done = self._resident(), 0.0, threading.Event()
@@ -61,7 +57,7 @@ class Peak:
 
 
 def excited(samples, joints, seed=0):
-    """Five harmonics of 0.1 Hz for each joint, phases at random."""
+    """Return five harmonics of 0.1 Hz for each joint, with random phases."""
     random = np.random.default_rng(seed)
     q, qd, qdd = (np.zeros((samples, joints)) for _ in range(3))
     for start in range(0, samples, 50_000):
@@ -78,76 +74,52 @@ def excited(samples, joints, seed=0):
 
 
 def virtual_log(base, samples):
-    """A motion, and the model's forces with noise."""
+    """Return a motion, and the model's forces with noise."""
     model, random = base.model, np.random.default_rng(1)
     p = random.uniform(0.2, 2.0, model.size)
     motion = excited(samples, model.robot.joints)
-    forces = np.empty(motion.q.shape)
-    for start in range(0, samples, 50_000):
-        part = slice(start, start + 50_000)
-        m = motion[part]
-        forces[part] = in_numpy(model, model.forces, m.q, m.qd, m.qdd, shared=(p,))
+    forces = np.asarray(model.inverse_dynamics(p, motion))
     return motion, forces + random.normal(size=forces.shape)
 
 
-def observations(motion, forces, filter, decimation):
-    samples, joints = forces.shape
-    fields = {
-        "time": np.arange(samples) / RATE,
-        "motion": motion,
-        "forces": forces,
-        "filter": filter,
-        "decimation": decimation,
-        "segments": ((0, samples),),
-        "sample_time": 1 / RATE,
-    }
-    rows = len(jid.Observations(**fields, mask=np.ones((0, joints), bool)).instants)
-    return jid.Observations(**fields, mask=np.ones((rows, joints), bool))
-
-
 def unfiltered(motion, forces):
-    nothing = jid.ZeroPhaseButterworth(0.4 * RATE, force_cutoff=math.inf, margin=0.0)
-    return observations(motion, forces, nothing, jid.Subsample(1))
+    """Return observations of which every sample is a row."""
+    arrays = motion.q, motion.qd, motion.qdd, forces
+    return jid.Observations.of(*arrays, sample_time=1 / RATE)
 
 
 def filtered(motion, forces):
-    return observations(motion, forces, jid.ZeroPhaseButterworth(20.0), jid.Subsample(25))
+    """Return observations that are low-passed at 20 Hz, every 25th sample a row."""
+    smooth = {"filter": jid.ZeroPhaseButterworth(20.0), "decimation": jid.Subsample(25)}
+    arrays = motion.q, motion.qd, motion.qdd, forces
+    return jid.Observations.of(*arrays, sample_time=1 / RATE, **smooth)
 
 
 def timed(run, *arguments):
+    """Return the duration of a call [s] and its result."""
     start = time.perf_counter()
     result = run(*arguments)
     return time.perf_counter() - start, result
 
 
 def identification(base, o):
-    return jid.identify(base, o, jid.LeastSquares(), uncertainty=jid.IndependentRows())
+    """Identify without weights, with the naive covariance."""
+    naive = jid.uncertainty.IndependentRows()
+    return jid.identify(base, o, jid.estimators.LeastSquares(), uncertainty=naive)
 
 
-def whole(base, o):
-    """The factors by the compiled loop, whatever the length of the log."""
-    edges = [int(k) for k in np.linspace(0, o.rows, 11)]
-    return Blocks(tuple(streamed(base, o, edges)))
-
-
-def distance(base, o, matrix, forces):
-    """Of the estimates from those of a dense QR, with columns of length one."""
-    R, z = whole(base, o).total.weighted(np.ones(o.joints))
-    norms = np.linalg.norm(matrix, axis=0)
-    Q, triangle = np.linalg.qr(matrix / norms)
-    expected = np.linalg.solve(triangle, Q.T @ forces)
-    got = np.linalg.lstsq(R / norms, z)[0]
-    condition = np.linalg.cond(triangle)
-    return np.linalg.norm(got - expected) / np.linalg.norm(expected), condition
-
-
-def dense(base, o):
-    model, m = base.model, o.motion
-    theta = in_numpy(model, model.columns, m.q, m.qd, m.qdd)[:, :, list(base.indices)]
-    return o.reduce(theta).reshape(-1, base.size), o.reduced_forces.ravel()
+def distance(base, o):
+    """Return the distance from the estimates of a dense QR, with columns of length one."""
+    theta = o.reduce(np.asarray(base.regressor(o.motion))).reshape(-1, base.size)
+    norms = np.linalg.norm(theta, axis=0)
+    Q, R = np.linalg.qr(theta / norms)
+    expected = np.linalg.solve(R, Q.T @ o.reduced_forces.ravel())
+    away = identification(base, o).parameters * norms - expected
+    return np.linalg.norm(away) / np.linalg.norm(expected), np.linalg.cond(R)
 
 
 def in_pinocchio(robot):
+    """Return a model of Pinocchio with the joints of a robot."""
     import pinocchio as pin
 
     model, joint = pin.Model(), 0
@@ -161,13 +133,13 @@ def in_pinocchio(robot):
 
 
 def peer(model, base, o):
-    """What one writes without this package: a loop over samples, then a QR."""
+    """Identify without this package: a loop over samples, then a QR."""
     import pinocchio as pin
 
     data, n = model.createData(), model.nv
     bodies = 10 * np.arange(n)[:, None] + np.array([0, 1, 2, 3, 4, 6, 9, 8, 7, 5])
     signs = np.tile([1.0] * 7 + [-1.0] * 3, n)
-    theta = np.empty((len(o.time), n, base.model.size))
+    theta = np.empty((len(o.forces), n, base.model.size))
     friction = np.arange(n)
     q, qd, qdd = o.motion.q, o.motion.qd, o.motion.qdd
     for i in range(len(theta)):
@@ -182,9 +154,8 @@ def peer(model, base, o):
 
 
 def case(number, name, base, o, repetitions, most, memory=math.inf):
-    """The row of a log in memory: seconds, and memory beyond the inputs [MB]."""
-    first, _ = timed(whole, base, o)
-    identification(base, o)
+    """Measure a log in memory: seconds, and memory beyond the inputs [MB]."""
+    first, _ = timed(identification, base, o)
     with Peak() as peak:
         runs = [timed(identification, base, o) for _ in range(repetitions)]
     times, fit = [seconds for seconds, _ in runs], runs[-1][1]
@@ -192,7 +163,7 @@ def case(number, name, base, o, repetitions, most, memory=math.inf):
     asked = f"<= {most:g} s" + (f", <= {memory:g} MB" if memory < math.inf else "")
     return Row(
         number,
-        f"{len(o.time)} samples in memory to base parameters, {name}",
+        f"{len(o.forces)} samples in memory to base parameters, {name}",
         f"rail + TX90L, {base.size} base parameters with friction and rotors, naive covariance, "
         f"two cores, median of {repetitions} runs; {fit.rows[0]} rows; the first run, which "
         f"compiles, {first:.1f} s",
@@ -203,7 +174,7 @@ def case(number, name, base, o, repetitions, most, memory=math.inf):
 
 
 def written(base, samples, folder):
-    """A Parquet file of one motion after the other, never held as a whole."""
+    """Write a Parquet file of one motion after the other."""
     step = min(samples, 500_000)
     motion, forces = virtual_log(base, step)
     arrays = {"q": motion.q, "tau": forces}
@@ -217,11 +188,12 @@ def written(base, samples, folder):
 
 
 def from_disk(base, samples, repetitions):
+    """Measure row 14."""
     columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1 / RATE)
     smooth, every = jid.ZeroPhaseButterworth(20.0), jid.Subsample(25)
     with tempfile.TemporaryDirectory() as name:
         path = written(base, samples, Path(name))
-        log = open_log(path, columns, base.model.robot, smooth, every)
+        log = jid.scan_log(path, columns, base.model.robot, smooth, every)
         part = slice(100_000 // 2, 100_000 // 2 + 65536)
         reading = [timed(log.read, part)[0] * samples / 65536 for _ in range(5)]
         motion, forces = log.read(slice(0, min(samples, 200_000)))
@@ -248,18 +220,17 @@ def from_disk(base, samples, repetitions):
 
 
 def against_pinocchio(base, motion, forces, samples, repetitions):
+    """Measure row 11."""
     o = unfiltered(motion[:samples], forces[:samples])
     model = in_pinocchio(base.model.robot)
     own, other = [], []
-    whole(base, o)
+    fit = identification(base, o)
     for _ in range(repetitions):
-        seconds, blocks = timed(whole, base, o)
-        own.append(seconds)
+        own.append(timed(identification, base, o)[0])
         seconds, p = timed(peer, model, base, o)
         other.append(seconds)
-    R, z = blocks.total.weighted(np.ones(7))
-    norms = np.linalg.norm(R, axis=0)
-    away = np.linalg.norm(norms * (np.linalg.lstsq(R, z)[0] - p)) / np.linalg.norm(norms * p)
+    norms = 1 / np.asarray(fit.naive_standard_deviations)
+    away = np.linalg.norm(norms * (fit.parameters - p)) / np.linalg.norm(norms * p)
     a, b = statistics.median(own), statistics.median(other)
     ratio = statistics.median(y / x for x, y in zip(own, other, strict=True))
     return Row(
@@ -274,11 +245,11 @@ def against_pinocchio(base, motion, forces, samples, repetitions):
 
 
 def accuracy(base, motion, forces):
-    """The largest distance from a dense QR, filtered and not."""
+    """Measure the largest distance from a dense QR, filtered and not (row 12)."""
     found = []
     for name, prepare in (("every sample a row", unfiltered), ("20 Hz, every 25th", filtered)):
         o = prepare(motion, forces)
-        away, condition = distance(base, o, *dense(base, o))
+        away, condition = distance(base, o)
         found.append((away, f"{name} {away:.1e} (condition number {condition:.0f})"))
     worst = max(away for away, _ in found)
     return Row(
@@ -292,10 +263,9 @@ def accuracy(base, motion, forces):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer samples and repetitions")
+    """Measure rows 10 to 14 on two cores."""
+    parser = timing.parser(__doc__, "fewer samples and repetitions")
     parser.add_argument("--disk", type=int, help="samples of the Parquet file")
-    parser.add_argument("--json", help="where to write the rows")
     given = parser.parse_args()
     timing.pin_to(2)
     jax.config.update("jax_enable_x64", True)

@@ -1,10 +1,9 @@
-"""How the benchmarks measure: interleaved medians, facts of the machine, physical floors.
+"""Measurement of the benchmarks: interleaved medians, facts of the machine, physical floors.
 
-    python benchmarks/timing.py [--quick]     # prints the machine and its floors
-
-It is read before JAX is imported, since threads and devices are chosen then.
+It is imported before JAX, since threads and devices are chosen then.
 """
 
+import argparse
 import datetime
 import importlib.metadata
 import importlib.util
@@ -21,21 +20,36 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent
+DATA = REPOSITORY.parent / "shared" / "data"
+EXPERIMENTS = REPOSITORY / "tests" / "real_data"
 sys.path.insert(0, str(REPOSITORY))
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 SHORTEST = 5e-3
-"""One turn of a case lasts at least this long [s]: shorter cases are called several times."""
+"""Shortest duration of one turn of a case [s]; shorter cases are called several times."""
 PEERS = ("pin", "figaroh", "frax")
 
 
+def parser(text: str, quick: str) -> argparse.ArgumentParser:
+    """Return a parser of the options that all scripts have.
+
+    Args:
+        text: Docstring of the script.
+        quick: Effect of `--quick`.
+    """
+    options = argparse.ArgumentParser(description=text.splitlines()[0])
+    options.add_argument("--quick", action="store_true", help=quick)
+    options.add_argument("--json", help="file for the rows, read by run.py")
+    return options
+
+
 def pin_to(cores: int) -> None:
-    """Gives this process so many cores, and its libraries as many threads. Before importing JAX."""
+    """Give this process some cores, and its libraries as many threads, before JAX is imported."""
     for name in THREADS:
         os.environ[name] = str(cores)
     if hasattr(os, "sched_setaffinity"):
         allowed = sorted(os.sched_getaffinity(0))
-        # Interrupts and other people's work gather on the first core.
+        # Interrupts and other processes mostly run on the first core.
         os.sched_setaffinity(0, allowed[-cores:])
     if cores == 1:
         flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
@@ -46,30 +60,30 @@ def pin_to(cores: int) -> None:
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds for one call, of all turns."""
+    """Seconds for one call, for each turn."""
 
     turns: tuple[float, ...]
 
     @property
     def median(self) -> float:
-        """The middle one of all turns."""
+        """Median of all turns."""
         return statistics.median(self.turns)
 
     @property
     def best(self) -> float:
-        """The shortest one."""
+        """Shortest turn."""
         return min(self.turns)
 
     def __truediv__(self, other: "Times") -> float:
-        """How many times longer: the median of the ratios turn by turn, so that load cancels."""
+        """Return the median of the ratios turn by turn, so that other load cancels."""
         return statistics.median(a / b for a, b in zip(self.turns, other.turns, strict=True))
 
 
 def interleaved(cases: dict[str, Callable[[], object]], turns: int) -> dict[str, Times]:
-    """Times all cases in turn, again and again, after warming each of them up.
+    """Time all cases in turn, again and again, after warming each of them up.
 
-    A case must block until its result is there. Each turn begins with a call that does not count:
-    caches and the memory that the process holds are as the case before left them.
+    A case must block until its result is available. Each turn begins with a call that does not
+    count, since the case before has filled the caches.
     """
     calls = {}
     for name, case in cases.items():
@@ -90,7 +104,7 @@ def interleaved(cases: dict[str, Callable[[], object]], turns: int) -> dict[str,
 
 
 def elapsed(work: Callable[[], object]) -> tuple[object, float]:
-    """What some work returns, and how long it took once [s]."""
+    """Return the result of a call, and its duration [s]."""
     start = time.perf_counter()
     result = work()
     return result, time.perf_counter() - start
@@ -98,7 +112,7 @@ def elapsed(work: Callable[[], object]) -> tuple[object, float]:
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table: what was asked and what was measured, in words and one number."""
+    """Row of a table: what was measured and how, the target, the result, and whether it holds."""
 
     number: str
     what: str
@@ -109,16 +123,16 @@ class Row:
 
 
 def hand_over(rows: list[Row], path: str | None) -> None:
-    """Prints rows, and writes them where `run.py` reads them."""
+    """Print rows, and write them where `run.py` reads them."""
     for row in rows:
         print(f"[{row.number}] {row.what}: {row.measured}; asked {row.asked}\n    {row.recipe}")
     if path is not None:
-        # What NumPy has compared is NumPy's truth.
+        # Comparisons of NumPy give its own booleans.
         Path(path).write_text(json.dumps([asdict(row) for row in rows], default=bool))
 
 
 def version(package: str) -> str | None:
-    """Version of an installed package, or None."""
+    """Return the version of an installed package, or None."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -126,14 +140,14 @@ def version(package: str) -> str | None:
 
 
 def missing(module: str) -> str | None:
-    """A sentence if a peer cannot be imported, else None: peers are skipped by name."""
+    """Return a sentence if a module cannot be imported, else None."""
     if importlib.util.find_spec(module) is None:
         return f"`{module}` is not installed: skipped"
     return None
 
 
 def machine() -> dict[str, str]:
-    """What the figures depend on."""
+    """Return what the figures depend on: date, processor, load, versions, compiler."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     features = ""
@@ -159,6 +173,7 @@ def machine() -> dict[str, str]:
 
 
 def compiler() -> str:
+    """Return the version of the C++ compiler."""
     try:
         return subprocess.run(
             ["g++", "--version"], capture_output=True, text=True, check=True
@@ -168,7 +183,7 @@ def compiler() -> str:
 
 
 def fill(doubles: int, samples: int) -> Callable[[], object]:
-    """The floor of every result: writing as many doubles to memory that is already mapped."""
+    """Return the floor of every result: writing as many doubles to mapped memory."""
     import numpy as np
 
     memory = np.ones((doubles, samples))
@@ -176,7 +191,7 @@ def fill(doubles: int, samples: int) -> Callable[[], object]:
 
 
 def flop_rate(turns: int = 5) -> float:
-    """Multiplications and additions per second in a product of two matrices."""
+    """Return multiplications and additions per second in a product of two matrices."""
     import numpy as np
 
     size = 768
@@ -184,18 +199,3 @@ def flop_rate(turns: int = 5) -> float:
     out = np.empty_like(a)
     times = interleaved({"product": lambda: np.matmul(a, a, out=out)}, turns)["product"]
     return 2 * size**3 / times.median
-
-
-def main():
-    quick = "--quick" in sys.argv
-    pin_to(1)
-    samples = 1024 if quick else 2048
-    for name, value in machine().items():
-        print(f"{name}: {value}")
-    times = interleaved({"fill": fill(255, samples)}, 5 if quick else 21)["fill"]
-    print(f"warm fill of 255 doubles: {times.median / samples * 1e9:.0f} ns, one core")
-    print(f"product of matrices: {flop_rate() / 1e9:.0f} Gflop/s, one core")
-
-
-if __name__ == "__main__":
-    main()
