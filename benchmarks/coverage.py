@@ -1,4 +1,4 @@
-"""How often 95 % intervals hold the truth, and how far filters take estimates from it.
+"""Coverage of 95 % intervals, and the bias that filters bring into estimates.
 
     python benchmarks/coverage.py [--quick] [--json FILE]
 
@@ -16,7 +16,6 @@ is made.
 With 1000 draws a perfect method has 0.4 % of its parameters outside 93 to 97 %.
 """
 
-import argparse
 import math
 import time
 
@@ -25,11 +24,11 @@ from timing import Row, hand_over
 
 RATE, DURATION, CUTOFF, EVERY, NOISE = 1000.0, 20.0, 15.0, 20, 0.01
 SEEDS = (2026, 2027)
-"""Of the trajectories; nothing was tuned on them."""
+"""Seeds of the trajectories; nothing was tuned on them."""
 KINDS = (("white", 0.0), ("50 ms", 0.05), ("300 ms", 0.3))
 ENCODER = 2 * math.pi / 2**17
 PHASES = 25
-"""Shifts of the encoders' steps over which a bias is averaged: what scatters is no bias."""
+"""Number of shifts of the encoders' steps over which a bias is averaged."""
 MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
 VISCOUS, COULOMB, ROTOR, OFFSET = (
     (0.5, 0.5, 0.4, 0.4, 0.1, 0.1, 0.1),
@@ -38,10 +37,11 @@ VISCOUS, COULOMB, ROTOR, OFFSET = (
     (0.2, -0.3, 0.1, 0.2, -0.1, 0.1, 0.05),
 )
 BATCH = 100
-"""Draws of noise that are filtered at once."""
+"""Number of draws of noise that are filtered at once."""
 
 
 def seven_axes():
+    """Return the base parameters of a Panda with friction, rotors and offsets."""
     import jaxid as jid
 
     terms = (
@@ -55,11 +55,14 @@ def seven_axes():
 
 
 def truth(base):
+    """Return standard parameters."""
     import numpy as np
 
-    from jaxid.simulation.virtual import random_bodies
+    import jaxid as jid
 
-    bodies = random_bodies(base.model.robot, np.array(MASSES), np.random.default_rng(0))
+    bodies = jid.simulation.random_bodies(
+        base.model.robot, np.array(MASSES), np.random.default_rng(0)
+    )
     p = np.concatenate([np.ravel(bodies), VISCOUS, COULOMB, ROTOR, OFFSET])
     named = dict(zip(base.model.parameter_names, p, strict=True))
     if (named["fv1"], named["fc1"], named["Ia1"], named["fo1"]) != (0.5, 0.8, 0.6, 0.2):
@@ -68,16 +71,15 @@ def truth(base):
 
 
 def observations(base, p, seed, encoder, phase=0.0):
-    """A log without noise in the forces."""
+    """Return observations of a log without noise in the forces."""
     import numpy as np
 
     import jaxid as jid
-    from jaxid.dynamics.machine import in_numpy
 
     robot = base.model.robot
     t = np.arange(round(DURATION * RATE)) / RATE
     m = jid.random_fourier_series(robot, omega=0.2 * math.pi, seed=seed).motion(t)
-    forces = in_numpy(base.model, base.model.forces, m.q, m.qd, m.qdd, shared=(p,))
+    forces = np.asarray(base.model.inverse_dynamics(p, m))
     q = np.asarray(m.q)
     if encoder:
         q = encoder * (np.round(q / encoder + phase) - phase)
@@ -86,7 +88,7 @@ def observations(base, p, seed, encoder, phase=0.0):
 
 
 def noise(random, shape, memory):
-    """Noise of unit size at the full rate, first order with a memory [s]."""
+    """Return noise of unit size at the full rate, first order with a memory [s]."""
     import numpy as np
     from scipy import signal
 
@@ -99,28 +101,30 @@ def noise(random, shape, memory):
 
 
 class Study:
-    """One trajectory: its fit without noise, and what uncertainties are computed from."""
+    """Fit to one trajectory without noise, with the spectra that give uncertainties."""
 
     def __init__(self, base, p, seed, encoder=0.0):
         import numpy as np
 
         import jaxid as jid
-        from jaxid.identification.uncertainty.sandwich import SpectralTable
-        from jaxid.identification.uncertainty.spectra import lines_of
+
+        # private: the table of a design, which many draws share
+        from jaxid.identification.uncertainty.spectra import row_spectra
+        from jaxid.identification.uncertainty.spectral import SpectralTable
 
         self.o = observations(base, p, seed, encoder)
-        self.rows = jid.Rows.of(base, [self.o])
+        self.rows = jid.RegressionProblem(base, [self.o])
         self.estimate = jid.WeightedLeastSquares()(self.rows)
         self.truth = np.asarray(base.from_standard(p))
         self.bias = np.asarray(self.estimate.parameters) - self.truth
         e = self.estimate
         self.w = np.asarray(e.weights)
-        (lines,) = lines_of(self.rows, e.influence, e.inverse, e.parameters).lines
+        (lines,) = row_spectra(self.rows, e).lines
         self.lines, self.table = lines, SpectralTable([lines])
         count, n = self.o.rows, base.model.robot.joints
         A = np.zeros((count, n, base.size))
         for chunk in self.rows.chunks():
-            for j, own in enumerate(chunk.acting):
+            for j, own in enumerate(chunk.indices):
                 A[chunk.rows, j, list(own)] = self.w[j] * chunk.columns[j]
         self.A = A.reshape(-1, base.size)
         self.P = self.A @ np.asarray(e.inverse)
@@ -128,7 +132,7 @@ class Study:
         self.own = self.o.reduced_forces - (self.A @ self.truth).reshape(count, n) / self.w
 
     def fits(self, noise):
-        """Errors of the estimates, and deviations: naive, honest, with degrees of freedom."""
+        """Return errors and deviations (naive; spectral, with degrees of freedom)."""
         import numpy as np
 
         y = ((noise + self.own) * self.w).reshape(len(noise), -1)
@@ -143,8 +147,8 @@ class Study:
         return error, naive, np.sqrt(variance), freedom
 
 
-def held(study, memory, draws, seed):
-    """Shares of draws in which intervals hold the truth, by parameter; seconds for a fit."""
+def coverage(study, memory, draws, seed):
+    """Return fractions of draws whose intervals hold the truth, and seconds for a fit."""
     import numpy as np
     from scipy import special
 
@@ -152,11 +156,11 @@ def held(study, memory, draws, seed):
     forces = NOISE * study_forces(study)
     naive_held, honest_held, ratio = 0, 0, 0
     spent = 0.0
-    count = len(study.o.time)
+    count = len(study.o.forces)
     for _ in range(draws // BATCH):
         e = noise(random, (BATCH, count, len(forces)), memory) * forces
         e = np.moveaxis(study.o.reduce(np.moveaxis(e, 0, 2)), 2, 0)
-        # One thread: its own time does not grow when others use the machine.
+        # Time of this thread, which other programs do not change.
         start = time.process_time()
         error, naive, honest, freedom = study.fits(e)
         quantile = special.stdtrit(np.maximum(freedom, 1.0), 0.975)
@@ -168,23 +172,26 @@ def held(study, memory, draws, seed):
 
 
 def study_forces(study):
-    """The largest forces of the joints [N m]."""
+    """Return the largest forces of the joints [N m]."""
     import numpy as np
 
     return np.asarray(study.rows.robot.max_forces)
 
 
 def inside(shares):
+    """Return the percentage of parameters whose coverage is between 93 and 97 %."""
     import numpy as np
 
     return 100 * np.mean((shares >= 0.93) & (shares <= 0.97))
 
 
 def said(shares):
+    """Return a coverage in words."""
     return f"{inside(shares):.0f} (mean {100 * shares.mean():.1f}, lowest {100 * shares.min():.1f})"
 
 
 def coverage_rows(base, p, seeds, draws):
+    """Measure the coverage for every kind of noise."""
     import numpy as np
 
     rows = []
@@ -192,7 +199,7 @@ def coverage_rows(base, p, seeds, draws):
         study = Study(base, p, seed)
         condition = np.linalg.cond(study.A / np.linalg.norm(study.A, axis=0))
         for k, (name, memory) in enumerate(KINDS):
-            naive, honest, ratio, spent = held(study, memory, draws, 10 * seed + k)
+            naive, honest, ratio, spent = coverage(study, memory, draws, 10 * seed + k)
             asked = 85.0 if memory > 0.1 else 95.0
             holds = bool(inside(honest) >= asked and (memory <= 0.1 or honest.min() >= 0.9))
             rows.append(
@@ -212,6 +219,7 @@ def coverage_rows(base, p, seeds, draws):
 
 
 def bias_rows(base, p, seeds, phases):
+    """Measure the bias without noise, with exact and with coarse encoders."""
     import numpy as np
 
     import jaxid as jid
@@ -220,14 +228,14 @@ def bias_rows(base, p, seeds, phases):
     for seed in seeds:
         study = Study(base, p, seed)
         random = np.random.default_rng(seed)
-        shape = (BATCH, len(study.o.time), base.model.robot.joints)
+        shape = (BATCH, len(study.o.forces), base.model.robot.joints)
         e = noise(random, shape, 0.0) * NOISE * study_forces(study)
         e = np.moveaxis(study.o.reduce(np.moveaxis(e, 0, 2)), 2, 0)
         deviation = np.mean(study.fits(e)[2], axis=0)
         coarse = []
         for phase in random.uniform(size=(phases, base.model.robot.joints)):
             o = observations(base, p, seed, ENCODER, phase)
-            estimate = jid.WeightedLeastSquares()(jid.Rows.of(base, [o]))
+            estimate = jid.WeightedLeastSquares()(jid.RegressionProblem(base, [o]))
             coarse.append(np.asarray(estimate.parameters) - study.truth)
         for name, errors in (("exact", study.bias[None]), ("17 bit", np.array(coarse))):
             shift = np.abs(errors.mean(axis=0)) / deviation
@@ -253,10 +261,8 @@ def bias_rows(base, p, seeds, phases):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="100 draws of one trajectory")
-    parser.add_argument("--json", help="where run.py reads the rows")
-    options = parser.parse_args()
+    """Measure bias and coverage on one core."""
+    options = timing.parser(__doc__, "100 draws of one trajectory").parse_args()
     timing.pin_to(1)
     base = seven_axes()
     p = truth(base)

@@ -1,10 +1,10 @@
-"""Does `jaxid inspect` name what is wrong with a log? Measured logs, spoilt in the usual ways.
+"""Mistakes in logs that `jid.diagnose` names: measured logs, changed in the usual ways.
 
     python benchmarks/doctor.py [--quick] [--json FILE] [--robot tx40] [--class sign] [--show]
 
 Data: the published logs of a Stäubli TX40 (motor side, 5 kHz) and a Universal Robots UR10 (joint
 side, 125 Hz) in `../shared/data`, with the experiment files of `tests/real_data` (their filters,
-models and weights). Of each log random stretches are taken, at least 60 % of it, and spoilt in one
+models and weights). Of each log random stretches are taken, at least 60 % of it, and changed in one
 way, of random joint and amount: the numbers are the log's, the experiment file is wrong about them.
 
 units: angles in degrees that are taken for radians, or the other way round; forces in N mm or kN m
@@ -16,17 +16,16 @@ samples lie at the limit. delay: forces late or early by 4 to 40 ms, on the UR10
 log, at 125 Hz, tells delays to about ±9 ms. milliseconds: a time in milliseconds taken for seconds.
 good: nothing is wrong.
 
-Named is a log of which some sentence names the slip, its joints and its key; the next column tells
-of how many of them no sentence names a slip of another class. A good log is right if nothing is
-said of it.
+Named is a log of which some sentence names the mistake, its joints and its key; the next column
+counts those for which no sentence names a mistake of another class. A good log is right if there
+are no findings.
 """
 
-import argparse
 import dataclasses
 import time
 
 import timing
-from timing import Row, hand_over
+from timing import DATA, EXPERIMENTS, Row, hand_over
 
 ASKED = 0.9
 GEARS = 101.0
@@ -46,15 +45,15 @@ SIGNS = {
 
 
 def stretch(recording, random):
-    """A part of a log, at least 60 % of it."""
+    """Return a part of a log, at least 60 % of it."""
     share = random.uniform(0.6, 1.0)
     first = random.uniform(0.0, 1.0 - share)
     length, start = recording.duration, float(recording.time[0])
     return recording.crop(start + first * length, start + (first + share) * length)
 
 
-def spoilt(kind, recording, robot, random):
-    """The log as a wrong experiment file sees it, and what a sentence must name."""
+def changed(kind, recording, robot, random):
+    """Return the log as a wrong experiment file reads it, and what a sentence must name."""
     import numpy as np
 
     angles, forces = np.array(recording.angles), np.array(recording.forces)
@@ -133,39 +132,46 @@ def spoilt(kind, recording, robot, random):
 
 
 def right(kind, told, said):
-    """Whether the sentences name this slip, and no slip of another class."""
-    if kind == "good":
-        return not said
+    """Return whether the sentences name this mistake, and no mistake of another class."""
     named = {k for k, marks in SIGNS.items() for s in said if any(m in s for m in marks)}
     hit = any(any(m in s for m in SIGNS[kind]) and all(t in s for t in told) for s in said)
     return hit, named == {kind}
 
 
+def findings(experiment, log):
+    """Return the findings of a log and of the fit to it."""
+    import jaxid as jid
+
+    observations = experiment.observe(log)
+    fit = jid.identify(experiment.base, observations)
+    minimum = experiment.min_speed
+    found = jid.diagnose(log, experiment.robot, fit, observations=observations, min_speed=minimum)
+    return (*found.findings, *found.mistakes(fit))
+
+
 def trials(robot_name, kind, count, show):
-    """How many are named, named alone, and how long one takes."""
+    """Return how many are named, named alone, and the duration of one."""
     import zlib
 
     import numpy as np
 
     import jaxid as jid
-    from jaxid.experiment.doctor import examine
-    from jaxid.experiment.experiment import load_experiment
+    from jaxid.experiment.experiment import load_experiment  # private: experiment files
 
-    data = timing.REPOSITORY.parent / "shared" / "data"
-    experiment = load_experiment(timing.REPOSITORY / f"tests/real_data/{robot_name}.toml")
+    experiment = load_experiment(EXPERIMENTS / f"{robot_name}.toml")
     if robot_name == "ur10":
-        drives = jid.Drives.of(6, reduction=[GEARS] * 6)
+        drives = jid.Drives(6, reduction=[GEARS] * 6)
         robot = experiment.robot.replace(drives=drives)
         model = jid.Model(robot, experiment.model.terms)
         experiment = dataclasses.replace(experiment, robot=robot, model=model)
-    whole = experiment.read(data / LOGS[robot_name])
+    whole = experiment.read(DATA / LOGS[robot_name])
     random = np.random.default_rng([2026, zlib.crc32(f"{robot_name}{kind}".encode())])
     hits = alone = 0
     began = time.perf_counter()
     for _ in range(count):
-        log, told = spoilt(kind, stretch(whole, random), experiment.robot, random)
+        log, told = changed(kind, stretch(whole, random), experiment.robot, random)
         try:
-            said = examine(experiment, log)
+            said = findings(experiment, log)
         except ValueError as error:
             said = (str(error),)
         if kind == "good":
@@ -181,16 +187,15 @@ def trials(robot_name, kind, count, show):
 
 
 def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json")
+    """Change the logs and print which mistakes are named."""
+    parser = timing.parser(__doc__, "one log of each class")
     parser.add_argument("--count", type=int)
     parser.add_argument("--robot", nargs="*", default=ROBOTS)
     parser.add_argument("--class", nargs="*", default=CLASSES, dest="classes")
     parser.add_argument("--show", action="store_true")
     given = parser.parse_args()
     timing.pin_to(1)
-    if not (timing.REPOSITORY.parent / "shared" / "data").is_dir():
+    if not DATA.is_dir():
         print("the measured logs (../shared/data) are not here: skipped")
         return
     import jax
@@ -199,7 +204,7 @@ def main():
     count = given.count or (1 if given.quick else 24)
     rows = []
     print(
-        "| robot | spoilt | logs | named | and nothing else | seconds |\n|---|---|---|---|---|---|"
+        "| robot | changed | logs | named | and nothing else | seconds |\n|---|---|---|---|---|---|"
     )
     for robot in given.robot:
         for kind in given.classes:
@@ -212,7 +217,7 @@ def main():
                 Row(
                     f"{robot}/{kind}",
                     f"{robot}: {kind}",
-                    f"{count} stretches of the measured log, each spoilt once",
+                    f"{count} stretches of the measured log, each changed once",
                     asked,
                     f"{100 * share:.0f} % ({100 * alone / count:.0f} % with no other sentence)",
                     None if given.quick else holds,

@@ -1,4 +1,4 @@
-"""Feed-forward in C: how long a call takes in each form, how many operations it has, who agrees.
+"""Feed-forward in C: time of a call and number of operations for each form.
 
     python benchmarks/export.py [--quick] [--model NAME ...] [--table NAME ...]
 
@@ -18,14 +18,10 @@ with `-std=c99`, which leaves multiplications and additions unfused. Peers, of t
 friction, with `-O3 -march=native`: Pinocchio's `rnea` in C++, and what CasADi generates from it.
 
 `worst`: 10^6 calls, each timed by the clock, beside as many calls of nothing: the clock's own cost
-and what the operating system takes. `agreement`: the exported C against JAX on 10^5 random states,
-relative to the largest force. `simulators`: on 10^5 states the torques of the exported URDF in
-Pinocchio and of the exported MJCF in MuJoCo against those of the model's bodies (in MuJoCo with
-rotors and viscous friction), relative to the largest. `counts`: operations for arms of which others
-have published programs.
+and interruptions by the operating system. `counts`: operations for arms of which others have
+published programs. Agreement with JAX, Pinocchio and MuJoCo is tested in `tests/export`.
 """
 
-import argparse
 import ctypes
 import hashlib
 import re
@@ -41,15 +37,10 @@ import numpy as np
 import timing
 
 import jaxid as jid
-from jaxid.dynamics.projection import partial_velocities
-from jaxid.export.compiled_model import CompiledModel
-from jaxid.export.feed_forward import bodies_of, torque_program
-from jaxid.export.physical import Joints
-from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.uncertainty.uncertainty import Uncertainty
-from jaxid.program import Library, definition, trace
-from jaxid.program.operation import Operation
-from jaxid.simulation.virtual import random_bodies
+from jaxid.dynamics.projection import partial_velocities  # private: Eq. 38 as the paper forms M
+from jaxid.export.feed_forward import body_parameters, torque_program  # private: counts, timing
+from jaxid.program import CWriter, trace  # private: other forms of the same torques
+from jaxid.program.operations import Operation  # private: number of angles
 
 FLAGS = {"O2": ["-O2"], "O3": ["-O3", "-march=native"]}
 FRICTION = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia())
@@ -63,7 +54,7 @@ ARMS = {
     "rail + TX90L, 57": (jid.robots.tx90l_on_rail, (jid.RigidBodies(), *FRICTION)),
     "TX40, coupled wrist": (
         jid.robots.tx40,
-        (jid.RigidBodies(), *FRICTION, jid.CoupledDrives()),
+        (jid.RigidBodies(), *FRICTION, jid.terms.CoupledDrives()),
     ),
 }
 QUICK = {"planar arm": (lambda: jid.robots.planar_arm(3, 0.4), (jid.RigidBodies(), *FRICTION))}
@@ -110,36 +101,26 @@ void each(form *f, long calls, int n, const double *q, const double *qd, const d
 """
 
 
-def fit_of(model, p, full=False):
-    """A fit with given parameters: what is exported does not depend on how it was found."""
-    base, n = jid.base_parameters(model), model.robot.joints
-    return Fit(
-        base=base,
-        parameters=np.asarray(base.from_standard(p)),
-        uncertainty=Uncertainty.given(np.eye(base.size)),
-        weights=np.ones(n),
-        condition_numbers=ConditionNumbers(1.0, 1.0, 1.0),
-        rows=(1,) * n,
-        residual_rms=np.zeros(n),
-        residual=0.0,
-        undetermined=(),
-        estimator=jid.LeastSquares(),
-        solution=jid.Complete(),
-        recordings=(),
-        notes=(),
-        full_parameters=p if full else None,
-    )
+def fit_of(model, p):
+    """Identify given parameters from forces without noise."""
+    base, random = jid.base_parameters(model), np.random.default_rng(3)
+    m = jid.Motion(*states_of(model.robot, random, 500))
+    forces = base.inverse_dynamics(base.from_standard(p), m)
+    o = jid.Observations.of(m.q, m.qd, m.qdd, forces, sample_time=0.001)
+    return jid.identify(base, o, uncertainty=jid.uncertainty.IndependentRows())
 
 
 def projected_mass_matrix(model, p, q):
-    """M as the paper forms it: the sum of F^T M_i F of all bodies (Eq. 38)."""
+    """Return M as the paper forms it: the sum of F^T M_i F of all bodies (Eq. 38)."""
     rest = jnp.zeros_like(q)
     F = jax.jacfwd(partial_velocities(model.robot, q, rest, rest))(rest)
     total = jnp.zeros((len(q), len(q)))
     for term, own in zip(model.terms, model.split(p), strict=True):
         if not term.body_parameters:
             total = total + term.mass_matrix(model.robot, own, q)
-    for f, (m, x, y, z, A, B, C, D, E, G) in zip(F, bodies_of(model, p).tolist(), strict=True):
+    for f, (m, x, y, z, A, B, C, D, E, G) in zip(
+        F, body_parameters(model, p).tolist(), strict=True
+    ):
         h = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         J = np.array([[A, -G, -E], [-G, B, -D], [-E, -D, C]])
         total = total + f.T @ (np.block([[m * np.eye(3), -h], [h, J]]) @ f)
@@ -147,7 +128,7 @@ def projected_mass_matrix(model, p, q):
 
 
 def programs(model, p):
-    """The forms of one model, by name."""
+    """Return the fit and the forms of one model, by name."""
     fit, one = fit_of(model, p), (model.robot.joints,)
     base = fit.base
     own, full = np.asarray(base.to_standard(fit.parameters)), np.asarray(p)
@@ -172,14 +153,13 @@ def programs(model, p):
 
 
 def build(found, flags):
-    """All forms of a model as one library."""
+    """Compile all forms of a model as one library."""
     names = {name: f"form{k}" for k, name in enumerate(found)}
     text = "#define _POSIX_C_SOURCE 199309L\n#include <float.h>\n#include <math.h>\n"
-    library = Library.of([*found.values()], "arm", double=True)
-    text += "#include <stdint.h>\n#include <string.h>\n" + library.text()
+    writer = CWriter(True, "arm", [*found.values()])
+    text += "#include <stdint.h>\n#include <string.h>\n" + writer.library()
     for name, program in found.items():
-        arguments = (["q", "qd", "qdd"], ["tau"])
-        text += definition(program, names[name], *arguments, double=True, library=library)
+        text += writer.definition(program, names[name], ["q", "qd", "qdd"], ["tau"])
     opened = ctypes.CDLL(str(compiled(text + HARNESS, flags)))
     return {
         name: ctypes.cast(getattr(opened, f), ctypes.c_void_p) for name, f in names.items()
@@ -187,7 +167,7 @@ def build(found, flags):
 
 
 def compiled(text, flags):
-    """C code as a library, from an earlier run if it is the same."""
+    """Compile C code as a library, or take that of an earlier run with the same code."""
     command = ["gcc", "-std=c99", "-w", *flags, "-shared", "-fPIC"]
     key = hashlib.sha256((text + " ".join(command)).encode()).hexdigest()[:16]
     target = Path(tempfile.gettempdir()) / f"jaxid-export-{key}.so"
@@ -200,11 +180,12 @@ def compiled(text, flags):
 
 
 def pointer(x):
+    """Return the address of an array."""
     return ctypes.c_void_p(x.ctypes.data)
 
 
 def time_forms(name, arm, quick):
-    """Times and counts of one arm, as rows of a table."""
+    """Print times and counts of one arm, as rows of a table."""
     make, terms = arm
     robot = make()
     model = jid.Model(robot, terms)
@@ -253,7 +234,7 @@ def time_forms(name, arm, quick):
 
 
 def interleaved(work, turns):
-    """CPU seconds of all cases, in turn, again and again."""
+    """Measure CPU seconds of all cases, in turn, again and again."""
     seconds = {key: [] for key in work}
     for turn in range(turns + 1):
         for key, case in work.items():
@@ -266,15 +247,17 @@ def interleaved(work, turns):
 
 
 def states_of(robot, random, samples):
+    """Draw positions, velocities and accelerations."""
     return [random.uniform(-s, s, (samples, robot.joints)) for s in (3.0, 2.0, 5.0)]
 
 
 def call(opened, function, calls, states, out):
+    """Call a form on all states."""
     opened.many(function, ctypes.c_long(calls), out.shape[1], *map(pointer, (*states, out)))
 
 
 def peers(robot, states):
-    """Pinocchio's rnea in C++ and what CasADi makes of it: work, calls in it, operations."""
+    """Return Pinocchio's rnea in C++ and CasADi's code of it: work, calls in it, operations."""
     found = {}
     try:
         import pinocchio_loop
@@ -306,7 +289,7 @@ def peers(robot, states):
 
 
 def time_worst(name, arm, quick):
-    """Quantiles of single calls of the factored form, beside calls of nothing."""
+    """Print quantiles of single calls of the factored form, beside calls of nothing."""
     make, terms = arm
     model = jid.Model(make(), terms)
     random = np.random.default_rng(0)
@@ -329,112 +312,8 @@ def time_worst(name, arm, quick):
             print(f"| {form}, {level} | {' | '.join(f'{x:.0f}' for x in shown)} |")
 
 
-def agreement(name, arm, quick):
-    make, terms = arm
-    model = jid.Model(make(), terms)
-    random = np.random.default_rng(1)
-    fit = fit_of(model, random.uniform(0.1, 1.0, model.size))
-    m = jid.Motion(*states_of(model.robot, random, 1000 if quick else 100_000))
-    wanted = np.asarray(fit.base.inverse_dynamics(fit.parameters, m))
-    found = CompiledModel.of(fit).torque(m)
-    report(f"{name}: C and JAX", found, wanted, 1e-12)
-
-
-def report(what, found, wanted, allowed):
-    """Prints a difference relative to the largest force, and ends if it is too large."""
-    error = np.abs(found - wanted).max() / np.abs(wanted).max()
-    print(f"{what} differ by {error:.1e} of the largest force, {len(wanted)} states")
-    if not error <= allowed:
-        raise SystemExit(f"{what} differ by more than {allowed}")
-
-
-def simulators(name, arm, quick):
-    """Exported files in Pinocchio and MuJoCo against the model."""
-    make, terms = arm
-    if terms[0].body_parameters < 10:
-        print(f"{name}: bodies of seven parameters need not be possible, simulators refuse them")
-        return
-    robot, random = make(), np.random.default_rng(2)
-    model, n = jid.Model(robot, terms), robot.joints
-    p = random.uniform(0.2, 0.9, model.size)
-    p[: 10 * n] = random_bodies(robot, random.uniform(0.5, 4.0, n), random).ravel()
-    fit = fit_of(model, p, full=True)
-    m = jid.Motion(*states_of(robot, random, 1000 if quick else 100_000))
-    bodies = np.asarray(jid.Model(robot, terms[:1]).inverse_dynamics(p[: 10 * n], m))
-    with tempfile.TemporaryDirectory() as folder:
-        source = Path(folder, "source.urdf")
-        source.write_text(urdf_of(robot))
-        files = Path(folder, "arm.urdf"), Path(folder, "arm.xml")
-        if timing.missing("pinocchio"):
-            print(timing.missing("pinocchio"))
-        else:
-            jid.export_urdf(fit, source, files[0])
-            report(
-                f"{name}: URDF in Pinocchio and JAX", in_pinocchio(files[0], robot, m), bodies, 1e-9
-            )
-        if timing.missing("mujoco"):
-            print(timing.missing("mujoco"))
-        else:
-            jid.export_mjcf(fit, files[1])
-            joints = Joints.of(fit)
-            wanted = bodies + joints.armature * m.qdd + joints.damping * m.qd
-            report(f"{name}: MJCF in MuJoCo and JAX", in_mujoco(files[1], m), wanted, 1e-9)
-
-
-def urdf_of(robot):
-    """A URDF with a robot's joints, and links without matter."""
-    lines = ['<robot name="arm">', '<link name="ground"/>']
-    for i, parent in enumerate(robot.parent):
-        R, r, axis = (np.asarray(x[i]) for x in (robot.rotation, robot.offset, robot.axis))
-        up = np.hypot(R[0, 0], R[1, 0])
-        turn = [np.arctan2(R[2, 1], R[2, 2]), np.arctan2(-R[2, 0], up), 0.0]
-        turn[2] = np.arctan2(R[1, 0], R[0, 0])
-        if up < 1e-12:
-            turn[0], turn[2] = np.arctan2(-R[1, 2], R[1, 1]), 0.0
-        place, attitude, along = (" ".join(repr(float(x)) for x in v) for v in (r, turn, axis))
-        above = "ground" if parent < 0 else f"link{parent}"
-        kind = "continuous" if robot.revolute[i] else "prismatic"
-        lines += [
-            f'<link name="link{i}"/>',
-            f'<joint name="{robot.joint_names[i]}" type="{kind}"><parent link="{above}"/>'
-            f'<child link="link{i}"/><origin xyz="{place}" rpy="{attitude}"/>'
-            f'<axis xyz="{along}"/><limit lower="-9" upper="9" effort="100" velocity="9"/></joint>',
-        ]
-    return "\n".join([*lines, "</robot>"])
-
-
-def in_pinocchio(path, robot, m):
-    import pinocchio as pin
-
-    model = pin.buildModelFromUrdf(str(path))
-    model.gravity.linear = np.asarray(robot.gravity)
-    data, found, q = model.createData(), np.empty_like(m.q), pin.neutral(model)
-    for k, (x, v, a) in enumerate(zip(m.q, m.qd, m.qdd, strict=True)):
-        for j, joint in enumerate(model.joints):
-            if joint.nq == 2:
-                q[joint.idx_q : joint.idx_q + 2] = np.cos(x[j - 1]), np.sin(x[j - 1])
-            elif joint.nq == 1:
-                q[joint.idx_q] = x[j - 1]
-        found[k] = pin.rnea(model, data, q, v, a)
-    return found
-
-
-def in_mujoco(path, m):
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(path))
-    flags = mujoco.mjtDisableBit
-    model.opt.disableflags |= flags.mjDSBL_CONSTRAINT
-    data, found = mujoco.MjData(model), np.empty_like(m.q)
-    for k in range(len(m.q)):
-        data.qpos[:], data.qvel[:], data.qacc[:] = m.q[k], m.qd[k], m.qdd[k]
-        mujoco.mj_inverse(model, data)
-        found[k] = data.qfrc_inverse
-    return found
-
-
 def published(name, arm, quick):
-    """Operations for arms of which others have published programs, bodies only.
+    """Print operations for arms of which others have published programs, bodies only.
 
     An RX90 with its joints as in robots/RX90/RX90_idm.txt of github.com/symoro/symoro; the LWR,
     with joints like those of S7RRRRRRR1 in github.com/SchapplM/robsynth-serroblib.
@@ -455,15 +334,13 @@ def published(name, arm, quick):
 TABLES = {
     "times": time_forms,
     "worst": time_worst,
-    "agreement": agreement,
-    "simulators": simulators,
     "counts": published,
 }
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a planar arm, few calls")
+    """Print the selected tables."""
+    parser = timing.parser(__doc__, "a planar arm, few calls")
     parser.add_argument("--model", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--table", nargs="+", choices=TABLES, default=list(TABLES))
     options = parser.parse_args()

@@ -1,14 +1,13 @@
-"""Do the fences of a scalar program still hold? Fenced against unfenced XLA, in one process.
+"""Fences of a scalar program: run time of fenced against unfenced XLA, in one process.
 
     python benchmarks/fences.py [--quick] [--check] [--json FILE]
 
-A new version of JAX can lose a fence silently: the results stay right and the program becomes many
-times slower. This prints run and compile time of a seven-joint regressor behind each fence, and
-says by name which one does not hold; with `--check` it then fails, if that is the default fence.
+A new version of JAX can ignore a fence silently: results stay right and the program becomes many
+times slower. The script prints run and compile time of a seven-joint regressor behind each fence,
+and names those without effect; with `--check` it fails if the default fence is one of them.
 Ratios count; absolute times depend on the machine.
 """
 
-import argparse
 import statistics
 import sys
 import time
@@ -20,13 +19,12 @@ import numpy as np
 import timing
 from timing import Row, hand_over
 
-from jaxid.program import (
+from jaxid.program import (  # private: the compiler itself
     AbstractFence,
     BarrierFence,
     DivisionFence,
     NoFence,
     default_fence,
-    library_sine_cosine,
     lower,
     sine_cosine,
     trace,
@@ -35,7 +33,7 @@ from jaxid.program import (
 JOINTS = 7
 FENCES = (NoFence(), DivisionFence(), BarrierFence())
 HOLDS_FROM = {"polynomial": 2.5, "library": 10.0}
-"""How many times faster a fenced program must be than the unfenced one, by its sine and cosine."""
+"""Required speed of a fenced program relative to the unfenced one, by its sine and cosine."""
 
 NUMBERS = {
     ("DivisionFence", "library"): "5a",
@@ -50,18 +48,20 @@ OFFSETS = np.array([0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0])
 
 
 def skew(a):
+    """Return the matrix of a cross product."""
     o = 0.0 * a[0]
     return jnp.array([[o, -a[2], a[1]], [a[2], o, -a[0]], [-a[1], a[0], o]])
 
 
 def inertia_operator(w):
+    """Return the matrix of the six moments of inertia."""
     x, y, z = w
     o = 0.0 * x
     return jnp.array([[x, y, o, z, o, o], [o, x, y, o, z, o], [o, o, o, x, y, z]])
 
 
 def accelerations(q, qd, qdd):
-    """Acceleration without gravity, angular velocity and acceleration of each body of the arm."""
+    """Return acceleration less gravity, angular velocity and acceleration of each body."""
     a, w, wd, z = jnp.array([0.0, 0.0, 9.81]), jnp.zeros(3), jnp.zeros(3), np.eye(3)[2]
     bodies = []
     for k in range(JOINTS):
@@ -78,7 +78,7 @@ def accelerations(q, qd, qdd):
 
 
 def regressor(q, qd, qdd):
-    """Joint torques per inertial parameter, [joint, body, parameter]."""
+    """Return joint torques per inertial parameter, [joint, body, parameter]."""
     partial = jax.jacfwd(lambda x: [(a, wd) for a, _, wd in accelerations(q, qd, x)])(qdd)
     columns = []
     for (along, about), (a, w, wd) in zip(partial, accelerations(q, qd, qdd), strict=True):
@@ -93,6 +93,8 @@ def regressor(q, qd, qdd):
 
 
 def compiled(lowered, inputs):
+    """Compile a program; return it with the seconds that this takes."""
+
     def results(*x):
         return [y for y in lowered(*x) if not isinstance(y, float)]
 
@@ -102,14 +104,14 @@ def compiled(lowered, inputs):
 
 
 class Measured(NamedTuple):
-    """A fence with one of the two pairs of sine and cosine.
+    """Times of a fence with one of the two pairs of sine and cosine.
 
     Attributes:
-        fence: The fence.
+        fence: Fence.
         pair: Name of the pair.
-        nanoseconds: For each sample, of all turns.
-        compiling: Seconds.
-        ratio: How many times faster than without a fence.
+        nanoseconds: Time for each sample, of all turns.
+        compiling: Compile time [s].
+        ratio: Speed relative to no fence.
     """
 
     fence: AbstractFence
@@ -120,27 +122,27 @@ class Measured(NamedTuple):
 
     @property
     def name(self):
-        """Of the fence."""
+        """Name of the fence."""
         return type(self.fence).__name__
 
     @property
     def median(self):
-        """Of all turns."""
+        """Median of all turns."""
         return statistics.median(self.nanoseconds)
 
     @property
     def lost(self):
-        """Whether it does not do what a fence is for."""
+        """Whether the fence has no effect."""
         return self.name != "NoFence" and self.ratio < HOLDS_FROM[self.pair]
 
 
 def measure(samples, turns):
-    """Every fence with each pair, on the backend that JAX has chosen."""
+    """Time every fence with each pair."""
     program = trace(regressor, (JOINTS,), (JOINTS,), (JOINTS,))
     generator = np.random.default_rng(0)
     inputs = [jnp.asarray(x) for x in generator.uniform(-1, 1, (3, JOINTS, samples))]
     print(f"seven-joint regressor: {program.counts}")
-    pairs = {"polynomial": sine_cosine, "library": library_sine_cosine}
+    pairs = {"polynomial": sine_cosine, "library": lambda x: (jnp.sin(x), jnp.cos(x))}
     cases = [(fence, pair) for pair in pairs for fence in FENCES]
     runs, compiling = {}, {}
     for fence, pair in cases:
@@ -165,7 +167,7 @@ def measure(samples, turns):
 
 
 def row(case, without, chosen, recipe):
-    """One fence as a row of the table; only the fence that is used has to hold."""
+    """Return the row of one fence; only the default fence has to hold."""
     used = case.fence == chosen
     said = f"{case.ratio:.1f}x ({case.median:.0f} ns against {without.median:.0f} ns)"
     if case.lost:
@@ -181,10 +183,9 @@ def row(case, without, chosen, recipe):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer samples and repetitions")
+    """Time all fences."""
+    parser = timing.parser(__doc__, "fewer samples and repetitions")
     parser.add_argument("--check", action="store_true", help="fail if the default fence is lost")
-    parser.add_argument("--json", help="where to write the rows")
     options = parser.parse_args()
     timing.pin_to(2)
     jax.config.update("jax_platforms", "cpu")

@@ -1,4 +1,4 @@
-"""Held-out errors of estimators and friction models on two measured robots, side by side.
+"""Held-out errors of estimators and friction models on two measured robots.
 
 Data: the logs of the Stäubli TX40 and the Universal Robots UR10 in `../shared/data`, prepared as
 the experiment files `tests/real_data/tx40.toml` (20 Hz, every 50th row) and `ur10.toml` (4 Hz) say,
@@ -19,30 +19,27 @@ TX40 stands still at the end. "of WLS" compares with weighted least squares.
     python benchmarks/held_out.py --quick    # the UR10, without the rows that search
 """
 
-import sys
-from pathlib import Path
-
 import jax
 import numpy as np
+import timing
 from stepwise import Stepwise
+from timing import DATA, EXPERIMENTS
 
 import jaxid as jid
-from jaxid.experiment.experiment import load_experiment
+from jaxid.experiment.experiment import load_experiment  # private: experiment files
 
-ROOT = Path(__file__).resolve().parent.parent
-DATA = ROOT.parent / "shared" / "data"
 LOGS = {"tx40": "tx40/motor_position.csv", "ur10": "ur10/exciting_measured.csv"}
 SHARE = 0.6
 STILL = 0.02
-"""Speed below which a joint stands [rad/s]."""
+"""Speed below which a joint counts as resting [rad/s]."""
 
 jax.config.update("jax_enable_x64", True)
 
 
 def stribeck(base: jid.BaseParameters) -> jid.BaseParameters:
-    """The same model with Stribeck's law in place of Coulomb's."""
+    """Return the same model with Stribeck's law in place of Coulomb's."""
     terms = [
-        jid.StribeckFriction(transition=term.transition)
+        jid.terms.StribeckFriction(transition=term.transition)
         if isinstance(term, jid.CoulombFriction)
         else term
         for term in base.model.terms
@@ -51,23 +48,23 @@ def stribeck(base: jid.BaseParameters) -> jid.BaseParameters:
 
 
 def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
-    """Name, fit and remark of each row of the table."""
+    """Yield name, fit and remark of each row of the table."""
     wls = jid.identify(base, train, jid.WeightedLeastSquares())
     yield "WLS, largest forces", wls, ""
-    yield "LS", jid.identify(base, train, jid.LeastSquares()), ""
-    variances = jid.WeightedLeastSquares(jid.ResidualVariances())
+    yield "LS", jid.identify(base, train, jid.estimators.LeastSquares()), ""
+    variances = jid.WeightedLeastSquares(jid.estimators.ResidualVariances())
     yield "WLS, residual variances", jid.identify(base, train, variances), ""
-    for loss in (jid.Huber(), jid.Tukey()):
-        robust = jid.identify(base, train, jid.IterativelyReweighted(loss))
+    for loss in (jid.estimators.Huber(), jid.estimators.Tukey()):
+        robust = jid.identify(base, train, jid.estimators.IterativelyReweighted(loss))
         yield f"IRLS, {type(loss).__name__}", robust, ""
-    for remark, pull in (("", None), ("entropic pull", jid.EntropicPull())):
+    for remark, pull in (("", None), ("entropic pull", jid.consistency.EntropicPull())):
         consistent = jid.identify(base, train, jid.PhysicallyConsistent(pull=pull))
-        price = f"price {consistent.consistency.price:.1%}"
+        price = f"residual increase {consistent.consistency.residual_increase:.1%}"
         yield "physically consistent", consistent, ", ".join(filter(None, (remark, price)))
     stepwise = jid.identify(base, train, Stepwise())
     yield "axis by axis", stepwise, ""
     essential = jid.essential_parameters(wls, train)
-    yield "essential parameters", essential.fit, f"{essential.chosen.left} of {base.size}"
+    yield "essential parameters", essential.fit, f"{essential.last.remaining} of {base.size}"
     if quick:
         return
     for name, other in (("epsilons", base), ("Stribeck", stribeck(base))):
@@ -80,8 +77,8 @@ def fits(base: jid.BaseParameters, train: jid.Observations, *, quick: bool):
 
 
 def table(name: str, *, quick: bool) -> list[str]:
-    """The rows of one robot."""
-    experiment = load_experiment(ROOT / "tests" / "real_data" / f"{name}.toml")
+    """Return the rows of one robot."""
+    experiment = load_experiment(EXPERIMENTS / f"{name}.toml")
     recording = experiment.read(DATA / LOGS[name])
     train, test = experiment.observe(recording).split(SHARE)
     lines = [
@@ -106,14 +103,15 @@ def table(name: str, *, quick: bool) -> list[str]:
 
 
 def main() -> None:
-    """Prints the tables."""
-    quick = "--quick" in sys.argv
+    """Print the tables."""
+    parser = timing.parser(__doc__, "the UR10, without the rows that search")
+    parser.add_argument("robots", nargs="*", default=list(LOGS))
+    options = parser.parse_args()
     if not DATA.is_dir():
-        print("measured data (../shared/data beside the project) are not here")
+        print("measured data (../shared/data beside the project) are not here: skipped")
         return
-    named = [name for name in LOGS if name in sys.argv]
-    for name in named or (("ur10",) if quick else LOGS):
-        print("\n".join(table(name, quick=quick)), end="\n\n", flush=True)
+    for name in ("ur10",) if options.quick else options.robots:
+        print("\n".join(table(name, quick=options.quick)), end="\n\n", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What gross outliers and noisy encoders do to estimates, and which estimators stand them.
+"""Effect of gross outliers and noisy encoders on estimates, by estimator.
 
     python benchmarks/robustness.py [--quick] [--json FILE]
 
@@ -22,7 +22,6 @@ tanh has an epsilon of 0.1 rad/s here: no instrument takes away what noise does 
 sharper one. For the same reason another row leaves Coulomb friction out of the arm.
 """
 
-import argparse
 import math
 
 import coverage
@@ -37,7 +36,7 @@ ENCODERS = ((1.4e-5, 60.0), (1e-4, 60.0))
 
 
 def arm(coulomb=True, epsilon=None):
-    """The arm of `coverage.py`, with another friction."""
+    """Return base parameters and truth of the arm of `coverage.py`, with another friction."""
     import numpy as np
 
     import jaxid as jid
@@ -49,27 +48,26 @@ def arm(coulomb=True, epsilon=None):
         dry = isinstance(term, jid.CoulombFriction)
         if dry and not coulomb:
             continue
-        terms.append(jid.CoulombFriction(jid.Tanh(epsilon)) if dry and epsilon else term)
+        terms.append(jid.CoulombFriction(jid.terms.Tanh(epsilon)) if dry and epsilon else term)
     base = jid.base_parameters(jid.Model(base.model.robot, tuple(terms)))
     return base, np.array([p[name] for name in base.model.parameter_names])
 
 
 def simulated(base, p, seed):
-    """Time, exact angles and exact forces of a motion that nothing was tuned on."""
+    """Return time, exact angles and exact forces of a motion that nothing was tuned on."""
     import numpy as np
 
     import jaxid as jid
-    from jaxid.dynamics.machine import in_numpy
 
     motion = jid.random_fourier_series(base.model.robot, omega=0.2 * math.pi, seed=seed)
     t = np.arange(round(coverage.DURATION * coverage.RATE)) / coverage.RATE
     m = motion.motion(t)
-    forces = in_numpy(base.model, base.model.forces, m.q, m.qd, m.qdd, shared=(p,))
+    forces = np.asarray(base.model.inverse_dynamics(p, m))
     return motion, t, np.asarray(m.q), forces
 
 
 def gross(random, shape, burst):
-    """Which samples are gross: 5 % of every joint's, alone or in bursts."""
+    """Draw the gross samples: 5 % of every joint's, alone or in bursts."""
     import numpy as np
 
     starts = random.random(shape) < SHARE / burst
@@ -80,6 +78,7 @@ def gross(random, shape, burst):
 
 
 def outlier_rows(draws):
+    """Measure errors of estimators with and without outliers."""
     import numpy as np
 
     import jaxid as jid
@@ -92,8 +91,8 @@ def outlier_rows(draws):
     filtering = jid.ZeroPhaseButterworth(15.0, force_cutoff=math.inf)
     estimators = {
         "WLS": jid.WeightedLeastSquares(),
-        "Huber": jid.IterativelyReweighted(jid.Huber()),
-        "Tukey": jid.IterativelyReweighted(jid.Tukey()),
+        "Huber": jid.estimators.IterativelyReweighted(jid.estimators.Huber()),
+        "Tukey": jid.estimators.IterativelyReweighted(jid.estimators.Tukey()),
     }
     kinds = (("none", 0), ("alone", 1), ("in bursts", BURST))
     errors = {(name, kind): [] for name in estimators for kind, _ in kinds}
@@ -109,9 +108,8 @@ def outlier_rows(draws):
                 forces = np.where(hit, size, forces)
             log = jid.Recording.of(q, forces, time=t)
             o = jid.observe(log, robot, filtering, jid.Subsample(1))
-            rows = jid.Rows.of(base, [o])
             for name, estimator in estimators.items():
-                fit = jid.fit_rows(rows, estimator)
+                fit = jid.identify(base, o, estimator)
                 low, high = fit.intervals().T
                 errors[name, kind].append(np.asarray(fit.parameters) - truth)
                 held[name, kind].append(np.mean((low <= truth) & (truth <= high)))
@@ -143,6 +141,7 @@ def outlier_rows(draws):
 
 
 def encoder_rows(draws):
+    """Measure the bias that noisy angles bring."""
     import numpy as np
 
     import jaxid as jid
@@ -158,7 +157,7 @@ def encoder_rows(draws):
         for noise, cutoff in ENCODERS:
             estimators = {
                 "WLS": jid.WeightedLeastSquares(),
-                "IV": jid.InstrumentalVariables((motion,)),
+                "IV": jid.estimators.InstrumentalVariables((motion,)),
             }
             errors = {name: [] for name in estimators}
             for draw in range(draws):
@@ -168,14 +167,14 @@ def encoder_rows(draws):
                 log = jid.Recording.of(measured, forces, time=t)
                 filtering = jid.ZeroPhaseButterworth(cutoff)
                 o = jid.observe(log, robot, filtering, jid.Subsample(EVERY_NOISY))
-                rows = jid.Rows.of(base, [o])
+                rows = jid.RegressionProblem(base, [o])
                 for name, estimator in estimators.items():
                     estimate = estimator(rows)
                     errors[name].append(np.asarray(estimate.parameters) - truth)
             said, bias = [], {}
             for name, e in errors.items():
                 e = np.array(e)
-                # Draws of one motion: what is left of their mean beyond its own scatter is bias.
+                # The mean of many draws of one motion, beyond its own scatter, is bias.
                 shift, scatter = e.mean(axis=0), e.std(axis=0, ddof=1)
                 bias[name] = np.abs(shift) / scatter
                 size = np.sqrt(np.mean(e**2, axis=0)) / np.std(errors["WLS"], axis=0, ddof=1)
@@ -202,10 +201,8 @@ def encoder_rows(draws):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="one draw, and two of encoders")
-    parser.add_argument("--json", help="where run.py reads the rows")
-    options = parser.parse_args()
+    """Measure outliers and encoders on one core."""
+    options = timing.parser(__doc__, "one draw, and two of encoders").parse_args()
     timing.pin_to(1)
     rows = outlier_rows(1 if options.quick else 20) + encoder_rows(2 if options.quick else 24)
     hand_over(rows, options.json)

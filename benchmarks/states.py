@@ -23,25 +23,24 @@ friction is 20 % larger with it. Gains are drawn within 20 % of 1. Forces are la
     python benchmarks/states.py --quick    # one draw of each
 """
 
-import sys
-
 import jax
 import numpy as np
+import timing
 from scipy import signal
 
 import jaxid as jid
-from jaxid.identification.runs.comparison import LEVEL
-from jaxid.identification.runs.estimates import groups
-from jaxid.identification.runs.states import stores_energy
-from jaxid.simulation.example import virtual_panda
-from jaxid.simulation.virtual import random_bodies
+from jaxid.identification.runs.comparison import LEVEL, Verdict  # private: levels
+from jaxid.identification.runs.estimates import groups  # private: kinds of parameters
+from jaxid.identification.runs.payload import Payload  # private: a known payload
+from jaxid.identification.runs.states import stores_energy  # private: kinds of parameters
+from jaxid.measurement.recording import remove_delay  # private: mend a log
 
 SAMPLE_TIME, MEMORY, NOISE = 0.002, 0.05, 0.01
 CAD = (273.4, 16.93, 14.35, 7.50, 6.42, 0.569, 0.031)
 """Masses of the bodies [kg]; that of the rail's carriage is what the paper's p_B(1) leaves."""
 VISCOUS, COULOMB = ((248.41, 90.19), (41.26, 25.65)), ((312.50, 233.00), (18.24, 15.07))
 DELAY = 0.01
-TOOL = jid.Tool.of(
+TOOL = jid.Tool(
     6,
     mass=3.0,
     centre_of_mass=(0.02, -0.03, 0.12),
@@ -52,7 +51,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 class Rig:
-    """A robot that repeats one motion: its forces are computed once, noise is drawn anew."""
+    """Robot that repeats one motion: forces are computed once, noise is drawn anew."""
 
     def __init__(self, model: jid.Model, omega: float, seed: int, late: float = 0.0):
         self.robot = model.robot
@@ -62,15 +61,15 @@ class Rig:
         self.model = model
 
     def forces(self, p: np.ndarray) -> np.ndarray:
-        """What the motion needs, without noise."""
+        """Return the forces of the motion, without noise."""
         return np.asarray(self.model.inverse_dynamics(p, self.late))
 
     def observe(self, forces: np.ndarray, seed: int, gains=1.0, name: str = "run"):
-        """The recording as rows."""
+        """Return rows of a recording."""
         return self.rows(self.record(forces, seed, gains, name))
 
     def record(self, forces: np.ndarray, seed: int, gains=1.0, name: str = "run"):
-        """One recording with noise of its own."""
+        """Return a recording with noise of its own."""
         random = np.random.default_rng(seed)
         white, drive = random.standard_normal((2, *forces.shape))
         kept = np.exp(-SAMPLE_TIME / MEMORY)
@@ -81,17 +80,17 @@ class Rig:
         return jid.Recording.of(self.motion.q, measured, sample_time=SAMPLE_TIME, name=name)
 
     def rows(self, recording: jid.Recording) -> jid.Observations:
-        """The recording, filtered."""
+        """Return the filtered recording."""
         return jid.observe(recording, self.robot, jid.ZeroPhaseButterworth(10.0), jid.Subsample(20))
 
 
 def paper_truth(base: jid.BaseParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Standard parameters of the cold and the warm arm."""
+    """Return standard parameters of the cold and the warm arm."""
     model, robot = base.model, base.model.robot
     names = list(model.parameter_names)
     random = np.random.default_rng(0)
     cold = np.zeros(model.size)
-    bodies = random_bodies(robot, np.array(CAD), random)
+    bodies = jid.simulation.random_bodies(robot, np.array(CAD), random)
     for i, body in enumerate(bodies):
         for name, value in zip(("m", "mx", "my", "mz", "A", "B", "C"), body[:7], strict=True):
             cold[names.index(f"{name}{i + 1}")] = value
@@ -111,7 +110,7 @@ def paper_truth(base: jid.BaseParameters) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cold_and_warm(draws: int) -> list[str]:
-    """The tables of figure 7."""
+    """Return the tables of cold and warm friction (Fig. 7)."""
     terms = (
         jid.RigidBodies(principal_axes=True),
         jid.ViscousFriction(),
@@ -128,23 +127,23 @@ def cold_and_warm(draws: int) -> list[str]:
     table: list[str] = []
     for seed in range(draws):
         cold, again, warm = (
-            jid.Run.of(base, rig.observe(clean[state], 100 * seed + k), name=name)
+            jid.identify(base, rig.observe(clean[state], 100 * seed + k), name=name)
             for k, (state, name) in enumerate(((0, "cold"), (0, "again"), (1, "warm")))
         )
-        found = jid.compare(cold.fit, warm.fit)
+        found = jid.compare(cold, warm)
         verdicts.append(found.verdicts)
-        nothing.append((jid.compare(cold.fit, again.fit).verdicts, _groups(cold, again)))
+        nothing.append((jid.compare(cold, again).verdicts, _groups(cold, again)))
         inside.append(np.abs(found.difference - (warm_p - cold_p)) <= found.half_widths)
         both = jid.identify_states([cold, warm])
         tested = both.compare("cold", "warm")
         states.append((tested.verdicts, both.sharing[1]))
         shared.append(_groups(cold, warm))
-        apart = cold.fit.standard_deviations[list(both.shared)]
+        apart = cold.standard_deviations[list(both.shared)]
         widths.append(np.median(both.of("cold").standard_deviations[list(both.shared)] / apart))
         if not seed:
             table = _paper_table(base, found, cold_p, warm_p)
-    changed = np.array([[v is jid.Verdict.CHANGED for v in row] for row in verdicts])
-    perhaps = np.array([[v is jid.Verdict.PERHAPS for v in row] for row in verdicts])
+    changed = np.array([[v is Verdict.CHANGED for v in row] for row in verdicts])
+    perhaps = np.array([[v is Verdict.PERHAPS for v in row] for row in verdicts])
     lines = [
         *table,
         "",
@@ -158,10 +157,8 @@ def cold_and_warm(draws: int) -> list[str]:
             f"| {_percent(changed[:, own])} | {_percent(perhaps[:, own])} "
             f"| {_percent(np.array(inside)[:, own])} |"
         )
-    false = np.array(
-        [[v is not jid.Verdict.UNCHANGED for v in row] for row, _ in nothing], dtype=float
-    )
-    certain = np.array([[v is jid.Verdict.CHANGED for v in row] for row, _ in nothing])
+    false = np.array([[v is not Verdict.UNCHANGED for v in row] for row, _ in nothing], dtype=float)
+    certain = np.array([[v is Verdict.CHANGED for v in row] for row, _ in nothing])
     return [
         *lines,
         "",
@@ -175,7 +172,7 @@ def cold_and_warm(draws: int) -> list[str]:
         f"| nothing changed: any group called changed (allowed 5 %) "
         f"| {np.mean([g for _, g in nothing]):.0%} |",
         "| joint fit of both states: all 14 friction parameters called changed "
-        f"| {_all(np.array([[v is jid.Verdict.CHANGED for v in row] for row, _ in states]))} |",
+        f"| {_all(np.array([[v is Verdict.CHANGED for v in row] for row, _ in states]))} |",
         "| joint fit: sharing of inertia rejected at 5 % "
         f"| {np.mean([p < 1 - LEVEL for _, p in states]):.0%} |",
         "| joint fit: standard deviations of inertia, of those of one run (median) "
@@ -183,9 +180,9 @@ def cold_and_warm(draws: int) -> list[str]:
     ]
 
 
-def _groups(first: jid.Run, second: jid.Run) -> bool:
-    """Whether the groups are judged wrongly (equal states), or all rightly (cold and warm)."""
-    found = {g.name: g.changed for g in jid.compare(first.fit, second.fit).groups}
+def _groups(first: jid.Fit, second: jid.Fit) -> bool:
+    """Return whether any group changed (equal states), or just friction (cold and warm)."""
+    found = {g.name: g.changed for g in jid.compare(first, second).groups}
     if second.name == "again":
         return any(found.values())
     return all(changed == ("friction" in name) for name, changed in found.items())
@@ -223,8 +220,8 @@ def _all(values: np.ndarray) -> str:
 
 
 def panda() -> tuple[jid.BaseParameters, np.ndarray, np.ndarray]:
-    """Base parameters, and standard parameters without and with the tool."""
-    virtual = virtual_panda(0)
+    """Return base parameters, and standard parameters without and with the tool."""
+    virtual = jid.simulation.virtual_panda(0)
     plain = np.array(virtual.parameters)
     loaded = plain.copy()
     names = virtual.model.parameter_names
@@ -235,16 +232,16 @@ def panda() -> tuple[jid.BaseParameters, np.ndarray, np.ndarray]:
 
 
 def payload(draws: int) -> list[str]:
-    """The tables of figure 8, with the drive gains from the same motions."""
+    """Return the tables of payloads (Fig. 8) and of drive gains from the same motions."""
     base, plain, loaded = panda()
     rigs = [Rig(base.model, omega=2 * np.pi / 8, seed=k + 1) for k in range(2)]
     clean = [rig.forces(p) for rig, p in zip(rigs, (plain, loaded), strict=True)]
-    truth = jid.Payload(6, *(np.asarray(TOOL.parameters),) * 2, np.eye(10), np.ones(10), 0.0)
+    truth = Payload(6, *(np.asarray(TOOL.parameters),) * 2, np.eye(10), np.ones(10), 0.0)
     wanted = truth.central.parameters
     masses, inside, estimates, distances, gains, holds = [], [], [], [], [], []
     for seed in range(draws):
         runs = [
-            jid.Run.of(base, rig.observe(f, 10 * seed + k))
+            jid.identify(base, rig.observe(f, 10 * seed + k))
             for k, (rig, f) in enumerate(zip(rigs, clean, strict=True))
         ]
         found = jid.identify_payload(*runs)
@@ -256,7 +253,7 @@ def payload(draws: int) -> list[str]:
         _ = found.tool
         true = np.random.default_rng(seed).uniform(0.8, 1.2, 7)
         currents = [
-            jid.Run.of(base, rig.observe(f, 10 * seed + k, true))
+            jid.identify(base, rig.observe(f, 10 * seed + k, true))
             for k, (rig, f) in enumerate(zip(rigs, clean, strict=True))
         ]
         drives = jid.identify_drive_gains(*currents, TOOL)
@@ -293,7 +290,7 @@ def payload(draws: int) -> list[str]:
 
 
 def delay(draws: int) -> list[str]:
-    """A delay of forces, found and removed; and a run that is added to earlier ones."""
+    """Return the table of delays and of runs that are added to earlier ones."""
     base, plain, _ = panda()
     rig = Rig(base.model, omega=2 * np.pi / 8, seed=1, late=DELAY)
     clean, truth = rig.forces(plain), np.asarray(base.from_standard(plain))
@@ -303,7 +300,7 @@ def delay(draws: int) -> list[str]:
         late = rig.rows(recording)
         one = jid.estimate_delay(base, late)
         low, high = one.interval(LEVEL)
-        mended = rig.rows(jid.remove_delay(recording, one.seconds))
+        mended = rig.rows(remove_delay(recording, one.seconds))
         fits = [jid.identify(base, o) for o in (late, mended)]
         found.append(one.seconds)
         inside.append(low <= DELAY <= high)
@@ -311,7 +308,7 @@ def delay(draws: int) -> list[str]:
             kept.append(np.median(np.abs(fit.parameters - truth) / fit.standard_deviations))
         others = [rig.observe(clean, 1000 + 10 * seed + k) for k in range(3)]
         together = jid.identify(base, others).parameters
-        earlier, *later = (jid.Run.of(base, o) for o in others)
+        earlier, *later = (jid.identify(base, o) for o in others)
         for run in later:
             earlier = jid.update(earlier, run)
         apart.append(np.linalg.norm(earlier.parameters - together) / np.linalg.norm(together))
@@ -333,11 +330,13 @@ STUDIES = {"cold": (cold_and_warm, 100), "payload": (payload, 30), "delay": (del
 
 
 def main() -> None:
-    """Prints the tables."""
-    quick = "--quick" in sys.argv
-    for name in [a for a in sys.argv[1:] if a in STUDIES] or STUDIES:
+    """Print the tables."""
+    parser = timing.parser(__doc__, "one draw of each")
+    parser.add_argument("studies", nargs="*", default=list(STUDIES))
+    options = parser.parse_args()
+    for name in options.studies:
         study, draws = STUDIES[name]
-        print("\n".join(study(1 if quick else draws)), end="\n\n", flush=True)
+        print("\n".join(study(1 if options.quick else draws)), end="\n\n", flush=True)
 
 
 if __name__ == "__main__":

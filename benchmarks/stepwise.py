@@ -19,13 +19,13 @@ Coulomb friction in percent of their true values.
 """
 
 import dataclasses
-import sys
 
 import jax
 import numpy as np
+import timing
 
 import jaxid as jid
-from jaxid.simulation.example import virtual_log, virtual_panda
+from jaxid.simulation.example import virtual_log  # private: logs of the example
 
 TURNS, ALONE, FILTER, EVERY = 5, 4.0, jid.ZeroPhaseButterworth(10.0), 20
 DECIDED = 1e-4
@@ -34,7 +34,7 @@ DECIDED = 1e-4
 jax.config.update("jax_enable_x64", True)
 
 
-class Stepwise(jid.AbstractEstimator):
+class Stepwise(jid.estimators.AbstractEstimator):
     """Least squares for one axis after the other, from the tip inward; deviations are not computed.
 
     Attributes:
@@ -71,7 +71,7 @@ class Stepwise(jid.AbstractEstimator):
             for c, value in zip(kept, values, strict=True):
                 p[joint.columns[new[c]]] = value
                 known.add(joint.columns[new[c]])
-        return dataclasses.replace(jid.LeastSquares()(problem), parameters=p)
+        return dataclasses.replace(jid.estimators.LeastSquares()(problem), parameters=p)
 
 
 def is_friction(name: str) -> bool:
@@ -93,12 +93,12 @@ def independent(R: np.ndarray) -> list[int]:
 
 
 def observed(robot: jid.Robot, recording: jid.Recording) -> jid.Observations:
-    """The rows of a log."""
+    """Return the rows of a log."""
     return jid.observe(recording, robot, FILTER, jid.Subsample(EVERY))
 
 
 def single_axes(virtual, seed: int) -> tuple[jid.Observations, ...]:
-    """Each axis alone."""
+    """Return a log of each axis alone."""
     robot = virtual.model.robot
     whole = jid.random_fourier_series(robot, omega=2 * np.pi / ALONE, reach=0.9, seed=seed)
     logs = []
@@ -114,8 +114,8 @@ def single_axes(virtual, seed: int) -> tuple[jid.Observations, ...]:
 
 
 def turn(seed: int) -> dict[str, tuple[float, float]]:
-    """Errors of the torques and of friction [%], by method."""
-    virtual = virtual_panda(seed)
+    """Return errors of the torques and of friction [%], by method."""
+    virtual = jid.simulation.virtual_panda(seed)
     robot, model = virtual.model.robot, virtual.model
     base = jid.base_parameters(model)
     seen = observed(robot, virtual_log(virtual, "seen", 2, (seed, 1)))
@@ -140,8 +140,9 @@ def turn(seed: int) -> dict[str, tuple[float, float]]:
 
 
 def main() -> None:
-    """Prints the table."""
-    turns = [turn(seed) for seed in range(1 if "--quick" in sys.argv else TURNS)]
+    """Print the table."""
+    options = timing.parser(__doc__, "one turn").parse_args()
+    turns = [turn(seed) for seed in range(1 if options.quick else TURNS)]
     print("| virtual Panda | torques of an unseen motion | friction |\n|---|---|---|")
     for name in turns[0]:
         torques, friction = np.mean([t[name] for t in turns], axis=0)

@@ -1,4 +1,4 @@
-"""The virtual robot against MuJoCo, against its own truth, and against the clock.
+"""The virtual robot: comparison with MuJoCo, recovery of its parameters, run time.
 
     python benchmarks/virtual_robot.py [--quick]
 
@@ -26,29 +26,25 @@ identification motion followed exactly (`measure`), and by the servo (`track`, t
 model has it); share of all that hold, median and least number of one draw, median over the
 parameters of the reported standard deviation over the scatter, and of the mean error over it.
 
-Table 4: what the paper's filter (Eq. 25) does to the estimates without any noise or encoder step:
-error of each estimate in standard deviations (of one log with noise, seed 0), and the share of 95 %
-intervals that can hold with such a bias if everything else is right. Beside it the same filter
-without the lag of its velocities (central differences in their place), without the second
-smoothing of its accelerations (which columns and forces get once more), and without both. Motions:
-the identification motion, and two periods of it as the demo runs them, from rest to rest.
+Table 4: bias of the estimates by the paper's filter (Eq. 25), without any noise or encoder step:
+error of each estimate in standard deviations (of one log with noise, seed 0), and the fraction of
+95 % intervals that can hold with such a bias. Motions: the identification motion, and two periods
+of it as the demo runs them, from rest to rest.
 
 Table 5: processor time of one second of the experiment.
 """
 
 import dataclasses
-import sys
 import time
 
-import equinox as eqx
 import jax
 import numpy as np
+import timing
 from scipy.stats import norm
 
 import jaxid as jid
-from jaxid.measurement.filters import first_difference, second_difference
 
-QUICK = "--quick" in sys.argv
+QUICK = timing.parser(__doc__, "3 s of motion, two draws").parse_args().quick
 DURATION = 3.0 if QUICK else 2 * np.pi / 0.8
 DRAWS = 2 if QUICK else 40
 AXES = range(1, 8)
@@ -58,29 +54,29 @@ jax.config.update("jax_enable_x64", True)
 
 
 def line(name, values, digits=3):
-    """One row of a table."""
+    """Return a row of a table."""
     return f"| {name} | " + " | ".join(f"{x:.{digits}f}" for x in values) + " |"
 
 
 def header(first, names):
-    """The head of a table."""
+    """Return the head of a table."""
     names = [str(n) for n in names]
     return f"| {first} | " + " | ".join(names) + " |\n|" + "---|" * (len(names) + 1)
 
 
 def rms(x):
-    """Root of the mean square of each joint."""
+    """Return the root of the mean square of each joint."""
     return np.sqrt(np.mean(np.square(np.asarray(x)), axis=0))
 
 
 def without_dry_friction(virtual):
-    """The same robot with viscous friction only."""
+    """Return the same robot with viscous friction only."""
     ones = np.ones(virtual.robot.joints)
     return virtual.replace(friction=virtual.friction.scaled(ones, 0.0 * ones))
 
 
 def tracked(machine, virtual, which, seed=None, **how):
-    """An experiment with the true model fed forward; the noise has the motion's seed if None."""
+    """Run an experiment with the true model fed forward."""
     trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=which)
 
     def known(motion):
@@ -96,17 +92,20 @@ def tracked(machine, virtual, which, seed=None, **how):
 
 
 def agreement(virtual):
-    """The first table."""
+    """Print the first table."""
     most = np.asarray(virtual.robot.max_forces)
     smooth = without_dry_friction(virtual)
     trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
     motion = trajectory.motion(np.linspace(0.0, DURATION, 500))
-    apart = np.abs(smooth.forces(motion) - jid.MujocoRobot.of(smooth).forces(motion)).max(axis=0)
+    apart = np.abs(smooth.forces(motion) - jid.simulation.MujocoRobot(smooth).forces(motion)).max(
+        axis=0
+    )
     print(header("ours less MuJoCo's", AXES))
     print(line("inverse dynamics [1e-15 of the largest force]", 1e15 * apart / most))
     for name, robot in (("without dry friction", smooth), ("with it", virtual)):
         ours, theirs = (
-            tracked(machine, robot, 1, substeps=4) for machine in (robot, jid.MujocoRobot.of(robot))
+            tracked(machine, robot, 1, substeps=4)
+            for machine in (robot, jid.simulation.MujocoRobot(robot))
         )
         difference = 100 * rms(ours.forces - theirs.forces) / most
         print(line(f"torques in the servo experiment, {name} [%]", difference))
@@ -115,14 +114,14 @@ def agreement(virtual):
 
 
 def identified(virtual, disturbed):
-    """The second table."""
+    """Print the second table."""
     base = jid.base_parameters(virtual.model)
     truth = np.asarray(base.from_standard(virtual.parameters))
     most = np.asarray(virtual.robot.max_forces)
     print()
     print(header("logs of", ["intervals that hold", *(f"axis {k} [%]" for k in AXES)]))
     for name, machine in (
-        ("MuJoCo", jid.MujocoRobot.of(virtual)),
+        ("MuJoCo", jid.simulation.MujocoRobot(virtual)),
         ("ours, as the model", virtual),
         ("ours, disturbed", disturbed),
     ):
@@ -143,12 +142,12 @@ def identified(virtual, disturbed):
 
 
 def fitted(base, robot, log, filter):
-    """Weighted estimates of one log."""
+    """Identify from one log."""
     return jid.identify(base, jid.observe(log, robot, filter, jid.Subsample(20)))
 
 
 def calibration(virtual):
-    """The third table."""
+    """Print the third table."""
     base = jid.base_parameters(virtual.model)
     truth = np.asarray(base.from_standard(virtual.parameters))
     trajectory = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
@@ -177,30 +176,15 @@ def calibration(virtual):
         )
 
 
-class Differences(jid.PaperFilter):
-    """The paper's filter with central differences in the place of what it does to the motion."""
-
-    velocities: bool = eqx.field(static=True, default=False)
-    accelerations: bool = eqx.field(static=True, default=False)
-
-    def motion(self, angles, velocities, sample_time):
-        """Replaces velocities, accelerations or both."""
-        as_printed = super().motion(angles, velocities, sample_time)
-        way = angles - angles[0]
-        qd = first_difference(way, sample_time) if self.velocities else as_printed.qd
-        qdd = second_difference(way, sample_time) if self.accelerations else as_printed.qdd
-        return jid.Motion(angles, qd, qdd)
-
-
 def filters(virtual):
-    """The fourth table."""
+    """Print the fourth table."""
     base = jid.base_parameters(virtual.model)
     truth = np.asarray(base.from_standard(virtual.parameters))
     most = virtual.sensors.white_noise
     perfect = dataclasses.replace(virtual.sensors, encoder_step=1e-11, white_noise=0.0 * most)
     quiet = virtual.replace(sensors=perfect)
     series = jid.random_fourier_series(virtual.robot, omega=0.8, reach=0.5, seed=1)
-    led = jid.with_leads(series, virtual.robot, periods=2)
+    led = jid.trajectories.with_leads(series, virtual.robot, periods=2)
     columns = ("median error [sd]", "largest [sd]", "worst", "beyond 1.96", "can hold [%]")
     print()
     print(header("filter; motion", columns))
@@ -214,10 +198,7 @@ def filters(virtual):
         )
         for name, filter in (
             ("`ZeroPhaseButterworth(15)`", SMOOTH),
-            ("`PaperFilter()`", jid.PaperFilter()),
-            ("without lag", Differences(velocities=True)),
-            ("without second smoothing", Differences(accelerations=True)),
-            ("without both", Differences(velocities=True, accelerations=True)),
+            ("`PaperFilter()`", jid.filters.PaperFilter()),
         ):
             deviations = fitted(base, virtual.robot, noisy, filter).standard_deviations
             wrong = fitted(base, virtual.robot, exact, filter).parameters - truth
@@ -231,12 +212,12 @@ def filters(virtual):
 
 
 def speed(disturbed):
-    """The fifth table."""
+    """Print the fifth table."""
     print()
     print("| one second of the experiment at 1 kHz | processor time [s] |\n|---|---|")
     for name, machine in (
         ("ours, everything on", disturbed),
-        ("MuJoCo", jid.MujocoRobot.of(disturbed)),
+        ("MuJoCo", jid.simulation.MujocoRobot(disturbed)),
     ):
         tracked(machine, disturbed, 1)
         start = time.process_time()
@@ -245,9 +226,9 @@ def speed(disturbed):
 
 
 def main():
-    """Prints the tables."""
-    virtual = jid.virtual_tx90l_on_rail(disturbed=False)
-    disturbed = jid.virtual_tx90l_on_rail()
+    """Print the tables."""
+    virtual = jid.simulation.virtual_tx90l_on_rail(disturbed=False)
+    disturbed = jid.simulation.virtual_tx90l_on_rail()
     agreement(virtual)
     identified(virtual, disturbed)
     calibration(virtual)

@@ -1,7 +1,6 @@
 """Linear least-squares problems of NIST's Statistical Reference Datasets, with certified values.
 
-Numbers as they were printed, so that exact arithmetic can check them. `tests/identification` and
-`benchmarks/nist.py` read them.
+Numbers as they were printed, so that exact arithmetic can check them.
 """
 
 from fractions import Fraction
