@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from jaxid import simulation as simulation
 from jaxid import trajectory as trajectories  # noqa: F401
 from jaxid.dynamics import terms as terms
+from jaxid.diagnose import diagnose as diagnose
 from jaxid.dynamics.base import BaseParameters as BaseParameters
 from jaxid.dynamics.base import Identifiability as Identifiability
 from jaxid.dynamics.base import base_parameters as base_parameters
@@ -51,6 +52,7 @@ from jaxid.excitation.criteria import WeightedConditionNumber as WeightedConditi
 from jaxid.excitation.design import DesignProgress as DesignProgress
 from jaxid.excitation.design import design_excitation as design_excitation
 from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
+from jaxid.excitation.problem import ExcitationProblem as ExcitationProblem
 from jaxid.export.c_code import export_c as export_c
 from jaxid.export.feed_forward import export_jax as export_jax
 from jaxid.export.feed_forward import exported_function as exported_function
