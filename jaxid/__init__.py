@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 from jaxid import simulation as simulation
 from jaxid import trajectory as trajectories  # noqa: F401
-from jaxid.dynamics import terms as terms
 from jaxid.diagnose import diagnose as diagnose
+from jaxid.dynamics import terms as terms
 from jaxid.dynamics.base import BaseParameters as BaseParameters
 from jaxid.dynamics.base import Identifiability as Identifiability
 from jaxid.dynamics.base import base_parameters as base_parameters
