@@ -200,7 +200,7 @@ def test_folders_that_hold_no_run_are_refused(folder, run):  # noqa: F811
     (folder / "ridge.toml").write_text(EXPERIMENT + "[estimator]\nridge = 0.1\n")
     assert refused(run("identify", "ridge.toml", "first", "b.csv"), "to plain least squares only")
     (folder / "spring.toml").write_text(EXPERIMENT + "[model]\nsprings = true\n")
-    assert refused(run("identify", "spring.toml", "first", "b.csv"), "run of other base parameters")
+    assert refused(run("identify", "spring.toml", "first", "b.csv"), "different base parameters")
     write_log(folder / "d.csv", 7)
     assert refused(
         run("payload", "experiment.toml", "a.csv", "--loaded", "d.csv", "--body", "elbow"),
@@ -229,7 +229,7 @@ def test_states_share_inertia(folder, run):  # noqa: F811
     base, read = described.base, lambda log: described.observe(described.read(folder / log))
     runs = [
         jid.identify(
-            base, read(log), estimator=jid.WeightedLeastSquares(described.plain.weights), name=name
+            base, read(log), estimator=jid.WeightedLeastSquares(described.estimation.plain.weights), name=name
         )
         for log, name in (("a.csv", "a"), ("warm.csv", "warm"))
     ]
