@@ -157,7 +157,8 @@ def test_columns_are_filtered_like_forces(base):
 
 
 def test_factors_alone_give_no_pass(base, recordings):
-    problem = jid.RegressionProblem(base, recordings)
+    blocks = jid.RegressionProblem(base, recordings).blocks
+    problem = jid.RegressionProblem(base, blocks=blocks)
     assert not problem.has_samples
     for refused in (lambda: next(problem.chunks()), lambda: problem.with_base(base)):
         with pytest.raises(ValueError, match="needs the rows themselves"):
