@@ -1,63 +1,32 @@
-"""jaxid: identifies the dynamic parameters of robots, from a log to a model (the public API)."""
+"""Identification of the dynamic parameters of robots: the public API, in the order of the pipeline.
 
-from typing import TYPE_CHECKING, Any
+Everything else is in namespaces: `terms`, `filters`, `units`, `estimators`, `uncertainty`,
+`consistency`, `criteria`, `constraints`, `trajectories`, `collision`, `simulation`, `devices`,
+`export`; the built-in robots are in `robots`, the figures in `plot`.
+"""
+
+import typing as _typing
 
 from jaxid import simulation as simulation
 from jaxid import trajectory as trajectories  # noqa: F401
 from jaxid.diagnose import diagnose as diagnose
 from jaxid.dynamics import terms as terms
 from jaxid.dynamics.base import BaseParameters as BaseParameters
-from jaxid.dynamics.base import Identifiability as Identifiability
 from jaxid.dynamics.base import base_parameters as base_parameters
-from jaxid.dynamics.friction import AsymmetricViscousFriction as AsymmetricViscousFriction
-from jaxid.dynamics.friction import LoadFriction as LoadFriction
-from jaxid.dynamics.friction import StribeckFriction as StribeckFriction
-from jaxid.dynamics.friction import TemperatureScaled as TemperatureScaled
 from jaxid.dynamics.model import Model as Model
 from jaxid.dynamics.motion import Motion as Motion
-from jaxid.dynamics.packed import PackedRegressor as PackedRegressor
-from jaxid.dynamics.rank import GramSchmidt as GramSchmidt
-from jaxid.dynamics.rank import SingularValues as SingularValues
-from jaxid.dynamics.terms import AbstractTerm as AbstractTerm
-from jaxid.dynamics.terms import AsymmetricCoulombFriction as AsymmetricCoulombFriction
 from jaxid.dynamics.terms import ConstantOffset as ConstantOffset
 from jaxid.dynamics.terms import CoulombFriction as CoulombFriction
-from jaxid.dynamics.terms import CoupledDrives as CoupledDrives
-from jaxid.dynamics.terms import LinearSpring as LinearSpring
 from jaxid.dynamics.terms import RigidBodies as RigidBodies
 from jaxid.dynamics.terms import RotorInertia as RotorInertia
 from jaxid.dynamics.terms import ViscousFriction as ViscousFriction
-from jaxid.dynamics.transitions import AbstractTransition as AbstractTransition
-from jaxid.dynamics.transitions import HardSign as HardSign
-from jaxid.dynamics.transitions import Tanh as Tanh
 from jaxid.errors import InputError as InputError
 from jaxid.excitation import constraints as constraints
 from jaxid.excitation import criteria as criteria
-from jaxid.excitation.constraints import AbstractConstraint as AbstractConstraint
-from jaxid.excitation.constraints import Clearance as Clearance
-from jaxid.excitation.constraints import JointForces as JointForces
-from jaxid.excitation.constraints import MotorTorques as MotorTorques
-from jaxid.excitation.constraints import NominalForces as NominalForces
-from jaxid.excitation.constraints import TipAcceleration as TipAcceleration
-from jaxid.excitation.constraints import TipSpeed as TipSpeed
-from jaxid.excitation.constraints import Workspace as Workspace
-from jaxid.excitation.constraints import tip_motion as tip_motion
-from jaxid.excitation.criteria import AbstractCriterion as AbstractCriterion
-from jaxid.excitation.criteria import AOptimal as AOptimal
-from jaxid.excitation.criteria import ConditionNumber as ConditionNumber
-from jaxid.excitation.criteria import DOptimal as DOptimal
-from jaxid.excitation.criteria import EOptimal as EOptimal
-from jaxid.excitation.criteria import ScaledConditionNumber as ScaledConditionNumber
-from jaxid.excitation.criteria import WeightedConditionNumber as WeightedConditionNumber
-from jaxid.excitation.design import DesignProgress as DesignProgress
 from jaxid.excitation.design import design_excitation as design_excitation
 from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
 from jaxid.excitation.problem import ExcitationProblem as ExcitationProblem
 from jaxid.export.c_code import export_c as export_c
-from jaxid.export.feed_forward import export_jax as export_jax
-from jaxid.export.feed_forward import exported_function as exported_function
-from jaxid.export.inertials import export_pinocchio as export_pinocchio
-from jaxid.export.inertials import pinocchio_parameters as pinocchio_parameters
 from jaxid.export.mjcf import export_mjcf as export_mjcf
 from jaxid.export.urdf import export_urdf as export_urdf
 from jaxid.identification import consistency as consistency
@@ -66,159 +35,54 @@ from jaxid.identification import estimators as estimators
 from jaxid.identification import uncertainty as uncertainty
 from jaxid.identification.batches import identify_batch as identify_batch
 from jaxid.identification.bootstrap import bootstrap as bootstrap
-from jaxid.identification.consistency import BodyBounds as BodyBounds
-from jaxid.identification.consistency import Consistency as Consistency
-from jaxid.identification.consistency import ConsistentBatch as ConsistentBatch
-from jaxid.identification.consistency import ConsistentBody as ConsistentBody
-from jaxid.identification.consistency import ConsistentSolver as ConsistentSolver
-from jaxid.identification.consistency import EntropicPull as EntropicPull
-from jaxid.identification.consistency import ParameterPrior as ParameterPrior
 from jaxid.identification.consistency import PhysicallyConsistent as PhysicallyConsistent
-from jaxid.identification.consistency import consistent_batch as consistent_batch
-from jaxid.identification.consistency import consistent_body as consistent_body
-from jaxid.identification.consistency import pseudo_inertia as pseudo_inertia
-from jaxid.identification.devices import factorise_across_processes as factorise_across_processes
-from jaxid.identification.devices import shards as shards
-from jaxid.identification.essential import EssentialParameters as EssentialParameters
 from jaxid.identification.essential import essential_parameters as essential_parameters
-from jaxid.identification.estimators import AbstractEstimator as AbstractEstimator
-from jaxid.identification.estimators import AbstractLoss as AbstractLoss
-from jaxid.identification.estimators import Complete as Complete
-from jaxid.identification.estimators import CrossValidated as CrossValidated
-from jaxid.identification.estimators import Estimate as Estimate
-from jaxid.identification.estimators import GeneralisedLeastSquares as GeneralisedLeastSquares
-from jaxid.identification.estimators import GivenWeights as GivenWeights
-from jaxid.identification.estimators import Huber as Huber
-from jaxid.identification.estimators import InstrumentalVariables as InstrumentalVariables
-from jaxid.identification.estimators import IterativelyReweighted as IterativelyReweighted
-from jaxid.identification.estimators import LeastSquares as LeastSquares
-from jaxid.identification.estimators import MaximumForces as MaximumForces
-from jaxid.identification.estimators import MeasuredForces as MeasuredForces
-from jaxid.identification.estimators import NonlinearFriction as NonlinearFriction
-from jaxid.identification.estimators import RelativeTo as RelativeTo
-from jaxid.identification.estimators import ResidualVariances as ResidualVariances
-from jaxid.identification.estimators import Ridge as Ridge
-from jaxid.identification.estimators import Truncated as Truncated
-from jaxid.identification.estimators import Tukey as Tukey
-from jaxid.identification.estimators import Unweighted as Unweighted
 from jaxid.identification.estimators import WeightedLeastSquares as WeightedLeastSquares
-from jaxid.identification.filter_choice import AbstractFilterCriterion as AbstractFilterCriterion
-from jaxid.identification.filter_choice import FilterCandidate as FilterCandidate
-from jaxid.identification.filter_choice import FilterChoice as FilterChoice
-from jaxid.identification.filter_choice import HeldOutError as HeldOutError
-from jaxid.identification.filter_choice import WhitestResidual as WhitestResidual
-from jaxid.identification.filter_choice import butterworth_candidates as butterworth_candidates
 from jaxid.identification.filter_choice import choose_filter as choose_filter
 from jaxid.identification.fit import Fit as Fit
-from jaxid.identification.fit import Trust as Trust
 from jaxid.identification.fit import load as load
 from jaxid.identification.identify import fit_problem as fit_problem
 from jaxid.identification.identify import identify as identify
-from jaxid.identification.nonlinear_friction import NonlinearFit as NonlinearFit
-from jaxid.identification.nonlinear_friction import TemperatureLaw as TemperatureLaw
 from jaxid.identification.nonlinear_friction import identify_nonlinear as identify_nonlinear
-from jaxid.identification.nonlinear_friction import temperature_law as temperature_law
 from jaxid.identification.problem import RegressionProblem as RegressionProblem
-from jaxid.identification.runs.comparison import Comparison as Comparison
-from jaxid.identification.runs.comparison import Verdict as Verdict
 from jaxid.identification.runs.comparison import compare as compare
-from jaxid.identification.runs.delay import Delay as Delay
 from jaxid.identification.runs.delay import estimate_delay as estimate_delay
-from jaxid.identification.runs.drive_gains import DriveGains as DriveGains
 from jaxid.identification.runs.drive_gains import identify_drive_gains as identify_drive_gains
-from jaxid.identification.runs.estimates import Estimates as Estimates
-from jaxid.identification.runs.payload import Payload as Payload
 from jaxid.identification.runs.payload import identify_payload as identify_payload
-from jaxid.identification.runs.states import StatesFit as StatesFit
 from jaxid.identification.runs.states import identify_states as identify_states
 from jaxid.identification.runs.update import update as update
-from jaxid.identification.uncertainty import AbstractUncertainty as AbstractUncertainty
-from jaxid.identification.uncertainty import BlockJackknife as BlockJackknife
-from jaxid.identification.uncertainty import IndependentRows as IndependentRows
-from jaxid.identification.uncertainty import ResidualSpectra as ResidualSpectra
-from jaxid.identification.uncertainty import SpectralSandwich as SpectralSandwich
-from jaxid.identification.uncertainty import Uncertainty as Uncertainty
 from jaxid.measurement import filters as filters
 from jaxid.measurement import units as units
 from jaxid.measurement.columns import Columns as Columns
 from jaxid.measurement.decimation import Decimation as Decimation
 from jaxid.measurement.decimation import Subsample as Subsample
-from jaxid.measurement.filters import AbstractFilter as AbstractFilter
-from jaxid.measurement.filters import PaperFilter as PaperFilter
-from jaxid.measurement.filters import PeriodicFourier as PeriodicFourier
 from jaxid.measurement.filters import ZeroPhaseButterworth as ZeroPhaseButterworth
 from jaxid.measurement.log_on_disk import scan_log as scan_log
 from jaxid.measurement.observations import Observations as Observations
 from jaxid.measurement.observations import observe as observe
 from jaxid.measurement.recording import Recording as Recording
 from jaxid.measurement.recording import read_recording as read_recording
-from jaxid.measurement.recording import remove_delay as remove_delay
 from jaxid.program.cache import keep_compiled as keep_compiled
 from jaxid.robot import collision as collision
 from jaxid.robot import library as robots  # noqa: F401
-from jaxid.robot.collision import AbstractObstacle as AbstractObstacle
-from jaxid.robot.collision import Box as Box
-from jaxid.robot.collision import Capsule as Capsule
-from jaxid.robot.collision import CollisionModel as CollisionModel
-from jaxid.robot.collision import HalfSpace as HalfSpace
-from jaxid.robot.collision import fit_capsules as fit_capsules
 from jaxid.robot.dh import from_dh as from_dh
 from jaxid.robot.drives import Drives as Drives
 from jaxid.robot.inverse_kinematics import inverse_kinematics as inverse_kinematics
-from jaxid.robot.inverse_kinematics import inverse_kinematics_along as inverse_kinematics_along
 from jaxid.robot.limits import Limits as Limits
 from jaxid.robot.robot import Robot as Robot
 from jaxid.robot.robot import Tool as Tool
 from jaxid.robot.urdf import load_urdf as load_urdf
 from jaxid.robot.urdf import urdf_parameters as urdf_parameters
-from jaxid.simulation.example import write_example as write_example
-from jaxid.simulation.experiment import Sensors as Sensors
-from jaxid.simulation.experiment import Servo as Servo
-from jaxid.simulation.experiment import Tracking as Tracking
-from jaxid.simulation.friction import AbstractDisturbance as AbstractDisturbance
-from jaxid.simulation.friction import AbstractGearFriction as AbstractGearFriction
-from jaxid.simulation.friction import CableForce as CableForce
-from jaxid.simulation.friction import FrictionTemperature as FrictionTemperature
-from jaxid.simulation.friction import LuGreFriction as LuGreFriction
-from jaxid.simulation.friction import SmoothFriction as SmoothFriction
-from jaxid.simulation.friction import TorqueRipple as TorqueRipple
-from jaxid.simulation.mechanics import AbstractGear as AbstractGear
-from jaxid.simulation.mechanics import BacklashGear as BacklashGear
-from jaxid.simulation.mechanics import FlexibleGear as FlexibleGear
-from jaxid.simulation.mechanics import RigidGear as RigidGear
-from jaxid.simulation.mujoco import MujocoRobot as MujocoRobot
-from jaxid.simulation.tx90l import cad_tx90l_on_rail as cad_tx90l_on_rail
-from jaxid.simulation.tx90l import virtual_tx90l_on_rail as virtual_tx90l_on_rail
 from jaxid.simulation.virtual import VirtualRobot as VirtualRobot
-from jaxid.trajectory import AbstractBasis as AbstractBasis
-from jaxid.trajectory import AbstractPiece as AbstractPiece
-from jaxid.trajectory import AbstractTrajectory as AbstractTrajectory
-from jaxid.trajectory import Circle as Circle
-from jaxid.trajectory import FourierBasis as FourierBasis
-from jaxid.trajectory import LeadsBasis as LeadsBasis
-from jaxid.trajectory import Line as Line
-from jaxid.trajectory import RestToRestBasis as RestToRestBasis
-from jaxid.trajectory import RestToRestSplineBasis as RestToRestSplineBasis
-from jaxid.trajectory import Segments as Segments
-from jaxid.trajectory import TipPath as TipPath
-from jaxid.trajectory import WithLeads as WithLeads
-from jaxid.trajectory import iso9283_path as iso9283_path
-from jaxid.trajectory import joint_path as joint_path
-from jaxid.trajectory import joint_trajectory as joint_trajectory
 from jaxid.trajectory import load_trajectory as load_trajectory
 from jaxid.trajectory import random_fourier_series as random_fourier_series
-from jaxid.trajectory import save_trajectory as save_trajectory
-from jaxid.trajectory import with_leads as with_leads
-from jaxid.trajectory import write_csv as write_csv
-from jaxid.trajectory import write_ros_json as write_ros_json
-from jaxid.trajectory import write_ros_yaml as write_ros_yaml
 from jaxid.validation import validate as validate
 
-if TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from jaxid.report import plot as plot
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> _typing.Any:
     """Load the figures, and matplotlib, when `jid.plot` is first used."""
     if name == "plot":
         import jaxid.report.plot

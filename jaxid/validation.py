@@ -6,7 +6,6 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float
-from jaxid.dynamics.compiled import mass_matrices, tool_forces
 from jaxid.identification.fit import Fit
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot
@@ -216,7 +215,7 @@ def torque_errors(
         # Masked parts are not evaluated.
         if mask[first:stop].any():
             motion, forces = observations.read(slice(*chunk.samples))
-            model_forces = fit.predict(motion) + tool_forces(fit.base, motion)
+            model_forces = fit.predict(motion) + fit.base.tool_forces(motion)
             rows = slice(-(-first // step), -(-stop // step))
             taken = slice(rows.start * step - first, None, step)
             measured[rows] = chunk.reduce(forces)[taken]
@@ -250,7 +249,7 @@ def definiteness(fit: Fit, *, poses: int = POSES, seed: int = 0) -> Definiteness
     robot = fit.base.model.robot
     low, high = position_range(robot)
     q = np.random.default_rng(seed).uniform(low, high, (poses, robot.joints))
-    M = mass_matrices(fit.base, fit.parameters, q)
+    M = in_numpy(fit.base, fit.base.inertia, q, shared=(fit.parameters,))
     smallest = np.linalg.eigvalsh(M)[:, 0]
     worst = int(np.argmin(smallest))
     return Definiteness(float(smallest[worst]), q[worst], float(np.mean(smallest <= 0.0)), poses)

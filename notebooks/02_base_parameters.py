@@ -52,9 +52,9 @@ base = jid.base_parameters(jid.Model(robot))
 print(f"{base.model.size} standard parameters, {base.size} base parameters")
 
 kinds = {
-    jid.Identifiability.ALONE: 2,
-    jid.Identifiability.COMBINED: 1,
-    jid.Identifiability.NONE: 0,
+    jid.dynamics.base.Identifiability.ALONE: 2,
+    jid.dynamics.base.Identifiability.COMBINED: 1,
+    jid.dynamics.base.Identifiability.NONE: 0,
 }
 verdict = np.array([kinds[v] for v in base.identifiability])
 names = ["m", "mx", "my", "mz", "A", "B", "C", "D", "E", "F"]

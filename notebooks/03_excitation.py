@@ -52,9 +52,9 @@ print(f"{base.size} base parameters; noise {noise} N m")
 
 # %%
 criteria = {
-    "condition number (Eq. 36)": jid.ConditionNumber(),
-    "A-optimal": jid.AOptimal(),
-    "D-optimal": jid.DOptimal(),
+    "condition number (Eq. 36)": jid.criteria.ConditionNumber(),
+    "A-optimal": jid.criteria.AOptimal(),
+    "D-optimal": jid.criteria.DOptimal(),
 }
 plans = {
     name: jid.design_excitation(

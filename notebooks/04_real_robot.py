@@ -47,7 +47,7 @@ if real:
         jid.ViscousFriction(),
         jid.CoulombFriction(),
         jid.RotorInertia(),
-        jid.CoupledDrives(),
+        jid.terms.CoupledDrives(),
     )
     cutoff, every = 20.0, 50
     said = {
@@ -59,7 +59,7 @@ if real:
 else:
     robot = jid.robots.panda()
     with tempfile.TemporaryDirectory() as folder:
-        jid.write_example(Path(folder))
+        jid.simulation.write_example(Path(folder))
         columns = jid.Columns(time="time", angles="q{}", forces="tau{}")
         log = jid.read_recording(Path(folder) / "identification.csv", columns, "virtual arm")
         truth = json.loads((Path(folder) / "truth.json").read_text())["standard_parameters"]
@@ -167,9 +167,9 @@ jid.plot.residuals(fit.residual_spectra, robot)
 
 # %%
 estimators = {
-    "least squares": jid.LeastSquares(),
+    "least squares": jid.estimators.LeastSquares(),
     "weighted": jid.WeightedLeastSquares(),
-    "residual variances": jid.WeightedLeastSquares(jid.ResidualVariances()),
+    "residual variances": jid.WeightedLeastSquares(jid.estimators.ResidualVariances()),
     "consistent": jid.PhysicallyConsistent(),
 }
 figure, axes = plt.subplots(figsize=(11, 3.0))

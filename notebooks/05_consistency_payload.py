@@ -65,7 +65,7 @@ other = observations(truth, seed=7)
 
 # %%
 fits = {
-    "least squares": jid.identify(base, short, jid.LeastSquares()),
+    "least squares": jid.identify(base, short, jid.estimators.LeastSquares()),
     "weighted": jid.identify(base, short),
     "consistent": jid.identify(base, short, jid.PhysicallyConsistent()),
 }
@@ -109,9 +109,11 @@ print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in found.masse
 
 # %%
 cad = bodies * np.random.default_rng(5).uniform(0.8, 1.2, (7, 1))
-bounds = jid.BodyBounds.from_geometry(robot).replace(total_mass=float(masses.sum()))
+bounds = jid.consistency.BodyBounds.from_geometry(robot).replace(total_mass=float(masses.sum()))
 pulled = jid.identify(
-    base, short, jid.PhysicallyConsistent(bounds=bounds, pull=jid.EntropicPull(cad, strength=1.0))
+    base,
+    short,
+    jid.PhysicallyConsistent(bounds=bounds, pull=jid.consistency.EntropicPull(cad, strength=1.0)),
 )
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.2))
 place = np.arange(7)

@@ -25,7 +25,7 @@ plt.style.use("notebook.mplstyle")
 # changes any more.
 
 # %%
-cold = jid.virtual_tx90l_on_rail()
+cold = jid.simulation.virtual_tx90l_on_rail()
 robot = cold.robot
 motions = [jid.random_fourier_series(robot, omega=0.8, seed=k, reach=0.9) for k in (1, 2, 3)]
 times, temperatures = cold.warming(motions[0], duration=3600.0)
@@ -73,7 +73,7 @@ verdicts = comparison.verdicts
 kinds = {"fv": "viscous friction", "fc": "Coulomb friction", "Ia": "rotors"}
 for kind in (*kinds.values(), "bodies"):
     chosen = [k for k, n in enumerate(base.names) if kinds.get(n[:2], "bodies") == kind]
-    changed = sum(verdicts[k] is jid.Verdict.CHANGED for k in chosen)
+    changed = sum(verdicts[k] is jid.identification.runs.comparison.Verdict.CHANGED for k in chosen)
     print(f"{kind:17} {changed} of {len(chosen)} changed")
 
 print(f"\n{'':12}{'cold':>16}{'truth':>9}{'warm':>20}{'truth':>9}")
@@ -126,7 +126,9 @@ several = [
     *(jid.identify(base, observed(cold.at(T), 0, int(T))) for T in steps[1:-1]),
     fits["warm"],
 ]
-law = jid.temperature_law(several, steps, jid.ViscousFriction(), reference=20.0)
+law = jid.identification.nonlinear_friction.temperature_law(
+    several, steps, jid.ViscousFriction(), reference=20.0
+)
 figure, axes = plt.subplots(figsize=(11, 3.4))
 T = np.linspace(15, 50, 50)
 for j in range(4):

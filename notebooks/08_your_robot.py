@@ -53,7 +53,7 @@ limits = jid.Limits.of(
 plan = jid.design_excitation(
     base,
     limits=limits,
-    basis=jid.RestToRestBasis(5, 0.8),
+    basis=jid.trajectories.RestToRestBasis(5, 0.8),
     starts=8,
     generations=4,
     polish=0,
@@ -77,12 +77,12 @@ yours = jid.VirtualRobot(
     robot=robot,
     terms=(jid.RigidBodies(), jid.RotorInertia()),
     values=np.concatenate([(cad * np.array([1.1, 1.25, 0.8])[:, None]).ravel(), rotors]),
-    friction=jid.LuGreFriction(
+    friction=jid.simulation.LuGreFriction(
         viscous=np.array([1.5, 2.0, 0.8]),
         coulomb=np.array([1.2, 1.8, 0.7]),
         breakaway=np.array([1.6, 2.4, 1.0]),
     ),
-    sensors=jid.Sensors(
+    sensors=jid.simulation.Sensors(
         encoder_step=2 * np.pi / 2**17,
         white_noise=0.01 * np.asarray(robot.limits.force),
         coloured_noise=np.zeros(3),

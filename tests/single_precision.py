@@ -83,7 +83,7 @@ def loaded():
 def written_motion():
     a = np.array([[0.1, 0.2], [0.3, -0.1]])
     series = fourier_series(np.array([0.3, 0.1]), a, a[::-1], 1.1)
-    jid.save_trajectory(series, FOLDER / "motion.json")
+    jid.trajectories.save_trajectory(series, FOLDER / "motion.json")
     return jid.load_trajectory(FOLDER / "motion.json").motion(np.linspace(0.0, 1.0, 5)).qdd
 
 
@@ -105,9 +105,9 @@ CASES = {
     "identify": lambda: plain().parameters,
     "standard deviations": lambda: plain().standard_deviations,
     "identify float32 arrays": rounded,
-    "Huber": lambda: jid.identify(base, cold, jid.IterativelyReweighted()).parameters,
+    "Huber": lambda: jid.identify(base, cold, jid.estimators.IterativelyReweighted()).parameters,
     "GeneralisedLeastSquares": lambda: (
-        jid.identify(base, cold, jid.GeneralisedLeastSquares()).parameters
+        jid.identify(base, cold, jid.estimators.GeneralisedLeastSquares()).parameters
     ),
     "PhysicallyConsistent": lambda: consistent().parameters,
     "identify_batch": batch,
@@ -115,7 +115,9 @@ CASES = {
         jid.RegressionProblem(base, [cold]).blocks, np.ones(2), 20, key
     ),
     "factorise_across_processes": lambda: (
-        jid.fit_problem(jid.factorise_across_processes(base, [cold]), jid.LeastSquares()).parameters
+        jid.fit_problem(
+            jid.devices.factorise_across_processes(base, [cold]), jid.estimators.LeastSquares()
+        ).parameters
     ),
     "essential_parameters": lambda: jid.essential_parameters(plain(), cold).fit.parameters,
     "identify_states": lambda: jid.identify_states(runs()).found.parameters,
@@ -131,7 +133,7 @@ CASES = {
         jid.export_urdf(consistent(), FOLDER / "arm.urdf", FOLDER / "new.urdf")
     ),
     "export_mjcf": lambda: numbers_of(jid.export_mjcf(consistent(), FOLDER / "new.xml")),
-    "pinocchio_parameters": lambda: jid.pinocchio_parameters(consistent()),
+    "pinocchio_parameters": lambda: jid.export.pinocchio_parameters(consistent()),
     "inverse_kinematics": lambda: jid.inverse_kinematics(jid.robots.tx40(), [0.3, 0.1, 0.4]),
 }
 REFUSED = (

@@ -9,7 +9,7 @@ import pytest
 from test_cli import EXPERIMENT, folder, refused, result, run, write_log  # noqa: F401
 
 import jaxid as jid
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.experiment import load_experiment
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -229,7 +229,10 @@ def test_states_share_inertia(folder, run):  # noqa: F811
     base, read = described.base, lambda log: described.observe(described.read(folder / log))
     runs = [
         jid.identify(
-            base, read(log), estimator=jid.WeightedLeastSquares(described.estimation.plain.weights), name=name
+            base,
+            read(log),
+            estimator=jid.WeightedLeastSquares(described.estimation.plain.weights),
+            name=name,
         )
         for log, name in (("a.csv", "a"), ("warm.csv", "warm"))
     ]

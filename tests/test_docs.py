@@ -15,7 +15,7 @@ import pytest
 
 import jaxid as jid
 from jaxid.diagnose.mislabelled import BAD, SURE
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.decoder import check_tables, decode
 from jaxid.experiment.estimator_table import KINDS, choose_uncertainty
 from jaxid.experiment.excitation_tables import Collision, Excitation

@@ -105,14 +105,14 @@ def test_defaults_are_said(load):
     assert experiment.decimation == jid.Subsample(1)
     assert experiment.min_speed is None
     assert experiment.columns is None
-    assert isinstance(experiment.estimation.estimator.weights, jid.ResidualVariances)
+    assert isinstance(experiment.estimation.estimator.weights, jid.estimators.ResidualVariances)
     assert "10 Hz is assumed" in experiment.notes[0]
     assert "largest forces" in experiment.notes[1]
 
 
 def test_weights_are_the_largest_forces_where_they_are_known(load):
     experiment = load('[robot]\nbuiltin = "ur10"\n')
-    assert isinstance(experiment.estimation.estimator.weights, jid.MaximumForces)
+    assert isinstance(experiment.estimation.estimator.weights, jid.estimators.MaximumForces)
     assert len(experiment.notes) == 1
 
 
@@ -254,7 +254,7 @@ asymmetric = true
 
 def test_friction_with_a_hard_sign_or_none(load):
     hard = load(ARM + "[model.coulomb]\nhard = true\ndead_zone = [0.1, 0.2]\n").model
-    assert isinstance(hard.terms[2].transition, jid.HardSign)
+    assert isinstance(hard.terms[2].transition, jid.terms.HardSign)
     none = load(ARM + "[model]\ncoulomb = false\noffset = false\n").model
     assert not any(n.startswith(("fc", "fo")) for n in none.parameter_names)
 
@@ -295,10 +295,10 @@ forces_side = "joint"
             'kind = "butterworth"\ncutoff = 20\norder = 2\nforce_cutoff = inf\nmargin = 0.1',
             jid.ZeroPhaseButterworth(20.0, 2, np.inf, 0.1),
         ),
-        ('kind = "paper"\nvelocity = 900', jid.PaperFilter(900.0, 100.0)),
+        ('kind = "paper"\nvelocity = 900', jid.filters.PaperFilter(900.0, 100.0)),
         (
             'kind = "periodic"\nperiod = 8\nharmonics = 5',
-            jid.PeriodicFourier(8.0, 5),
+            jid.filters.PeriodicFourier(8.0, 5),
         ),
     ],
 )
@@ -320,34 +320,49 @@ def test_rows(load):
 @pytest.mark.parametrize(
     ("text", "estimator", "solution"),
     [
-        ('kind = "least_squares"', jid.LeastSquares, jid.Complete),
-        ('kind = "least_squares"\nridge = "cross_validated"', jid.LeastSquares, jid.CrossValidated),
-        ("ridge = 0.02", jid.WeightedLeastSquares, jid.Ridge),
-        ("truncate = 0.02", jid.WeightedLeastSquares, jid.Truncated),
+        ('kind = "least_squares"', jid.estimators.LeastSquares, jid.estimators.Complete),
+        (
+            'kind = "least_squares"\nridge = "cross_validated"',
+            jid.estimators.LeastSquares,
+            jid.estimators.CrossValidated,
+        ),
+        ("ridge = 0.02", jid.WeightedLeastSquares, jid.estimators.Ridge),
+        ("truncate = 0.02", jid.WeightedLeastSquares, jid.estimators.Truncated),
     ],
 )
 def test_estimators(load, text, estimator, solution):
     experiment = load(f"{ARM}[estimator]\n{text}\n")
     assert isinstance(experiment.estimation.estimator, estimator)
     assert isinstance(experiment.estimation.estimator.solution, solution)
-    assert experiment.estimation.regularised == (solution is not jid.Complete)
-    if solution in (jid.Ridge, jid.Truncated):
+    assert experiment.estimation.regularised == (solution is not jid.estimators.Complete)
+    if solution in (jid.estimators.Ridge, jid.estimators.Truncated):
         assert experiment.estimation.estimator.solution.strength == 0.02
 
 
 @pytest.mark.parametrize(
     ("text", "estimator"),
     [
-        ('kind = "huber"', jid.IterativelyReweighted(jid.Huber(), jid.ResidualVariances())),
+        (
+            'kind = "huber"',
+            jid.estimators.IterativelyReweighted(
+                jid.estimators.Huber(), jid.estimators.ResidualVariances()
+            ),
+        ),
         (
             'kind = "tukey"\nlimit = 4\nridge = 0.1',
-            jid.IterativelyReweighted(jid.Tukey(4.0), jid.ResidualVariances(), jid.Ridge(0.1)),
+            jid.estimators.IterativelyReweighted(
+                jid.estimators.Tukey(4.0),
+                jid.estimators.ResidualVariances(),
+                jid.estimators.Ridge(0.1),
+            ),
         ),
-        ('kind = "correlated"', jid.GeneralisedLeastSquares()),
+        ('kind = "correlated"', jid.estimators.GeneralisedLeastSquares()),
         (
             'kind = "consistent"\npull = 2\nmargin = 0.01',
             jid.PhysicallyConsistent(
-                jid.ResidualVariances(), margin=0.01, pull=jid.EntropicPull(strength=2.0)
+                jid.estimators.ResidualVariances(),
+                margin=0.01,
+                pull=jid.consistency.EntropicPull(strength=2.0),
             ),
         ),
     ],
@@ -356,16 +371,17 @@ def test_estimators_of_other_kinds(load, text, estimator):
     experiment = load(f"{ARM}[estimator]\n{text}\n")
     assert experiment.estimation.estimator == estimator
     assert experiment.estimation.plain == jid.WeightedLeastSquares(
-        jid.ResidualVariances(), jid.Ridge(0.1) if "ridge" in text else jid.Complete()
+        jid.estimators.ResidualVariances(),
+        jid.estimators.Ridge(0.1) if "ridge" in text else jid.estimators.Complete(),
     )
 
 
 def test_estimators_of_files(load, tmp_path):
     motion = jid.random_fourier_series(jid.robots.planar_arm(2), omega=1.0, seed=3)
-    jid.save_trajectory(motion, tmp_path / "motion.json")
+    jid.trajectories.save_trajectory(motion, tmp_path / "motion.json")
     text = '[estimator]\nkind = "instrumental"\nreference = ["motion.json"]\nreference_start = 2\n'
     estimator = load(ARM + text).estimation.estimator
-    assert isinstance(estimator, jid.InstrumentalVariables)
+    assert isinstance(estimator, jid.estimators.InstrumentalVariables)
     assert (len(estimator.references), estimator.starts) == (1, (2.0,))
     inertia = (
         "<inertial><mass value='{}'/><inertia ixx='{}' ixy='0' ixz='0' iyy='6' iyz='0' izz='6'/>"
@@ -379,7 +395,7 @@ def test_estimators_of_files(load, tmp_path):
         '[robot]\nurdf = "arm.urdf"\n[model]\nprincipal_axes = true\n[estimator]\nprior = "urdf"\n'
     )
     experiment = load(robot + "ridge = 0.1\n")
-    assert isinstance(experiment.estimation.estimator, jid.RelativeTo)
+    assert isinstance(experiment.estimation.estimator, jid.estimators.RelativeTo)
     named = dict(
         zip(
             experiment.model.parameter_names,
@@ -414,9 +430,9 @@ total_mass = 12
 def test_uncertainties(load, name):
     found = load(f'{ARM}[estimator]\nuncertainty = "{name}"\n').estimation.uncertainty
     kinds = {
-        "spectral": jid.SpectralSandwich,
-        "jackknife": jid.BlockJackknife,
-        "independent": jid.IndependentRows,
+        "spectral": jid.uncertainty.SpectralSandwich,
+        "jackknife": jid.uncertainty.BlockJackknife,
+        "independent": jid.uncertainty.IndependentRows,
     }
     assert found == kinds[name]()
 

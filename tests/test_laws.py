@@ -19,15 +19,15 @@ ARM = jid.robots.planar_arm(2, 0.4)
 ODD = (
     jid.ViscousFriction(),
     jid.CoulombFriction(),
-    jid.CoulombFriction(jid.HardSign(dead_zone=0.01)),
-    jid.StribeckFriction(),
-    jid.StribeckFriction(0.3, exponent=1.3),
-    jid.TemperatureScaled(jid.ViscousFriction(), rate=0.02, temperature=40.0),
+    jid.CoulombFriction(jid.terms.HardSign(dead_zone=0.01)),
+    jid.terms.StribeckFriction(),
+    jid.terms.StribeckFriction(0.3, exponent=1.3),
+    jid.terms.TemperatureScaled(jid.ViscousFriction(), rate=0.02, temperature=40.0),
 )
 # With a tanh the second of these is an offset as well, which pushes near standstill.
 ASYMMETRIC = (
-    jid.AsymmetricViscousFriction(),
-    jid.AsymmetricCoulombFriction(jid.HardSign(dead_zone=0.01)),
+    jid.terms.AsymmetricViscousFriction(),
+    jid.terms.AsymmetricCoulombFriction(jid.terms.HardSign(dead_zone=0.01)),
 )
 few = settings(max_examples=10)
 seeds = st.integers(0, 1000)
@@ -63,7 +63,10 @@ def test_friction_takes_energy_on_every_joint(term, seed, qd):
 )
 def test_derivatives_belong_to_their_motion_and_files_keep_it(seed, harmonics, omega, periods):
     series = jid.random_fourier_series(ARM, omega=omega, harmonics=harmonics, seed=seed)
-    for trajectory in (series, jid.RestToRestBasis(harmonics, omega, periods).nearest(series)):
+    for trajectory in (
+        series,
+        jid.trajectories.RestToRestBasis(harmonics, omega, periods).nearest(series),
+    ):
         t = np.linspace(0.05, 0.95, 11) * float(trajectory.duration)
         h = 1e-4 / omega
         ahead, now, behind = (trajectory.motion(x) for x in (t + h, t, t - h))
@@ -72,7 +75,7 @@ def test_derivatives_belong_to_their_motion_and_files_keep_it(seed, harmonics, o
             size = np.abs(derivative).max()
             np.testing.assert_allclose(slope, derivative, rtol=0, atol=1e-6 * size)
         with tempfile.TemporaryDirectory() as folder:
-            jid.save_trajectory(trajectory, Path(folder) / "t.json")
+            jid.trajectories.save_trajectory(trajectory, Path(folder) / "t.json")
             again = jid.load_trajectory(Path(folder) / "t.json").motion(t)
         for a, b in zip((now.q, now.qd, now.qdd), (again.q, again.qd, again.qdd), strict=True):
             np.testing.assert_array_equal(a, b)
@@ -181,7 +184,7 @@ def model_file(tmp_path_factory):
     forces = base.model.inverse_dynamics(np.ones(base.model.size), motion)
     log = jid.Recording.of(motion.q, forces, sample_time=0.01)
     o = jid.observe(log, ARM, jid.ZeroPhaseButterworth(10.0))
-    return jid.identify(base, o, jid.LeastSquares()).save(
+    return jid.identify(base, o, jid.estimators.LeastSquares()).save(
         tmp_path_factory.mktemp("model") / "arm.json"
     )
 

@@ -4,9 +4,11 @@ import random
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jaxid.errors import InputError
+from jaxid.io import read_arrays
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 

@@ -54,7 +54,9 @@ class Timing(NamedTuple):
         return self.literal / self.full
 
 
-def time_feed_forward(fit: jid.Fit, trajectory: jid.AbstractTrajectory) -> Timing | str:
+def time_feed_forward(
+    fit: jid.Fit, trajectory: jid.trajectories.AbstractTrajectory
+) -> Timing | str:
     """Return the cost of all forms on states of a motion; a sentence where it cannot be measured.
 
     Args:

@@ -116,9 +116,9 @@ class Study(NamedTuple):
     base: jid.BaseParameters
     truth: Float[np.ndarray, " base"]
     plans: tuple[jid.ExcitationPlan, ...]
-    played: jid.WithLeads
-    path: jid.TipPath
-    joint_path: jid.AbstractTrajectory
+    played: jid.trajectories.WithLeads
+    path: jid.trajectories.TipPath
+    joint_path: jid.trajectories.AbstractTrajectory
     runs: tuple[Tracking, ...]
     observations: tuple[jid.Observations, ...]
     unweighted: Model
@@ -126,7 +126,7 @@ class Study(NamedTuple):
     consistent: Model
     true: Model
     warm: jid.Fit
-    temperature: jid.Comparison
+    temperature: jid.identification.runs.comparison.Comparison
     coverage: tuple[Coverage, ...]
     followed: tuple[PathRun, ...]
     timing: Timing | str
@@ -162,7 +162,7 @@ class Study(NamedTuple):
         """Largest speed [m/s] and acceleration [m/s²] of the end-effector in the identification."""
         series = self.played.inner
         times = np.linspace(0.0, float(series.duration), 4000, endpoint=False)
-        tip = jid.tip_motion(self.base.model.robot, series.motion(times))
+        tip = jid.constraints.tip_motion(self.base.model.robot, series.motion(times))
         rates = (tip.velocity, tip.acceleration)
         speed, acceleration = (float(np.linalg.norm(x, axis=1).max()) for x in rates)
         return speed, acceleration
@@ -175,7 +175,7 @@ def run_study(
     starts: int = 2,
     draws: int = 4,
     periods: int = 2,
-    motion: jid.AbstractTrajectory | None = None,
+    motion: jid.trajectories.AbstractTrajectory | None = None,
 ) -> Study:
     """Repeat the experiments of the paper.
 
@@ -188,18 +188,23 @@ def run_study(
         motion: Motion to identify with; designed if None.
     """
     progress("finding base parameters", 0.0)
-    cold, hot = jid.virtual_tx90l_on_rail(), jid.virtual_tx90l_on_rail(warm=True)
+    cold, hot = (
+        jid.simulation.virtual_tx90l_on_rail(),
+        jid.simulation.virtual_tx90l_on_rail(warm=True),
+    )
     robot, base = cold.robot, jid.base_parameters(cold.model)
     _ = base.expressions
     plans: tuple[jid.ExcitationPlan, ...] = ()
     if motion is None:
         plans = _design(base, seed, starts, progress)
-        motion = jid.FourierBasis(HARMONICS, OMEGA).trajectory(plans[0].trajectory.coefficients)
+        motion = jid.trajectories.FourierBasis(HARMONICS, OMEGA).trajectory(
+            plans[0].trajectory.coefficients
+        )
     progress("adding the leads", 0.0)
-    played = jid.with_leads(motion, robot, periods=periods)
+    played = jid.trajectories.with_leads(motion, robot, periods=periods)
     progress("inverse kinematics of the verification path", 0.0)
     path = verification_path()
-    joints = jid.joint_path(robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0))
+    joints = jid.trajectories.joint_path(robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0))
     runs = []
     for k, (name, virtual, trajectory) in enumerate(
         (
@@ -211,11 +216,11 @@ def run_study(
         progress(f"measuring: {name}", 0.0)
         options = {"sample_time": SAMPLE_TIME, "seed": 10 * seed + k, "name": name}
         runs.append(virtual.track(trajectory, **options))
-    observations = [_observe(run.recording, robot, jid.PaperFilter()) for run in runs]
+    observations = [_observe(run.recording, robot, jid.filters.PaperFilter()) for run in runs]
     progress("identifying", 0.0)
     rows = jid.RegressionProblem(base, [observations[0]])
     fits = {
-        "without weights": jid.fit_problem(rows, jid.LeastSquares()),
+        "without weights": jid.fit_problem(rows, jid.estimators.LeastSquares()),
         "weighted": jid.fit_problem(rows, jid.WeightedLeastSquares()),
         "consistent": jid.fit_problem(rows, jid.PhysicallyConsistent()),
     }
@@ -252,15 +257,17 @@ def run_study(
     )
 
 
-def verification_path() -> jid.TipPath:
+def verification_path() -> jid.trajectories.TipPath:
     """Return the path of ISO 9283 of the demo; the tool points along the rail (Fig. 8)."""
     forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    return jid.iso9283_path(
+    return jid.trajectories.iso9283_path(
         CUBE, EDGE, forward, leans_along=1, speed=SPEED, acceleration=ACCELERATION
     )
 
 
-def _observe(log: jid.Recording, robot: jid.Robot, filter: jid.AbstractFilter) -> jid.Observations:
+def _observe(
+    log: jid.Recording, robot: jid.Robot, filter: jid.filters.AbstractFilter
+) -> jid.Observations:
     return jid.observe(log, robot, filter, jid.Subsample(STEP))
 
 
@@ -276,15 +283,15 @@ def _design(
     low[2], high[2], most[2] = -0.4, 0.4, 3.0
     limits = dataclasses.replace(limits, position_min=low, position_max=high, acceleration=most)
 
-    def design(criterion: jid.AbstractCriterion) -> jid.ExcitationPlan:
+    def design(criterion: jid.criteria.AbstractCriterion) -> jid.ExcitationPlan:
         name = f"designing the motion: {criterion.name}"
         progress(name, 0.0)
         return jid.design_excitation(
             base,
             criterion=criterion,
-            basis=jid.FourierBasis(HARMONICS, OMEGA),
+            basis=jid.trajectories.FourierBasis(HARMONICS, OMEGA),
             limits=limits,
-            constraints=(jid.Clearance(jid.robots.tx90l_on_rail_collision()),),
+            constraints=(jid.constraints.Clearance(jid.robots.tx90l_on_rail_collision()),),
             starts=starts,
             generations=0,
             polish=0,
@@ -294,14 +301,14 @@ def _design(
             throw=False,
         )
 
-    return design(jid.ConditionNumber()), design(jid.DOptimal())
+    return design(jid.criteria.ConditionNumber()), design(jid.criteria.DOptimal())
 
 
 def _check_coverage(
-    base: jid.BaseParameters, excitation: jid.WithLeads, seed: int, draws: int
+    base: jid.BaseParameters, excitation: jid.trajectories.WithLeads, seed: int, draws: int
 ) -> tuple[Coverage, ...]:
     """Count the intervals that hold the truth, for a robot with noise and encoders only."""
-    quiet = jid.virtual_tx90l_on_rail(disturbed=False)
+    quiet = jid.simulation.virtual_tx90l_on_rail(disturbed=False)
     truth = np.asarray(base.from_standard(quiet.parameters))
     duration = float(excitation.duration)
     seeds = range(1000 * (seed + 1), 1000 * (seed + 1) + draws)
@@ -309,7 +316,7 @@ def _check_coverage(
         quiet.measure(excitation, duration=duration, sample_time=SAMPLE_TIME, seed=k) for k in seeds
     ]
 
-    def count(filter: jid.AbstractFilter) -> int:
+    def count(filter: jid.filters.AbstractFilter) -> int:
         inside = 0
         for log in logs:
             rows = jid.RegressionProblem(base, [_observe(log, quiet.robot, filter)])
@@ -318,7 +325,7 @@ def _check_coverage(
         return inside
 
     filters = {
-        "the paper's filter, which lags and smooths accelerations twice": jid.PaperFilter(),
+        "the paper's filter, which lags and smooths accelerations twice": jid.filters.PaperFilter(),
         "a zero-phase Butterworth filter of 15 Hz": jid.ZeroPhaseButterworth(15.0),
     }
     return tuple(Coverage(name, count(f), draws * base.size) for name, f in filters.items())
@@ -326,13 +333,13 @@ def _check_coverage(
 
 def _follow(
     virtual: jid.VirtualRobot,
-    path: jid.TipPath,
-    joints: jid.AbstractTrajectory,
+    path: jid.trajectories.TipPath,
+    joints: jid.trajectories.AbstractTrajectory,
     fit: jid.Fit,
     seed: int,
 ) -> tuple[PathRun, ...]:
     """Run the path by the servo alone, and with two models fed forward."""
-    cad = jid.cad_tx90l_on_rail()
+    cad = jid.simulation.cad_tx90l_on_rail()
     controllers = {
         "no model": None,
         "CAD values": lambda motion: np.asarray(virtual.model.inverse_dynamics(cad, motion)),
@@ -342,7 +349,7 @@ def _follow(
     for k, (name, feed_forward) in enumerate(controllers.items()):
         number = 100 + 10 * seed + k
         run = virtual.track(joints, feed_forward=feed_forward, seed=number, name=name)
-        tip = np.asarray(jid.tip_motion(virtual.robot, run.actual).position)
+        tip = np.asarray(jid.constraints.tip_motion(virtual.robot, run.actual).position)
         distance = np.linalg.norm(tip - path.positions(np.asarray(run.time)), axis=1)
         runs.append(PathRun(name, run, distance))
     return tuple(runs)

@@ -13,7 +13,6 @@ import numpy as np
 from scipy import stats
 
 from jaxid.arrays import Float
-from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.estimators import GivenWeights
@@ -170,13 +169,13 @@ def _unexplained(
 
     All joints count equally. Friction terms that would come out negative are left out.
     """
-    wanted = forces - compiled.tool_forces(base, motion)
+    wanted = forces - base.tool_forces(motion)
     size = np.sqrt(np.mean(wanted**2, axis=0))
     scale = 1.0 / np.where(size > 0, size, np.inf)
-    rows = compiled.regressor_rows(base, motion)
+    rows = base.regressor_rows(motion)
     joints = len(scale)
     theta = np.zeros((joints, len(forces), base.size + 1))
-    for joint, columns in enumerate(compiled.acting_columns(base)):
+    for joint, columns in enumerate(base.acting_columns):
         theta[joint][:, columns] = rows[joint] * scale[joint]
     theta[..., -1] = (wanted * scale).T
     theta = theta.reshape(-1, base.size + 1)

@@ -4,7 +4,6 @@ A joint feels only the bodies beyond it, so most entries of a regressor are zero
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -42,16 +41,6 @@ class JointRegressor(eqx.Module):
         self.lowered = method.lowered
         self.columns = method.acting
         self.size = method.program.output_shapes[0][1]
-
-    @classmethod
-    def of(cls, owner: eqx.Module, definition: Callable, *shapes: tuple) -> "JointRegressor":
-        """Return `JointRegressor(owner, definition, *shapes)`; the former way."""
-        return cls(owner, definition, *shapes)
-
-    @classmethod
-    def of_base(cls, base: Any) -> "JointRegressor":
-        """Return `base.joint_regressor`; the former way."""
-        return base.joint_regressor
 
     @property
     def for_gradients(self) -> "JointRegressor":

@@ -12,10 +12,10 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.machine import on_samples
+from jaxid.dynamics.dispatch import on_samples
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.transitions import AbstractTransition, Reversal
+from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.kinematics import tip_placement

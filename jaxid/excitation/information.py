@@ -9,8 +9,6 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import regressor_rows
-from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
 from jaxid.trajectory.basis import AbstractBasis
 
@@ -48,9 +46,9 @@ def information(
     """
     plain = np.zeros((base.size, base.size))
     weighted = plain.copy() if prior is None else np.array(prior, np.float64)
-    columns = JointRows.of_base(base).columns
+    columns = base.joint_regressor.columns
     for own, theta, w in zip(
-        columns, regressor_rows(base, motion), np.asarray(weights), strict=True
+        columns, base.regressor_rows(motion), np.asarray(weights), strict=True
     ):
         gram = theta.T @ theta
         place = np.ix_(own, own)
@@ -81,7 +79,7 @@ def information_map(
     Returns:
         Function whose results are the plain and the weighted information.
     """
-    rows = JointRows.of_base(base).for_gradients
+    rows = base.joint_regressor.for_gradients
     motion = np.asarray(basis.rows(basis.times(samples))[:3])
 
     def evaluate(x: Float[Array, "starts joints variables"]) -> tuple[Array, Array]:

@@ -7,19 +7,21 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.dynamics.friction import StribeckFriction
 from jaxid.dynamics.terms import (
     AbstractTerm,
+    AbstractTransition,
     AsymmetricCoulombFriction,
     ConstantOffset,
     CoulombFriction,
     CoupledDrives,
+    HardSign,
     LinearSpring,
     RigidBodies,
     RotorInertia,
+    StribeckFriction,
+    Tanh,
     ViscousFriction,
 )
-from jaxid.dynamics.transitions import AbstractTransition, HardSign, Tanh
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import Bounds, Count, Magnitude, Positive, decode, quoted, within
 from jaxid.experiment.robot_tables import one_per_joint

@@ -17,8 +17,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bool, Float, is_traced, require_float64
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.regressor import JointRegressor
 from jaxid.errors import InputError
 from jaxid.identification.batch_estimators import estimate_each
 from jaxid.identification.estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
@@ -87,11 +87,11 @@ def identify_batch(
     if weights is None:
         weights = 1.0 / np.asarray(robot.max_forces)
     if robots is None:
-        rows, numbers = JointRows.of_base(base), None
+        rows, numbers = base.joint_regressor, None
     else:
         family, numbers = geometries(base, robots)
         n = (robot.joints,)
-        rows = JointRows.of(family, family.columns, n, n, n, (numbers.shape[1],))
+        rows = JointRegressor(family, family.columns, n, n, n, (numbers.shape[1],))
     batch = DataSets(
         motion,
         _without_tool(base, motion, forces).reshape(len(forces), -1, *forces.shape[-2:]),
@@ -154,7 +154,7 @@ def _without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Arr
     )
 
 
-def _solve_in_parts(rows: JointRows, batch: DataSets, row_time: float | None) -> BatchFit:
+def _solve_in_parts(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
     """Calls the compiled computation for a few data sets at a time, on all cores.
 
     XLA leaves small operations to one core, so each core gets data sets of its own. Parts of equal
@@ -181,7 +181,11 @@ def _solve_in_parts(rows: JointRows, batch: DataSets, row_time: float | None) ->
 
 
 def _solved_again(
-    base: BaseParameters, rows: JointRows, batch: DataSets, fit: BatchFit, row_time: float | None
+    base: BaseParameters,
+    rows: JointRegressor,
+    batch: DataSets,
+    fit: BatchFit,
+    row_time: float | None,
 ) -> BatchFit:
     """Solves the data sets that are not well conditioned by orthogonal factors, one by one.
 
@@ -215,7 +219,7 @@ def _solved_again(
     return BatchFit(*map(jnp.asarray, (p, deviations, rms, condition, determined, naive, freedom)))
 
 
-def _blocks(rows: JointRows, one: DataSets, forces: np.ndarray) -> Blocks:
+def _blocks(rows: JointRegressor, one: DataSets, forces: np.ndarray) -> Blocks:
     """The triangular factors of one data set and one draw of its forces, by blocks of time."""
     edges = np.linspace(0, len(forces), BLOCKS + 1).astype(int)
     parts = []

@@ -20,8 +20,7 @@ from scipy import signal
 
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import acting_columns
-from jaxid.dynamics.machine import program_of
+from jaxid.dynamics.dispatch import program_of
 from jaxid.measurement.decimation import AbstractDecimation
 from jaxid.measurement.filters import AbstractFilter, LowPass
 from jaxid.program import Program, default_fence, lower
@@ -160,7 +159,7 @@ class CompiledLoop:
         self.shape = loop_shape(stages, chunk)
         self.devices = tuple(jax.local_devices(backend="cpu"))
         self._matrices = [stage.matrix(TILE) for stage in stages]
-        self._run = _compiled(columns, tool, tuple(acting_columns(base)), self.shape)
+        self._run = _compiled(columns, tool, tuple(base.acting_columns), self.shape)
 
     def prepare(self, samples: Sequence[AnyArray], mask: np.ndarray) -> list[np.ndarray]:
         """Return the arrays of one piece, filled up to the shape of the loop.
@@ -239,7 +238,7 @@ def _compiled(
     def evaluate(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
         packed = base_columns(q, qd, qdd)
         rows = [jnp.broadcast_to(jnp.asarray(packed[i], float), q.shape[1:]) for i in first]
-        known = [0.0] * joints if tool_forces is None else tool_forces(q, qd, qdd)
+        known = [0.0] * joints if tool_forces is None else q.tool_forces(qd, qdd)
         rows += [f - k for f, k in zip(forces, known, strict=True)]
         return rows
 

@@ -18,7 +18,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxid.arrays import Float, require_float64
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import acting_columns
 from jaxid.errors import InputError
 from jaxid.identification.compiled import shard_map
 from jaxid.identification.factors import Blocks, Factors, JointFactor
@@ -164,7 +163,7 @@ def _wait(patience: float) -> None:
 
 def _pack(blocks: Blocks, base: BaseParameters) -> Float[np.ndarray, "most numbers"]:
     """Return one row of numbers for each block, behind a one; rows of zeros fill up."""
-    size = sum((len(own) + 1) ** 2 + 1 for own in acting_columns(base))
+    size = sum((len(own) + 1) ** 2 + 1 for own in base.acting_columns)
     packed = np.zeros((MOST, 1 + size))
     for row, part in zip(packed, blocks.parts, strict=False):
         numbers = [[1.0]]
@@ -181,7 +180,7 @@ def _unpack(packed: Float[np.ndarray, "most numbers"], base: BaseParameters) -> 
     parts = []
     for row in packed[packed[:, 0] > 0]:
         joints, start = [], 1
-        for own in acting_columns(base):
+        for own in base.acting_columns:
             width = len(own) + 1
             stop = start + 1 + width**2
             R = row[start + 1 : stop].reshape(width, width)

@@ -16,7 +16,6 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import regressor_rows, tool_forces
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Chunk
 
@@ -74,8 +73,8 @@ def reduce_chunk(
     """
     forces = np.asarray(forces)
     if base.model.robot.tool is not None:
-        forces = forces - tool_forces(base, motion)
-    columns = [chunk.reduce(theta) for theta in regressor_rows(base, motion)]
+        forces = forces - base.tool_forces(motion)
+    columns = [chunk.reduce(theta) for theta in base.regressor_rows(motion)]
     return columns, chunk.reduce(forces)
 
 

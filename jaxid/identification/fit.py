@@ -8,7 +8,6 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -316,7 +315,7 @@ class Fit(eqx.Module):
                 f"`motion` must be of the {robot.joints} joints of `{robot.name}`, but is of "
                 f"{motion.joints}."
             )
-        return compiled.forces(self.base, self.parameters, motion)
+        return self.base.forces_in_numpy(self.parameters, motion)
 
     @property
     def checksum(self) -> str:

@@ -10,9 +10,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.friction import TemperatureScaled
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import AbstractTerm
+from jaxid.dynamics.terms import AbstractTerm, TemperatureScaled
 from jaxid.errors import InputError
 from jaxid.identification.estimators.friction import (
     NonlinearFriction,

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bool, Float
-from jaxid.dynamics.joint_rows import JointRows
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.regressor import JointRegressor
 from jaxid.identification.uncertainty.spectral import LineSums, line_sums, variances
 
 AT_ONCE = 2048
@@ -68,7 +68,7 @@ class DataSets(eqx.Module):
     numbers: Float[AnyArray, "datasets numbers"] | None
 
 
-def solve(rows: JointRows, batch: DataSets, row_time: float | None = None) -> BatchFit:
+def solve(rows: JointRegressor, batch: DataSets, row_time: float | None = None) -> BatchFit:
     """Solves all data sets, a group at a time; compiled once for each of the latest shapes.
 
     Args:
@@ -96,7 +96,7 @@ def _compiled(tree: Any, known: tuple[bool, ...], numbers: tuple, shapes: tuple)
     return jax.jit(run)
 
 
-def _solved(rows: JointRows, batch: DataSets, row_time: float | None) -> BatchFit:
+def _solved(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
     batch = jax.tree.map(jnp.asarray, batch)
     datasets, samples, _ = batch.motion.q.shape
     calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
@@ -126,7 +126,9 @@ def _filled(batch: DataSets, missing: int) -> DataSets:
     )
 
 
-def _solve_group(rows: JointRows, batch: DataSets, chunks: int, row_time: float | None) -> BatchFit:
+def _solve_group(
+    rows: JointRegressor, batch: DataSets, chunks: int, row_time: float | None
+) -> BatchFit:
     """Solves a few data sets; those that fit evaluate their columns together, once."""
     length = batch.forces.shape[-2] // chunks
     if chunks == 1:
@@ -175,7 +177,7 @@ def _in_chunks(one: DataSets, chunks: int) -> DataSets:
     )
 
 
-def _columns(rows: JointRows, batch: DataSets) -> list[Array]:
+def _columns(rows: JointRegressor, batch: DataSets) -> list[Array]:
     """For each joint the columns of some data sets, [datasets, columns, samples]."""
     arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(batch.motion)]
     if batch.numbers is not None:
@@ -185,7 +187,7 @@ def _columns(rows: JointRows, batch: DataSets) -> list[Array]:
 
 
 def _solve_one(
-    rows: JointRows, one: DataSets, total: Callable, length: int, row_time: float | None
+    rows: JointRegressor, one: DataSets, total: Callable, length: int, row_time: float | None
 ) -> BatchFit:
     """Solves one data set by the products of its rows.
 
@@ -257,7 +259,7 @@ def _products(columns: list[Array], forces: list[Array]) -> tuple[list[Array], l
 
 
 def _squares(
-    rows: JointRows, grams: list[Array], products: list[Array], forces: Array, p: Array
+    rows: JointRegressor, grams: list[Array], products: list[Array], forces: Array, p: Array
 ) -> Array:
     """The residuals' squares by joint [draws, joints], from products alone."""
     felt = []
@@ -267,14 +269,14 @@ def _squares(
     return forces - 2 * _along(rows, p, products) + jnp.stack(felt, axis=-1)
 
 
-def _along(rows: JointRows, p: Array, products: list[Array]) -> Array:
+def _along(rows: JointRegressor, p: Array, products: list[Array]) -> Array:
     """Parameters times products, by joint [draws, joints]."""
     pairs = zip(rows.columns, products, strict=True)
     return jnp.stack([jnp.sum(p[:, np.array(k, int)] * y, axis=-1) for k, y in pairs], axis=-1)
 
 
 def _residuals(
-    rows: JointRows, columns: list[Array], forces: list[Array], p: Array
+    rows: JointRegressor, columns: list[Array], forces: list[Array], p: Array
 ) -> tuple[list[Array], Array]:
     """Products of the columns with the residuals, and the residuals' squares by joint."""
     products, squares = [], []
@@ -285,7 +287,7 @@ def _residuals(
     return products, jnp.stack(squares, axis=-1)
 
 
-def _added(rows: JointRows, grams: list[Array], weights: Array) -> Array:
+def _added(rows: JointRegressor, grams: list[Array], weights: Array) -> Array:
     """The weighted information of all joints."""
     whole = jnp.zeros((rows.size, rows.size), weights.dtype)
     for own, gram, w in zip(rows.columns, grams, weights, strict=True):
@@ -294,7 +296,7 @@ def _added(rows: JointRows, grams: list[Array], weights: Array) -> Array:
     return whole
 
 
-def _added_products(rows: JointRows, products: list[Array], weights: Array) -> Array:
+def _added_products(rows: JointRegressor, products: list[Array], weights: Array) -> Array:
     """The weighted products of columns and forces [draws, base]."""
     sums = jnp.zeros((products[0].shape[0], rows.size), weights.dtype)
     for own, y, w in zip(rows.columns, products, weights, strict=True):
@@ -303,7 +305,7 @@ def _added_products(rows: JointRows, products: list[Array], weights: Array) -> A
 
 
 def _deviations(
-    rows: JointRows,
+    rows: JointRegressor,
     inverse: Array,
     grams: list[Array],
     weights: Array,

@@ -7,7 +7,6 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import acting_columns
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.factors import (
@@ -76,7 +75,7 @@ class RegressionProblem:
         if self._given is not None:
             return self._given
         self.require_samples("a pass over the rows")
-        parts = self._empty(acting_columns(self.base), self.base.size)
+        parts = self._empty(self.base.acting_columns, self.base.size)
         done, samples = 0, [o.samples for o in self.recordings]
         for number, recording in enumerate(self.recordings):
             if suits(recording):
@@ -141,7 +140,7 @@ class RegressionProblem:
         Raises:
             InputError: If only factors are known.
         """
-        columns = acting_columns(self.base) if columns is None else columns
+        columns = self.base.acting_columns if columns is None else columns
         parts = self._empty(columns, self.base.size if size is None else size)
         _append(parts, self.chunks(), equations)
         return Blocks(tuple(parts))
@@ -184,7 +183,7 @@ class RegressionProblem:
         self, number: int, wanted: Sequence[tuple[int, int]] | None
     ) -> Iterator[RowChunk]:
         observations = self.recordings[number]
-        mask, indices = np.asarray(observations.mask), acting_columns(self.base)
+        mask, indices = np.asarray(observations.mask), self.base.acting_columns
         reduced = reduced_rows(self.base, observations, self.samples_per_chunk, wanted=wanted)
         for rows, columns, forces in reduced:
             whole = RowChunk(number, 0, rows, indices, columns, forces, mask[rows])

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.compiled import acting_columns
 from jaxid.identification.compiled import CompiledLoop, Grams, Stage, filter_stages, reach_of
 from jaxid.identification.factors import (
     Factors,
@@ -77,7 +76,7 @@ def stream_blocks(
         progress: Callback, called with the completed fraction (0 to 1).
         chunk: Samples of an iteration of the loop.
     """
-    mask, indices = np.asarray(observations.mask), acting_columns(base)
+    mask, indices = np.asarray(observations.mask), base.acting_columns
     stream = _Stream(base, observations, edges, progress, chunk)
     blocks = []
     for R, (first, last) in zip(stream.triangles(), itertools.pairwise(edges), strict=True):
@@ -104,7 +103,7 @@ class _Stream:
             # Without filters the samples between the rows are not needed.
             self._stride, stages = math.prod(stage.factor for stage in stages), ()
         self._observations, self._edges = observations, list(edges)
-        self._widths = [len(columns) + 1 for columns in acting_columns(base)]
+        self._widths = [len(columns) + 1 for columns in base.acting_columns]
         self._loop = CompiledLoop(base, stages, chunk)
         self._mask = np.asarray(observations.mask)
         reach = reach_of(stages)
@@ -147,7 +146,7 @@ class _Stream:
         covered = np.zeros(len(self._mask), bool)
         for piece in self._pieces:
             covered[slice(*piece.rows)] = True
-        indices = acting_columns(base)
+        indices = base.acting_columns
         for chunk in self._observations.chunks(max(4096, 2 * reach)):
             start, stop = chunk.rows
             outer = np.flatnonzero(~covered[start:stop])

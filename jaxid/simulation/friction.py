@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable
-from jaxid.dynamics.terms import AbstractTerm, CoulombFriction, ViscousFriction
-from jaxid.dynamics.transitions import Tanh
+from jaxid.dynamics.terms import AbstractTerm, CoulombFriction, Tanh, ViscousFriction
 from jaxid.robot.robot import Robot
 
 Joints = Float[AnyArray, " joints"]

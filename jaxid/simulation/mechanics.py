@@ -9,9 +9,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable
 from jaxid.dynamics import projection
-from jaxid.dynamics.machine import program_of
+from jaxid.dynamics.dispatch import program_of, solve_symmetric
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.solve import solve_symmetric
 from jaxid.program import to_python
 from jaxid.simulation.experiment import AbstractPlant
 from jaxid.simulation.friction import AbstractDisturbance, AbstractGearFriction

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, require_float64
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTerm

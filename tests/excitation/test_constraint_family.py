@@ -8,8 +8,7 @@ import pytest
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.terms import CoulombFriction, RigidBodies
-from jaxid.dynamics.transitions import HardSign
+from jaxid.dynamics.terms import CoulombFriction, HardSign, RigidBodies
 from jaxid.excitation.constraints import (
     Clearance,
     JointForces,

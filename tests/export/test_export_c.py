@@ -11,7 +11,7 @@ from compiled_model import CompiledModel
 from export_samples import changed, fit_of, motion, possible
 
 import jaxid as jid
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
 from jaxid.export.c_code import c_functions
 from jaxid.export.feed_forward import torque_program
@@ -24,14 +24,14 @@ STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror", "-O1"]
 def railed():
     terms = (
         jid.RigidBodies(principal_axes=True),
-        jid.AsymmetricCoulombFriction(),
+        jid.terms.AsymmetricCoulombFriction(),
         jid.ConstantOffset(),
     )
     return jid.Model(jid.robots.tx90l_on_rail(), terms[:2])
 
 
 def coupled():
-    terms = (*jid.Model(jid.robots.planar_arm(1, 1.0)).terms, jid.CoupledDrives())
+    terms = (*jid.Model(jid.robots.planar_arm(1, 1.0)).terms, jid.terms.CoupledDrives())
     return jid.Model(jid.robots.tx40(), terms)
 
 
@@ -110,13 +110,13 @@ def test_bodies_with_no_symmetry_in_a_tree_with_skew_axes():
         offset=rng.normal(size=(5, 3)),
         gravity=(1.0, 2.0, -9.0),
     )
-    model = jid.Model(robot, (jid.RigidBodies(), jid.LinearSpring(0.3)))
+    model = jid.Model(robot, (jid.RigidBodies(), jid.terms.LinearSpring(0.3)))
     fit = fit_of(model, rng.normal(size=model.size))
     m = motion(5, 50)
     close(evaluate(torque_program(fit), m.q.T, m.qd.T, m.qdd.T).T, fit.predict(m))
 
 
-class CubicFriction(jid.AbstractTerm):
+class CubicFriction(jid.terms.AbstractTerm):
     def parameters(self, robot):
         return tuple((f"fq{i + 1}", "N m s³") for i in range(robot.joints))
 
@@ -126,7 +126,12 @@ class CubicFriction(jid.AbstractTerm):
 
 @pytest.fixture(scope="module")
 def small():
-    terms = (jid.RigidBodies(), jid.StribeckFriction(), jid.CoulombFriction(), CubicFriction())
+    terms = (
+        jid.RigidBodies(),
+        jid.terms.StribeckFriction(),
+        jid.CoulombFriction(),
+        CubicFriction(),
+    )
     model = jid.Model(jid.robots.planar_arm(2, 0.4), (terms[0], terms[1], terms[3]))
     return fit_of(model, possible(model))
 

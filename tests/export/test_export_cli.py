@@ -72,7 +72,7 @@ def test_files_hold_the_model(report, run):
     with open("b.json", encoding="utf-8") as file:
         content = json.load(file)
     rows = [joint["parameters"] for joint in content["joints"]]
-    np.testing.assert_array_equal(rows, jid.pinocchio_parameters(report))
+    np.testing.assert_array_equal(rows, jid.export.pinocchio_parameters(report))
     assert content["model"] == report.checksum
     assert run("report", "--to", "c", "-o", "c/my_arm.c", "--float")[0] == 0
     with open("c/my_arm.h", encoding="ascii") as file:

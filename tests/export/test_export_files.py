@@ -167,7 +167,7 @@ def test_the_mjcf_gives_the_same_torques_in_mujoco(fit, tmp_path, name):
 
 def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, source):
     pin = pytest.importorskip("pinocchio")
-    rows, m = jid.pinocchio_parameters(fit), motion(3, 20)
+    rows, m = jid.export.pinocchio_parameters(fit), motion(3, 20)
     model = pin.buildModelFromUrdf(str(source))
     for i, row in enumerate(rows):
         model.inertias[i + 1] = pin.Inertia.FromDynamicParameters(row)
@@ -179,21 +179,21 @@ def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, sourc
 
 
 def test_the_exported_function_takes_any_number_of_samples_and_needs_no_jaxid(fit, tmp_path):
-    exported, m = jid.exported_function(fit), motion(3, 30)
+    exported, m = jid.export.exported_function(fit), motion(3, 30)
     np.testing.assert_allclose(
         exported.call(m.q, m.qd, m.qdd), fit.predict(m), rtol=1e-11, atol=1e-11
     )
     if importlib.util.find_spec("flatbuffers") is None:
         with pytest.raises(RuntimeError, match="pip install flatbuffers"):
-            jid.export_jax(fit, tmp_path / "arm.bin")
+            jid.export.export_jax(fit, tmp_path / "arm.bin")
         return
-    path, m = jid.export_jax(fit, tmp_path / "arm.bin"), motion(3, 1)
+    path, m = jid.export.export_jax(fit, tmp_path / "arm.bin"), motion(3, 1)
     read = jax.export.deserialize(bytearray(path.read_bytes()))
     found = read.call(m.q, m.qd, m.qdd)
     np.testing.assert_allclose(found, fit.predict(m), rtol=1e-11, atol=1e-11)
 
 
-class Drag(jid.AbstractTerm):
+class Drag(jid.terms.AbstractTerm):
     """A damping term of a user, with one friction that depends on the direction."""
 
     def parameters(self, robot):

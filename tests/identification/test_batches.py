@@ -9,7 +9,7 @@ import pytest
 from virtual import motion, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification import normal_equations
 from jaxid.identification.batches import identify_batch
 from jaxid.identification.bootstrap import bootstrap
@@ -68,7 +68,7 @@ def test_masked_rows_and_weights_of_each_data_set(base):
     fit = identify_batch(base, m, forces, weights, mask=mask)
     for k, o in enumerate(sets):
         masked = o.replace(mask=mask[k])
-        estimator = jid.WeightedLeastSquares(jid.GivenWeights(weights[k]))
+        estimator = jid.WeightedLeastSquares(jid.estimators.GivenWeights(weights[k]))
         assert_same(base, fit, k, jid.identify(base, masked, estimator))
 
 
@@ -85,7 +85,7 @@ def test_honest_deviations_of_many_draws(base):
     naive = identify_batch(base, m, draws, WEIGHTS, mask=mask)
     np.testing.assert_allclose(fit.naive_standard_deviations, naive.standard_deviations)
     assert np.median(fit.standard_deviations / fit.naive_standard_deviations) > 1.5
-    estimator = jid.WeightedLeastSquares(jid.GivenWeights(WEIGHTS))
+    estimator = jid.WeightedLeastSquares(jid.estimators.GivenWeights(WEIGHTS))
     for k, draw in ((0, 0), (0, 2), (1, 1)):
         fields = {"mask": mask[k], "forces": draws[k, draw]}
         one = jid.identify(base, sets[k].replace(**fields), estimator)
@@ -113,19 +113,19 @@ def test_honest_deviations_under_jit_and_by_chunks(base, monkeypatch):
     # Chunks are stretches of their own, as if a gap divided them.
     half = SAMPLES // 2
     halves = {"segments": ((0, half), (half, SAMPLES))}
-    estimator = jid.WeightedLeastSquares(jid.GivenWeights(WEIGHTS))
+    estimator = jid.WeightedLeastSquares(jid.estimators.GivenWeights(WEIGHTS))
     one = jid.identify(base, sets[1].replace(**halves), estimator)
     np.testing.assert_allclose(parts.standard_deviations[1], one.standard_deviations, rtol=1e-8)
 
 
-@pytest.mark.parametrize("loss", [jid.Huber(), jid.Tukey()])
+@pytest.mark.parametrize("loss", [jid.estimators.Huber(), jid.estimators.Tukey()])
 def test_any_estimator_takes_batches(base, loss):
     mask = np.random.default_rng(1).random((2, SAMPLES, 2)) < 0.8
     sets = some_sets(base, 2)
     m, forces = stacked(sets)
     draws = np.stack([forces, 2.0 * forces], axis=1)
     draws = np.where(mask[:, None], draws, np.nan)
-    estimator = jid.IterativelyReweighted(loss)
+    estimator = jid.estimators.IterativelyReweighted(loss)
     dt = sets[0].sample_time
     fit = identify_batch(base, m, draws, mask=mask, estimator=estimator, row_time=dt)
     assert fit.parameters.shape == (2, 2, base.size)
@@ -257,7 +257,7 @@ def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
     order = np.random.default_rng(0).permutation(12000)
     o = o.replace(motion=o.motion[order], forces=o.forces[order])
     blocks = jid.RegressionProblem(base, [o], divisions=60).blocks
-    fit = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), jid.LeastSquares())
+    fit = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), jid.estimators.LeastSquares())
     draws = bootstrap(blocks, fit.weights, 4000, jax.random.key(0))
     np.testing.assert_allclose(
         np.mean(draws, axis=0), fit.parameters, atol=0.2 * fit.standard_deviations.max()

@@ -13,7 +13,7 @@ MODEL = jid.Model(
 )
 BASE = jid.base_parameters(MODEL)
 P = virtual.standard_parameters(MODEL, seed=1)
-WLS = jid.WeightedLeastSquares(jid.Unweighted())
+WLS = jid.WeightedLeastSquares(jid.estimators.Unweighted())
 
 
 def without_offsets():
@@ -87,7 +87,7 @@ CUTOFFS = (0.5, 2.0, 8.0, 16.0, 60.0, 100.0)
 
 
 def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
-    candidates = jid.butterworth_candidates(0.004, CUTOFFS)
+    candidates = jid.identification.filter_choice.butterworth_candidates(0.004, CUTOFFS)
     told = []
     found = jid.choose_filter(BASE, noisy_log, candidates, estimator=WLS, progress=told.append)
     best = CUTOFFS[found.best]
@@ -99,13 +99,15 @@ def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
     assert told[-1] == 1.0
     assert f"a cut-off of {best:.3g} Hz" in str(found)
     # Whiteness may decide among all candidates.
-    whitest = jid.WhitestResidual(cost=10.0).choose(found.errors, found.correlations)
+    whitest = jid.identification.filter_choice.WhitestResidual(cost=10.0).choose(
+        found.errors, found.correlations
+    )
     good = found.curve <= 11.0 * found.curve.min()
     assert whitest == int(np.argmin(np.where(good, np.abs(found.correlations), np.inf)))
 
 
 def test_candidates_are_decimated_to_their_band():
-    candidates = jid.butterworth_candidates(0.001)
+    candidates = jid.identification.filter_choice.butterworth_candidates(0.001)
     cutoffs = [c.filter.cutoff for c in candidates]
     assert cutoffs[0] == pytest.approx(1.0)
     assert cutoffs[-1] == pytest.approx(100.0)

@@ -16,7 +16,7 @@ KINDS = ("bodies",) * 8 + ("friction",) * 4
 
 
 def estimates(parameters, covariance, freedom=np.inf, label="run"):
-    return jid.Estimates(
+    return jid.identification.runs.estimates.Estimates(
         label=label,
         names=NAMES,
         expressions=NAMES,

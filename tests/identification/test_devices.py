@@ -44,7 +44,7 @@ def say(*words):
     # In one piece: an unbuffered print writes word by word, and JAX's own log comes between.
     os.write(1, (" ".join(map(str, words)) + "\\n").encode())
 def write(problem):
-    fit = jid.fit_problem(problem, jid.LeastSquares())
+    fit = jid.fit_problem(problem, jid.estimators.LeastSquares())
     np.savez(sys.argv[1], p=fit.parameters, s=fit.naive_standard_deviations, rows=fit.rows)
 """
 LONG = """
@@ -54,14 +54,14 @@ streaming.LONG, compiled.PIECE = 1000, 2048
 o = observations(base.model, standard_parameters(base.model), samples=20011, noise=0.3,
                  filter=jid.ZeroPhaseButterworth(30.0), every=15)
 shares = []
-fit = jid.identify(base, o, jid.LeastSquares(), progress=shares.append)
+fit = jid.identify(base, o, jid.estimators.LeastSquares(), progress=shares.append)
 assert shares == sorted(shares) and shares[-1] == 1.0
 np.savez(sys.argv[1], p=fit.parameters, s=fit.standard_deviations, rows=fit.rows)
 """
 SHARDS = """
 from pathlib import Path
 columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
-paths = jid.shards(sys.argv[4])
+paths = jid.devices.shards(sys.argv[4])
 assert 1 <= len(paths) <= 3, paths
 logs = [jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0)) for p in paths]
 write(factorise_across_processes(base, logs, patience=60.0))
@@ -179,7 +179,7 @@ def test_two_processes(base, tmp_path):
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0, 0], "\n\n".join(outputs)
     recordings = [recording(base, k) for k in range(3)]
-    fit = jid.fit_problem(jid.RegressionProblem(base, recordings), jid.LeastSquares())
+    fit = jid.fit_problem(jid.RegressionProblem(base, recordings), jid.estimators.LeastSquares())
     for path in paths:
         assert_same(path, fit)
     a, b = (np.load(path)["p"] for path in paths)
@@ -200,12 +200,12 @@ def test_three_processes_read_their_own_shards(base, tmp_path):
     processes = [start(SHARDS, p, port, f"{k}/{count}", folder) for k, p in enumerate(paths)]
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0] * count, "\n\n".join(outputs)
-    assert len(jid.shards(folder)) == 5
+    assert len(jid.devices.shards(folder)) == 5
     logs = [
         jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0))
-        for p in jid.shards(folder)
+        for p in jid.devices.shards(folder)
     ]
-    fit = jid.identify(base, logs, jid.LeastSquares())
+    fit = jid.identify(base, logs, jid.estimators.LeastSquares())
     for path in paths:
         assert_same(path, fit)
         np.testing.assert_array_equal(np.load(path)["p"], np.load(paths[0])["p"])
@@ -272,4 +272,4 @@ def test_a_program_of_one_process_needs_no_coordinator(base):
 
 def test_refusals():
     with pytest.raises(ValueError, match="holds no file"):
-        jid.shards(HERE)
+        jid.devices.shards(HERE)

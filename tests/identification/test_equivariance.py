@@ -16,18 +16,18 @@ ROBOT = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 
 BASE = jid.base_parameters(jid.Model(ROBOT, TERMS))
 NOISE = np.array([0.5, 0.1])
 LINEAR = (
-    jid.LeastSquares(),
+    jid.estimators.LeastSquares(),
     jid.WeightedLeastSquares(),
-    jid.LeastSquares(solution=jid.Truncated(1e-6)),
-    jid.WeightedLeastSquares(solution=jid.Ridge(0.1)),
+    jid.estimators.LeastSquares(solution=jid.estimators.Truncated(1e-6)),
+    jid.WeightedLeastSquares(solution=jid.estimators.Ridge(0.1)),
 )
 """Estimates that are linear in the forces."""
 FOLLOWING = (
     *LINEAR,
-    jid.WeightedLeastSquares(jid.ResidualVariances()),
-    jid.IterativelyReweighted(loss=jid.Huber()),
-    jid.IterativelyReweighted(loss=jid.Tukey()),
-    jid.GeneralisedLeastSquares(),
+    jid.WeightedLeastSquares(jid.estimators.ResidualVariances()),
+    jid.estimators.IterativelyReweighted(loss=jid.estimators.Huber()),
+    jid.estimators.IterativelyReweighted(loss=jid.estimators.Tukey()),
+    jid.estimators.GeneralisedLeastSquares(),
 )
 """Estimates that are in other units where the forces are."""
 few = settings(max_examples=4)
@@ -82,7 +82,9 @@ def test_forces_that_add_up_give_parameters_that_do(estimator, first, second, c)
 def test_only_the_ratio_of_weights_counts(seed, weights, power):
     o = observed(seed)
     fits = [
-        jid.identify(BASE, o, jid.WeightedLeastSquares(jid.GivenWeights(c * np.array(weights))))
+        jid.identify(
+            BASE, o, jid.WeightedLeastSquares(jid.estimators.GivenWeights(c * np.array(weights)))
+        )
         for c in (1.0, 2.0**power)
     ]
     close(fits[1].parameters, fits[0].parameters)

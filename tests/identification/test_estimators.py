@@ -8,7 +8,7 @@ from virtual import dense, observations, standard_parameters
 import jaxid as jid
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
-MEASURED = jid.MeasuredForces()
+MEASURED = jid.estimators.MeasuredForces()
 
 
 class Known(AbstractTrajectory):
@@ -40,15 +40,18 @@ def noisy(base):
 
 def members(o, size=1.0):
     return (
-        jid.LeastSquares(),
+        jid.estimators.LeastSquares(),
         jid.WeightedLeastSquares(MEASURED),
-        jid.WeightedLeastSquares(jid.ResidualVariances()),
-        jid.IterativelyReweighted(jid.Huber(), MEASURED),
-        jid.IterativelyReweighted(jid.Tukey(), MEASURED),
-        jid.GeneralisedLeastSquares(),
-        jid.InstrumentalVariables((Known(o.motion, o.sample_time),), MEASURED),
-        jid.RelativeTo(size * rough(o.joints), jid.IterativelyReweighted(jid.Tukey(), MEASURED)),
-        jid.RelativeTo(size * rough(o.joints), jid.WeightedLeastSquares(MEASURED)),
+        jid.WeightedLeastSquares(jid.estimators.ResidualVariances()),
+        jid.estimators.IterativelyReweighted(jid.estimators.Huber(), MEASURED),
+        jid.estimators.IterativelyReweighted(jid.estimators.Tukey(), MEASURED),
+        jid.estimators.GeneralisedLeastSquares(),
+        jid.estimators.InstrumentalVariables((Known(o.motion, o.sample_time),), MEASURED),
+        jid.estimators.RelativeTo(
+            size * rough(o.joints),
+            jid.estimators.IterativelyReweighted(jid.estimators.Tukey(), MEASURED),
+        ),
+        jid.estimators.RelativeTo(size * rough(o.joints), jid.WeightedLeastSquares(MEASURED)),
     )
 
 
@@ -102,7 +105,7 @@ def test_what_needs_rows_refuses_factors(base, noisy, k):
         jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), members(noisy)[k])
 
 
-@pytest.mark.parametrize("loss", [jid.Huber(), jid.Tukey()])
+@pytest.mark.parametrize("loss", [jid.estimators.Huber(), jid.estimators.Tukey()])
 def test_a_loss_is_consistent_with_itself(loss):
     x = np.linspace(-8, 8, 4001)
     felt = x * loss.weight(x)
@@ -118,13 +121,15 @@ def test_a_loss_is_consistent_with_itself(loss):
 def test_huber_minimises_its_loss(base, noisy):
     """scipy's least squares with the same scales as an oracle."""
     o = with_forces(noisy, lambda f: np.add(f[::17], 5.0, out=f[::17]))
-    estimator = jid.IterativelyReweighted(jid.Huber(), MEASURED, tolerance=1e-9)
+    estimator = jid.estimators.IterativelyReweighted(
+        jid.estimators.Huber(), MEASURED, tolerance=1e-9
+    )
     fit = jid.identify(base, o, estimator)
     theta, forces, joint = dense(base, o)
     r = forces - theta @ fit.parameters
     scale = np.array([1.4826 * np.median(np.abs(r[joint == j])) for j in range(2)])[joint]
     size = np.asarray(fit.weights)[joint] * scale
-    c = jid.Huber().limit
+    c = jid.estimators.Huber().limit
 
     def residuals(p):
         x = np.abs((forces - theta @ p) / scale)
@@ -137,8 +142,8 @@ def test_huber_minimises_its_loss(base, noisy):
 
 def test_a_ridge_towards_a_prior_is_solved_as_numpy_does(base, noisy):
     share, prior = 0.3, 1.1 * standard_parameters(base.model)
-    ridge = jid.WeightedLeastSquares(MEASURED, jid.Ridge(share))
-    fit = jid.identify(base, noisy, jid.RelativeTo(prior, ridge))
+    ridge = jid.WeightedLeastSquares(MEASURED, jid.estimators.Ridge(share))
+    fit = jid.identify(base, noisy, jid.estimators.RelativeTo(prior, ridge))
     theta, forces, joint = dense(base, noisy)
     w = np.asarray(fit.weights)[joint]
     A, b = theta * w[:, None], forces * w
@@ -152,10 +157,12 @@ def test_a_ridge_towards_a_prior_is_solved_as_numpy_does(base, noisy):
     truth = np.asarray(base.from_standard(standard_parameters(base.model)))
     assert np.linalg.norm(fit.parameters - truth) < np.linalg.norm(plain.parameters - truth)
     with pytest.raises(ValueError, match="`parameters`"):
-        jid.identify(base, noisy, jid.RelativeTo(prior[:5], ridge))
+        jid.identify(base, noisy, jid.estimators.RelativeTo(prior[:5], ridge))
 
 
-@pytest.mark.parametrize(("loss", "gain"), [(jid.Huber(), 3.0), (jid.Tukey(), 5.0)])
+@pytest.mark.parametrize(
+    ("loss", "gain"), [(jid.estimators.Huber(), 3.0), (jid.estimators.Tukey(), 5.0)]
+)
 def test_outliers_do_little(base, loss, gain):
     p = standard_parameters(base.model)
     truth = np.asarray(base.from_standard(p))
@@ -163,7 +170,7 @@ def test_outliers_do_little(base, loss, gain):
     wild = np.random.default_rng(5).random(1500) < 0.05
     o = with_forces(o, lambda f: np.add(f, np.where(wild[:, None], [20.0, 4.0], 0.0), out=f))
     plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
-    fit = jid.identify(base, o, jid.IterativelyReweighted(loss, MEASURED))
+    fit = jid.identify(base, o, jid.estimators.IterativelyReweighted(loss, MEASURED))
     size = plain.naive_standard_deviations
     errors = [np.linalg.norm((f.parameters - truth) / size) for f in (fit, plain)]
     assert gain * errors[0] < errors[1]
@@ -177,7 +184,7 @@ def test_correlated_joints_are_solved_as_numpy_does(base):
     S = np.array([[1.0, 0.9 * 0.3], [0.9 * 0.3, 0.09]])
     noise = np.random.default_rng(3).standard_normal((400, 2)) @ np.linalg.cholesky(S).T
     o = with_forces(o, lambda f: np.add(f, noise, out=f))
-    fit = jid.identify(base, o, jid.GeneralisedLeastSquares(iterations=4))
+    fit = jid.identify(base, o, jid.estimators.GeneralisedLeastSquares(iterations=4))
     theta, forces, joint = dense(base, o)
     r = np.full((400, 2), np.nan)
     r[mask] = forces - theta @ fit.parameters
@@ -191,7 +198,7 @@ def test_correlated_joints_are_solved_as_numpy_does(base):
         theta.T @ np.linalg.solve(V, theta), theta.T @ np.linalg.solve(V, forces)
     )
     np.testing.assert_allclose(fit.parameters, expected, rtol=1e-4, atol=1e-4)
-    plain = jid.identify(base, o, jid.WeightedLeastSquares(jid.ResidualVariances()))
+    plain = jid.identify(base, o, jid.WeightedLeastSquares(jid.estimators.ResidualVariances()))
     assert np.median(fit.standard_deviations / plain.standard_deviations) < 0.9
 
 
@@ -210,7 +217,7 @@ def test_instruments_take_the_bias_of_noisy_columns_away(base):
         m = clean.motion
         o = clean.replace(motion=jid.Motion(m.q + noise[0], m.qd + noise[1], m.qdd + noise[2]))
         plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
-        fit = jid.identify(base, o, jid.InstrumentalVariables((reference,), MEASURED))
+        fit = jid.identify(base, o, jid.estimators.InstrumentalVariables((reference,), MEASURED))
         errors["plain"].append(plain.parameters - truth)
         errors["instruments"].append(fit.parameters - truth)
     # Means over the draws, in units of what chance lets them scatter.
@@ -220,4 +227,6 @@ def test_instruments_take_the_bias_of_noisy_columns_away(base):
     assert np.sqrt(np.mean(bias["instruments"] ** 2)) < 1.6
     assert np.sqrt(np.mean(bias["plain"] ** 2)) > 6.0
     with pytest.raises(ValueError, match="`references`"):
-        jid.identify(base, clean, jid.InstrumentalVariables((reference, reference), MEASURED))
+        jid.identify(
+            base, clean, jid.estimators.InstrumentalVariables((reference, reference), MEASURED)
+        )

@@ -8,7 +8,7 @@ import jaxid as jid
 from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.fit import Trust
 
-WEIGHTED = jid.WeightedLeastSquares(jid.MeasuredForces())
+WEIGHTED = jid.WeightedLeastSquares(jid.estimators.MeasuredForces())
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def noisy(base):
 @pytest.mark.parametrize(
     ("estimator", "weights"),
     [
-        (jid.LeastSquares(), [1.0, 1.0]),
+        (jid.estimators.LeastSquares(), [1.0, 1.0]),
         (jid.WeightedLeastSquares(), [1 / 40.0, 1 / 5.0]),
     ],
 )
@@ -63,12 +63,12 @@ def test_residual_variances_find_the_noise_of_each_joint(base):
     p = standard_parameters(base.model)
     noise = np.array([0.5, 0.02])
     o = observations(base.model, p, samples=4000, noise=noise)
-    fit = jid.identify(base, o, jid.WeightedLeastSquares(jid.ResidualVariances()))
+    fit = jid.identify(base, o, jid.WeightedLeastSquares(jid.estimators.ResidualVariances()))
     np.testing.assert_allclose(1 / fit.weights, noise, rtol=0.05)
     assert fit.undetermined == ()
 
 
-@pytest.mark.parametrize("estimator", [jid.LeastSquares(), WEIGHTED])
+@pytest.mark.parametrize("estimator", [jid.estimators.LeastSquares(), WEIGHTED])
 def test_naive_covariance_is_that_of_many_draws_of_independent_noise(base, estimator):
     p = standard_parameters(base.model)
     truth = np.asarray(base.from_standard(p))
@@ -77,7 +77,7 @@ def test_naive_covariance_is_that_of_many_draws_of_independent_noise(base, estim
             base,
             observations(base.model, p, samples=120, noise=np.array([0.5, 0.05]), noise_seed=seed),
             estimator,
-            uncertainty=jid.IndependentRows(),
+            uncertainty=jid.uncertainty.IndependentRows(),
         )
         for seed in range(200)
     ]
@@ -93,7 +93,7 @@ def test_several_recordings_are_fitted_together(base):
     two = [observations(base.model, p, noise=0.4, seed=s, noise_seed=s) for s in (1, 2)]
     stacked = [np.concatenate(x) for x in zip(*(dense(base, o) for o in two), strict=True)]
     expected, *_ = np.linalg.lstsq(stacked[0], stacked[1], rcond=None)
-    fit = jid.identify(base, two, jid.LeastSquares())
+    fit = jid.identify(base, two, jid.estimators.LeastSquares())
     np.testing.assert_allclose(fit.parameters, expected, rtol=1e-10)
     assert fit.rows == (800, 800)
 
@@ -115,9 +115,9 @@ def test_a_known_tool_is_taken_off():
     base = jid.base_parameters(jid.Model(robot))
     p = standard_parameters(base.model)
     o = observations(base.model, p)
-    fit = jid.identify(base, o, jid.LeastSquares())
+    fit = jid.identify(base, o, jid.estimators.LeastSquares())
     np.testing.assert_allclose(fit.parameters, base.from_standard(p), rtol=1e-9)
-    with_tool = jid.identify(bare, o, jid.LeastSquares())
+    with_tool = jid.identify(bare, o, jid.estimators.LeastSquares())
     assert np.abs(with_tool.parameters - fit.parameters).max() > 0.05
     errors = jid.validate(fit, o).errors[0]
     assert errors.relative < 1e-11
@@ -126,7 +126,7 @@ def test_a_known_tool_is_taken_off():
 def test_a_joint_that_never_moves_is_named_and_the_rest_is_right(base):
     p = standard_parameters(base.model)
     o = observations(base.model, p, still=(1,))
-    fit = jid.identify(base, o, jid.LeastSquares())
+    fit = jid.identify(base, o, jid.estimators.LeastSquares())
     named = {base.names[k] for d in fit.undetermined for k in d.parts}
     assert {"fv2", "fc2"} <= named
     assert fit.undetermined[0].uncertainty == np.inf
@@ -137,14 +137,18 @@ def test_a_joint_that_never_moves_is_named_and_the_rest_is_right(base):
     assert "fv2" in " ".join(d.sentence(base) for d in fit.undetermined)
 
 
-@pytest.mark.parametrize("solution", [jid.Complete(), jid.Truncated(), jid.Ridge()])
+@pytest.mark.parametrize(
+    "solution", [jid.estimators.Complete(), jid.estimators.Truncated(), jid.estimators.Ridge()]
+)
 def test_a_log_of_a_joint_that_stands_gives_no_absurd_estimates(base, solution):
     """From the recorded angles on, whose differences must not make columns out of rounding."""
     robot, p = base.model.robot, standard_parameters(base.model)
     o = observations(base.model, p, still=(1,), samples=2000, noise=0.1)
     log = jid.Recording.of(np.asarray(o.motion.q) + 0.3, o.forces, sample_time=0.005)
     fit = jid.identify(
-        base, jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0)), jid.LeastSquares(solution)
+        base,
+        jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0)),
+        jid.estimators.LeastSquares(solution),
     )
     assert np.abs(fit.parameters).max() < 1e3
     open_ = [base.names.index(name) for name in ("fv2", "fc2")]
@@ -156,15 +160,15 @@ def test_columns_of_nothing_but_rounding_count_as_zero():
     rng = np.random.default_rng(0)
     R = rng.normal(size=(20, 3)) * [1.0, 1e-13, 1.0]
     d = Decomposition.of(R, rng.normal(size=20))
-    p = d.solve(jid.Complete().inverse(d.values))
+    p = d.solve(jid.estimators.Complete().inverse(d.values))
     assert p[1] == 0.0
     assert np.abs(p).max() < 10.0
 
 
 def test_what_a_solution_pulls_is_said(base, noisy):
     assert jid.identify(base, noisy).notes == ()
-    for solution in (jid.Ridge(0.3), jid.Truncated(0.3)):
-        (note,) = jid.identify(base, noisy, jid.LeastSquares(solution)).notes
+    for solution in (jid.estimators.Ridge(0.3), jid.estimators.Truncated(0.3)):
+        (note,) = jid.identify(base, noisy, jid.estimators.LeastSquares(solution)).notes
         assert f"of {base.size} directions" in note
         assert "not how far this pull takes them from the truth" in note
 
@@ -185,16 +189,16 @@ def test_truncated_solution_leaves_weak_directions_at_zero(base, noisy):
     blocks = jid.RegressionProblem(base, [noisy]).blocks
     d = Decomposition.of(*blocks.total.weighted(weights))
     share = float(d.values[4] / d.values[0]) * 0.999
-    fit = jid.identify(base, noisy, jid.LeastSquares(jid.Truncated(share)))
+    fit = jid.identify(base, noisy, jid.estimators.LeastSquares(jid.estimators.Truncated(share)))
     along = np.asarray(d.directions) @ (np.asarray(d.scale) * fit.parameters)
     np.testing.assert_allclose(along[5:], 0.0, atol=1e-12 * np.abs(along).max())
-    complete = jid.identify(base, noisy, jid.LeastSquares())
+    complete = jid.identify(base, noisy, jid.estimators.LeastSquares())
     full = np.asarray(d.directions) @ (np.asarray(d.scale) * complete.parameters)
     np.testing.assert_allclose(along[:5], full[:5], rtol=1e-10)
 
 
 def test_ridge_solves_its_normal_equations(base, noisy):
-    fit = jid.identify(base, noisy, jid.LeastSquares(jid.Ridge(0.1)))
+    fit = jid.identify(base, noisy, jid.estimators.LeastSquares(jid.estimators.Ridge(0.1)))
     theta, forces, _ = dense(base, noisy)
     scale = np.linalg.norm(theta, axis=0)
     A = theta / scale
@@ -205,15 +209,15 @@ def test_ridge_solves_its_normal_equations(base, noisy):
 
 def test_cross_validation_leaves_clean_data_alone(base):
     o = observations(base.model, standard_parameters(base.model), noise=1e-3)
-    fit = jid.identify(base, o, jid.LeastSquares(jid.CrossValidated()))
+    fit = jid.identify(base, o, jid.estimators.LeastSquares(jid.estimators.CrossValidated()))
     assert fit.solution.strength < 2e-3
 
 
 def test_cross_validation_pulls_where_data_are_poor(base):
     p = standard_parameters(base.model)
     o = observations(base.model, p, samples=60, noise=20.0)
-    fit = jid.identify(base, o, jid.LeastSquares(jid.CrossValidated()))
-    plain = jid.identify(base, o, jid.LeastSquares())
+    fit = jid.identify(base, o, jid.estimators.LeastSquares(jid.estimators.CrossValidated()))
+    plain = jid.identify(base, o, jid.estimators.LeastSquares())
     fresh = observations(base.model, p, samples=800, seed=9)
     assert fit.solution.strength > 1e-2
     errors = [jid.validate(f, fresh).errors[0].relative for f in (fit, plain)]
@@ -236,9 +240,9 @@ def test_refusals(base, noisy):
 
 def test_what_is_undetermined_is_not_trusted_however_small_its_deviation(base):
     p = standard_parameters(base.model)
-    fit = jid.identify(base, observations(base.model, p, still=(1,)), jid.LeastSquares())
+    fit = jid.identify(base, observations(base.model, p, still=(1,)), jid.estimators.LeastSquares())
     parts = {k for d in fit.undetermined for k in d.parts}
     assert parts
     assert all(fit.trust[k] is Trust.NONE for k in parts)
-    good = jid.identify(base, observations(base.model, p), jid.LeastSquares())
+    good = jid.identify(base, observations(base.model, p), jid.estimators.LeastSquares())
     assert set(good.trust) == {Trust.GOOD}

@@ -32,8 +32,12 @@ def test_chosen_on_one_motion_a_ridge_transfers_to_others(recordings):
     assert base.size == 58
     identification, *verification = recordings
     plain, ridge = (
-        jid.identify(base, identification, jid.WeightedLeastSquares(jid.MeasuredForces(), solution))
-        for solution in (jid.Complete(), jid.CrossValidated())
+        jid.identify(
+            base,
+            identification,
+            jid.WeightedLeastSquares(jid.estimators.MeasuredForces(), solution),
+        )
+        for solution in (jid.estimators.Complete(), jid.estimators.CrossValidated())
     )
     assert len(plain.undetermined) >= 5
     named = plain.undetermined[0].sentence(base)

@@ -28,8 +28,8 @@ def fit(robot):
     terms = (
         jid.RigidBodies(),
         jid.ViscousFriction(),
-        jid.StribeckFriction(speed=[0.1, 0.2], transition=jid.Tanh(1e-3)),
-        jid.TemperatureScaled(jid.ConstantOffset(), rate=0.02),
+        jid.terms.StribeckFriction(speed=[0.1, 0.2], transition=jid.terms.Tanh(1e-3)),
+        jid.terms.TemperatureScaled(jid.ConstantOffset(), rate=0.02),
     )
     model = jid.Model(robot, terms)
     p = standard_parameters(model)
@@ -115,7 +115,7 @@ def test_every_number_survives(number):
     assert np.array(again).tobytes() == np.array(number).tobytes()
 
 
-class TermOfOnesOwn(jid.AbstractTerm):
+class TermOfOnesOwn(jid.terms.AbstractTerm):
     power: float = 3.0
 
     def parameters(self, robot):
@@ -127,20 +127,23 @@ class TermOfOnesOwn(jid.AbstractTerm):
 
 def test_a_term_of_ones_own_is_found_where_it_is_known():
     values = to_json(TermOfOnesOwn(2.0))
-    assert from_json(values, jid.AbstractTerm) == TermOfOnesOwn(2.0)
+    assert from_json(values, jid.terms.AbstractTerm) == TermOfOnesOwn(2.0)
     with pytest.raises(ValueError, match=r"`Cubic` , which|is a `Cubic`, which is not known"):
-        from_json({**values, "kind": "Cubic"}, jid.AbstractTerm)
+        from_json({**values, "kind": "Cubic"}, jid.terms.AbstractTerm)
 
 
 def test_a_class_outside_of_the_family_is_not_looked_up():
     with pytest.raises(ValueError, match="not known"):
-        from_json({"kind": "WeightedLeastSquares"}, jid.AbstractTerm)
+        from_json({"kind": "WeightedLeastSquares"}, jid.terms.AbstractTerm)
 
 
 def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
     log = observations(fit.base.model, standard_parameters(fit.base.model))
     fit = dataclasses.replace(
-        fit, estimator=jid.NonlinearFriction(free=lambda terms: [terms[1].transition.epsilon])
+        fit,
+        estimator=jid.estimators.NonlinearFriction(
+            free=lambda terms: [terms[1].transition.epsilon]
+        ),
     )
     loaded = jid.load(fit.save(tmp_path / "arm.json"))
     assert str(loaded.estimator) == str(fit.estimator)

@@ -13,14 +13,14 @@ from jaxid.identification.estimators.friction_rows import SeparableProblem, sele
 
 ROBOT = jid.robots.planar_arm(3)
 TRUE_EPSILON, TRUE_SPEED = np.array([0.02, 0.05, 0.03]), np.array([0.2, 0.3, 0.15])
-WLS = jid.WeightedLeastSquares(jid.Unweighted())
+WLS = jid.WeightedLeastSquares(jid.estimators.Unweighted())
 
 
 def model(epsilon, speed=None, exponent=2.0):
     dry = (
-        jid.CoulombFriction(jid.Tanh(epsilon))
+        jid.CoulombFriction(jid.terms.Tanh(epsilon))
         if speed is None
-        else jid.StribeckFriction(speed, exponent, jid.Tanh(epsilon))
+        else jid.terms.StribeckFriction(speed, exponent, jid.terms.Tanh(epsilon))
     )
     terms = (jid.RigidBodies(), jid.ViscousFriction(), dry, jid.ConstantOffset())
     return jid.Model(ROBOT, terms)
@@ -149,13 +149,13 @@ def test_two_recordings_are_fitted_together():
 
 
 def test_what_cannot_be_searched_is_refused():
-    terms = (jid.RigidBodies(), jid.CoulombFriction(jid.HardSign()))
+    terms = (jid.RigidBodies(), jid.CoulombFriction(jid.terms.HardSign()))
     hard = jid.base_parameters(jid.Model(ROBOT, terms))
     with pytest.raises(ValueError, match="`model`"):
         select_shapes(hard)
     with pytest.raises(ValueError, match="`free`"):
         select_shapes(START, lambda terms: (terms[2].transition.dead_zone,))
-    friction = jid.StribeckFriction(), jid.LoadFriction(np.ones((3, 10)))
+    friction = jid.terms.StribeckFriction(), jid.terms.LoadFriction(np.ones((3, 10)))
     double = jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), *friction)))
     with pytest.raises(ValueError, match="`eps`"):
         select_shapes(double, lambda t: (t[1].transition.epsilon, t[2].transition.epsilon))
@@ -173,18 +173,24 @@ def test_friction_falls_with_temperature_as_fits_at_several_tell():
     base = jid.base_parameters(jid.Model(ROBOT, (*dry, jid.ViscousFriction())))
     fits = []
     for seed, temperature in enumerate((15.0, 30.0, 45.0)):
-        warm = jid.TemperatureScaled(jid.ViscousFriction(), rates, temperature)
+        warm = jid.terms.TemperatureScaled(jid.ViscousFriction(), rates, temperature)
         truth = jid.Model(ROBOT, (*dry, warm))
         p = virtual.standard_parameters(truth, seed=4)
         o = virtual.observations(truth, p, samples=600, noise=0.3, noise_seed=seed)
         fits.append(jid.identify(base, o, WLS))
-    law = jid.temperature_law(fits, (15.0, 30.0, 45.0), jid.ViscousFriction())
+    law = jid.identification.nonlinear_friction.temperature_law(
+        fits, (15.0, 30.0, 45.0), jid.ViscousFriction()
+    )
     assert law.names == ("fv1", "fv2", "fv3")
     assert (np.abs(law.rates - rates) < 4 * law.rate_deviations).all()
     assert law.rate_deviations.max() < 0.005
     assert (np.abs(law.values - p[-3:]) < 4 * law.value_deviations).all()
     np.testing.assert_array_equal(law.term.rate, law.rates)
     with pytest.raises(ValueError, match="at least two different"):
-        jid.temperature_law(fits, (15.0, 15.0, 15.0), jid.ViscousFriction())
+        jid.identification.nonlinear_friction.temperature_law(
+            fits, (15.0, 15.0, 15.0), jid.ViscousFriction()
+        )
     with pytest.raises(ValueError, match="must have one parameter for each joint"):
-        jid.temperature_law(fits, (15.0, 30.0, 45.0), jid.StribeckFriction())
+        jid.identification.nonlinear_friction.temperature_law(
+            fits, (15.0, 30.0, 45.0), jid.terms.StribeckFriction()
+        )

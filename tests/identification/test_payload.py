@@ -159,12 +159,14 @@ def test_removing_a_delay_undoes_it():
     angles = np.sin(np.outer(t, [3.0, 5.0]))
     shifted = np.sin(np.outer(t - 0.0234, [3.0, 5.0]))
     log = jid.Recording.of(angles, shifted, velocities=angles, sample_time=0.01)
-    back = jid.remove_delay(log, 0.0234)
+    back = jid.measurement.recording.remove_delay(log, 0.0234)
     assert back.samples == 397
     np.testing.assert_allclose(back.time, t[3:])
     np.testing.assert_allclose(back.angles[3:-3], back.forces[3:-3], atol=2e-6)
     np.testing.assert_allclose(back.velocities, back.angles)
-    early = jid.remove_delay(jid.Recording.of(shifted, angles, sample_time=0.01), -0.0234)
+    early = jid.measurement.recording.remove_delay(
+        jid.Recording.of(shifted, angles, sample_time=0.01), -0.0234
+    )
     assert early.samples == 397
     np.testing.assert_allclose(early.angles[3:-3], early.forces[3:-3], atol=2e-6)
     assert "23.4 ms was removed" in back.notes[-1]
@@ -205,4 +207,4 @@ def test_refusals(base):
         jid.identify_drive_gains(*of(other, runs(base)), LOAD)
     recording = jid.Recording.of(np.zeros((20, 3)), np.ones((20, 3)), sample_time=0.01)
     with pytest.raises(ValueError, match=r"but the longest segment of `recording` lasts 0.2 s"):
-        jid.remove_delay(recording, 1.0)
+        jid.measurement.recording.remove_delay(recording, 1.0)

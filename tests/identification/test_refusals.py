@@ -9,14 +9,32 @@ import pytest
 import jaxid as jid
 
 MADE = {
-    "weights of zero": (lambda: jid.GivenWeights(np.zeros(2)), "not all zero, but are"),
-    "weights below zero": (lambda: jid.GivenWeights([1.0, -1.0]), "none below zero"),
-    "weights that are no number": (lambda: jid.GivenWeights([np.nan, 1.0]), "one finite number"),
-    "a share of all": (lambda: jid.Truncated(2.0), "`share` of `Truncated` must be at least 0 and"),
-    "a negative ridge": (lambda: jid.Ridge(-1.0), "`share` of `Ridge` must be a finite number"),
-    "a ridge that is no number": (lambda: jid.Ridge(np.nan), "`share` of `Ridge` must be"),
-    "a limit that is no number": (lambda: jid.Huber(np.nan), "`limit` of `Huber` must be a posit"),
-    "a limit of zero": (lambda: jid.Tukey(0.0), "`limit` of `Tukey` must be a positive number"),
+    "weights of zero": (lambda: jid.estimators.GivenWeights(np.zeros(2)), "not all zero, but are"),
+    "weights below zero": (lambda: jid.estimators.GivenWeights([1.0, -1.0]), "none below zero"),
+    "weights that are no number": (
+        lambda: jid.estimators.GivenWeights([np.nan, 1.0]),
+        "one finite number",
+    ),
+    "a share of all": (
+        lambda: jid.estimators.Truncated(2.0),
+        "`share` of `Truncated` must be at least 0 and",
+    ),
+    "a negative ridge": (
+        lambda: jid.estimators.Ridge(-1.0),
+        "`share` of `Ridge` must be a finite number",
+    ),
+    "a ridge that is no number": (
+        lambda: jid.estimators.Ridge(np.nan),
+        "`share` of `Ridge` must be",
+    ),
+    "a limit that is no number": (
+        lambda: jid.estimators.Huber(np.nan),
+        "`limit` of `Huber` must be a posit",
+    ),
+    "a limit of zero": (
+        lambda: jid.estimators.Tukey(0.0),
+        "`limit` of `Tukey` must be a positive number",
+    ),
     "a negative torque": (
         lambda: jid.Drives(2, max_torques=[-5.0, 1.0]),
         "`max_torques` must be positive, but that of joint 1 is -5",
@@ -45,9 +63,9 @@ def test_what_cannot_be_is_refused_where_it_is_made(make, sentence):
 
 
 def test_weights_go_through_jit_and_vmap():
-    total = jax.jit(lambda w: jid.GivenWeights(w).weights.sum())
+    total = jax.jit(lambda w: jid.estimators.GivenWeights(w).weights.sum())
     assert total(np.zeros(2)) == 0.0
-    made = jid.GivenWeights(np.ones((3, 2))[0])
+    made = jid.estimators.GivenWeights(np.ones((3, 2))[0])
     axes = jax.tree.map(lambda _: 0, made)
     many = jax.tree.map(lambda w: np.stack([0.0 * w, w]), made)
     sums = jax.vmap(lambda one: one.weights.sum(), in_axes=(axes,))(many)
@@ -68,9 +86,9 @@ def test_what_does_not_belong_together_is_named():
         identify(base, recording)
     with pytest.raises(TypeError, match="`base` must be base parameters, but is a `Model`"):
         identify(model, observed)
-    weights = jid.GivenWeights(np.ones(3))
+    weights = jid.estimators.GivenWeights(np.ones(3))
     with pytest.raises(ValueError, match="one number for each of the 2 joints of `planar arm"):
         jid.identify(base, observed, jid.WeightedLeastSquares(weights))
-    fit = jid.identify(base, observed, jid.LeastSquares())
+    fit = jid.identify(base, observed, jid.estimators.LeastSquares())
     with pytest.raises(ValueError, match="`motion` must be of the 2 joints of `planar arm"):
         fit.predict(jid.Motion(*np.zeros((3, 5, 3))))

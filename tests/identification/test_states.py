@@ -91,7 +91,7 @@ def test_what_changed_is_found_and_what_is_shared_is_tested(base, truths):
         zip(*(lambda c: (c.first.names, c.verdicts))(found.compare("cold", "warm")), strict=True)
     )
     assert set(verdicts) == {base.names[k] for k in found.varying}
-    assert verdicts["fv1"] is jid.Verdict.CHANGED
+    assert verdicts["fv1"] is jid.identification.runs.comparison.Verdict.CHANGED
     assert found.sharing[1] > 1e-3
     cold, _ = truths
     heavier = cold.copy()
@@ -114,7 +114,7 @@ def test_what_stores_energy_is_told_by_physics_not_by_names(base):
     stored = dict(zip(base.names, stores_energy(base), strict=True))
     assert stored["C1"]
     assert not stored["fv1"]
-    terms = (jid.RigidBodies(), jid.LinearSpring(), jid.RotorInertia(), jid.CoulombFriction())
+    terms = (jid.RigidBodies(), jid.terms.LinearSpring(), jid.RotorInertia(), jid.CoulombFriction())
     other = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
     stored = dict(zip(other.names, stores_energy(other), strict=True))
     assert stored["ks1"]
@@ -143,7 +143,7 @@ def test_an_update_equals_the_joint_fit(base, truths):
 
 def test_runs_with_weights_of_their_own_keep_them(base, truths):
     two = observed(base, truths)
-    weights = jid.ResidualVariances()
+    weights = jid.estimators.ResidualVariances()
     one, other = (jid.identify(base, o, estimator=jid.WeightedLeastSquares(weights)) for o in two)
     assert np.abs(one.weights / other.weights - 1).max() > 1e-6
     E = np.eye(base.size)
@@ -191,7 +191,7 @@ def test_a_fit_from_a_file_goes_on_exactly(base, truths, tmp_path):
 
 def test_other_estimates_are_solved_anew_from_their_factors(base, truths):
     one, other = observed(base, truths)
-    robust = jid.identify(base, one, jid.IterativelyReweighted())
+    robust = jid.identify(base, one, jid.estimators.IterativelyReweighted())
     assert not robust.is_least_squares
     np.testing.assert_allclose(
         jid.update(robust, jid.identify(base, other)).parameters,

@@ -8,7 +8,7 @@ import pytest
 from virtual import motion, standard_parameters
 
 import jaxid as jid
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification import streaming
 from jaxid.measurement import chunked_files, units
 from jaxid.measurement.log_on_disk import filter_memory, scan_log
@@ -87,7 +87,7 @@ def test_parquet_compiled(base, parquet, monkeypatch):
     log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, EVERY)
     agree(base, log, in_memory(base, parquet, EVERY))
     fractions = []
-    fit = jid.identify(base, log, jid.LeastSquares(), progress=fractions.append)
+    fit = jid.identify(base, log, jid.estimators.LeastSquares(), progress=fractions.append)
     assert fit.recordings == ("log",)
     assert fractions == sorted(fractions)
     assert fractions[-1] == 1.0
@@ -127,7 +127,7 @@ def test_how_long_filters_remember():
     assert slow > 5 * fast
     assert filter_memory(jid.ZeroPhaseButterworth(math.inf), DT, True) < 10
     with pytest.raises(NeedsMemory, match="PeriodicFourier"):
-        filter_memory(jid.PeriodicFourier(2.0, 3), DT, False)
+        filter_memory(jid.filters.PeriodicFourier(2.0, 3), DT, False)
 
 
 @pytest.mark.usefixtures("short_parts")

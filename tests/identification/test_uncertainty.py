@@ -8,11 +8,11 @@ from scipy import signal, special
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.uncertainty import spectra
 from jaxid.identification.uncertainty.spectral import SpectralTable, sandwich
 
-ESTIMATOR = jid.WeightedLeastSquares(jid.MeasuredForces())
+ESTIMATOR = jid.WeightedLeastSquares(jid.estimators.MeasuredForces())
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +199,12 @@ def test_intervals_by_the_fit(base):
 
 
 @pytest.mark.parametrize(
-    "method", [jid.SpectralSandwich(), jid.BlockJackknife(), jid.IndependentRows()]
+    "method",
+    [
+        jid.uncertainty.SpectralSandwich(),
+        jid.uncertainty.BlockJackknife(),
+        jid.uncertainty.IndependentRows(),
+    ],
 )
 def test_every_way_gives_a_whole_uncertainty(base, method):
     p = standard_parameters(base.model)

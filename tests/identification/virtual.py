@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 import jaxid as jid
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 
 
 def standard_parameters(model: jid.Model, seed: int = 0) -> np.ndarray:
@@ -37,7 +37,7 @@ def observations(
     seed: int = 0,
     noise_seed: int = 0,
     still: tuple[int, ...] = (),
-    filter: jid.AbstractFilter | None = None,
+    filter: jid.filters.AbstractFilter | None = None,
     every: int = 1,
     mask: np.ndarray | None = None,
 ) -> jid.Observations:

@@ -293,7 +293,7 @@ def planar_tip(q):
 
 
 def tip_in_space(robot, motion):
-    return np.asarray(jid.tip_motion(robot, motion).position)
+    return np.asarray(jid.constraints.tip_motion(robot, motion).position)
 
 
 def test_the_path_is_that_of_the_tip_and_its_colours_are_speeds(motion):
@@ -308,18 +308,17 @@ def test_the_path_is_that_of_the_tip_and_its_colours_are_speeds(motion):
     speeds = np.asarray(line.get_array())
     middle = 0.5 * (numerical[1:] + numerical[:-1])
     np.testing.assert_allclose(speeds[2:-2], middle[2:-2], atol=5e-3)
-    assert f"up to {np.linalg.norm(jid.tip_motion(robot, motion).velocity, axis=1).max():.3g}" in (
-        figure.texts[0].get_text()
-    )
+    fastest = np.linalg.norm(jid.constraints.tip_motion(robot, motion).velocity, axis=1).max()
+    assert f"up to {fastest:.3g}" in figure.texts[0].get_text()
 
 
 def test_poses_show_joints_capsules_and_what_stands_still(motion):
     robot = arm_of(2)
     shapes = (
-        jid.Capsule("link", 1, start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), radius=0.1),
-        jid.Capsule("post", -1, start=(0.0, 1.5, 0.0), end=(0.0, 2.5, 0.0), radius=0.2),
+        jid.collision.Capsule("link", 1, start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), radius=0.1),
+        jid.collision.Capsule("post", -1, start=(0.0, 1.5, 0.0), end=(0.0, 2.5, 0.0), radius=0.2),
     )
-    collision = jid.CollisionModel(robot, shapes, pairs=(("link", "post"),))
+    collision = jid.collision.CollisionModel(robot, shapes, pairs=(("link", "post"),))
     figure = jid.plot.poses(robot, motion.q, collision, poses=4)
     (axes,) = figure.axes
     polygons = [c for c in axes.collections if isinstance(c, PolyCollection)]

@@ -76,8 +76,8 @@ def fit_of(parameters):
         residual_rms=np.ones(2),
         residual=0.0,
         undetermined=(),
-        estimator=jid.LeastSquares(),
-        solution=jid.Complete(),
+        estimator=jid.estimators.LeastSquares(),
+        solution=jid.estimators.Complete(),
         recordings=(),
         notes=(),
     )

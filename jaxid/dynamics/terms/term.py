@@ -39,16 +39,6 @@ class NonlinearParameter(NamedTuple):
         """Return the current value in its term: a scalar, or one number for each joint."""
         return functools.reduce(getattr, self.path, owner)
 
-    @property
-    def leaf(self) -> Any:
-        """The method `value`; the former name."""
-        return self.value
-
-    @property
-    def wanted(self) -> bool:
-        """The field `default`; the former name."""
-        return self.default
-
     def inside(self, attribute: str) -> "NonlinearParameter":
         """Return the parameter as seen from a term that holds its owner as an attribute."""
         return self._replace(path=(attribute, *self.path))
@@ -110,11 +100,6 @@ class AbstractTerm(eqx.Module):
     def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
         """Parameters that `identify_nonlinear` can identify; none for most terms."""
         return ()
-
-    @property
-    def shapes(self) -> tuple[NonlinearParameter, ...]:
-        """The property `nonlinear_parameters`; the former name."""
-        return self.nonlinear_parameters
 
     @property
     def body_parameters(self) -> int:

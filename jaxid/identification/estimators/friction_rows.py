@@ -11,9 +11,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.machine import program_of
-from jaxid.dynamics.terms import AbstractTerm
-from jaxid.dynamics.transitions import Shape
+from jaxid.dynamics.dispatch import program_of
+from jaxid.dynamics.terms import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks, Factors, JointFactor, RowChunk
 from jaxid.identification.problem import RegressionProblem
@@ -33,7 +32,7 @@ class Shapes(eqx.Module):
     """
 
     robot: Robot
-    members: tuple[tuple[int, Shape], ...] = eqx.field(static=True)
+    members: tuple[tuple[int, NonlinearParameter], ...] = eqx.field(static=True)
 
     @property
     def size(self) -> int:
@@ -63,7 +62,7 @@ class Shapes(eqx.Module):
         terms, n = base.model.terms, self.robot.joints
         x = np.concatenate(
             [
-                np.broadcast_to(np.asarray(shape.leaf(terms[i]), np.float64), (n,))
+                np.broadcast_to(np.asarray(shape.value(terms[i]), np.float64), (n,))
                 for i, shape in self.members
             ]
         )
@@ -81,7 +80,7 @@ class Shapes(eqx.Module):
         """Return the terms of a model with other shapes."""
         changed = list(terms)
         for (i, shape), row in zip(self.members, x.reshape(len(self.members), -1), strict=True):
-            changed[i] = eqx.tree_at(shape.leaf, changed[i], row)
+            changed[i] = eqx.tree_at(shape.value, changed[i], row)
         return tuple(changed)
 
     def set(self, base: BaseParameters, x: Float[AnyArray, " shapes"]) -> BaseParameters:
@@ -104,7 +103,9 @@ def select_shapes(base: BaseParameters, free: Selection | None = None) -> Shapes
     terms = base.model.terms
     numbered = jax.tree.unflatten(jax.tree.structure(terms), range(len(jax.tree.leaves(terms))))
     selected = None if free is None else set(jax.tree.leaves(tuple(free(numbered))))
-    known = [(i, s, s.leaf(numbered[i])) for i, t in enumerate(terms) for s in t.shapes]
+    known = [
+        (i, s, s.value(numbered[i])) for i, t in enumerate(terms) for s in t.nonlinear_parameters
+    ]
     if selected is not None and not selected <= {leaf for _, _, leaf in known}:
         raise InputError(
             "`free` selects a leaf that is no shape of a friction law: select one like "
@@ -113,7 +114,7 @@ def select_shapes(base: BaseParameters, free: Selection | None = None) -> Shapes
     members = tuple(
         (i, shape)
         for i, shape, leaf in known
-        if (shape.wanted if selected is None else leaf in selected)
+        if (shape.default if selected is None else leaf in selected)
     )
     names = [shape.name for _, shape in members]
     if not names:

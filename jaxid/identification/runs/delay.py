@@ -7,7 +7,6 @@ import numpy as np
 from scipy import stats
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.dynamics import compiled
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractWeights, Complete, MaximumForces
@@ -136,7 +135,7 @@ def _with_delays(
     """Return factors with a column for the delay of each joint behind the others."""
     late = []
     for o in recordings:
-        forces = compiled.forces(base, p, o.motion)
+        forces = base.forces_in_numpy(p, o.motion)
         dt = o.sample_time
         rates = np.concatenate([np.gradient(forces[a:b], dt, axis=0) for a, b in o.segments])
         late.append(-o.reduce(rates))
@@ -146,7 +145,7 @@ def _with_delays(
         rows = zip(chunk.columns, delays.T, chunk.forces.T, chunk.mask.T, strict=True)
         return [np.column_stack([theta, d, force])[kept] for theta, d, force, kept in rows]
 
-    acting = enumerate(compiled.acting_columns(base))
+    acting = enumerate(base.acting_columns)
     columns = [(*own, base.size + j) for j, own in acting]
     problem = RegressionProblem(base, recordings, divisions=divisions)
     return problem.fold(equations, columns, base.size + len(columns))

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxid.arrays import Bool, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.machine import in_numpy
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.comparison import LEVEL, Comparison, joint_test

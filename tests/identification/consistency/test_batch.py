@@ -17,7 +17,7 @@ def test_a_batch_is_its_data_sets_one_by_one():
     base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.5), TERMS))
     factors = [arms.factor(base, seed, 0.2, 100) for seed in range(3)]
     R, z, rows = (np.array([f[k] for f in factors]) for k in range(3))
-    many = jid.consistent_batch(base, R, z, rows)
+    many = jid.consistency.consistent_batch(base, R, z, rows)
     estimator = PhysicallyConsistent()
     feasible = estimator.feasible_set(base)
     for k in range(3):
@@ -32,17 +32,17 @@ def test_a_batch_is_its_data_sets_one_by_one():
     bodies = np.asarray(many.standard)[:, :20].reshape(3, 2, 10)
     assert (consistency_margin(bodies) > 0).all()
     with pytest.raises(ValueError, match="`R`, `z` and `rows` must have the shapes"):
-        jid.consistent_batch(base, R[:, :, :-1], z, rows)
+        jid.consistency.consistent_batch(base, R[:, :, :-1], z, rows)
 
 
 def test_a_solver_is_a_function_of_arrays():
     base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.5), TERMS))
     R, z, rows, _ = arms.factor(base, 0, 0.2, 100)
     estimator = PhysicallyConsistent(margin=0.1)
-    solver = jid.ConsistentSolver(base, estimator)
-    assert solver == jid.ConsistentSolver(base, PhysicallyConsistent(margin=0.1))
-    assert solver != jid.ConsistentSolver(base)
+    solver = jid.consistency.ConsistentSolver(base, estimator)
+    assert solver == jid.consistency.ConsistentSolver(base, PhysicallyConsistent(margin=0.1))
+    assert solver != jid.consistency.ConsistentSolver(base)
     one = jax.jit(solver)(R, z, rows)
-    many = jid.consistent_batch(base, R[None], z[None], np.array([rows]), estimator)
+    many = jid.consistency.consistent_batch(base, R[None], z[None], np.array([rows]), estimator)
     np.testing.assert_allclose(one.standard, many.standard[0], rtol=1e-6, atol=1e-9)
     assert one.parameters.shape == (base.size,)

@@ -19,7 +19,7 @@ def test_it_is_the_integral_of_points():
     J -= np.einsum("k,ki,kj->ij", m, r, r)
     body = [m.sum(), *(m @ r), J[0, 0], J[1, 1], J[2, 2], -J[1, 2], -J[0, 2], -J[0, 1]]
     points = np.column_stack([r, np.ones(8)])
-    P = jid.pseudo_inertia(np.array(body))
+    P = jid.consistency.pseudo_inertia(np.array(body))
     np.testing.assert_allclose(P, np.einsum("k,ki,kj->ij", m, points, points), rtol=1e-12)
     np.testing.assert_allclose(inertial_parameters(P), body, rtol=1e-12)
 
@@ -28,7 +28,7 @@ def test_the_order_is_that_of_tools():
     tool = jid.Tool(0, mass=2.0, centre_of_mass=(0.1, -0.2, 0.3), inertia=0.08 * np.eye(3))
     radius = np.sqrt(0.08 / 2.0 * 5 / 2)
     P = ball(np.array(2.0), np.array([0.1, -0.2, 0.3]), np.array(radius))
-    np.testing.assert_allclose(jid.pseudo_inertia(tool.parameters), P, rtol=1e-12)
+    np.testing.assert_allclose(jid.consistency.pseudo_inertia(tool.parameters), P, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -49,20 +49,20 @@ BODY = inertial_parameters(ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.arr
 
 
 def test_a_possible_body_stays():
-    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
+    bounds = jid.consistency.BodyBounds(mass_max=10.0, radius=0.5)
     assert consistency_margin(BODY) > 0
-    found = jid.consistent_body(BODY, 1e-4 * np.eye(10), bounds)
+    found = jid.consistency.consistent_body(BODY, 1e-4 * np.eye(10), bounds)
     np.testing.assert_allclose(found.parameters, BODY, atol=1e-4)
     assert found.distance < 0.05
     assert found.outcome is Outcome.CERTIFIED
 
 
 def test_an_impossible_body_moves_as_little_as_its_errors_allow():
-    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
+    bounds = jid.consistency.BodyBounds(mass_max=10.0, radius=0.5)
     wrong = BODY.copy()
     wrong[6] = -0.02
     covariance = np.diag([1e-4, *[1e-4] * 3, *[1e-6] * 2, 1e-2, *[1e-6] * 3])
-    found = jid.consistent_body(wrong, covariance, bounds)
+    found = jid.consistency.consistent_body(wrong, covariance, bounds)
     assert consistency_margin(found.parameters) > 0
     assert abs(found.parameters[4] - wrong[4]) < 5e-3
     assert found.parameters[6] > 0
@@ -71,6 +71,6 @@ def test_an_impossible_body_moves_as_little_as_its_errors_allow():
 
 
 def test_an_undetermined_body_is_refused():
-    bounds = jid.BodyBounds(mass_max=10.0, radius=0.5)
+    bounds = jid.consistency.BodyBounds(mass_max=10.0, radius=0.5)
     with pytest.raises(ValueError, match="`covariance`"):
-        jid.consistent_body(BODY, np.diag([1.0] * 9 + [-1.0]), bounds)
+        jid.consistency.consistent_body(BODY, np.diag([1.0] * 9 + [-1.0]), bounds)

@@ -31,7 +31,7 @@ def _robot(name):
 
 def _case(name, terms=TERMS, margin=0.0, **bounds):
     base = jid.base_parameters(jid.Model(_robot(name), terms))
-    wide = jid.BodyBounds.from_geometry(base.model.robot)
+    wide = jid.consistency.BodyBounds.from_geometry(base.model.robot)
     return base, feasible_set(base.model, wide.replace(**bounds), margin)
 
 
@@ -41,7 +41,7 @@ def _program(feasible, data):
 
 CASES = {
     "a seven-axis arm": (_case("panda"), 0.2),
-    "coupled drives": (_case("tx40", (*TERMS, jid.CoupledDrives())), 0.3),
+    "coupled drives": (_case("tx40", (*TERMS, jid.terms.CoupledDrives())), 0.3),
     "a rail": (_case("rail"), 0.1),
     "seven parameters": (_case("planar", (jid.RigidBodies(principal_axes=True), *TERMS[1:])), 0.2),
     "all bounds": (

@@ -17,7 +17,7 @@ from virtual import observations
 
 FRICTION = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia(), jid.ConstantOffset())
 TERMS = (jid.RigidBodies(), *FRICTION)
-WEIGHTS = jid.MeasuredForces()
+WEIGHTS = jid.estimators.MeasuredForces()
 
 
 def case(robot, terms=TERMS, noise=3.0, samples=150):
@@ -84,7 +84,7 @@ def test_without_noise_the_truth_is_found():
 
 
 def test_coupled_drives_are_definite():
-    terms = (*TERMS, jid.CoupledDrives())
+    terms = (*TERMS, jid.terms.CoupledDrives())
     base, _, o = case(jid.robots.tx40(), terms, noise=6.0)
     fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
     p = dict(zip(base.model.parameter_names, fit.full_parameters, strict=True))
@@ -106,7 +106,7 @@ def test_seven_parameters_are_bodies_with_principal_axes():
 
 def test_bounds_hold_and_are_named(panda):
     base, _, o = panda
-    bounds = jid.BodyBounds.from_geometry(base.model.robot).replace(
+    bounds = jid.consistency.BodyBounds.from_geometry(base.model.robot).replace(
         mass_max=[8, 8, 8, 2, 8, 8, 8], mass_min=0.2, centre_max=[np.inf, 0.01, 0.2], total_mass=20
     )
     fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, bounds))
@@ -126,7 +126,7 @@ def test_a_strong_pull_leads_to_its_bodies(panda):
     bodies = p[:70].reshape(7, 10)
     gaps = []
     for strength in (1e-2, 1.0, 1e4):
-        pull = jid.EntropicPull(bodies, strength)
+        pull = jid.consistency.EntropicPull(bodies, strength)
         fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=pull))
         gaps.append(np.abs(fit.consistency.bodies - bodies).max())
     assert gaps[0] > gaps[1] > gaps[2]
@@ -135,7 +135,9 @@ def test_a_strong_pull_leads_to_its_bodies(panda):
 
 def test_a_pull_gives_the_mass_matrix_a_margin(panda, consistent):
     base, _, o = panda
-    pulled = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=jid.EntropicPull()))
+    pulled = jid.identify(
+        base, o, jid.PhysicallyConsistent(WEIGHTS, pull=jid.consistency.EntropicPull())
+    )
     smallest = [jid.validate(fit, o).definiteness.smallest for fit in (consistent, pulled)]
     assert smallest[1] > smallest[0] > 0
 
@@ -144,17 +146,17 @@ def test_a_parameter_prior_counts(panda):
     base, p, o = panda
     deviations = np.full(base.model.size, np.inf)
     deviations[0] = 1e-4
-    prior = jid.ParameterPrior(p, deviations)
+    prior = jid.consistency.ParameterPrior(p, deviations)
     fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, prior=prior))
     np.testing.assert_allclose(fit.consistency.bodies[0, 0], p[0], atol=1e-3)
 
 
 def bounds(**change):
-    return lambda: jid.BodyBounds.from_geometry(jid.robots.panda()).replace(**change)
+    return lambda: jid.consistency.BodyBounds.from_geometry(jid.robots.panda()).replace(**change)
 
 
 def coupled_without_rotors():
-    model = jid.Model(jid.robots.tx40(), (jid.RigidBodies(), jid.CoupledDrives()))
+    model = jid.Model(jid.robots.tx40(), (jid.RigidBodies(), jid.terms.CoupledDrives()))
     return jid.PhysicallyConsistent().feasible_set(jid.base_parameters(model))
 
 
@@ -167,7 +169,10 @@ def coupled_without_rotors():
         (bounds(centre_min=[0.9, 0.9, 0.9]), "no centre of mass of body 1"),
         (bounds(centre_min=[0.1, 0, 0], centre_max=[0, 1, 1]), "`centre_min`"),
         (bounds(radius=[1.0, 2.0]), "`radius`"),
-        (lambda: jid.EntropicPull(np.array([[1.0, 0, 0, 0, 1, 1, 3.0, 0, 0, 0]])), "`bodies`"),
+        (
+            lambda: jid.consistency.EntropicPull(np.array([[1.0, 0, 0, 0, 1, 1, 3.0, 0, 0, 0]])),
+            "`bodies`",
+        ),
         (lambda: jid.PhysicallyConsistent(margin=1.0), "`margin`"),
         (coupled_without_rotors, r"`RotorInertia\(\)`"),
     ],

@@ -1,3 +1,0 @@
-"""Former place of `PackedRegressor`."""
-
-from jaxid.dynamics.regressor import PackedRegressor as PackedRegressor
