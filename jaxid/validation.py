@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.fit import Fit
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot

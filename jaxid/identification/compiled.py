@@ -238,7 +238,7 @@ def _compiled(
     def evaluate(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
         packed = base_columns(q, qd, qdd)
         rows = [jnp.broadcast_to(jnp.asarray(packed[i], float), q.shape[1:]) for i in first]
-        known = [0.0] * joints if tool_forces is None else q.tool_forces(qd, qdd)
+        known = [0.0] * joints if tool_forces is None else tool_forces(q, qd, qdd)
         rows += [f - k for f, k in zip(forces, known, strict=True)]
         return rows
 

@@ -165,15 +165,24 @@ class Fit(eqx.Module):
         )
 
     @property
-    def factor(self) -> tuple[Float[np.ndarray, "height base"], Float[np.ndarray, " height"]]:
-        """Matrix and right-hand side with the norms of all weighted rows (Eq. 29).
+    def time_blocks(self) -> Blocks:
+        """The factors by contiguous blocks of time.
 
         Raises:
             InputError: If the fit does not hold its factors.
         """
         if self.blocks is None:
             raise InputError(f"the fit `{self.name}` does not hold its factors: identify again.")
-        return self.blocks.total.weighted(self.weights)
+        return self.blocks
+
+    @property
+    def factor(self) -> tuple[Float[np.ndarray, "height base"], Float[np.ndarray, " height"]]:
+        """Matrix and right-hand side with the norms of all weighted rows (Eq. 29).
+
+        Raises:
+            InputError: If the fit does not hold its factors.
+        """
+        return self.time_blocks.total.weighted(self.weights)
 
     @property
     def is_least_squares(self) -> bool:

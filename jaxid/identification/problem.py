@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -264,7 +264,7 @@ def reduced_rows(
     base: BaseParameters,
     observations: Observations,
     samples: int = RegressionProblem.samples_per_chunk,
-    read: Callable[[slice], tuple[Motion, np.ndarray]] | None = None,
+    read: Callable[[slice], tuple[Motion, AnyArray]] | None = None,
     wanted: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[tuple[slice, list[np.ndarray], np.ndarray]]:
     """Yield the rows of observations by chunks; forces of a known tool are subtracted.
@@ -280,12 +280,12 @@ def reduced_rows(
         Range of the rows; columns of each joint [rows, columns of the joint]; forces
         [rows, joints] in [N m] or [N].
     """
-    read = observations.read if read is None else read
+    reader = observations.read if read is None else read
     for chunk in observations.chunks(samples):
         first, last = chunk.rows
         if wanted is not None and not any(a < last and first < b for a, b in wanted):
             continue
-        yield slice(*chunk.rows), *reduce_chunk(base, *read(slice(*chunk.samples)), chunk)
+        yield slice(*chunk.rows), *reduce_chunk(base, *reader(slice(*chunk.samples)), chunk)
 
 
 def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blocks, Blocks]]:

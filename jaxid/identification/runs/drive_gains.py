@@ -130,7 +130,7 @@ def identify_drive_gains(
     added = body_columns(base, load.body) @ load.parameters
     known = (np.zeros(base.size), added)
     terms = [
-        _Rows(run.blocks.total, np.asarray(run.weights), E, c)
+        _Rows(run.time_blocks.total, np.asarray(run.weights), E, c)
         for run, E, c in zip(runs, maps, known, strict=True)
     ]
     n, size = robot.joints, maps[0].shape[1]
@@ -157,7 +157,7 @@ def identify_drive_gains(
         )
     blocks: list[Block] = []
     for run, E, k in zip(runs, maps, known, strict=True):
-        for part in run.blocks.parts:
+        for part in run.time_blocks.parts:
             rows = _Rows(part, np.asarray(run.weights), E, k)
             blocks.append((rows.derivatives(found.x), -rows.residuals(found.x)))
     covariance, freedom = block_covariance(blocks, B)

@@ -54,7 +54,7 @@ def tied(
     Raises:
         InputError: If two runs have seen the same data.
     """
-    refuse_shared([(run.name, run.blocks) for run in runs])
+    refuse_shared([(run.name, run.time_blocks) for run in runs])
     known = [np.zeros(run.base.size) for run in runs] if known is None else known
     maps = [np.asarray(E, np.float64) for E in maps]
     factors = [run.factor for run in runs]
@@ -105,5 +105,5 @@ def _blocks(run: Fit) -> tuple[list[Block], Float[np.ndarray, "base base"]]:
     decomposition = Decomposition.of(*run.factor)
     inverse = Complete().inverse(decomposition.values)
     p = decomposition.solve(inverse)
-    parts = (part.weighted(run.weights) for part in run.blocks.parts)
+    parts = (part.weighted(run.weights) for part in run.time_blocks.parts)
     return [(R, z - R @ p) for R, z in parts], decomposition.inverse_information(inverse)
