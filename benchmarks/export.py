@@ -107,7 +107,8 @@ def fit_of(model, p):
     m = jid.Motion(*states_of(model.robot, random, 500))
     forces = base.inverse_dynamics(base.from_standard(p), m)
     o = jid.Observations.of(m.q, m.qd, m.qdd, forces, sample_time=0.001)
-    return jid.identify(base, o, uncertainty=jid.uncertainty.IndependentRows())
+    naive = jid.uncertainty.IndependentRows()
+    return jid.identify(base, o, jid.estimators.LeastSquares(), uncertainty=naive)
 
 
 def projected_mass_matrix(model, p, q):
