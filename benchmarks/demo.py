@@ -71,7 +71,9 @@ def figures(record):
                 100 * (one["estimates"][k] - paper) / paper
             )
     for one in record["coverage"]:
-        found[f"within 95 % intervals, {one['filter'].split(',')[0]} [%]"] = 100 * one["share"]
+        found[f"within 95 % intervals, {one['filter'].split(',')[0]} [%]"] = (
+            100 * one["inside"] / one["of"]
+        )
     for one in record["following"]:
         found[f"end-effector off the path, RMS, {one['fed_forward']} [mm]"] = 1e3 * one["tip_rms"]
         found[f"end-effector off the path, largest, {one['fed_forward']} [mm]"] = (

@@ -146,7 +146,7 @@ def findings(experiment, log):
     fit = jid.identify(experiment.base, observations)
     minimum = experiment.min_speed
     found = jid.diagnose(log, experiment.robot, fit, observations=observations, min_speed=minimum)
-    return (*found.findings, *found.mistakes(fit))
+    return found.findings
 
 
 def trials(robot_name, kind, count, show):
