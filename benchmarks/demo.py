@@ -82,7 +82,7 @@ def figures(record):
     excitation = record["excitation"]
     timed = record["feed_forward"]
     if not isinstance(timed, str):
-        for key in ("eq_39", "eq_39_factored", "eq_38"):
+        for key in ("literal", "factored", "full"):
             found[f"feed-forward in C, {key} [µs]"] = 1e6 * timed[key]
     found["end-effector, speed up to [m/s]"] = excitation["tip_speed"]
     found["end-effector, acceleration up to [m/s²]"] = excitation["tip_acceleration"]
