@@ -16,7 +16,7 @@ samples lie at the limit. delay: forces late or early by 4 to 40 ms, on the UR10
 log, at 125 Hz, tells delays to about ±9 ms. milliseconds: a time in milliseconds taken for seconds.
 good: nothing is wrong.
 
-Named is a log of which some sentence names the mistake, its joints and its key; the next column
+Named is a log of which a sentence names the mistake, its joints and its key; the next column
 counts those for which no sentence names a mistake of another class. A good log is right if there
 are no findings.
 """

@@ -40,7 +40,7 @@ class Bodies:
 
     @property
     def parameters(self):
-        """The ten standard parameters of each body."""
+        """Ten standard parameters of each body."""
         rows = []
         for m, c, inertia in zip(self.mass, self.centre, self.inertia, strict=True):
             J = inertia + m * (c @ c * np.eye(3) - np.outer(c, c))
@@ -49,7 +49,7 @@ class Bodies:
 
 
 def pinocchio_model(robot, bodies):
-    """A model with the joints of a robot, in the robot's order."""
+    """Return a model with the joints of a robot, in the robot's order."""
     import pinocchio as pin
 
     model = pin.Model()
@@ -66,13 +66,13 @@ def pinocchio_model(robot, bodies):
 
 
 def in_our_order(regressors, joints):
-    """Pinocchio's columns [samples, joints, columns] as those of `RigidBodies`."""
+    """Return Pinocchio's columns [samples, joints, columns] in the order of `RigidBodies`."""
     columns = regressors.reshape(-1, joints, joints, 10)[..., ORDER] * SIGNS
     return columns.reshape(-1, joints, 10 * joints)
 
 
 def prefixes():
-    """Where headers may be: the wheels' common prefix first."""
+    """Return the folders that may hold headers, first the common prefix of the wheels."""
     import cmeel
 
     found = [Path(p).parent / "cmeel.prefix" for p in cmeel.__path__]
@@ -80,7 +80,7 @@ def prefixes():
 
 
 def build(source=SOURCE, *extra):
-    """The compiled loop, or what is made of it, from an earlier run if it is the same.
+    """Compile the loop, or take that of an earlier run with the same source.
 
     Raises:
         RuntimeError: If it cannot be built, with the reason.
@@ -113,7 +113,7 @@ def build(source=SOURCE, *extra):
 
 
 class Loop:
-    """Pinocchio in C++ over rows of samples, with results in memory that is already mapped."""
+    """Pinocchio in C++ over rows of samples, with results in mapped memory."""
 
     def __init__(self, robot, bodies, q, qd, qdd, built=None):
         if not all(robot.revolute):
@@ -135,12 +135,12 @@ class Loop:
         self.forces = np.zeros((len(q), joints))
 
     def regressors(self):
-        """The regressors of all samples [samples, joints, columns], in Pinocchio's columns."""
+        """Return the regressors [samples, joints, columns], in Pinocchio's columns."""
         self._run(self.library.arm_regressors, self.columns)
         return self.columns.swapaxes(1, 2)
 
     def torques(self):
-        """The generalized forces of all samples [samples, joints]."""
+        """Return the generalised forces [samples, joints]."""
         self._run(self.library.arm_torques, self.forces)
         return self.forces
 
@@ -150,7 +150,7 @@ class Loop:
 
 
 def generated(robot, bodies):
-    """The C code that CasADi makes of Pinocchio's rnea: the function `peer`.
+    """Return the C code that CasADi makes of Pinocchio's rnea: the function `peer`.
 
     Raises:
         RuntimeError: If it cannot be built, with the reason.

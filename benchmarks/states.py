@@ -1,4 +1,4 @@
-"""Several runs of one robot: cold and warm, payload, drive gains, delay, update; with known truth.
+"""Several runs of one simulated robot: cold and warm, payload, drive gains, delay, update.
 
 Everything is simulated; noise on the forces has a standard deviation of 1 % of each joint's largest
 force, half of its variance white and half with a memory of 50 ms. Motions are
@@ -37,7 +37,7 @@ from jaxid.measurement.recording import remove_delay  # private: mend a log
 
 SAMPLE_TIME, MEMORY, NOISE = 0.002, 0.05, 0.01
 CAD = (273.4, 16.93, 14.35, 7.50, 6.42, 0.569, 0.031)
-"""Masses of the bodies [kg]; that of the rail's carriage is what the paper's p_B(1) leaves."""
+"""Masses of the bodies [kg]; the first is the difference to the paper's p_B(1)."""
 VISCOUS, COULOMB = ((248.41, 90.19), (41.26, 25.65)), ((312.50, 233.00), (18.24, 15.07))
 DELAY = 0.01
 TOOL = jid.Tool(

@@ -1,4 +1,4 @@
-"""Physically consistent fits as conic programs, written down anew for benchmarks and tests."""
+"""Physically consistent fits as conic programs, an independent form for benchmarks and tests."""
 
 import cvxpy as cp
 import numpy as np
@@ -7,7 +7,7 @@ from jaxid.identification.consistency.feasible_set import FeasibleSet, ScaledRow
 
 
 def problem(feasible: FeasibleSet, data: ScaledRows) -> tuple[cp.Problem, cp.Variable, np.ndarray]:
-    """The fit as a conic program, written down in SI units anew; its variables and their units."""
+    """Return the fit as a conic program in SI units, its variables and their units."""
     bounds = feasible.bounds
     size = data.A.shape[1]
     norms = np.linalg.norm(data.A, axis=0)
@@ -59,7 +59,7 @@ def problem(feasible: FeasibleSet, data: ScaledRows) -> tuple[cp.Problem, cp.Var
 
 
 def optimum(feasible: FeasibleSet, data: ScaledRows) -> tuple[float, np.ndarray]:
-    """Smallest half squares, and the parameters, by CLARABEL."""
+    """Return the smallest half squares, and the parameters, by CLARABEL."""
     fit, y, unit = problem(feasible, data)
     fit.solve(cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
     return float(fit.value), unit * np.asarray(y.value)
