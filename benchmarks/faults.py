@@ -74,6 +74,15 @@ def example(folder):
     return folder
 
 
+def planar_base(lengths):
+    """Return the base parameters of a planar arm with limits."""
+    import jaxid as jid
+
+    limits = {"position_min": [-2, -2], "position_max": [2, 2], "velocity": [3, 3]}
+    limits = jid.Limits(2, **limits, acceleration=[10, 10], force=[50, 20])
+    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, lengths).replace(limits=limits)))
+
+
 # Damaged files
 
 
@@ -112,7 +121,7 @@ def readers(folder):
     arrays = {name: table[name].to_numpy() for name in table.columns}
     np.savez(folder / "log.npz", **arrays)
     (folder / "arm.urdf").write_text(URDF, encoding="utf-8")
-    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2)))
+    base = planar_base((0.5, 0.4))
     q = np.random.default_rng(0).normal(size=(4, 200, 2))
     jid.identify(base, jid.Observations.of(*q, sample_time=0.01)).save(folder / "model.json")
 
@@ -222,8 +231,7 @@ def round_of_jobs(seed):
 
     import jaxid as jid
 
-    lengths = np.random.default_rng(seed).uniform(0.3, 0.6, 2)
-    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, lengths)))
+    base = planar_base(np.random.default_rng(seed).uniform(0.3, 0.6, 2))
     series = jid.random_fourier_series(base.model.robot, omega=0.8, seed=seed)
     motion = series.motion(0.002 * np.arange(4000))
     forces = np.asarray(base.model.inverse_dynamics(np.ones(base.model.size), motion))
@@ -233,7 +241,8 @@ def round_of_jobs(seed):
     jid.identify(base, rows)
     with contextlib.suppress(jid.InputError):
         jid.identify(base, rows.split(0.99)[1])
-    jid.identify_batch(base, motion[::10], (forces + noise)[:, ::10])
+    parts = (x[None, ::10] for x in (motion.q, motion.qd, motion.qdd))
+    jid.identify_batch(base, jid.Motion(*parts), (forces + noise)[None, :, ::10])
     settings = {"harmonics": 2, "starts": 2, "generations": 0, "polish": 0, "samples": 100}
     jid.design_excitation(base, key=jax.random.key(seed), **settings)
 
