@@ -9,7 +9,7 @@ import typing as _typing
 
 from jaxid import simulation as simulation
 from jaxid import trajectory as trajectories  # noqa: F401
-from jaxid.diagnose import diagnose as diagnose
+from jaxid.diagnosis import diagnose as diagnose
 from jaxid.dynamics import terms as terms
 from jaxid.dynamics.base import BaseParameters as BaseParameters
 from jaxid.dynamics.base import base_parameters as base_parameters

@@ -114,7 +114,7 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     assert run("identify", "tool.toml", "loaded.csv", "-o", "b")[0] == 0
     code, out, _ = run("compare", "a", "b")
     changed = [line for line in out.splitlines() if line.rstrip().endswith("  changed")]
-    assert {re.sub("  .*", "", line.strip()) for line in changed} >= {"viscous friction"}
+    assert any("viscous friction" in line for line in changed)
     assert not any("rigid bodies" in line for line in changed)
 
 
@@ -148,7 +148,7 @@ def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     np.testing.assert_allclose(forces, expected, rtol=0.02, atol=1e-3)
     wrong = text.replace(line, "force_gains = [1, -1, 1]")
     (shop / "wrong.toml").write_text(wrong)
-    assert refused(run("inspect", "wrong.toml"), "`recording.force_gains[1]` must be positive")
+    assert refused(run("inspect", "wrong.toml"), "`force_gains` must be positive")
     (shop / "tool.toml").write_text(SPATIAL + LOAD + LOAD.replace("[load]", "[robot.tool]"))
     assert refused(run("gains", "tool.toml", *logs), "has a known tool")
 
@@ -258,7 +258,7 @@ def test_essential_parameters_on_the_command_line(folder, run):  # noqa: F811
     assert 0 < few < every
     said = " ".join(out.split())
     assert f"{few} of {every} base parameters are essential" in said
-    assert "left out, and taken as zero: " in said
+    assert "eliminated, and taken as zero: " in said
     assert refused(run("identify", "essential.toml", "all", "b.csv"), "for essential parameters")
 
 

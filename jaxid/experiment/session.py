@@ -5,9 +5,9 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxid.diagnose import Diagnosis, diagnose
-from jaxid.diagnose.diagnosis import mistakes_in_logs
-from jaxid.diagnose.mislabelled import BAD
+from jaxid.diagnosis import Diagnosis, diagnose
+from jaxid.diagnosis.diagnosis import mistakes_in_logs
+from jaxid.diagnosis.mislabelled import BAD
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import within

@@ -263,9 +263,10 @@ class Fit(eqx.Module):
             f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of these "
             "parameters mean nothing one by one, and the model may fail on other motions. Record "
             "a motion that moves these joints in more poses, faster and in both directions, or "
-            'leave effects out in `[model]`; `ridge = "cross_validated"` in `[estimator]` keeps '
-            "small what the logs leave open."
+            "leave effects out in `[model]`"
         )
+        if isinstance(self.solution, Complete):
+            advice += '; `ridge = "cross_validated"` in `[estimator]` keeps small what the logs leave open'
         return [*remarks, Remark(advice)]
 
     def summary(self) -> Table:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import AnyArray
-from jaxid.diagnose import Diagnosis
+from jaxid.diagnosis import Diagnosis
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators import AbstractSpectralSolution

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxid.diagnose import diagnose
-from jaxid.diagnose.mislabelled import likely_mistakes
+from jaxid.diagnosis import diagnose
+from jaxid.diagnosis.mislabelled import likely_mistakes
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxid.diagnose.sensor_faults import channel_faults, stuck_findings
+from jaxid.diagnosis.sensor_faults import channel_faults, stuck_findings
 from jaxid.measurement.recording import Recording
 from jaxid.robot.library import panda
 from jaxid.trajectory.fourier import random_fourier_series

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from jaxid.arrays import Float
-from jaxid.diagnose.limits import STANDING
+from jaxid.diagnosis.limits import STANDING
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
 

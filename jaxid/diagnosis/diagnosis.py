@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.arrays import AnyArray
-from jaxid.diagnose.limits import (
+from jaxid.diagnosis.limits import (
     LogStatistics,
     StatisticsAccumulator,
     limit_findings,
     rate_findings,
 )
-from jaxid.diagnose.mislabelled import delay_finding, likely_mistakes, negative_friction
-from jaxid.diagnose.sensor_faults import channel_faults, stuck_findings
+from jaxid.diagnosis.mislabelled import delay_finding, likely_mistakes, negative_friction
+from jaxid.diagnosis.sensor_faults import channel_faults, stuck_findings
 from jaxid.errors import InputError
 from jaxid.identification.fit import Fit
 from jaxid.measurement.filters import ZeroPhaseButterworth
