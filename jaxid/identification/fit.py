@@ -266,7 +266,7 @@ class Fit(eqx.Module):
             "leave effects out in `[model]`"
         )
         if isinstance(self.solution, Complete):
-            advice += '; `ridge = "cross_validated"` in `[estimator]` keeps small what the logs leave open'
+            advice += '; `ridge = "cross_validated"` in `[estimator]` keeps small what is left open'
         return [*remarks, Remark(advice)]
 
     def summary(self) -> Table:
