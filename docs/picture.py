@@ -1,7 +1,4 @@
-"""Draws the picture of the README: the TX90L on its rail along a motion, and its path in space.
-
-Writes `docs/picture.png`.
-"""
+"""Draw docs/picture.png: the TX90L on its rail along a motion, and the path of its end-effector."""
 
 from pathlib import Path
 
@@ -14,11 +11,11 @@ import jaxid as jid
 OMEGA = 0.8
 """Base frequency of the motion, as in the paper [rad/s]."""
 HEIGHT = 560
-"""Of the picture [pixel]."""
+"""Height of the picture [pixel]."""
 
 
 def main() -> None:
-    """Draws both figures and sets them beside each other."""
+    """Draw both figures side by side."""
     jax.config.update("jax_enable_x64", True)
     robot = jid.robots.tx90l_on_rail()
     time = np.linspace(0.0, 7.85, 400)
@@ -26,7 +23,7 @@ def main() -> None:
     capsules = jid.robots.tx90l_on_rail_collision()
     figures = (
         jid.plot.poses(robot, motion.q, capsules, poses=4, title="TX90L on rail: a motion"),
-        jid.plot.path(robot, motion, title="its end-effector"),
+        jid.plot.path(robot, motion, title="path of the end-effector"),
     )
     path = Path(__file__).parent / "picture.png"
     parts = []

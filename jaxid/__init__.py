@@ -7,6 +7,7 @@ Everything else is in namespaces: `terms`, `filters`, `units`, `estimators`, `un
 
 import typing as _typing
 
+from jaxid import export as export
 from jaxid import simulation as simulation
 from jaxid import trajectory as trajectories  # noqa: F401
 from jaxid.diagnosis import diagnose as diagnose

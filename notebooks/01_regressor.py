@@ -62,7 +62,7 @@ print("columns that act in motion:", np.flatnonzero(np.any(turning != 0, axis=0)
 
 # %%
 series = jid.random_fourier_series(robot, omega=0.8, seed=1)
-t = np.linspace(0.0, series.period, 400)
+t = np.linspace(0.0, series.duration, 400)
 motion = series.motion(t)
 theta = np.asarray(model.regressor(motion))
 print("regressor of", len(t), "samples:", theta.shape)
@@ -94,7 +94,7 @@ plt.show()
 masses = [200.0, 45.0, 30.0, 15.0, 20.0, 4.0, 1.5]
 ends = [*robot.offset[1:], robot.tip_offset]
 bodies = [
-    jid.Tool.of(i, mass=m, centre_of_mass=0.5 * end, inertia=0.01 * m * np.eye(3)).parameters
+    jid.Tool(i, mass=m, centre_of_mass=0.5 * end, inertia=0.01 * m * np.eye(3)).parameters
     for i, (m, end) in enumerate(zip(masses, ends))
 ]
 viscous = [250.0, 41.0, 30.0, 16.0, 4.0, 5.0, 2.0]
@@ -149,7 +149,7 @@ plt.show()
 energy = np.asarray(model.kinetic_energy(frictionless, motion.q, motion.qd)) + np.asarray(
     model.potential_energy(frictionless, motion.q)
 )
-fine = np.linspace(0.0, series.period, 4000)
+fine = np.linspace(0.0, series.duration, 4000)
 along = series.motion(fine)
 E = np.asarray(model.kinetic_energy(frictionless, along.q, along.qd)) + np.asarray(
     model.potential_energy(frictionless, along.q)

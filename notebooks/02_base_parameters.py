@@ -52,11 +52,11 @@ base = jid.base_parameters(jid.Model(robot))
 print(f"{base.model.size} standard parameters, {base.size} base parameters")
 
 kinds = {
-    jid.dynamics.base.Identifiability.ALONE: 2,
-    jid.dynamics.base.Identifiability.COMBINED: 1,
-    jid.dynamics.base.Identifiability.NONE: 0,
+    "ALONE": 2,
+    "COMBINED": 1,
+    "NONE": 0,
 }
-verdict = np.array([kinds[v] for v in base.identifiability])
+verdict = np.array([kinds[v.name] for v in base.identifiability])
 names = ["m", "mx", "my", "mz", "A", "B", "C", "D", "E", "F"]
 figure, axes = plt.subplots(figsize=(11, 3.0))
 shown = np.vstack([verdict[:70].reshape(7, 10).T])
@@ -84,9 +84,9 @@ plt.show()
 # agree: Gram-Schmidt in column order, and the gap in the singular values.
 
 # %%
-from jaxid.dynamics.observation import observation_matrix
+from jaxid.dynamics.rank import random_regressor
 
-W, scale = observation_matrix(base.model, 0)
+W, scale = random_regressor(base.model, 0)
 scaled = np.linalg.svd(W, compute_uv=False)
 raw = np.linalg.svd(W / scale, compute_uv=False)
 print(f"least independent column: {base.smallest_independent:.2g} of it is new")

@@ -23,14 +23,14 @@ plt.style.use("notebook.mplstyle")
 # Two joints, a waist and a shoulder with a link: small enough to design in seconds. Noise is 1 % of each motor's largest torque.
 
 # %%
-robot = jid.Robot.of(
+robot = jid.Robot(
     "two axes",
     revolute=(True, True),
     axis=[(0, 0, 1.0), (0, 1.0, 0)],
     rotation=np.tile(np.eye(3), (2, 1, 1)),
     offset=[(0, 0, 0.3), (0.1, 0, 0.1)],
     tip_offset=(0, 0, 0.5),
-    limits=jid.Limits.of(
+    limits=jid.Limits(
         2,
         position_min=[-2.6, -1.8],
         position_max=[2.6, 1.8],
@@ -103,16 +103,15 @@ plt.show()
 # of the best random motion, and no smaller deviations than that one has. The other two designs are far below all of them.
 
 # %%
-from jaxid.excitation.information import information
-from jaxid.excitation.plan import deviations
+from jaxid.excitation.information import information, standard_deviations
 
 measured = np.linspace(0, 2 * np.pi / 0.8, 400, endpoint=False)
 
 
 def conditioned(trajectory):
     """Condition number of a motion, and the standard deviations it gives."""
-    told = information(base, trajectory.motion(measured), 1.0 / noise)
-    return np.linalg.cond(told.plain), deviations(told.weighted)
+    gram = information(base, trajectory.motion(measured), 1.0 / noise)
+    return np.linalg.cond(gram.plain), standard_deviations(gram.weighted)
 
 
 random = [

@@ -49,13 +49,13 @@ if real:
         jid.RotorInertia(),
         jid.terms.CoupledDrives(),
     )
-    cutoff, every = 20.0, 50
-    said = {
+    cutoff, step = 20.0, 50
+    published = {
         "fv": (8.05, 5.53, 1.97, 1.11, 1.86, 0.65),
         "fc": (7.14, 8.26, 6.34, 2.48, 3.03, 0.28),
         "Ia": (0.362, 0.362, 0.0988, 0.0313, 0.0468, 0.0105),
     }
-    known = {f"{kind}{j + 1}": value for kind, six in said.items() for j, value in enumerate(six)}
+    known = {f"{kind}{j + 1}": value for kind, six in published.items() for j, value in enumerate(six)}
 else:
     robot = jid.robots.panda()
     with tempfile.TemporaryDirectory() as folder:
@@ -69,7 +69,7 @@ else:
         jid.RotorInertia(),
         jid.ConstantOffset(),
     )
-    cutoff, every = 10.0, 20
+    cutoff, step = 10.0, 20
     known = {row["name"]: row["value"] for row in truth if row["name"][:2] in ("fv", "fc", "Ia")}
 
 print(
@@ -87,10 +87,9 @@ print(robot.drives.reduction)
 # %%
 model = jid.Model(robot, (jid.RigidBodies(), *friction))
 base = jid.base_parameters(model)
-smooth, thin = jid.ZeroPhaseButterworth(cutoff), jid.Subsample(every)
+smooth, thin = jid.ZeroPhaseButterworth(cutoff), jid.Subsample(step)
 seen, unseen = (jid.observe(part, robot, smooth, thin) for part in log.split(0.6))
-rows = jid.Rows.of(base, [seen])
-fit = jid.fit_rows(rows, jid.WeightedLeastSquares())  # in one call: jid.identify(base, seen)
+fit = jid.identify(base, seen)
 
 print(f"{base.size} base parameters from {sum(fit.rows)} rows")
 print(
@@ -174,7 +173,7 @@ estimators = {
 }
 figure, axes = plt.subplots(figsize=(11, 3.0))
 for k, estimator in enumerate(estimators.values()):
-    one = jid.validate(jid.fit_rows(rows, estimator), [seen, unseen])
+    one = jid.validate(jid.identify(base, seen, estimator), [seen, unseen])
     percent = [np.sqrt(np.mean(e.rms_percent**2)) for e in one.errors]
     axes.barh(k - 0.18, percent[0], 0.34, color="#0072B2", label="seen" if k == 0 else None)
     axes.barh(k + 0.18, percent[1], 0.34, color="#E69F00", label="not seen" if k == 0 else None)

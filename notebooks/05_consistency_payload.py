@@ -2,7 +2,7 @@
 # # 05 · Physical consistency and payload
 #
 # Least squares know nothing of bodies. This notebook shows a good fit that is *no robot*, what bounds from physics do about it, what they cannot know, and
-# how the ten parameters of a payload are found.
+# how the ten parameters of a payload are consistent.
 
 # %%
 # %matplotlib inline
@@ -32,7 +32,7 @@ masses = np.array([3.4, 2.9, 2.9, 2.5, 1.9, 1.5, 0.6])
 ends = [*robot.offset[1:], robot.tip_offset]
 bodies = np.array(
     [
-        jid.Tool.of(
+        jid.Tool(
             i,
             mass=m,
             centre_of_mass=0.5 * end + 0.02,
@@ -95,11 +95,11 @@ plt.show()
 # cannot do that, because each of its bodies is a distribution of positive mass: its pseudo-inertia is positive semidefinite.
 
 # %%
-found = fits["consistent"].consistency
-print(f"price: the weighted residual grows by {found.price:.2%}")
-print(f"proof: within {found.error_bound:.0e} of the optimum, {found.iterations} iterations")
-print("bounds that decide:", "; ".join(found.active) or "none")
-print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in found.masses_from_bounds])
+consistent = fits["consistent"].consistency
+print(f"the weighted residual grows by {consistent.residual_increase:.2%}")
+print(f"within {consistent.error_bound:.0e} of the optimum, {consistent.iterations} iterations")
+print("active bounds:", "; ".join(consistent.active) or "none")
+print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in consistent.masses_from_bounds])
 
 # %% [markdown]
 # ## What the data cannot see
@@ -111,15 +111,13 @@ print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in found.masse
 cad = bodies * np.random.default_rng(5).uniform(0.8, 1.2, (7, 1))
 bounds = jid.consistency.BodyBounds.from_geometry(robot).replace(total_mass=float(masses.sum()))
 pulled = jid.identify(
-    base,
-    short,
-    jid.PhysicallyConsistent(bounds=bounds, pull=jid.consistency.EntropicPull(cad, strength=1.0)),
+    base, short, jid.PhysicallyConsistent(bounds=bounds, pull=jid.consistency.EntropicPull(cad, strength=1.0))
 )
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.2))
 place = np.arange(7)
 ways = {
     "truth": bodies,
-    "bounds alone": found.bodies,
+    "bounds alone": consistent.bodies,
     "with CAD and a scale": pulled.consistency.bodies,
 }
 for k, (name, some) in enumerate(ways.items()):
@@ -139,7 +137,7 @@ for name, fit in (
     error = np.sort(np.abs(np.asarray(fit.parameters) - exact_base) / sizes)
     panels[1].plot(error, np.linspace(0, 1, len(error)), label=name)
 panels[1].set_xlabel("error of the base parameters [standard deviations]")
-panels[1].set_ylabel("share of the parameters")
+panels[1].set_ylabel("fraction of the parameters")
 panels[1].set_title("base parameters: data say much")
 panels[1].legend()
 plt.show()
@@ -152,24 +150,21 @@ plt.show()
 # Of ten intervals of 95 % one may well miss.
 
 # %%
-tool = jid.Tool.of(
+tool = jid.Tool(
     6, mass=2.0, centre_of_mass=(0.02, -0.03, 0.16), inertia=np.diag([0.012, 0.011, 0.006])
 )
 loaded = truth.copy()
 loaded[60:70] += tool.parameters
 loaded[70:] *= 1.2
-runs = [
-    jid.Run.of(base, [observations(p, seed, noise=0.01) for seed in seeds], name=name)
+empty_fit, loaded_fit = (
+    jid.identify(base, [observations(p, seed, noise=0.01) for seed in seeds], name=name)
     for p, seeds, name in ((truth, (11, 12), "empty"), (loaded, (13, 14), "loaded"))
-]
-payload = jid.identify_payload(*runs)
+)
+payload = jid.identify_payload(empty_fit, loaded_fit)
+print(payload)
 central = payload.central
 half = central.half_widths(0.95)
 exact = [2.0, 0.02, -0.03, 0.16, 0.012, 0.011, 0.006, 0.0, 0.0, 0.0]
-for name, unit, value, width, true in zip(
-    central.names, central.units, central.parameters, half, exact
-):
-    print(f"{name:4} {value:8.4f} ± {width:.4f} {unit:6} (truth {true:g})")
 figure, axes = plt.subplots(figsize=(11, 2.8))
 axes.axhspan(-1, 1, color="#d5dae0", lw=0)
 axes.plot(np.arange(10), (np.asarray(central.parameters) - exact) / half, "o")
@@ -179,7 +174,7 @@ axes.set_ylim(-2, 2)
 axes.grid(axis="x", visible=False)
 plt.show()
 heavier = robot.replace(tool=payload.tool)
-print(f"the robot now knows its tool: {float(heavier.tool.mass):.3f} kg")
+print(f"\nthe robot with its tool: {float(heavier.tool.mass):.3f} kg")
 
 # %% [markdown]
 # ## What you learned

@@ -25,14 +25,14 @@ plt.style.use("notebook.mplstyle")
 # %%
 from scipy import stats
 
-robot = jid.Robot.of(
+robot = jid.Robot(
     "two axes",
     revolute=(True, True),
     axis=[(0, 0, 1.0), (0, 1.0, 0)],
     rotation=np.tile(np.eye(3), (2, 1, 1)),
     offset=[(0, 0, 0.3), (0.1, 0, 0.1)],
     tip_offset=(0, 0, 0.5),
-    limits=jid.Limits.of(
+    limits=jid.Limits(
         2,
         position_min=[-2.6, -1.8],
         position_max=[2.6, 1.8],
@@ -117,7 +117,7 @@ plt.show()
 log = jid.Recording.of(motion.q, forces[0], sample_time=step, name="one log")
 seen = jid.observe(log, robot, jid.ZeroPhaseButterworth(12.0), jid.Subsample(3))
 fit = jid.identify(base, seen)
-blocks = jid.factorise(base, [seen], blocks=32)
+blocks = jid.RegressionProblem(base, [seen], divisions=32).blocks
 draws = np.asarray(jid.bootstrap(blocks, fit.weights, 2000, jax.random.key(0)))
 
 figure, axes = plt.subplots(figsize=(11, 3.0))
@@ -165,11 +165,11 @@ def forces_of(offset, p, *state):
     return jid.Model(robot.replace(offset=offset)).inverse_dynamics(p, jid.Motion(*state))
 
 
-told = np.asarray(jax.jit(jax.vmap(forces_of))(lengths, p, asked.q, asked.qd, asked.qdd))
-told = told + 0.005 * largest * fleet.normal(size=told.shape)
+forces = np.asarray(jax.jit(jax.vmap(forces_of))(lengths, p, asked.q, asked.qd, asked.qdd))
+forces = forces + 0.005 * largest * fleet.normal(size=forces.shape)
 ways = {
-    "own geometry": jid.identify_batch(base, asked, told, robots=arms),
-    "drawing's geometry": jid.identify_batch(base, asked, told),
+    "own geometry": jid.identify_batch(base, asked, forces, robots=arms),
+    "drawing's geometry": jid.identify_batch(base, asked, forces),
 }
 
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.2), width_ratios=(1, 2))
@@ -216,7 +216,7 @@ plt.show()
 # %%
 device = jax.devices()[0]  # a GPU, where there is one
 whole = jax.jit(lambda motion, forces: jid.identify_batch(base, motion, forces))
-again = whole(*jax.device_put((asked, told), device)).parameters
+again = whole(*jax.device_put((asked, forces), device)).parameters
 difference = np.abs(again - ways["drawing's geometry"].parameters).max() / np.abs(again).max()
 print(f"on this {device.platform}, in one computation: the same parameters, {difference < 1e-9}")
 

@@ -72,9 +72,9 @@ comparison = jid.compare(fits["cold"], fits["warm"])
 verdicts = comparison.verdicts
 kinds = {"fv": "viscous friction", "fc": "Coulomb friction", "Ia": "rotors"}
 for kind in (*kinds.values(), "bodies"):
-    chosen = [k for k, n in enumerate(base.names) if kinds.get(n[:2], "bodies") == kind]
-    changed = sum(verdicts[k] is jid.identification.runs.comparison.Verdict.CHANGED for k in chosen)
-    print(f"{kind:17} {changed} of {len(chosen)} changed")
+    members = [k for k, n in enumerate(base.names) if kinds.get(n[:2], "bodies") == kind]
+    changed = sum(verdicts[k].value == "changed" for k in members)
+    print(f"{kind:17} {changed} of {len(members)} changed")
 
 print(f"\n{'':12}{'cold':>16}{'truth':>9}{'warm':>20}{'truth':>9}")
 exact = {name: np.asarray(base.from_standard(v.parameters)) for name, v in robots.items()}
@@ -99,19 +99,10 @@ jid.plot.comparison(comparison)
 
 # %%
 new = observed(warm, 2, 99)
-figure, axes = plt.subplots(figsize=(11, 3.0))
-for k, (name, fit) in enumerate(fits.items()):
-    errors = jid.validate(fit, new).errors[0]
-    print(f"{name} model: relative error {errors.relative:.1%}")
-    bars = axes.bar(
-        np.arange(7) + 0.4 * (k - 0.5), errors.mean_percent, 0.38, label=f"{name} model"
-    )
-    axes.bar_label(bars, fmt="%.2f", fontsize=8)
-axes.set_xticks(range(7), robot.joint_names)
-axes.set_ylabel("mean error on the warm robot\n[% of the largest force]")
-axes.grid(axis="x", visible=False)
-axes.legend(ncols=2)
-plt.show()
+errors = {name: jid.validate(fit, new).errors for name, fit in fits.items()}
+for name, one in errors.items():
+    print(f"{name} model: relative error {one[0].relative:.1%}")
+jid.plot.bars([(f"{name} model", one) for name, one in errors.items()], robot)
 
 # %% [markdown]
 # ## A law instead of two states
@@ -126,9 +117,7 @@ several = [
     *(jid.identify(base, observed(cold.at(T), 0, int(T))) for T in steps[1:-1]),
     fits["warm"],
 ]
-law = jid.identification.nonlinear_friction.temperature_law(
-    several, steps, jid.ViscousFriction(), reference=20.0
-)
+law = jid.temperature_law(several, steps, jid.ViscousFriction(), reference=20.0)
 figure, axes = plt.subplots(figsize=(11, 3.4))
 T = np.linspace(15, 50, 50)
 for j in range(4):
@@ -149,7 +138,7 @@ axes.set_xlabel("temperature of the gear [°C]")
 axes.set_ylabel("viscous friction [% of that at 20 °C]")
 axes.legend()
 plt.show()
-true = np.asarray(cold.lubricant.viscous_rate)
+true = np.asarray(cold.heating.viscous_rate)
 for j, name in enumerate(robot.joint_names):
     print(
         f"{name:7} falls by {100 * law.rates[j]:.2f} ± {196 * law.rate_deviations[j]:.2f} % per degree "

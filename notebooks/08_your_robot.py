@@ -24,7 +24,9 @@ plt.style.use("notebook.mplstyle")
 # unknowns, which `urdf_parameters` gives if you want it.
 
 # %%
+import ctypes
 import shutil
+import subprocess
 import tempfile
 from pathlib import Path
 
@@ -43,7 +45,7 @@ print(
 # A motion that begins and ends at rest, within the limits, made for these parameters. `plan.to_csv` writes it for the controller.
 
 # %%
-limits = jid.Limits.of(
+limits = jid.Limits(
     3,
     position_min=robot.limits.position_min,
     position_max=robot.limits.position_max,
@@ -166,11 +168,18 @@ with tempfile.TemporaryDirectory() as folder:
     for line in source.with_suffix(".h").read_text().splitlines():
         if line.startswith("void"):
             print("  ", line)
-if shutil.which("cc") or shutil.which("gcc"):
-    compiled = jid.CompiledModel.of(fit)
-    few = jid.Motion(*(np.asarray(x)[::50] for x in (motion.q, motion.qd, motion.qdd)))
-    difference = np.abs(compiled.torque(few) - fit.predict(few)).max()
-    print(f"compiled code agrees with the package: {difference < 1e-10}")
+    if shutil.which("cc"):
+        library = Path(folder) / "arm.so"
+        subprocess.run(["cc", "-O2", "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
+        pointer = np.ctypeslib.ndpointer(float, flags="C")
+        torque = ctypes.CDLL(str(library))[f"{source.stem}_torque"]
+        torque.argtypes = [pointer] * 4
+        few = jid.Motion(*(np.asarray(x)[::50] for x in (motion.q, motion.qd, motion.qdd)))
+        torques = np.zeros(few.q.shape)
+        for k, Q in enumerate(torques):
+            torque(few.q[k].copy(), few.qd[k].copy(), few.qdd[k].copy(), Q)
+        difference = np.abs(torques - fit.predict(few)).max()
+        print(f"compiled code agrees with the package: {difference < 1e-10}")
 
 # %% [markdown]
 # ## What you learned

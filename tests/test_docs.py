@@ -1,9 +1,13 @@
 """Code that stands in the documents runs: blocks of Python one after the other, TOML as a file.
 
-A page may take for granted what its reader has by then (`given`), and nothing else.
+The names in `given` are those that a page may use without defining them.
 """
 
+import os
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -80,7 +84,7 @@ def _ordered(body, order: str) -> np.ndarray:
 
 
 def _theirs(body) -> dict[str, np.ndarray]:
-    """One body as other packages hold it, in the orders that docs/coming_from.md names."""
+    """One body as other packages hold it, in the orders that docs/conventions.md names."""
     tensor = _ordered(body, "Ixx Ixy Ixz Ixy Iyy Iyz Ixz Iyz Izz").reshape(3, 3)
     m, c = body[0], body[1:4] / body[0]
     central = tensor - m * (c @ c * np.eye(3) - np.outer(c, c))
@@ -114,7 +118,7 @@ def _log(model: jid.Model, p, seed: int, alone: int | None = None) -> jid.Record
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
-    """What readers of a page have by then: a robot, its model, logs of it in a folder, a fit."""
+    """Names and files that pages may use: a robot, its model, logs of it in a folder, a fit."""
     folder = tmp_path_factory.mktemp("documents")
     robot = jid.Robot(
         "two joints",
@@ -142,6 +146,7 @@ def given(tmp_path_factory):
     (folder / "logs").mkdir()
     for k, one in enumerate((log, second)):
         _table(one, degrees=False).write_parquet(folder / "logs" / f"{k}.parquet")
+    jid.simulation.write_example(folder / "example")
     base = jid.base_parameters(model)
     smooth, every = jid.ZeroPhaseButterworth(10.0), jid.Subsample(40)
     seen = [jid.observe(x, robot, smooth, every) for x in (log, second, *single)]
@@ -149,6 +154,8 @@ def given(tmp_path_factory):
     rows, forces = observations.reduced_motion, observations.reduced_forces
     names = {"jax": jax, "np": np, "jid": jid, "robot": robot, "model": model, "base": base}
     names |= {"observations": observations, "log": log}
+    columns = jid.Columns(time="time", angles="q{}", forces="tau{}", angle_unit=jid.units.DEG)
+    names["columns"] = columns
     names |= {"recording": log, "motion": rows, "forces": forces, "p": p}
     names |= {"motions": jax.tree.map(lambda x: np.stack([x, x]), rows)}
     names |= {"torques": np.stack([forces, forces]), "single_axes": tuple(seen[2:])}
@@ -207,11 +214,32 @@ def test_keys_in_a_page_exist(page):
 def test_other_packages_bodies_become_ours(given):
     _, names = given
     names = dict(names)
-    for block in _blocks(ROOT / "docs" / "coming_from.md", "python"):
-        exec(block, names)
+    for block in _blocks(ROOT / "docs" / "conventions.md", "python"):
+        if "from_pinocchio" in block or "from_matlab" in block:
+            exec(block, names)
     body = np.asarray(names["p"])[:10]
     for package in ("pinocchio", "idyntree", "figaroh", "sympybotics", "matlab"):
         np.testing.assert_allclose(names[f"from_{package}"], body, atol=1e-12, err_msg=package)
+
+
+def test_the_example_in_the_readme_runs(given, tmp_path):
+    folder, names = given
+    (block,) = _blocks(ROOT / "README.md", "python")
+    (tmp_path / "example.py").write_text(block, encoding="utf-8")
+    shutil.copy(folder / "arm.urdf", tmp_path)
+    _table(names["log"], degrees=False).rename({"t": "time"}).write_csv(tmp_path / "log.csv")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "example.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "12 base parameters" in done.stdout
+    made = {path.name for path in tmp_path.iterdir()} - {"arm.urdf", "log.csv", "example.py"}
+    assert made == {"model.json"}
 
 
 THRESHOLDS = {

@@ -26,7 +26,7 @@ from jaxid.measurement.observations import Observations, Progress
 
 def identify(
     base: BaseParameters,
-    observations: Observations | Sequence[Observations],
+    observations: Observations | Sequence[Observations] | RegressionProblem,
     estimator: AbstractEstimator | None = None,
     progress: Progress | None = None,
     uncertainty: AbstractUncertainty | None = None,
@@ -38,7 +38,8 @@ def identify(
     Args:
         base: Base parameters of the robot.
         observations: Observations of one recording, or of several that are fitted together; logs
-            larger than memory come from `scan_log`.
+            larger than memory come from `scan_log`. Or the regression problem of recordings, such
+            as that of several processes.
         estimator: Estimator; by default least squares weighted by the largest forces.
         progress: Callback, called with the completed fraction (0 to 1) of a pass over a long log.
         uncertainty: Method for the standard deviations; by default the spectral sandwich.
@@ -52,9 +53,13 @@ def identify(
         InputError: If the observations belong to another number of joints, have fewer rows than
             there are parameters, or weights are not known.
     """
-    recordings = tuple(observations) if isinstance(observations, Iterable) else (observations,)
-    _check(base, recordings)
-    fit = fit_problem(RegressionProblem(base, recordings, progress), estimator, uncertainty)
+    if isinstance(observations, RegressionProblem):
+        problem = observations
+    else:
+        recordings = tuple(observations) if isinstance(observations, Iterable) else (observations,)
+        _check(base, recordings)
+        problem = RegressionProblem(base, recordings, progress)
+    fit = fit_problem(problem, estimator, uncertainty)
     return fit if name is None else dataclasses.replace(fit, name=name)
 
 
