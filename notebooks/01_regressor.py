@@ -5,7 +5,7 @@
 #
 # $$\Theta(q, \dot q, \ddot q)\, p = Q_m .$$
 #
-# Everything in this package rests on that one line. Here we look at $\Theta$: where it comes from, what its zeros mean, and that it is right.
+# The whole package rests on this equation. This notebook shows where $\Theta$ comes from, what its zeros mean, and how it is checked.
 
 # %%
 # %matplotlib inline
@@ -39,9 +39,9 @@ for kind in ("RigidBodies", "ViscousFriction", "CoulombFriction", "RotorInertia"
 # %% [markdown]
 # ## One free body (Eq. 10)
 #
-# Take one body, moved by hand. With $a$ the acceleration of its reference point less gravity, and $\omega, \dot\omega$ its rotation, the force and
+# Take one free body. With $a$ the acceleration of its reference point less gravity, and $\omega, \dot\omega$ its rotation, the force and
 # moment on it are $\bar\Theta\, p$: six rows, ten columns. A body at rest in gravity shows its mass (first column, force 9.81 N per kg) and its first
-# moments (they make moments); its inertia is silent until it turns.
+# moments (they cause moments); its moments of inertia have no effect until it rotates.
 
 # %%
 from jaxid.dynamics.projection import body_regressor
@@ -57,7 +57,7 @@ print("columns that act in motion:", np.flatnonzero(np.any(turning != 0, axis=0)
 # ## All bodies, projected on the joints (Eq. 11)
 #
 # A joint feels a body only along the directions in which it can move it. The *projection* with the Jacobians $\partial v/\partial \dot q$,
-# $\partial\omega/\partial\dot q$ turns six rows per body into one row per joint, and internal forces between the bodies vanish by themselves. Joint $j$
+# $\partial\omega/\partial\dot q$ turns six rows per body into one row per joint, and constraint forces between the bodies drop out. Joint $j$
 # does not move the bodies before it: their columns are zero in its row. Below is one sample of $\Theta$.
 
 # %%
@@ -113,7 +113,7 @@ print(
 )
 
 # %% [markdown]
-# What is a torque made of? The same model answers, with parts of the motion or of the parameters set to zero.
+# Which effects does a torque consist of? Set parts of the motion or of the parameters to zero to see each of them.
 
 # %%
 still = np.zeros_like(motion.q)
@@ -140,10 +140,10 @@ panels[1].legend(ncols=2, fontsize=8)
 plt.show()
 
 # %% [markdown]
-# ## A law that no formula here knows: power
+# ## An independent check: power
 #
-# The drives' power, less what friction eats, must be the rate at which kinetic and potential energy change. Energy is computed from $M$ and from heights,
-# forces from $\Theta$: if any sign, any Coriolis term were wrong, the two lines would part.
+# The power of the drives, minus that of friction, must equal the rate of change of kinetic and potential energy. The energy is computed from $M$ and from
+# heights, the forces from $\Theta$: if a sign or a Coriolis term were wrong, the two lines would differ.
 
 # %%
 energy = np.asarray(model.kinetic_energy(frictionless, motion.q, motion.qd)) + np.asarray(
@@ -170,7 +170,7 @@ print(
 # %% [markdown]
 # ## Everything is differentiable
 #
-# $\Theta$ is a JAX function. How much torque does one millimetre of a link's length make? One `jvp` with respect to the *geometry*:
+# $\Theta$ is a JAX function. How much does the torque change if a link is one millimetre longer? One `jvp` with respect to the *geometry* says it:
 
 
 # %%
@@ -191,9 +191,9 @@ print(
 # %% [markdown]
 # ## What you learned
 #
-# * A `Robot` is what you know, a `Model` is what you do not know, and $\Theta$ ties both: linear in $p$, whatever the motion.
+# * A `Robot` holds what is known, a `Model` what is unknown. $\Theta$ connects both; it is linear in $p$ for any motion.
 # * Row $j$ has zeros for every body that joint $j$ does not move. Estimation here uses that, joint by joint.
 # * Inverse dynamics, mass matrix, bias forces and energies are one definition, checked against each other to $10^{-12}$, and differentiable with
 #   respect to everything, geometry included.
 #
-# Which of these 91 numbers can forces tell at all? Next: [base parameters](02_base_parameters.ipynb).
+# Which of these 91 parameters can forces determine at all? Next: [base parameters](02_base_parameters.ipynb).

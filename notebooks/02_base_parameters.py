@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 02 · Base parameters and their expressions
 #
-# The seven-axes manipulator of the paper has 91 standard parameters. Forces determine 57 numbers, which are *combinations* of them. Which ones, how
-# that is decided, and what can go wrong, is this notebook.
+# The seven-axes manipulator of the paper has 91 standard parameters. Forces determine 57 numbers, which are *combinations* of them. This notebook shows
+# which ones, and how they are found.
 
 # %%
 # %matplotlib inline
@@ -20,8 +20,8 @@ plt.style.use("notebook.mplstyle")
 # %% [markdown]
 # ## The paper's count (Eq. 24)
 #
-# The paper keeps seven parameters of each body (without products of inertia). Then forces determine 44 combinations. Each is written in letters, with
-# one letter for every length of the geometry.
+# The paper keeps seven parameters of each body (without products of inertia). Then forces determine 44 combinations. Each is an expression with one
+# symbol for every length of the geometry.
 
 # %%
 robot = jid.robots.tx90l_on_rail()
@@ -45,7 +45,7 @@ print("with", ", ".join(f"{letter} = {value:g} m" for letter, value in paper.len
 # ## All ten parameters of each body
 #
 # Products of inertia vanish for principal axes through the *centre of mass*. The model's axes go through the joint's origin, where they do not vanish:
-# thirteen more numbers can be told from the forces. This is the default.
+# forces determine thirteen more parameters. This is the default.
 
 # %%
 base = jid.base_parameters(jid.Model(robot))
@@ -74,13 +74,13 @@ bar.ax.set_yticklabels(["nothing", "in combination", "alone"])
 plt.show()
 
 # %% [markdown]
-# Body 1 slides on the rail: only its mass is felt, and only together with everything that it carries. Body 2 turns about an upright axis: of its ten
-# parameters one moment of inertia and two first moments act. The further out, the more can be told.
+# Body 1 moves along the rail: only its mass has an effect, and only in combination with all that it carries. Body 2 turns about an upright axis: of its ten
+# parameters one moment of inertia and two first moments have an effect. More parameters of the distal bodies can be determined.
 #
 # ## How the rank is decided
 #
 # The regressor is evaluated at random motions and stacked. Its columns are scaled to comparable size before anything is compared: a wrist's inertia makes
-# small columns, a rail's mass large ones, and a tolerance on the raw matrix would mistake small for dependent. Then two methods that share no code must
+# small columns, a rail's mass large ones, and a tolerance on the raw matrix would mistake small for dependent. Then two independent methods must
 # agree: Gram-Schmidt in column order, and the gap in the singular values.
 
 # %%

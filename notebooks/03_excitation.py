@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 03 · Excitation: criteria compared
 #
-# A motion must make every parameter felt. Most papers minimise the condition number of $\Lambda = \Theta_B^T\Theta_B$ (Eq. 36). This notebook designs
-# motions by three criteria for one arm within the same limits, and asks the only question that counts: *how far do the estimates scatter?*
+# A motion must make every parameter act on the forces. Most papers minimise the condition number of $\Lambda = \Theta_B^T\Theta_B$ (Eq. 36). This notebook designs
+# motions by three criteria for one arm within the same limits, and answers the important question: *how far do the estimates scatter?*
 
 # %%
 # %matplotlib inline
@@ -47,7 +47,7 @@ print(f"{base.size} base parameters; noise {noise} N m")
 # ## Three designs
 #
 # Each starts from eight random motions that fill the limits; all are improved at once, and the best one is taken. Limits hold for all times, not only at
-# samples. Of each criterion, small is meant to be good. The table shows all of them for each design, and the condition number a second time, with masses in
+# samples. Small values of a criterion are good. The table shows all of them for each design, and the condition number a second time, with masses in
 # grams instead of kilograms.
 
 # %%
@@ -81,8 +81,8 @@ for name, plan in plans.items():
     )
 
 # %% [markdown]
-# Each design is the best one in its own column, and all use their limits to the full. But what the first one has won depends on a choice that has nothing to
-# do with robots: in grams, it is no longer the best. The other two criteria do not depend on units.
+# Each design is the best one in its own column, and all use their limits to the full. But the result of the first one depends on the choice
+# of units: in grams, it is no longer the best. The other two criteria do not depend on units.
 
 # %%
 t = np.linspace(0, 2 * np.pi / 0.8, 500)
@@ -96,11 +96,11 @@ panels[0].legend(loc="lower left", ncols=2, fontsize=8)
 plt.show()
 
 # %% [markdown]
-# ## Condition number against what you get
+# ## Condition number and standard deviations
 #
 # Sixty random motions beside the designs. *Standard deviations* are a geometric mean over all parameters, 1 for the median random motion. Among random
-# motions the condition number is a fair guide: the points rise. Whoever follows it to its end leaves that path: fewer than two thirds of the condition number
-# of the best random motion, and no smaller deviations than that one has. The other two designs are far below all of them.
+# motions the condition number is a fair guide: the points rise. A design that minimises it is different: it has half the condition number of the best random
+# motion, but hardly smaller deviations. The deviations of the other two designs are far below those of all random motions.
 
 # %%
 from jaxid.excitation.information import information, standard_deviations
@@ -148,10 +148,10 @@ axes.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.17))
 plt.show()
 
 # %% [markdown]
-# ## Is the promise kept?
+# ## Are the predicted deviations right?
 #
-# A design promises standard deviations before anything is measured. So we measure: 200 noise draws over each designed motion, all identified in one call.
-# What scatters is compared with what was promised.
+# A design predicts standard deviations before anything is measured. To check them, we identify with 200 noise draws on each designed motion, in one call,
+# and compare the scatter of the estimates with the prediction.
 
 # %%
 truth = np.random.default_rng(2).uniform(0.5, 1.5, base.size)
@@ -189,14 +189,14 @@ for k, (name, plan) in enumerate(plans.items()):
     )
 
 # %% [markdown]
-# Not every parameter gains. In SI units the least certain numbers are friction's, so the condition number looks at those: dry friction comes out best by it,
-# and the moments of inertia, whose deviations happen to be small numbers, pay for that.
+# Not every parameter gains. In SI units the least certain numbers are friction's, so the condition number looks at those: dry friction comes out best,
+# at the expense of the moments of inertia, whose deviations are small numbers.
 #
 # ## What you learned
 #
 # * The condition number says how *round* the confidence ellipsoid is, in units that anyone may choose; D-optimality says how *small* it is.
-# * Standard deviations can be predicted before the experiment, and the prediction is kept where noise is what the design took it for. On real robots friction
-#   is not what the model says: ratios between designs are safer than their numbers.
+# * Standard deviations can be predicted before the experiment, and the prediction holds if the noise is as assumed. On real robots the
+#   friction model is not exact: trust ratios between designs more than their values.
 # * All criteria are one line each: exchange them, or write your own ([how to choose](../docs/how_to_choose.md)).
 #
 # With seven joints, collisions and limits of forces it is the same call: [the guide](../docs/excitation.md). Next: [a real robot](04_real_robot.ipynb).

@@ -2,8 +2,8 @@
 # # 04 · A real robot
 #
 # A Stäubli TX40: six axes, nine seconds of motor angles and motor torques at 5 kHz, published with the FIGAROH examples. From its log to parameters
-# with uncertainties, and to the question whether to believe them. Where the data are not beside the project, the log of a virtual arm takes their place:
-# what the text says of the TX40 is then not what you see, but the questions are the same.
+# with uncertainties, and to the question whether to trust them. If the data are not in `../shared/data`, the log of a virtual arm is used instead:
+# then the remarks about the TX40 do not apply to the figures.
 
 # %%
 # %matplotlib inline
@@ -82,7 +82,7 @@ print(robot.drives.reduction)
 # ## From samples to rows
 #
 # Angles are differentiated behind a zero-phase filter; the regressor's columns and the torques pass the *same* filter, and both are thinned out
-# alike. Nothing is compared that was not treated equally. The first 60 % of the log are for identification, the rest to ask whether it is true.
+# alike. The first 60 % of the log are for identification, the rest for validation.
 
 # %%
 model = jid.Model(robot, (jid.RigidBodies(), *friction))
@@ -101,8 +101,8 @@ print("not determined:", "; ".join(d.sentence(base) for d in fit.undetermined) o
 # %% [markdown]
 # ## How well is each parameter known?
 #
-# Standard deviations come from the spectrum of the residuals: rows behind a filter are not independent, and the textbook's formula would be too small by the
-# factor printed here. Blue is known to 10 %, yellow to 50 %; what is red is small, or hardly felt in this motion.
+# Standard deviations come from the spectrum of the residuals: rows behind a filter are not independent, and the textbook formula gives values that are too small by
+# the factor printed here. Blue parameters are known to 10 %, yellow ones to 50 %; red ones are small, or have little effect in this motion.
 
 # %%
 print(
@@ -111,10 +111,10 @@ print(
 jid.plot.parameters(fit)
 
 # %% [markdown]
-# ## Do others find the same?
+# ## Comparison with known values
 #
 # Friction and rotors of the TX40's drives have been published (of the virtual arm the truth is known). Where such a number is a base parameter by itself, it
-# can be compared. Wide intervals belong to what the log hardly shows, and say so.
+# can be compared. Parameters that the log hardly excites have wide intervals.
 
 # %%
 alone = [k for k, name in enumerate(base.names) if base.expressions[k] == name and name in known]
@@ -133,7 +133,7 @@ inside = np.abs(ratio - 1) <= half
 print(f"{inside.sum()} of {len(alone)} intervals of 95 % hold the known value")
 
 # %% [markdown]
-# ## Does it predict what it has not seen?
+# ## Does it predict new data?
 
 # %%
 check = jid.validate(fit, [seen, unseen])
@@ -145,13 +145,13 @@ for errors, part in zip(check.errors, ("first 60 %", "rest")):
 jid.plot.torques(check.errors[1], robot, title=f"{log.name}, the rest of the log")
 
 # %% [markdown]
-# In the last second and a half of its log the TX40 stands: what a joint at rest feels is decided by stiction, which the model does not have, and a
-# relative error looks bad where torques are small. Absolute errors stay below 3 % of the largest torques in every joint.
+# In the last second and a half of its log the TX40 stands still: there the torques depend on stiction, which the model does not have, and the
+# relative error is large because the torques are small. Absolute errors stay below 3 % of the largest torques in every joint.
 #
 # ## What is left?
 #
-# If residuals were noise and nothing else, their spectra would follow the dashed lines. Those of the TX40 lie above them at low frequencies: what is left is
-# slow and repeats with the motion, as errors of the friction law do. That is why its standard deviations are larger than the textbook's.
+# If residuals were noise and nothing else, their spectra would follow the dashed lines. Those of the TX40 lie above them at low frequencies: the errors are
+# slow and repeat with the motion, as errors of the friction law do. This is why the standard deviations are larger than those of the textbook formula.
 
 # %%
 white = sum(fit.residual_spectra.white)
@@ -161,7 +161,7 @@ jid.plot.residuals(fit.residual_spectra, robot)
 # %% [markdown]
 # ## Would another estimator do better?
 #
-# Rows are made once; each estimator then costs next to nothing. On the TX40's log they differ by a few percent of their errors, much less than seen and unseen
+# On the TX40's log they differ by a few percent of their errors, much less than seen and unseen
 # data do: a better log, or a better friction law, is worth more than another estimator ([how to choose](../docs/how_to_choose.md)).
 
 # %%

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 05 · Physical consistency and payload
 #
-# Least squares know nothing of bodies. This notebook shows a good fit that is *no robot*, what bounds from physics do about it, what they cannot know, and
-# how the ten parameters of a payload are consistent.
+# Least squares ignore that masses are positive. This notebook shows a good fit that is *physically impossible*, how physical bounds help, what data cannot
+# determine, and how the ten parameters of a payload are identified.
 
 # %%
 # %matplotlib inline
@@ -59,9 +59,9 @@ short = observations(truth, seed=4)
 other = observations(truth, seed=7)
 
 # %% [markdown]
-# ## A good fit that is no robot
+# ## A good fit that is physically impossible
 #
-# Three estimators on the same log. What matters for a simulation or a controller is the smallest eigenvalue of the mass matrix over the whole workspace.
+# Three estimators on the same log. Important for a simulation or a controller is the smallest eigenvalue of the mass matrix over the whole workspace.
 
 # %%
 fits = {
@@ -91,8 +91,8 @@ axes.legend(ncols=4)
 plt.show()
 
 # %% [markdown]
-# A negative eigenvalue means that some joint, pushed, accelerates *backwards*: a simulation explodes. The consistent fit costs next to nothing in residual and
-# cannot do that, because each of its bodies is a distribution of positive mass: its pseudo-inertia is positive semidefinite.
+# A negative eigenvalue means that some joint, pushed, accelerates *backwards*: a simulation explodes. The residual of the consistent fit is hardly larger, and
+# this cannot happen, because each of its bodies is a distribution of positive mass: its pseudo-inertia is positive semidefinite.
 
 # %%
 consistent = fits["consistent"].consistency
@@ -102,10 +102,10 @@ print("active bounds:", "; ".join(consistent.active) or "none")
 print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in consistent.masses_from_bounds])
 
 # %% [markdown]
-# ## What the data cannot see
+# ## What the data cannot determine
 #
-# Masses of the first bodies make no force of their own. Bounds leave them anywhere inside; what is known from elsewhere, a CAD model or a scale, fills
-# the gap: an *entropic pull* towards nominal bodies, and the total mass.
+# The masses of the first bodies have no effect of their own on the forces. Bounds only limit them; other knowledge, from a CAD model or a scale, can
+# fill the gap: an *entropic pull* towards nominal bodies, and the total mass.
 
 # %%
 cad = bodies * np.random.default_rng(5).uniform(0.8, 1.2, (7, 1))
@@ -145,8 +145,8 @@ plt.show()
 # %% [markdown]
 # ## A payload
 #
-# Someone hands the arm a tool of 2 kg. One log without it and one with it, fitted together, determine all ten parameters of the *tool*, although those
-# of the link that carries it stay unknown: the difference is what counts. Friction may have changed meanwhile (here by 20 %).
+# The arm now carries a tool of 2 kg. One log without it and one with it, fitted together, determine all ten parameters of the *tool*, although those
+# of the link that carries it stay unknown: only the difference counts. Friction may have changed meanwhile (here by 20 %).
 # Of ten intervals of 95 % one may well miss.
 
 # %%
@@ -179,8 +179,8 @@ print(f"\nthe robot with its tool: {float(heavier.tool.mass):.3f} kg")
 # %% [markdown]
 # ## What you learned
 #
-# * A small residual does not make a robot: look at the definiteness of $M$ (`jid.validate`), and take `PhysicallyConsistent` for models that simulate or control.
+# * A small residual does not make a model physically possible: check the definiteness of $M$ (`jid.validate`), and use `PhysicallyConsistent` for models that simulate or control.
 # * Base parameters and forces follow from data; masses of the first bodies reflect bounds and priors, and the fit says so.
 # * A payload is identified as a difference between two runs, with intervals, and goes back into the robot as a known tool.
 #
-# Details: [consistency](../docs/consistency.md), [several runs](../docs/runs.md). Next: [batches](06_batches.ipynb).
+# Details: [consistency](../docs/consistency.md), [several runs](../docs/uncertainty.md). Next: [batches](06_batches.ipynb).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 06 · Batches: Monte-Carlo, bootstrap, a thousand robots
 #
-# One identification is a number with an error bar. Thousands of them, in one compiled call, tell whether the error bar is honest, and which robot of a fleet
-# is not like the others. The code is the same on a CPU and on a GPU.
+# One identification is a number with an error bar. Thousands of them, in one compiled call, show whether the error bar is right, and which robot of a fleet
+# differs from the others. The code is the same on a CPU and on a GPU.
 
 # %%
 # %matplotlib inline
@@ -20,7 +20,7 @@ plt.style.use("notebook.mplstyle")
 # %% [markdown]
 # ## A small arm
 #
-# A waist and a shoulder with a link: what follows is the same for seven joints, it only takes longer to wait for.
+# A waist and a shoulder with a link: seven joints work in the same way, but take longer.
 
 # %%
 from scipy import stats
@@ -105,13 +105,13 @@ panels[1].legend(fontsize=8, loc="upper left")
 plt.show()
 
 # %% [markdown]
-# Who takes neighbouring rows for independent promises deviations of less than half their true size. The sandwich sees the memory of the noise in the
-# residuals of each single log.
+# If neighbouring rows are taken as independent, the standard deviations are less than half their true size. The sandwich estimates the correlation of the
+# noise from the residuals of each single log.
 #
 # ## Bootstrap: error bars from one log
 #
-# On a real robot there is one log. Blocks of time, drawn with replacement, play the part of further logs: each draw counts how often every block occurs, and
-# nothing is evaluated again. Blocks must be longer than the noise remembers and many: here 32 of a quarter of a second.
+# On a real robot there is one log. Blocks of time, drawn with replacement, replace further logs: each draw counts how often every block occurs, and
+# nothing is evaluated again. Blocks must be many, and longer than the correlation time of the noise: here 32 of a quarter of a second.
 
 # %%
 log = jid.Recording.of(motion.q, forces[0], sample_time=step, name="one log")
@@ -140,7 +140,7 @@ plt.show()
 
 # %% [markdown]
 # 1 is the scatter of the 2000 logs above. One log of eight seconds does not know its own uncertainty to better than some tens of percent, by either way. But
-# both miss to both sides, while independent rows promise too much for every parameter.
+# both err in both directions, while independent rows give too small deviations for every parameter.
 #
 # ## A thousand robots
 #
@@ -205,8 +205,8 @@ panels[1].legend(ncols=2, loc="upper right")
 plt.show()
 
 # %% [markdown]
-# With the drawing's lengths for all, what differs in length appears as a moment of inertia: C1 scatters more than its error bars say. With its own geometry
-# each robot scatters as it should.
+# With the drawing's lengths for all, what differs in length appears as a moment of inertia: C1 scatters more than its standard deviation. With the robots' own geometry
+# the scatter agrees with it.
 #
 # ## On a GPU
 #
@@ -221,14 +221,14 @@ difference = np.abs(again - ways["drawing's geometry"].parameters).max() / np.ab
 print(f"on this {device.platform}, in one computation: the same parameters, {difference < 1e-9}")
 
 # %% [markdown]
-# What decides is how much there is to do: a single log of a few seconds leaves a GPU idle, thousands of data sets do not. All is in double precision, of which
+# The amount of work decides: a single log of a few seconds leaves a GPU idle, thousands of data sets do not. All is in double precision, of which
 # graphics cards for games have little. This notebook was executed on a CPU; `benchmarks/gpu.py` says what your GPU does. Several devices and several hosts
-# share the work on long logs by factors: [cluster](../docs/cluster.md).
+# share the work on long logs by factors: [long logs and clusters](../docs/operations.md).
 #
 # ## What you learned
 #
 # * `identify_batch` takes data sets, draws of noise, masks, geometries: leading axes, one compiled call.
-# * Intervals are honest only if they know that neighbouring rows are alike; one log is enough to know, by the spectrum of its residuals or by bootstrap.
+# * Intervals are right only if they account for the correlation of neighbouring rows; one log suffices for that, by the spectrum of its residuals or by bootstrap.
 # * What differs between robots of one type can be an input: each gets its own geometry, and outliers of a fleet stand out in units of their own uncertainty.
 #
 # Next: [what temperature does](07_temperature.ipynb).

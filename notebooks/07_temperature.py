@@ -3,7 +3,7 @@
 #
 # A robot that has just been switched on is not the robot of half an hour later: the lubricant in its gears warms up, and friction falls, viscous friction
 # by a third and more. The paper identifies both states (Sec. 6). Here a virtual TX90L on its rail, whose rail and first joint have the published friction,
-# cold and warm, shows what changes, what must not change, and what a model without temperature costs.
+# cold and warm, shows what changes, what must not change, and how large the errors of a model without temperature are.
 
 # %%
 # %matplotlib inline
@@ -21,8 +21,8 @@ plt.style.use("notebook.mplstyle")
 # %% [markdown]
 # ## An hour of motion
 #
-# Friction turns the drives' work into heat; the heat stays in the gear for some ten minutes; warmer gears brake less and heat less. After half an hour little
-# changes any more.
+# Friction turns the drives' work into heat; the heat stays in the gear for some ten minutes; warmer gears have less friction and produce less heat. After half an hour little
+# changes.
 
 # %%
 cold = jid.simulation.virtual_tx90l_on_rail()
@@ -48,7 +48,7 @@ plt.show()
 #
 # Two logs of 15.7 s (two periods) in each state, warm with all gears at 45 °C, with encoders, torque noise and ripple, and with more friction near standstill
 # than elsewhere (Stribeck). The model that is identified knows viscous and Coulomb friction only. Which of its 44 parameters have *changed*? An estimate outside
-# of the other's 95 % interval is no sign: without any change that happens to one parameter in six. The test below keeps the chance of *any* false alarm at 5 %.
+# of the other's 95 % interval is not yet a sign: without any change this happens to one parameter in six. The test below keeps the chance of *any* false alarm at 5 %.
 
 # %%
 base = jid.base_parameters(cold.model)
@@ -87,15 +87,15 @@ for parameter in ("fv1", "fv2", "fc1", "fc2"):
     print(line.rstrip())
 
 # %% [markdown]
-# Friction has changed, in all gears; bodies and rotors have not: as in truth.
+# Friction has changed in all gears; bodies and rotors have not. This is true of the simulated robot.
 
 # %%
 jid.plot.comparison(comparison)
 
 # %% [markdown]
-# ## What the wrong temperature costs
+# ## Errors at the wrong temperature
 #
-# The cold model predicts the torques of the warm robot, on a motion that neither has seen.
+# The cold model predicts the torques of the warm robot, on a motion that is in neither of the fits.
 
 # %%
 new = observed(warm, 2, 99)
@@ -148,8 +148,8 @@ for j, name in enumerate(robot.joint_names):
 # %% [markdown]
 # ## What you learned
 #
-# * Identify the robot in the state in which it works: a model of the cold robot misses the warm one by many times its own error.
-# * Bodies must *not* change between both states. If they do, something else is wrong, and `jid.compare` says so without crying wolf.
-# * A few logs at known temperatures give a law with intervals, and models that follow the temperature. Details: [several runs](../docs/runs.md).
+# * Identify the robot in the state in which it works: the errors of the cold model on the warm robot are many times larger than those of the warm model.
+# * Bodies must *not* change between both states. If they do, something else is wrong, and `jid.compare` reports it with few false alarms.
+# * A few logs at known temperatures give a law with intervals, and models that follow the temperature. Details: [several runs](../docs/uncertainty.md).
 #
 # Next: [your own robot](08_your_robot.ipynb).

@@ -2,7 +2,7 @@
 # # 08 · Your own robot: from URDF to controller
 #
 # A URDF file in, feed-forward code for a controller and a better URDF file out. On the way: which motion to record, a log (of a virtual arm that stands in for
-# yours), a model that could exist, and the only test that a user notices: how much better the robot follows.
+# yours), a model that could exist, and the test that matters to a user: how much better the robot follows its path.
 
 # %%
 # %matplotlib inline
@@ -20,8 +20,8 @@ plt.style.use("notebook.mplstyle")
 # %% [markdown]
 # ## 1. What is known
 #
-# `load_urdf` reads joints, limits and geometry, and says what it had to decide. The file's inertials are *not* part of the robot: they are a guess about
-# unknowns, which `urdf_parameters` gives if you want it.
+# `load_urdf` reads joints, limits and geometry, and reports its decisions. The file's inertials are *not* part of the robot: they are estimates of
+# unknown parameters, which `urdf_parameters` returns.
 
 # %%
 import ctypes
@@ -42,7 +42,7 @@ print(
 # %% [markdown]
 # ## 2. Which motion
 #
-# A motion that begins and ends at rest, within the limits, made for these parameters. `plan.to_csv` writes it for the controller.
+# The motion begins and ends at rest, stays within the limits, and is designed for these parameters. `plan.to_csv` writes it for the controller.
 
 # %%
 limits = jid.Limits(
@@ -68,9 +68,9 @@ jid.plot.joints(robot, limits, time, motion)
 # %% [markdown]
 # ## 3. The log
 #
-# In place of your robot: a virtual arm whose bodies are 10 to 25 % off the CAD, with gear friction that sticks, encoders with 17 bits and noisy torques. Its
-# servo, without any model, follows the motion as well as it can. The log ends with the motion: while a joint stands, its gear holds anything up to
-# stiction, which this model does not know.
+# A virtual arm stands in for your robot. It is an arm whose bodies are 10 to 25 % off the CAD, with gear friction that sticks, encoders with 17 bits and noisy torques. Its
+# servo uses no model. The log ends with the motion: at standstill friction can have any value up to stiction, which
+# this model does not describe.
 
 # %%
 cad = jid.urdf_parameters("arm.urdf").reshape(3, 10)
@@ -101,8 +101,8 @@ print(
 # %% [markdown]
 # ## 4. The model
 #
-# A controller needs bodies that could exist, so the physically consistent estimate. Then the questions of [is my fit good?](../docs/is_my_fit_good.md), on a
-# motion that the fit has not seen.
+# A controller needs physically possible bodies, so we use the physically consistent estimator. Then the questions of [is my fit good?](../docs/is_my_fit_good.md), on a
+# motion that is not in the fit.
 
 # %%
 fit = jid.identify(base, observations, jid.PhysicallyConsistent())
@@ -145,11 +145,11 @@ panels[0].legend()
 plt.show()
 
 # %% [markdown]
-# The CAD's bodies help where gravity is large. What is left of the error then is friction and what the CAD has wrong; the identified model has both.
+# The CAD model helps where gravity is large. Its remaining errors come from friction and from wrong masses; the identified model describes both.
 #
 # ## 6. To the controller, and back into the URDF
 #
-# The model is saved whole; written as C, one file without dependencies; and put into the robot's own URDF, for simulators. If a compiler is at hand, the
+# The model is saved; written as C, one file without dependencies; and put into the robot's own URDF, for simulators. If a compiler is at hand, the
 # compiled file is compared with the package.
 
 # %%
@@ -185,9 +185,9 @@ with tempfile.TemporaryDirectory() as folder:
 # ## What you learned
 #
 # * From a URDF file to a controller in six steps; only the log and the last test need the robot.
-# * What CAD knows of masses is worth something; what it does not know of friction, and has wrong, is worth more. The identified model follows best.
-# * Masses in the new URDF file are *one* set of bodies that could exist and makes the identified forces: data cannot tell them apart
+# * The masses of the CAD model help, but the identified model, with friction and corrected masses, follows the path best.
+# * Masses in the new URDF file are *one* set of possible bodies with the identified forces: data cannot distinguish such sets
 #   ([consistency](05_consistency_payload.ipynb)).
-# * The same on the command line: `jaxid init`, `excite`, `inspect`, `identify`, `export` ([README](../README.md#your-own-robot)).
+# * The same on the command line: `jaxid init`, `excite`, `inspect`, `identify`, `export` ([README](../README.md#the-same-in-the-shell)).
 #
 # Where to go on: [how to choose](../docs/how_to_choose.md), [is my fit good?](../docs/is_my_fit_good.md).
