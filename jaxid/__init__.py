@@ -39,12 +39,14 @@ from jaxid.identification.bootstrap import bootstrap as bootstrap
 from jaxid.identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from jaxid.identification.essential import essential_parameters as essential_parameters
 from jaxid.identification.estimators import WeightedLeastSquares as WeightedLeastSquares
+from jaxid.identification.filter_choice import WhitestResidual as WhitestResidual
 from jaxid.identification.filter_choice import choose_filter as choose_filter
 from jaxid.identification.fit import Fit as Fit
 from jaxid.identification.fit import load as load
 from jaxid.identification.identify import fit_problem as fit_problem
 from jaxid.identification.identify import identify as identify
 from jaxid.identification.nonlinear_friction import identify_nonlinear as identify_nonlinear
+from jaxid.identification.nonlinear_friction import temperature_law as temperature_law
 from jaxid.identification.problem import RegressionProblem as RegressionProblem
 from jaxid.identification.runs.comparison import compare as compare
 from jaxid.identification.runs.delay import estimate_delay as estimate_delay
