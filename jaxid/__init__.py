@@ -7,7 +7,6 @@ Everything else is in namespaces: `terms`, `filters`, `units`, `estimators`, `un
 
 import typing as _typing
 
-from jaxid import export as export
 from jaxid import simulation as simulation
 from jaxid import trajectory as trajectories  # noqa: F401
 from jaxid.diagnosis import diagnose as diagnose
@@ -43,7 +42,6 @@ from jaxid.identification.filter_choice import WhitestResidual as WhitestResidua
 from jaxid.identification.filter_choice import choose_filter as choose_filter
 from jaxid.identification.fit import Fit as Fit
 from jaxid.identification.fit import load as load
-from jaxid.identification.identify import fit_problem as fit_problem
 from jaxid.identification.identify import identify as identify
 from jaxid.identification.nonlinear_friction import identify_nonlinear as identify_nonlinear
 from jaxid.identification.nonlinear_friction import temperature_law as temperature_law
@@ -77,7 +75,6 @@ from jaxid.robot.robot import Tool as Tool
 from jaxid.robot.urdf import load_urdf as load_urdf
 from jaxid.robot.urdf import urdf_parameters as urdf_parameters
 from jaxid.simulation.virtual import VirtualRobot as VirtualRobot
-from jaxid.trajectory import load_trajectory as load_trajectory
 from jaxid.trajectory import random_fourier_series as random_fourier_series
 from jaxid.validation import validate as validate
 

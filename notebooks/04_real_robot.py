@@ -55,7 +55,9 @@ if real:
         "fc": (7.14, 8.26, 6.34, 2.48, 3.03, 0.28),
         "Ia": (0.362, 0.362, 0.0988, 0.0313, 0.0468, 0.0105),
     }
-    known = {f"{kind}{j + 1}": value for kind, six in published.items() for j, value in enumerate(six)}
+    known = {
+        f"{kind}{j + 1}": value for kind, six in published.items() for j, value in enumerate(six)
+    }
 else:
     robot = jid.robots.panda()
     with tempfile.TemporaryDirectory() as folder:

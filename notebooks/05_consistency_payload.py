@@ -111,7 +111,9 @@ print("masses that reflect bounds, not data:", [f"m{k + 1}" for k in consistent.
 cad = bodies * np.random.default_rng(5).uniform(0.8, 1.2, (7, 1))
 bounds = jid.consistency.BodyBounds.from_geometry(robot).replace(total_mass=float(masses.sum()))
 pulled = jid.identify(
-    base, short, jid.PhysicallyConsistent(bounds=bounds, pull=jid.consistency.EntropicPull(cad, strength=1.0))
+    base,
+    short,
+    jid.PhysicallyConsistent(bounds=bounds, pull=jid.consistency.EntropicPull(cad, strength=1.0)),
 )
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.2))
 place = np.arange(7)

@@ -57,7 +57,7 @@ def rounded():
     if DOUBLE:
         single = [x.astype(np.float64) for x in single]
     *motion, forces = single
-    o = dataclasses.replace(cold, motion=jid.Motion(*motion), forces=forces)
+    o = cold.replace(motion=jid.Motion(*motion), forces=forces)
     return jid.identify(base, o).parameters
 
 
@@ -84,7 +84,11 @@ def written_motion():
     a = np.array([[0.1, 0.2], [0.3, -0.1]])
     series = fourier_series(np.array([0.3, 0.1]), a, a[::-1], 1.1)
     jid.trajectories.save_trajectory(series, FOLDER / "motion.json")
-    return jid.load_trajectory(FOLDER / "motion.json").motion(np.linspace(0.0, 1.0, 5)).qdd
+    return (
+        jid.trajectories.load_trajectory(FOLDER / "motion.json")
+        .motion(np.linspace(0.0, 1.0, 5))
+        .qdd
+    )
 
 
 def batch():
@@ -115,7 +119,7 @@ CASES = {
         jid.RegressionProblem(base, [cold]).blocks, np.ones(2), 20, key
     ),
     "factorise_across_processes": lambda: (
-        jid.fit_problem(
+        jid.identification.identify.fit_problem(
             jid.devices.factorise_across_processes(base, [cold]), jid.estimators.LeastSquares()
         ).parameters
     ),
@@ -139,7 +143,6 @@ CASES = {
 REFUSED = (
     "identify_batch",
     "bootstrap",
-    "factorise_on_devices",
     "factorise_across_processes",
     "design_excitation",
 )

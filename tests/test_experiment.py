@@ -335,8 +335,10 @@ def test_estimators(load, text, estimator, solution):
     assert isinstance(experiment.estimation.estimator, estimator)
     assert isinstance(experiment.estimation.estimator.solution, solution)
     assert experiment.estimation.regularised == (solution is not jid.estimators.Complete)
-    if solution in (jid.estimators.Ridge, jid.estimators.Truncated):
+    if solution is jid.estimators.Ridge:
         assert experiment.estimation.estimator.solution.strength == 0.02
+    if solution is jid.estimators.Truncated:
+        assert experiment.estimation.estimator.solution.rcond == 0.02
 
 
 @pytest.mark.parametrize(

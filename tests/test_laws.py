@@ -76,7 +76,7 @@ def test_derivatives_belong_to_their_motion_and_files_keep_it(seed, harmonics, o
             np.testing.assert_allclose(slope, derivative, rtol=0, atol=1e-6 * size)
         with tempfile.TemporaryDirectory() as folder:
             jid.trajectories.save_trajectory(trajectory, Path(folder) / "t.json")
-            again = jid.load_trajectory(Path(folder) / "t.json").motion(t)
+            again = jid.trajectories.load_trajectory(Path(folder) / "t.json").motion(t)
         for a, b in zip((now.q, now.qd, now.qdd), (again.q, again.qd, again.qdd), strict=True):
             np.testing.assert_array_equal(a, b)
 
@@ -122,7 +122,7 @@ KEYS = {
     "limits": ("position_min", "position_max", "velocity", "acceleration", "force"),
     "recording": ("angles", "forces", "time", "angle_unit", "force_unit"),
     "filter": ("kind", "cutoff"),
-    "rows": ("every",),
+    "rows": ("min_speed",),
     "excitation": ("harmonics", "omega", "samples", "starts"),
 }
 VALUES = {

@@ -220,9 +220,11 @@ def run_study(
     progress("identifying", 0.0)
     rows = jid.RegressionProblem(base, [observations[0]])
     fits = {
-        "without weights": jid.fit_problem(rows, jid.estimators.LeastSquares()),
-        "weighted": jid.fit_problem(rows, jid.WeightedLeastSquares()),
-        "consistent": jid.fit_problem(rows, jid.PhysicallyConsistent()),
+        "without weights": jid.identification.identify.fit_problem(
+            rows, jid.estimators.LeastSquares()
+        ),
+        "weighted": jid.identification.identify.fit_problem(rows, jid.WeightedLeastSquares()),
+        "consistent": jid.identification.identify.fit_problem(rows, jid.PhysicallyConsistent()),
     }
     truth = np.asarray(base.from_standard(cold.parameters))
     fits["true parameters"] = eqx.tree_at(lambda f: f.parameters, fits["weighted"], truth)
@@ -230,7 +232,7 @@ def run_study(
     recordings = [observations[0], observations[2]]
     models = [Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()]
     progress("comparing cold and warm", 0.0)
-    warm = jid.fit_problem(
+    warm = jid.identification.identify.fit_problem(
         jid.RegressionProblem(base, [observations[1]]), jid.WeightedLeastSquares()
     )
     progress("checking intervals", 0.0)
@@ -320,7 +322,11 @@ def _check_coverage(
         inside = 0
         for log in logs:
             rows = jid.RegressionProblem(base, [_observe(log, quiet.robot, filter)])
-            low, high = jid.fit_problem(rows, jid.WeightedLeastSquares()).intervals(0.95).T
+            low, high = (
+                jid.identification.identify.fit_problem(rows, jid.WeightedLeastSquares())
+                .intervals(0.95)
+                .T
+            )
             inside += int(np.count_nonzero((low <= truth) & (truth <= high)))
         return inside
 

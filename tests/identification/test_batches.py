@@ -257,7 +257,9 @@ def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
     order = np.random.default_rng(0).permutation(12000)
     o = o.replace(motion=o.motion[order], forces=o.forces[order])
     blocks = jid.RegressionProblem(base, [o], divisions=60).blocks
-    fit = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), jid.estimators.LeastSquares())
+    fit = jid.identification.identify.fit_problem(
+        jid.RegressionProblem(base, blocks=blocks), jid.estimators.LeastSquares()
+    )
     draws = bootstrap(blocks, fit.weights, 4000, jax.random.key(0))
     np.testing.assert_allclose(
         np.mean(draws, axis=0), fit.parameters, atol=0.2 * fit.standard_deviations.max()

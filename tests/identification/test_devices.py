@@ -44,7 +44,7 @@ def say(*words):
     # In one piece: an unbuffered print writes word by word, and JAX's own log comes between.
     os.write(1, (" ".join(map(str, words)) + "\\n").encode())
 def write(problem):
-    fit = jid.fit_problem(problem, jid.estimators.LeastSquares())
+    fit = jid.identification.identify.fit_problem(problem, jid.estimators.LeastSquares())
     np.savez(sys.argv[1], p=fit.parameters, s=fit.naive_standard_deviations, rows=fit.rows)
 """
 LONG = """
@@ -179,7 +179,9 @@ def test_two_processes(base, tmp_path):
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0, 0], "\n\n".join(outputs)
     recordings = [recording(base, k) for k in range(3)]
-    fit = jid.fit_problem(jid.RegressionProblem(base, recordings), jid.estimators.LeastSquares())
+    fit = jid.identification.identify.fit_problem(
+        jid.RegressionProblem(base, recordings), jid.estimators.LeastSquares()
+    )
     for path in paths:
         assert_same(path, fit)
     a, b = (np.load(path)["p"] for path in paths)

@@ -102,7 +102,9 @@ def test_every_estimator_goes_through_logs_that_are_not_held(base, noisy, k, mon
 def test_what_needs_rows_refuses_factors(base, noisy, k):
     blocks = jid.RegressionProblem(base, [noisy]).blocks
     with pytest.raises(ValueError, match="only their factors"):
-        jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), members(noisy)[k])
+        jid.identification.identify.fit_problem(
+            jid.RegressionProblem(base, blocks=blocks), members(noisy)[k]
+        )
 
 
 @pytest.mark.parametrize("loss", [jid.estimators.Huber(), jid.estimators.Tukey()])

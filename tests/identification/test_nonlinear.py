@@ -164,7 +164,9 @@ def test_what_cannot_be_searched_is_refused():
         select_shapes(zero).values(zero)
     blocks = jid.RegressionProblem(START, [observations(samples=300)]).blocks
     with pytest.raises(ValueError, match="needs the rows themselves"):
-        jid.fit_problem(jid.RegressionProblem(START, blocks=blocks), NonlinearFriction(WLS))
+        jid.identification.identify.fit_problem(
+            jid.RegressionProblem(START, blocks=blocks), NonlinearFriction(WLS)
+        )
 
 
 def test_friction_falls_with_temperature_as_fits_at_several_tell():

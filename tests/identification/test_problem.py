@@ -87,7 +87,7 @@ def test_columns_are_evaluated_once(base, recordings, monkeypatch):
     problem, evaluated = jid.RegressionProblem(base, recordings), []
     evaluate = problem._evaluate
     monkeypatch.setattr(problem, "_evaluate", lambda *x: evaluated.append(x) or evaluate(*x))
-    jid.fit_problem(problem, jid.estimators.LeastSquares())
+    jid.identification.identify.fit_problem(problem, jid.estimators.LeastSquares())
     assert len(evaluated) == len(recordings)
 
 
@@ -124,7 +124,7 @@ def test_a_fold_of_other_columns_is_that_of_numpy(base, recordings):
 def test_other_columns_of_the_same_recordings(base, recordings):
     less = jid.base_parameters(jid.Model(base.model.robot, base.model.terms[:2]))
     problem = jid.RegressionProblem(base, recordings).with_base(less)
-    fit = jid.fit_problem(problem, jid.estimators.LeastSquares())
+    fit = jid.identification.identify.fit_problem(problem, jid.estimators.LeastSquares())
     expected = jid.identify(less, recordings, jid.estimators.LeastSquares())
     np.testing.assert_array_equal(fit.parameters, expected.parameters)
     assert fit.recordings == expected.recordings

@@ -74,7 +74,7 @@ def agree(base, o, **options) -> None:
     for a, b in zip(got.parts, expected.parts, strict=True):
         assert distance(a, b) < 1e-12
     p, q = (
-        jid.fit_problem(
+        jid.identification.identify.fit_problem(
             jid.RegressionProblem(base, blocks=x), jid.estimators.LeastSquares()
         ).parameters
         for x in (got, expected)
@@ -120,7 +120,7 @@ def test_a_known_tool():
 
 def test_forces_without_noise_are_explained_to_rounding(base):
     o = observed(base, noise=0.0)
-    fit = jid.fit_problem(
+    fit = jid.identification.identify.fit_problem(
         jid.RegressionProblem(base, blocks=fast(base, o)), jid.estimators.LeastSquares()
     )
     assert fit.residual < 1e-13

@@ -223,7 +223,9 @@ def test_every_way_gives_a_whole_uncertainty(base, method):
 def test_factors_alone_are_judged_by_blocks(base):
     o = observations(base.model, standard_parameters(base.model), noise=0.3)
     blocks = jid.RegressionProblem(base, [o], divisions=12).blocks
-    fit = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), ESTIMATOR)
+    fit = jid.identification.identify.fit_problem(
+        jid.RegressionProblem(base, blocks=blocks), ESTIMATOR
+    )
     left_out = np.array(
         [
             np.linalg.lstsq(*blocks.without(k).weighted(fit.weights), rcond=None)[0]
@@ -235,7 +237,9 @@ def test_factors_alone_are_judged_by_blocks(base):
     assert (fit.uncertainty.dof == 11).all()
     assert any("block jackknife" in note for note in fit.notes)
     blocks = jid.RegressionProblem(base, [o], divisions=1).blocks
-    one = jid.fit_problem(jid.RegressionProblem(base, blocks=blocks), ESTIMATOR)
+    one = jid.identification.identify.fit_problem(
+        jid.RegressionProblem(base, blocks=blocks), ESTIMATOR
+    )
     np.testing.assert_array_equal(one.standard_deviations, one.naive_standard_deviations)
     assert any("only one block of time" in note for note in one.notes)
 
