@@ -17,15 +17,15 @@ MADE = {
     ),
     "a share of all": (
         lambda: jid.estimators.Truncated(2.0),
-        "`share` of `Truncated` must be at least 0 and",
+        "`rcond` of `Truncated` must be",
     ),
     "a negative ridge": (
         lambda: jid.estimators.Ridge(-1.0),
-        "`share` of `Ridge` must be a finite number",
+        "`strength` of `Ridge` must be a finite number",
     ),
     "a ridge that is no number": (
         lambda: jid.estimators.Ridge(np.nan),
-        "`share` of `Ridge` must be",
+        "`strength` of `Ridge` must be",
     ),
     "a limit that is no number": (
         lambda: jid.estimators.Huber(np.nan),
