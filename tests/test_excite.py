@@ -417,7 +417,9 @@ def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
     assert code == 0, err
     assert "`some/motion.state.npz` is not there to go on with: the design begins" in out
     assert asked == [c.name for c in CRITERIA[:2]]
-    assert out.index("wrote some: motion.csv") < out.index("motions that minimise one of the criteria each")
+    assert out.index("wrote some: motion.csv") < out.index(
+        "motions that minimise one of the criteria each"
+    )
     assert "stopped after 1 of 6 criteria" in out
 
 
