@@ -53,6 +53,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxid.errors import InputError
+
 MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
 
@@ -185,7 +187,7 @@ class Table:
         rules: Indices of rows above which a line is drawn.
 
     Raises:
-        ValueError: If columns and `status` are not of the same length.
+        InputError: If columns and `status` are not of the same length.
     """
 
     def __init__(
@@ -205,7 +207,7 @@ class Table:
         self.rules = frozenset(rules)
         lengths = {len(c.values) for c in columns} | ({len(self.status)} if self.status else set())
         if len(lengths) > 1:
-            raise ValueError(f"`columns` and `status` must have one length, not {sorted(lengths)}.")
+            raise InputError(f"`columns` and `status` must have one length, not {sorted(lengths)}.")
 
     @property
     def rows(self) -> list[tuple[str, ...]]:

@@ -151,7 +151,6 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "criteria: smaller is better",
         "D: mean axis",
         "expected standard deviations",
-        "± [%]",
         "use of the limits",
         "is in the designed motion from",
         "of 100 samples in 7.854 s (12.73 Hz), of one run",

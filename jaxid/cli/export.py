@@ -20,7 +20,7 @@ from jaxid.report.terminal import show_files
 
 
 class Target(enum.StrEnum):
-    """What a model can be written as."""
+    """Formats of an exported model."""
 
     C = "c"
     URDF = "urdf"

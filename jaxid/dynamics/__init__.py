@@ -1,1 +1,1 @@
-"""What is linear in the unknowns: terms, models, base parameters."""
+"""Dynamics linear in the unknowns: terms, models, base parameters."""

@@ -32,8 +32,8 @@ def estimate_each(
 
     Args:
         base: What can be identified.
-        motion: Of each data set, filtered and decimated before.
-        forces: Of each data set and draw.
+        motion: Motion of each data set, already filtered and decimated.
+        forces: Forces of each data set and draw.
         mask: Which rows count.
         estimator: How; each data set for itself.
         row_time: Between two rows [s]; None if rows are taken for independent.

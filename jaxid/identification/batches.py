@@ -54,10 +54,10 @@ def identify_batch(
 
     Args:
         base: What can be identified on this robot.
-        motion: Of each data set, [datasets, samples, joints]: filtered and decimated before.
+        motion: Motions [datasets, samples, joints], already filtered and decimated.
         forces: Generalized forces [N m or N], reduced like the motion. With an axis of draws, many
             sets of forces over one motion, whose columns are then evaluated and factored once.
-        weights: Of the joints' rows [1/(N m) or 1/N], the same for all data sets or for each; the
+        weights: Weights of the joints' rows [1/(N m) or 1/N], for all data sets or for each;
             reciprocals of the largest forces if None (Eq. 30).
         mask: Which rows count: data sets of different length are filled up and masked.
         robots: The robot of each data set, of the topology of the base parameters' robot: the

@@ -1,4 +1,4 @@
-"""What comes out of an identification."""
+"""Result of an identification: estimates, covariance, factors."""
 
 import dataclasses
 import enum
@@ -36,7 +36,7 @@ from jaxid.table import (
 )
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
-"""Relative standard deviations up to which an estimate is trusted, or doubtful, of 1."""
+"""Relative standard deviations up to which an estimate is trusted, or doubtful, as fractions."""
 
 
 class Trust(enum.Enum):
@@ -72,11 +72,11 @@ class Fit(eqx.Module):
     Attributes:
         base: Which combinations of standard parameters they are.
         parameters: The estimates, in the units of `base.units`.
-        uncertainty: Of the estimates, and how it was found.
-        weights: Of the joints' rows [1/(N m) or 1/N].
-        condition_numbers: Of the observation matrix.
+        uncertainty: Uncertainty of the estimates, and its method.
+        weights: Weights of the joints' rows [1/(N m) or 1/N].
+        condition_numbers: Condition numbers of the observation matrix.
         rows: Number of rows of each joint.
-        residual_rms: Of each joint's rows [N m or N].
+        residual_rms: RMS of the residuals of each joint [N m or N].
         residual: Norm of all residuals relative to the norm of all forces, of 1.
         undetermined: Combinations that these observations do not determine.
         estimator: What made the fit.
@@ -85,7 +85,7 @@ class Fit(eqx.Module):
         notes: What the user should know, in sentences.
         consistency: How a physically consistent estimate came about, and which bounds decide.
         full_parameters: Standard parameters, of an estimator that finds a complete set of them.
-        residual_spectra: Of each joint's residuals, and whether they are white; None where only
+        residual_spectra: Spectra of each joint's residuals, and their whiteness; None where only
             factors of the rows were known.
         date: Day on which the fit was made, like 2026-01-31; empty if it is not known.
         blocks: Factors of the rows by contiguous blocks of time, with which later functions go on;
@@ -125,7 +125,7 @@ class Fit(eqx.Module):
 
     @property
     def naive_standard_deviations(self) -> Float[np.ndarray, " base"]:
-        """What they would be if the rows were independent; filtered rows are not."""
+        """Standard deviations for independent rows; filtered rows are not independent."""
         return self.uncertainty.naive_standard_deviations
 
     def intervals(self, level: float = 0.95) -> Float[np.ndarray, "base 2"]:
@@ -146,7 +146,7 @@ class Fit(eqx.Module):
 
     @property
     def relative_standard_deviations(self) -> Float[np.ndarray, " base"]:
-        """Standard deviations in units of the estimates' sizes, of 1."""
+        """Standard deviations in units of the estimates' sizes, as fractions."""
         size = np.abs(np.asarray(self.parameters))
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(size > 0, self.standard_deviations / size, np.inf)
@@ -338,7 +338,7 @@ class Fit(eqx.Module):
         An estimator that holds recordings or functions is kept in words only.
 
         Args:
-            path: Of the file; one that is there already is replaced.
+            path: Path of the file; an existing file is replaced.
 
         Raises:
             InputError: If the model holds something that no file can hold, such as a term with
@@ -361,7 +361,7 @@ def load(path: str | Path) -> Fit:
     one's own are found if the module that defines them is imported; nothing in a file is run.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
 
     Raises:
         OSError: If the file cannot be read.

@@ -21,7 +21,7 @@ def write_model(path: str | Path, model: eqx.Module) -> Path:
     """Writes a model file, whole or not at all.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         model: An identified model.
 
     Raises:
@@ -43,7 +43,7 @@ def read_model(path: str | Path, kind: type[_Kind], check: Callable[[_Kind], Non
     """Reads a model file.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         kind: What it must hold.
         check: Raises a `ValueError` where parts of it do not belong together.
 

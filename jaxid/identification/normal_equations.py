@@ -38,11 +38,11 @@ class BatchFit(eqx.Module):
 
     Attributes:
         parameters: The estimates; zero along what a data set does not determine.
-        standard_deviations: Of the estimates, by the spectral sandwich if the time between rows was
-            given; otherwise naive. Infinite where nothing is known.
-        residual_rms: Of each joint's rows [N m or N].
-        condition_numbers: Of each weighted observation matrix with columns of length one; an upper
-            bound, at most the number of parameters too large, where it is well conditioned.
+        standard_deviations: Standard deviations by the spectral sandwich if the time between rows
+            was given; otherwise naive. Infinite where nothing is known.
+        residual_rms: RMS of the residuals of each joint [N m or N].
+        condition_numbers: Those of each weighted observation matrix with columns of length one; an
+            upper bound, at most the number of parameters too large, where it is well conditioned.
         determined: Whether a data set determines all parameters. Where it is False while JAX
             traces, the estimates are not to be used.
         naive_standard_deviations: For independent rows and a variance of each joint's own.
@@ -59,7 +59,7 @@ class BatchFit(eqx.Module):
 
 
 class DataSets(eqx.Module):
-    """What is known of some data sets: leading axes datasets, then samples (forces: draws)."""
+    """Data sets of a batch: leading axes datasets, then samples (forces: draws)."""
 
     motion: Motion
     forces: Float[AnyArray, "datasets draws samples joints"]

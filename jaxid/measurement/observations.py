@@ -10,14 +10,13 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
 from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth, high_rate_hint
-from jaxid.measurement.recording import Recording, require_finite_delay
+from jaxid.measurement.recording import Recording
 from jaxid.robot.limits import per_joint
 from jaxid.robot.robot import Robot
 
@@ -411,15 +410,17 @@ def observe(
         filter.motion(angles[a:b], None if velocities is None else velocities[a:b], dt)
         for a, b in used
     ]
-    motion = Motion(*(_join([getattr(m, x) for m in motions]) for x in ("q", "qd", "qdd")))
+    motion = Motion(*(np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "qd", "qdd")))
     ends = [0, *itertools.accumulate(b - a for a, b in used)]
     segments = tuple(itertools.pairwise(ends))
-    speeds = per_joint("min_speed", _optional_array(min_speed), n, 0.0)
+    speeds = per_joint(
+        "min_speed", None if min_speed is None else np.asarray(min_speed, np.float64), n, 0.0
+    )
     rows = _row_samples(segments, filter.edge(dt), decimation.factor)
     mask = np.abs(motion.qd[np.concatenate([np.asarray(r) for r in rows])]) >= speeds
     require_fast_rows(mask, speeds, robot, recording.name)
     return Observations(
-        source=SamplesInMemory(motion, _join([forces[a:b] for a, b in used])),
+        source=SamplesInMemory(motion, np.concatenate([forces[a:b] for a, b in used])),
         filter=filter,
         decimation=decimation,
         segments=segments,
@@ -496,47 +497,3 @@ def joint_side(
     if forces_on_motor_side:
         forces = np.asarray(drives.joint_forces(forces))
     return angles, velocities, forces
-
-
-def _join(parts: list) -> np.ndarray:
-    return np.concatenate([np.asarray(p, np.float64) for p in parts])
-
-
-def _optional_array(value: ArrayLike | tuple | None) -> np.ndarray | None:
-    return None if value is None else np.asarray(value, np.float64)
-
-
-def without_delay(observations: Observations, seconds: float) -> Observations:
-    """Remove a delay of the forces, like `remove_delay`: rows near the ends are left out.
-
-    Args:
-        observations: Observations whose forces are delayed.
-        seconds: Delay of the forces [s]; negative if they are early.
-
-    Raises:
-        InputError: If no rows are left.
-    """
-    require_finite_delay(seconds)
-    time, dt = observations.time, observations.sample_time
-    lost = math.ceil(abs(seconds) / dt - 1e-9)
-    edge = observations.filter.edge(dt)
-    mask, instants = np.array(observations.mask), observations.instants
-    motion = observations.motion
-    parts: dict[str, list[np.ndarray]] = {"q": [], "qd": [], "qdd": []}
-    for (a, b), (r0, r1) in zip(observations.segments, observations.row_segments, strict=True):
-        # Beyond the ends the nearest motion is used, in rows that do not count.
-        at = np.clip(time[a:b] - seconds, time[a], time[b - 1])
-        for key, values in parts.items():
-            x = np.asarray(getattr(motion, key), np.float64)
-            values.append(CubicSpline(time[a:b], x[a:b])(at))
-        rows = instants[r0:r1]
-        first, last = (a + edge + lost, b) if seconds > 0 else (a, b - edge - lost)
-        mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
-    if not mask.any(axis=0).all():
-        raise InputError(
-            f"the delay is {seconds:g} s, but `{observations.name}` lasts "
-            f"{time[-1] - time[0]:g} s: no rows of some joint are left."
-        )
-    return observations.replace(
-        motion=Motion(**{key: np.concatenate(values) for key, values in parts.items()}), mask=mask
-    )

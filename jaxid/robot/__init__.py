@@ -1,1 +1,1 @@
-"""What is known of a robot: joints, geometry, limits, drives; from URDF, DH or the library."""
+"""Known properties of a robot: joints, geometry, limits, drives; from URDF, DH or the library."""

@@ -19,7 +19,7 @@ INDEPENDENT = 1e-12
 
 
 class Verdict(enum.Enum):
-    """What a comparison says about one parameter."""
+    """Verdict of a comparison about one parameter."""
 
     CHANGED = "changed"
     PERHAPS = "perhaps changed"
@@ -31,7 +31,7 @@ class GroupChange(eqx.Module):
     """Whether any parameter of a group has changed.
 
     Attributes:
-        name: Of the group.
+        name: Name of the group.
         size: Number of its parameters that both runs determine.
         statistic: Squared length of the differences in their own standard deviations; about `size`
             where nothing has changed.
@@ -59,12 +59,12 @@ class Comparison(eqx.Module):
     in twenty does without any change.
 
     Attributes:
-        first: Of one run.
-        second: Of the other.
+        first: Estimates of one run.
+        second: Estimates of the other.
         difference: The second's parameters less the first's.
-        covariance: Of the differences.
+        covariance: Covariance of the differences.
         freedom: Degrees of freedom of their standard deviations.
-        level: Confidence of intervals and tests, of 1.
+        level: Confidence of intervals and tests, a fraction from 0 to 1.
     """
 
     first: Estimates
@@ -85,9 +85,9 @@ class Comparison(eqx.Module):
         """Compares estimates of the same parameters.
 
         Args:
-            first: Of one run.
-            second: Of another run.
-            level: Confidence of intervals and tests, of 1.
+            first: Estimates of one run.
+            second: Estimates of another run.
+            level: Confidence of intervals and tests, a fraction from 0 to 1.
             cross: Covariance of the first with the second estimates; None if they come from
                 different data.
 
@@ -147,7 +147,7 @@ class Comparison(eqx.Module):
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
-        """What can be said about each parameter."""
+        """Verdict about each parameter."""
         largest = 1.0 - self.level
         rows = zip(self.determined, self.p_values, self.adjusted_p_values, strict=True)
         return tuple(
@@ -256,8 +256,8 @@ def joint_test(
     It is chi-squared where the covariance is exact, else Hotelling's $T^2$.
 
     Args:
-        difference: Of estimates.
-        covariance: Of the differences, with finite variances above zero.
+        difference: Differences of estimates.
+        covariance: Covariance of the differences, with finite variances above zero.
         freedom: Degrees of freedom of the covariance.
     """
     d, C = np.asarray(difference), np.asarray(covariance)
@@ -280,9 +280,9 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
     """Decides which base parameters have changed between two fits of one robot (Sec. 6).
 
     Args:
-        first: Of one run, such as that of the cold robot.
-        second: Of another run, such as that of the warm robot; of other recordings.
-        level: Confidence of intervals and tests, of 1.
+        first: Fit of one run, such as that of the cold robot.
+        second: Fit of another run, such as that of the warm robot; of other recordings.
+        level: Confidence of intervals and tests, a fraction from 0 to 1.
 
     Raises:
         InputError: If the fits are not of the same base parameters, or `level` is no share.

@@ -1,13 +1,16 @@
 """How late a log's forces are against its angles, found from the model itself."""
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
 from scipy import stats
+from scipy.interpolate import CubicSpline
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractWeights, Complete, MaximumForces
 from jaxid.identification.estimators.solutions import Decomposition
@@ -15,7 +18,8 @@ from jaxid.identification.factors import Blocks, RowChunk
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.comparison import joint_test
 from jaxid.identification.runs.left_out import block_covariance
-from jaxid.measurement.observations import Observations, without_delay
+from jaxid.measurement.observations import Observations
+from jaxid.measurement.recording import require_finite_delay
 
 BLOCKS = 20
 """Blocks of time of all recordings together, from which the uncertainty is found."""
@@ -32,11 +36,11 @@ class Delay(eqx.Module):
 
     Attributes:
         seconds: The delay of all joints [s].
-        standard_deviation: Of the delay [s].
+        standard_deviation: Standard deviation of the delay [s].
         freedom: Degrees of freedom of the standard deviation.
         of_joints: Each joint's own delay [s].
-        covariance: Of the joints' own delays [s²].
-        joint_names: Of the joints.
+        covariance: Covariance of the joints' own delays [s²].
+        joint_names: Names of the joints.
     """
 
     seconds: float
@@ -79,8 +83,8 @@ def estimate_delay(
 
     Args:
         base: What can be identified on this robot.
-        observations: Of one recording, or of several with the same delay.
-        weights: Of the joints; the reciprocals of the largest forces if None.
+        observations: One or several recordings with the same delay.
+        weights: Weights of the joints; the reciprocals of the largest forces if None.
 
     Raises:
         InputError: If weights are not known, or the search does not settle: the delay is longer
@@ -158,3 +162,39 @@ def _solved(
     decomposition = Decomposition.of(R, z)
     inverse = Complete().inverse(decomposition.values)
     return decomposition.solve(inverse), decomposition.inverse_information(inverse)
+
+
+def without_delay(observations: Observations, seconds: float) -> Observations:
+    """Remove a delay of the forces, like `remove_delay`: rows near the ends are left out.
+
+    Args:
+        observations: Observations whose forces are delayed.
+        seconds: Delay of the forces [s]; negative if they are early.
+
+    Raises:
+        InputError: If no rows are left.
+    """
+    require_finite_delay(seconds)
+    time, dt = observations.time, observations.sample_time
+    lost = math.ceil(abs(seconds) / dt - 1e-9)
+    edge = observations.filter.edge(dt)
+    mask, instants = np.array(observations.mask), observations.instants
+    motion = observations.motion
+    parts: dict[str, list[np.ndarray]] = {"q": [], "qd": [], "qdd": []}
+    for (a, b), (r0, r1) in zip(observations.segments, observations.row_segments, strict=True):
+        # Beyond the ends the nearest motion is used, in rows that do not count.
+        at = np.clip(time[a:b] - seconds, time[a], time[b - 1])
+        for key, values in parts.items():
+            x = np.asarray(getattr(motion, key), np.float64)
+            values.append(CubicSpline(time[a:b], x[a:b])(at))
+        rows = instants[r0:r1]
+        first, last = (a + edge + lost, b) if seconds > 0 else (a, b - edge - lost)
+        mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
+    if not mask.any(axis=0).all():
+        raise InputError(
+            f"the delay is {seconds:g} s, but `{observations.name}` lasts "
+            f"{time[-1] - time[0]:g} s: no rows of some joint are left."
+        )
+    return observations.replace(
+        motion=Motion(**{key: np.concatenate(values) for key, values in parts.items()}), mask=mask
+    )

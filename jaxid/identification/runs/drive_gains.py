@@ -36,10 +36,10 @@ class DriveGains(eqx.Module):
 
     Attributes:
         gains: Factors by which the measured forces of each joint must be multiplied, of 1.
-        covariance: Of the gains.
+        covariance: Covariance of the gains.
         freedom: Degrees of freedom of their standard deviations.
         parameters: Base parameters of the unloaded robot, from true forces.
-        joint_names: Of the joints.
+        joint_names: Names of the joints.
     """
 
     gains: Float[AnyArray, " joints"]
@@ -74,7 +74,7 @@ class DriveGains(eqx.Module):
         """A recording with true forces in place of those of nominal gains.
 
         Args:
-            recording: Of the same drives, with the same nominal gains.
+            recording: Recording of the same drives, with the same nominal gains.
 
         Raises:
             InputError: If it has another number of joints.

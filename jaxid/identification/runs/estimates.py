@@ -1,4 +1,4 @@
-"""What others need of a fit to compare it: numbers with names, units and their covariance."""
+"""Estimates for comparisons: numbers with names, units and their covariance."""
 
 import dataclasses
 import re
@@ -19,13 +19,13 @@ class Estimates(eqx.Module):
     """Estimated parameters and their uncertainty.
 
     Attributes:
-        label: Of the run that they come from, such as `cold`.
-        names: Of the parameters.
+        label: Name of their run, such as `cold`.
+        names: Names of the parameters.
         expressions: What each parameter is made of, in letters; its name where nobody knows.
-        units: Of the parameters.
+        units: Units of the parameters.
         groups: The kind of each parameter, such as `viscous friction`.
         parameters: The estimates.
-        covariance: Of the estimates; infinite on the diagonal where nothing is known.
+        covariance: Covariance of the estimates; infinite on the diagonal where nothing is known.
         freedom: Degrees of freedom of each standard deviation; infinite where it is taken as exact.
     """
 
@@ -44,7 +44,7 @@ class Estimates(eqx.Module):
 
         Args:
             fit: The fit.
-            label: Of the run; the names of its recordings if None.
+            label: Name of the run; the names of its recordings if None.
         """
         base = fit.base
         return cls(

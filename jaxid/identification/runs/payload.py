@@ -28,14 +28,14 @@ CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
 
 
 class Payload(eqx.Module):
-    """What a load on a body weighs, where its mass is, and how it resists turning.
+    """Mass, centre of mass and inertia of a load on a body.
 
     Attributes:
         body: Index of the body that carries it (0 is the first).
         parameters: $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame: the
             estimate, or the body nearest to it, in units of its uncertainty, that could exist.
         estimate: What the forces say, whether such a body could exist or not.
-        covariance: Of the estimate.
+        covariance: Covariance of the estimate.
         freedom: Degrees of freedom of its standard deviations.
         distance: From the estimate to the parameters, in standard deviations: below 4 nothing
             unusual; NaN where the runs do not determine all ten.
@@ -195,7 +195,7 @@ def _possible(
 
 
 def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:
-    """What unit parameters of a load on a body add to the base parameters.
+    """Return the base parameters that unit parameters of a load on a body add.
 
     Args:
         base: The base parameters.

@@ -26,7 +26,7 @@ class Tied(eqx.Module):
 
     Attributes:
         parameters: Estimates of the unknowns.
-        covariance: Of the estimates; infinite on the diagonal where nothing is known.
+        covariance: Covariance of the estimates; infinite on the diagonal where nothing is known.
         freedom: Degrees of freedom of their standard deviations.
         factor: Triangle with the norm of all weighted rows, as a matrix on the unknowns.
         target: The right-hand side that belongs to it.
@@ -85,7 +85,7 @@ def tied(
 def _carried(
     run: Fit, onto: Float[np.ndarray, "unknowns height"], own: Float[np.ndarray, "height base"]
 ) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
-    """What a run's errors make of the unknowns' covariance, and its degrees of freedom."""
+    """Return a run's part of the unknowns' covariance, and its degrees of freedom."""
     C, own_freedom = np.asarray(run.covariance), np.asarray(run.uncertainty.dof)
     if not np.isfinite(C).all():
         # The run alone does not determine everything, so not all of its estimates have a variance.
@@ -101,7 +101,7 @@ def _carried(
 
 
 def _blocks(run: Fit) -> tuple[list[Block], Float[np.ndarray, "base base"]]:
-    """What the run's estimates leave of each block of time, and the inverse of its information."""
+    """Return the residuals of each block of time, and the inverse of the run's information."""
     decomposition = Decomposition.of(*run.factor)
     inverse = Complete().inverse(decomposition.values)
     p = decomposition.solve(inverse)

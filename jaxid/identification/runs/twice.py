@@ -22,7 +22,7 @@ def share_data(first: Blocks, second: Blocks) -> bool:
 
     Args:
         first: Factors of some rows, by blocks of time.
-        second: Of others.
+        second: Factors of other logs.
     """
     ours, theirs = _norms(first), _norms(second)
     found = 0
