@@ -33,7 +33,7 @@ before = settings()
 import jaxid
 after = settings()
 assert after == before, {k: v for k, v in after.items() if before.get(k, v) != v}
-loaded = sorted({"matplotlib", "typer", "rich", "msgspec"} & set(sys.modules))
+loaded = sorted({"matplotlib", "typer", "rich"} & set(sys.modules))
 assert not loaded, f"import jaxid has loaded {loaded}"
 from jax._src import xla_bridge
 assert not xla_bridge._backends, "import jaxid has started a backend"
