@@ -95,6 +95,14 @@ def run(written, monkeypatch, capsys):
     return run
 
 
+@pytest.fixture
+def designed(written, run):
+    """The folder with a finished design in `plan`, whichever test runs first."""
+    if not (written / "plan" / "motion.json").exists():
+        assert run("excite", "experiment.toml", "-o", "plan/motion.csv")[0] == 0
+    return written
+
+
 @pytest.fixture(scope="module")
 def excited(written):
     """A motion as fast as it can be had, for what is said of it."""
@@ -170,7 +178,8 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         assert said in page
 
 
-def test_a_killed_design_goes_on_to_the_same_motion(written, run):
+def test_a_killed_design_goes_on_to_the_same_motion(designed, run):
+    written = designed
     arguments = ["excite", "experiment.toml", "-o", "killed/motion.csv"]
     process = subprocess.Popen(
         [sys.executable, "-c", "from jaxid.cli import main; main()", *arguments],
@@ -195,7 +204,11 @@ def test_a_killed_design_goes_on_to_the_same_motion(written, run):
     assert same[0] == same[1]
 
 
-def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(written, run, no_pictures):
+def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
+    designed, run, no_pictures
+):
+    written = designed
+
     # The angle turns about y: the rod points ahead at zero, and holding it there takes 7.8 N m.
     def largest_force(folder):
         _, q, _, qdd = table(written / folder / "motion.csv").T
