@@ -68,10 +68,11 @@ def numbers_of_report(folder):
 
 
 def compare(case, found, tolerance=TOLERANCE):
-    """Compare numbers with the golden file of a case; write it where there is none."""
+    """Compare numbers with the golden file of a case; write it and fail where there is none."""
     path = HERE / f"{case}.json"
     if not path.exists():
         path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        pytest.fail(f"`{path.name}` was missing and has been recorded: check it, then run again.")
     _compare(case, json.loads(json.dumps(found)), golden(case), tolerance)
 
 
