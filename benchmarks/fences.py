@@ -20,10 +20,7 @@ import timing
 from timing import Row, hand_over
 
 from jaxid.program import (  # private: the compiler itself
-    AbstractFence,
-    BarrierFence,
-    DivisionFence,
-    NoFence,
+    Fence,
     default_fence,
     lower,
     sine_cosine,
@@ -31,16 +28,16 @@ from jaxid.program import (  # private: the compiler itself
 )
 
 JOINTS = 7
-FENCES = (NoFence(), DivisionFence(), BarrierFence())
+FENCES = (Fence.NONE, Fence.DIVISION, Fence.BARRIER)
 PAIRS = {"polynomial": sine_cosine, "library": lambda x: (jnp.sin(x), jnp.cos(x))}
 HOLDS_FROM = {"polynomial": 2.5, "library": 10.0}
 """Required speed of a fenced program relative to the unfenced one, by its sine and cosine."""
 
 NUMBERS = {
-    ("DivisionFence", "library"): "5a",
-    ("DivisionFence", "polynomial"): "5b",
-    ("BarrierFence", "library"): "5c",
-    ("BarrierFence", "polynomial"): "5d",
+    ("division", "library"): "5a",
+    ("division", "polynomial"): "5b",
+    ("barrier", "library"): "5c",
+    ("barrier", "polynomial"): "5d",
 }
 
 TURNS = np.pi / 2 * np.array([0, -1, 1, 1, -1, 1, 1])
@@ -115,7 +112,7 @@ class Measured(NamedTuple):
         ratio: Speed relative to no fence.
     """
 
-    fence: AbstractFence
+    fence: Fence
     pair: str
     nanoseconds: list[float]
     compiling: float
@@ -124,7 +121,7 @@ class Measured(NamedTuple):
     @property
     def name(self):
         """Name of the fence."""
-        return type(self.fence).__name__
+        return self.fence.value
 
     @property
     def median(self):
@@ -134,7 +131,7 @@ class Measured(NamedTuple):
     @property
     def lost(self):
         """Whether the fence has no effect."""
-        return self.name != "NoFence" and self.ratio < HOLDS_FROM[self.pair]
+        return self.name != "none" and self.ratio < HOLDS_FROM[self.pair]
 
 
 def measure(samples, turns, pairs):
@@ -200,9 +197,9 @@ def main():
             f"{case.pair:<13}{case.name:<15}{case.median:>8.0f}{min(case.nanoseconds):>8.0f}"
             f"{case.compiling:>9.1f}{case.ratio:>7.1f}"
         )
-    without = {case.pair: case for case in found if case.name == "NoFence"}
+    without = {case.pair: case for case in found if case.name == "none"}
     recipe = f"Panda, 70 columns, jax {jax.__version__}, two cores, N = {samples}, {turns} turns"
-    fenced = [case for case in found if case.name != "NoFence"]
+    fenced = [case for case in found if case.name != "none"]
     rows = [row(case, without[case.pair], chosen, recipe) for case in fenced]
     lost = [case for case in fenced if case.lost]
     for case in lost:

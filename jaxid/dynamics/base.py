@@ -4,7 +4,7 @@ import enum
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,12 +16,11 @@ from jaxid.dynamics.dispatch import compiled_method, in_numpy, on_samples, progr
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.rank import (
-    AbstractRankMethod,
     Dependence,
-    GramSchmidt,
-    SingularValues,
+    gram_schmidt,
     random_regressor,
     regrouping,
+    singular_values,
 )
 from jaxid.dynamics.regressor import JointRegressor, PackedRegressor, rows_in_numpy
 from jaxid.errors import InputError
@@ -243,7 +242,10 @@ def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch param
 
 
 def base_parameters(
-    model: Model, *, method: AbstractRankMethod | None = None, seed: int = 0
+    model: Model,
+    *,
+    method: Literal["gram_schmidt", "singular_values"] = "gram_schmidt",
+    seed: int = 0,
 ) -> BaseParameters:
     r"""Find the combinations of parameters that forces determine (Eqs. 20-22).
 
@@ -252,22 +254,31 @@ def base_parameters(
 
     Args:
         model: The model.
-        method: Method by which dependence is decided, `GramSchmidt` if None; the other method is
-            always the cross-check.
+        method: Method by which dependence is decided; the other one is always the cross-check.
         seed: Seed of the random motions.
 
     Returns:
         The base parameters; a disagreement or a small gap is reported in their `notes`.
+
+    Raises:
+        InputError: If there is no such method.
     """
-    method = GramSchmidt() if method is None else method
-    check = GramSchmidt() if isinstance(method, SingularValues) else SingularValues()
+    methods = {"gram_schmidt": gram_schmidt, "singular_values": singular_values}
+    if method not in methods:
+        raise InputError(f"`method` must be one of {', '.join(methods)}, but is {method!r}.")
     W, scale = random_regressor(model, seed)
-    found = method(W)
+    found = methods.pop(method)(W)
+    ((_, check),) = methods.items()
     other = check(W)
     kappa, left = regrouping(W, found)
     first, second = np.array(found.independent, int), np.array(found.dependent, int)
     kappa = kappa * scale[first][:, None] / scale[second]
-    notes = _doubts(found, other, left, _least_independent(W, model, found))
+    weakest = ""
+    if found.independent:
+        chosen = W[:, found.independent]
+        R = np.linalg.qr(chosen / np.linalg.norm(chosen, axis=0), mode="r")
+        weakest = model.parameter_names[found.independent[int(np.argmin(np.abs(np.diag(R))))]]
+    notes = _doubts(found, other, left, weakest)
     return BaseParameters(
         model,
         found.independent,
@@ -277,17 +288,6 @@ def base_parameters(
         found.largest_dependent,
         notes,
     )
-
-
-def _least_independent(
-    W: Float[np.ndarray, "rows standard"], model: Model, found: Dependence
-) -> str:
-    """Return the name of the parameter whose column earlier independent ones explain best."""
-    if not found.independent:
-        return ""
-    chosen = W[:, found.independent]
-    R = np.linalg.qr(chosen / np.linalg.norm(chosen, axis=0), mode="r")
-    return model.parameter_names[found.independent[int(np.argmin(np.abs(np.diag(R))))]]
 
 
 def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> tuple[str, ...]:

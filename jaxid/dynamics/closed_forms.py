@@ -12,7 +12,7 @@ ground is 0; a body with several children has `l3_4z`, `l3_7z`. Gravity is `g`.
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -28,7 +28,7 @@ from jaxid.dynamics.rank import (
     row_units,
     solve_from_earlier,
 )
-from jaxid.program import FREE, Program, evaluate, trace
+from jaxid.program import FREE, evaluate, trace
 from jaxid.robot.inertia import AXES
 from jaxid.robot.robot import Robot
 
@@ -57,14 +57,6 @@ class ClosedForms:
 
     expressions: tuple[Expression, ...]
     lengths: dict[str, float]
-
-
-@dataclass(frozen=True)
-class _Samples:
-    r"""Matrix $\kappa$ at many geometries, with the lengths in their units."""
-
-    lengths: Float[np.ndarray, "cases lengths"]
-    kappa: Float[np.ndarray, "cases base dependent"]
 
 
 def closed_forms(
@@ -122,23 +114,17 @@ class _Finder:
             regrouping.units[regrouping.independent, None] / regrouping.units[regrouping.dependent]
         )
         self._values = np.array([x.value for x in lengths]) / self._units
-        samples = _Samples(values / self._units, found)
-        parts = (0, 1 + len(alone), 1 + len(alone) + _FITTED, len(values))
-        self._swept, self._fitted, self._checked = (
-            _Samples(samples.lengths[a:b], samples.kappa[a:b]) for a, b in itertools.pairwise(parts)
-        )
-        self._exponents = self._exponents_of_all()
-
-    def _exponents_of_all(self) -> Float[np.ndarray, "lengths powers base dependent"]:
-        """Return for each length and power its fraction when this length alone varies."""
-        kappa, shares = self._swept.kappa, []
-        for k in range(len(self.lengths)):
+        scaled = values / self._units
+        fitted, checked = slice(1 + len(alone), -_CHECKED), slice(-_CHECKED, None)
+        self._fitted, self._checked = ((scaled[x], found[x]) for x in (fitted, checked))
+        # For each length and power its fraction when this length alone varies.
+        shares = []
+        for k in range(len(lengths)):
             rows = [0, *range(1 + k * len(_SCALES), 1 + (k + 1) * len(_SCALES))]
-            t = self._swept.lengths[rows, k]
-            factors = np.linalg.solve(t[:, None] ** _POWERS, kappa[rows].reshape(len(rows), -1))
-            factors = np.abs(factors).reshape(len(_POWERS), *kappa.shape[1:])
+            powers = scaled[rows, k, None] ** _POWERS
+            factors = np.abs(np.linalg.solve(powers, found[rows].reshape(len(rows), -1)))
             shares.append(factors / np.maximum(factors.max(axis=0), np.finfo(float).tiny))
-        return np.array(shares).reshape(len(self.lengths), len(_POWERS), *kappa.shape[1:])
+        self._shares = np.array(shares).reshape(len(lengths), len(_POWERS), *found.shape[1:])
 
     def coefficient(
         self, row: int, column: int, difference: tuple[int, ...] | None, value: float
@@ -151,19 +137,27 @@ class _Finder:
             difference: Dimension of the coefficient, if it is known.
             value: Coefficient of the robot.
         """
-        y = self._fitted.kappa[:, row, column]
-        number = _number(value)
+        x, kappa = self._fitted
+        y = kappa[:, row, column]
+        # A coefficient without a short form is a number.
+        whole = Fraction(round(value)) if abs(abs(value) - 1.0) < _FITS else float(value)
+        number = Coefficient((Monomial(whole),)) if value else None
         if not self.right or not y.any():
             return number
         powers = self._candidates(row, column, difference)
         if not 0 < len(powers) <= 24:
             return number
-        found = _fit(self._fitted.lengths, y, powers)
-        if found is None:
+        numbers, needed = np.zeros(0), np.zeros(1, bool)
+        while not needed.all():
+            numbers = np.linalg.lstsq(_products(x, powers), y, rcond=None)[0]
+            needed = np.abs(numbers) > _SMALL * np.abs(numbers).max()
+            powers = powers[needed]
+        if len(powers) > 6:
             return number
-        numbers, powers = found
-        checks = self._checked.kappa[:, row, column]
-        error = np.abs(_products(self._checked.lengths, powers) @ numbers - checks).max()
+        numbers = np.array([float(_simple(factor)) for factor in numbers])
+        x, kappa = self._checked
+        checks = kappa[:, row, column]
+        error = np.abs(_products(x, powers) @ numbers - checks).max()
         unit = self._entry_units[row, column]
         own = float((_products(self._values[None], powers) @ numbers)[0]) * unit
         if error > _FITS * np.abs(checks).max() or abs(own - value) > 1e-6 * max(abs(value), unit):
@@ -171,7 +165,7 @@ class _Finder:
         return self._written(numbers, powers, unit)
 
     def _candidates(self, row: int, column: int, difference: tuple[int, ...] | None) -> np.ndarray:
-        possible = self._exponents[:, :, row, column] > _SMALL
+        possible = self._shares[:, :, row, column] > _SMALL
         choices = [_POWERS[p] for p in possible]
         if np.prod([len(c) for c in choices], dtype=float) > 20_000:
             return np.zeros((0, len(self.lengths)), int)
@@ -196,24 +190,6 @@ class _Finder:
             monomials.append(Monomial(_simple(float(number) * factor), symbols))
         order = sorted(range(len(monomials)), key=lambda k: tuple(-powers[k]))
         return Coefficient(tuple(monomials[k] for k in order))
-
-
-def _number(value: float) -> Coefficient | None:
-    """Return a coefficient without a short form: a number."""
-    whole = Fraction(round(value)) if abs(abs(value) - 1.0) < _FITS else float(value)
-    return Coefficient((Monomial(whole),)) if value else None
-
-
-def _fit(x: np.ndarray, y: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return factors of products of powers, without those that are not needed."""
-    factors, needed = np.zeros(0), np.zeros(1, bool)
-    while not needed.all():
-        factors = np.linalg.lstsq(_products(x, powers), y, rcond=None)[0]
-        needed = np.abs(factors) > _SMALL * np.abs(factors).max()
-        powers = powers[needed]
-    if len(powers) > 6:
-        return None
-    return np.array([float(_simple(f)) for f in factors]), powers
 
 
 def _products(x: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -263,7 +239,15 @@ class Regrouping:
         samples = math.ceil(1.5 * model.size / robot.joints) + 2
         motion = random_motion(model, samples, seed=1)
         self._motion = [np.asarray(x).T for x in (motion.q, motion.qd, motion.qdd)]
-        self._program = _program_of_geometry(model, self.geometry)
+        varying = np.zeros(len(self.geometry), object)
+        varying[self.geometry != 0.0] = FREE
+        n = robot.joints
+
+        def columns(q, qd, qdd, x):
+            moved = robot.replace(offset=x[: 3 * n].reshape(n, 3), gravity=x[3 * n :])
+            return Model(moved, model.terms).columns(q, qd, qdd)
+
+        self._program = trace(columns, (n,), (n,), (n,), varying)
 
     def unit(self, length: Length) -> float:
         """Return a value of typical size: the robot's size, or gravity."""
@@ -323,18 +307,6 @@ class Regrouping:
         return kappa, bool(left < _FITS)
 
 
-def _program_of_geometry(model: Model, geometry: np.ndarray) -> Program:
-    n = model.robot.joints
-    varying = np.zeros(len(geometry), object)
-    varying[geometry != 0.0] = FREE
-
-    def columns(q, qd, qdd, x):
-        robot = model.robot.replace(offset=x[: 3 * n].reshape(n, 3), gravity=x[3 * n :])
-        return Model(robot, model.terms).columns(q, qd, qdd)
-
-    return trace(columns, (n,), (n,), (n,), varying)
-
-
 def draws(
     regrouping: Regrouping, lengths: tuple[Length, ...], cases: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "cases lengths"]:
@@ -365,8 +337,14 @@ def changing_lengths(robot: Robot, regrouping: Regrouping) -> tuple[Length, ...]
             free += (length,)
         elif not length.dimension.second:
             rigid.append(length)
-    for tie in (_by_offset, _by_magnitude, _all_of_them):
-        for together in tie(rigid):
+    same: tuple[Callable[[Length], object], ...] = (
+        lambda x: x.entries[0][0] // 3,  # lengths of one offset
+        lambda x: f"{abs(x.value):.9e}",  # equal ones
+        lambda _: 0,
+    )
+    for key in same:
+        for _, members in itertools.groupby(sorted(rigid, key=key), key):
+            together = tuple(members)
             if len(together) > 1 and possible((*free, _tied(together, robot))):
                 free += (_tied(together, robot),)
                 rigid = [x for x in rigid if x not in together]
@@ -394,23 +372,6 @@ def offset_name(robot: Robot, body: int) -> str:
     parent = robot.parent[body]
     alone = robot.parent.count(parent) == 1
     return f"l{parent + 1}" if alone else f"l{parent + 1}_{body + 1}"
-
-
-def _by_offset(lengths: list[Length]) -> Iterator[tuple[Length, ...]]:
-    yield from _groups(lengths, lambda x: x.entries[0][0] // 3)
-
-
-def _by_magnitude(lengths: list[Length]) -> Iterator[tuple[Length, ...]]:
-    yield from _groups(lengths, lambda x: f"{abs(x.value):.9e}")
-
-
-def _all_of_them(lengths: list[Length]) -> Iterator[tuple[Length, ...]]:
-    yield tuple(lengths)
-
-
-def _groups(lengths: list[Length], key: Callable) -> Iterator[tuple[Length, ...]]:
-    for _, members in itertools.groupby(sorted(lengths, key=key), key):
-        yield tuple(members)
 
 
 def _tied(lengths: tuple[Length, ...], robot: Robot) -> Length:

@@ -5,7 +5,6 @@ lengths, or a number where there is no short form.
 """
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -95,78 +94,48 @@ class Expression:
         return {name: c.evaluate(lengths) for name, c in self.terms}
 
     def __str__(self):
-        return _written(self, _Plain())
-
-    def latex(self) -> str:
-        r"""Return the expression as LaTeX, such as `m_{1} - \frac{1}{l_{3z}}\, mz_{4}`."""
-        return _written(self, _Latex())
-
-
-class _Plain:
-    """Notation of expressions in plain text."""
-
-    def name(self, name: str) -> str:
-        return name
-
-    def power(self, base: str, exponent: int) -> str:
-        return base if exponent == 1 else f"{base}^{exponent}"
-
-    def product(self, above: list[str], below: list[str], last: str) -> str:
-        above = [x for x in (*above, last) if x]
-        text = "*".join(above) if above else "1"
-        if not below:
-            return text
-        return f"{text}/{below[0]}" if len(below) == 1 else f"{text}/({'*'.join(below)})"
-
-    def bracket(self, text: str) -> str:
-        return f"({text})"
-
-    def number(self, x: float) -> str:
-        return f"{x:.6g}"
+        # Parameters that share a factor are put in one bracket, at the place of the first of them.
+        groups: dict[tuple, list[tuple[bool, str]]] = {}
+        for name, coefficient in self.terms:
+            negative, factor, rest = coefficient.factored()
+            alone = coefficient.symbols == () and factor.number == 1
+            key = (factor, rest, name if alone else "")
+            groups.setdefault(key, []).append((negative, name))
+        return _sum([_part(factor, rest, g) for (factor, rest, _), g in groups.items()])
 
 
-class _Latex(_Plain):
-    """Notation of expressions in LaTeX."""
-
-    def name(self, name: str) -> str:
-        moment = re.fullmatch(r"m([xyz])(\d+)", name)
-        if moment:
-            return rf"m_{{{moment[2]}}} r_{{c,{moment[2]}{moment[1]}}}"
-        parts = re.fullmatch(r"([A-Za-z])([A-Za-z]*)(\d[\w]*)?", name)
-        if not parts:
-            return rf"\mathrm{{{name}}}".replace("_", r"\_")
-        below = (parts[2] + (parts[3] or "")).replace("_", ",")
-        return f"{parts[1]}_{{{below}}}" if below else parts[1]
-
-    def power(self, base: str, exponent: int) -> str:
-        return base if exponent == 1 else f"{base}^{{{exponent}}}"
-
-    def product(self, above: list[str], below: list[str], last: str) -> str:
-        text = " ".join(above)
-        if below:
-            text = rf"\frac{{{text or '1'}}}{{{' '.join(below)}}}"
-        return r"\, ".join(x for x in (text, last) if x) or "1"
-
-    def bracket(self, text: str) -> str:
-        return rf"\left({text}\right)"
-
-    def number(self, x: float) -> str:
-        mantissa, _, exponent = f"{x:.6g}".partition("e")
-        return rf"{mantissa} \cdot 10^{{{int(exponent)}}}" if exponent else mantissa
+def _part(
+    factor: Monomial, rest: tuple[Monomial, ...], members: list[tuple[bool, str]]
+) -> tuple[bool, str]:
+    """Return whether a group of parameters with one factor is negative, and its text."""
+    negative = members[0][0]
+    names = _sum([(sign != negative, name) for sign, name in members])
+    above, below = _factors(factor)
+    if len(rest) > 1:
+        inner = ((m.number < 0, _factors(Monomial(abs(m.number), m.powers))) for m in rest)
+        above.append(f"({_sum([(sign, _product(*factors)) for sign, factors in inner])})")
+    return negative, _product([*above, f"({names})" if len(members) > 1 else names], below)
 
 
-def _factors(monomial: Monomial, style: _Plain) -> tuple[list[str], list[str]]:
+def _factors(monomial: Monomial) -> tuple[list[str], list[str]]:
     """Return numerator and denominator; the number must not be negative."""
     above, below = [], []
     if isinstance(monomial.number, Fraction):
         above += [str(monomial.number.numerator)] if monomial.number.numerator != 1 else []
         below += [str(monomial.number.denominator)] if monomial.number.denominator != 1 else []
     else:
-        above.append(style.number(monomial.number))
+        above.append(f"{monomial.number:.6g}")
     for name, exponent in monomial.powers:
-        side = above if exponent > 0 else below
-        side.append(style.power(style.name(name), abs(exponent)))
+        power = name if abs(exponent) == 1 else f"{name}^{abs(exponent)}"
+        (above if exponent > 0 else below).append(power)
     return above, below
+
+
+def _product(above: list[str], below: list[str]) -> str:
+    text = "*".join(above) or "1"
+    if not below:
+        return text
+    return f"{text}/{below[0]}" if len(below) == 1 else f"{text}/({'*'.join(below)})"
 
 
 def _sum(parts: list[tuple[bool, str]]) -> str:
@@ -175,33 +144,6 @@ def _sum(parts: list[tuple[bool, str]]) -> str:
         sign = ("-" if negative else "") if not text else (" - " if negative else " + ")
         text += sign + part
     return text
-
-
-def _written(expression: Expression, style: _Plain) -> str:
-    # Parameters that share a factor are put in one bracket, at the place of the first of them.
-    groups: dict[tuple, tuple[Monomial, tuple[Monomial, ...], list[tuple[bool, str]]]] = {}
-    for name, coefficient in expression.terms:
-        negative, factor, rest = coefficient.factored()
-        alone = coefficient.symbols == () and factor.number == 1
-        key = (name,) if alone else (factor, rest)
-        groups.setdefault(key, (factor, rest, []))[2].append((negative, style.name(name)))
-    return _sum([_part(*group, style) for group in groups.values()])
-
-
-def _part(
-    factor: Monomial, rest: tuple[Monomial, ...], members: list[tuple[bool, str]], style: _Plain
-) -> tuple[bool, str]:
-    """Return whether a group of parameters with one factor is negative, and its text."""
-    negative = members[0][0]
-    names = _sum([(sign != negative, name) for sign, name in members])
-    above, below = _factors(factor, style)
-    if len(rest) > 1:
-        inner = [(m.number < 0, Monomial(abs(m.number), m.powers)) for m in rest]
-        text = _sum([(sign, style.product(*_factors(m, style), "")) for sign, m in inner])
-        above.append(style.bracket(text))
-    return negative, style.product(
-        above, below, style.bracket(names) if len(members) > 1 else names
-    )
 
 
 class Dimension(NamedTuple):

@@ -6,9 +6,8 @@ order decides which columns are independent, so that the choice is the same for 
 """
 
 import math
-from abc import abstractmethod
+from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 import scipy.linalg
 
@@ -22,7 +21,7 @@ ROUNDING = 1e-12
 """Fraction of the largest column below which a column is nothing but rounding."""
 
 
-class Dependence(eqx.Module):
+class Dependence(NamedTuple):
     """Independent and dependent columns of a matrix, and how clear the distinction is.
 
     Attributes:
@@ -32,8 +31,8 @@ class Dependence(eqx.Module):
         largest_dependent: Largest measure among the second.
     """
 
-    independent: tuple[int, ...] = eqx.field(static=True)
-    dependent: tuple[int, ...] = eqx.field(static=True)
+    independent: tuple[int, ...]
+    dependent: tuple[int, ...]
     smallest_independent: float
     largest_dependent: float
 
@@ -43,110 +42,92 @@ class Dependence(eqx.Module):
         return self.smallest_independent / max(self.largest_dependent, np.finfo(float).tiny)
 
 
-class AbstractRankMethod(eqx.Module):
-    """Method to decide which columns depend on earlier ones."""
-
-    @abstractmethod
-    def __call__(self, W: Float[AnyArray, "rows columns"]) -> Dependence:
-        """Decide for a matrix whose columns are of comparable size or zero."""
-
-
-class GramSchmidt(AbstractRankMethod):
-    """Gram-Schmidt in column order, orthogonalised again, relative to each column (Eq. 20).
+def gram_schmidt(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-9) -> Dependence:
+    """Orthogonalise the columns in order, twice, each relative to its own norm (Eq. 20).
 
     A dependent column uses up no direction, unlike in a plain QR decomposition without pivoting,
     and every column is measured against its own norm. So near-degenerate geometry is still told
     apart: an elbow offset of a micrometre.
 
-    Attributes:
+    Args:
+        W: Matrix whose columns are of comparable size or zero.
         tolerance: Fraction of a column, from 0 to 1, below which its new part counts as none.
     """
-
-    tolerance: float = 1e-9
-
-    def __call__(self, W):
-        """Orthogonalise the columns in order."""
-        rows, columns = W.shape
-        W = np.asarray(W, np.float64)
-        norms = np.linalg.norm(W, axis=0)
-        largest = norms.max(initial=0.0)
-        Q = np.zeros((rows, min(rows, columns)))
-        independent: list[int] = []
-        dependent: list[int] = []
-        new, old = [np.inf], [0.0]
-        for k in range(columns):
-            w, share = W[:, k], 0.0
-            if norms[k] > ROUNDING * largest and len(independent) < rows:
-                w = w / norms[k]
-                basis = Q[:, : len(independent)]
-                # Twice is enough unless almost nothing is left; the third pass costs little.
-                for _ in range(3):
-                    w = w - basis @ (basis.T @ w)
-                share = float(np.linalg.norm(w))
-            if share > self.tolerance:
-                Q[:, len(independent)] = w / share
-                independent.append(k)
-                new.append(share)
-            else:
-                dependent.append(k)
-                old.append(share)
-        return Dependence(tuple(independent), tuple(dependent), min(new), max(old))
+    rows, columns = W.shape
+    W = np.asarray(W, np.float64)
+    norms = np.linalg.norm(W, axis=0)
+    largest = norms.max(initial=0.0)
+    Q = np.zeros((rows, min(rows, columns)))
+    independent: list[int] = []
+    dependent: list[int] = []
+    new, old = [np.inf], [0.0]
+    for k in range(columns):
+        w, share = W[:, k], 0.0
+        if norms[k] > ROUNDING * largest and len(independent) < rows:
+            w = w / norms[k]
+            basis = Q[:, : len(independent)]
+            # Twice is enough unless almost nothing is left; the third pass costs little.
+            for _ in range(3):
+                w = w - basis @ (basis.T @ w)
+            share = float(np.linalg.norm(w))
+        if share > tolerance:
+            Q[:, len(independent)] = w / share
+            independent.append(k)
+            new.append(share)
+        else:
+            dependent.append(k)
+            old.append(share)
+    return Dependence(tuple(independent), tuple(dependent), min(new), max(old))
 
 
-class SingularValues(AbstractRankMethod):
-    """The null space from a singular value decomposition, the paper's alternative method.
+def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6) -> Dependence:
+    """Find the null space by a singular value decomposition, the paper's alternative method.
 
     The rank is where the singular values fall by the largest factor. A column depends on earlier
     ones if some vector of the null space ends there: the null space is brought into that form by a
     QR decomposition with its columns reversed.
 
-    Attributes:
+    Args:
+        W: Matrix whose columns are of comparable size or zero.
         tolerance: Fraction of the largest singular value above which none counts as zero.
-        rounding: Fraction of the largest singular value below which all count as zero.
     """
-
-    tolerance: float = 1e-6
-    rounding: float = 1e-14
-
-    def __call__(self, W):
-        """Find the rank, the null space, and the columns in which its vectors end."""
-        W = np.asarray(W, np.float64)
-        columns = W.shape[1]
-        norms = np.linalg.norm(W, axis=0)
-        live = norms > ROUNDING * norms.max(initial=0.0)
-        scaled = np.where(live, W / np.where(live, norms, 1.0), 0.0)
-        # The triangular factor has the same singular values and null space, and few rows.
-        _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=True)
-        s = np.concatenate([s, np.zeros(columns - len(s))]) / max(s[0], np.finfo(float).tiny)
-        floored = np.maximum(s, self.rounding)
-        certain = int(np.count_nonzero(s > self.tolerance))
-        drops = floored[:-1] / floored[1:]
-        possible = np.arange(1, columns) >= certain
-        rank = certain if not possible.any() else 1 + int(np.argmax(np.where(possible, drops, 0.0)))
-        if columns and s[-1] > self.tolerance:
-            rank = columns
-        if not live.any():
-            rank = 0
-        null = Vt[rank:]
-        dependent: list[int] = []
-        # Eliminate from the last column backwards: a pivot found there is where a vector ends.
-        for k in reversed(range(columns)):
-            if not len(null):
-                break
-            pivot = null[:, k]
-            if np.linalg.norm(pivot) < 1e-8:
-                continue
-            dependent.append(k)
-            Q = np.linalg.qr(pivot[:, None], mode="complete").Q
-            null = (Q.T @ null)[1:]
-        independent = tuple(k for k in range(columns) if k not in set(dependent))
-        small = s[rank] if rank < columns else 0.0
-        return Dependence(
-            independent,
-            tuple(sorted(dependent)),
-            float(s[rank - 1]) if rank else np.inf,
-            float(small),
-        )
+    W = np.asarray(W, np.float64)
+    columns = W.shape[1]
+    norms = np.linalg.norm(W, axis=0)
+    live = norms > ROUNDING * norms.max(initial=0.0)
+    scaled = np.where(live, W / np.where(live, norms, 1.0), 0.0)
+    # The triangular factor has the same singular values and null space, and few rows.
+    _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"), full_matrices=True)
+    s = np.concatenate([s, np.zeros(columns - len(s))]) / max(s[0], np.finfo(float).tiny)
+    floored = np.maximum(s, 1e-14)  # all below are rounding
+    certain = int(np.count_nonzero(s > tolerance))
+    drops = floored[:-1] / floored[1:]
+    possible = np.arange(1, columns) >= certain
+    rank = certain if not possible.any() else 1 + int(np.argmax(np.where(possible, drops, 0.0)))
+    if columns and s[-1] > tolerance:
+        rank = columns
+    if not live.any():
+        rank = 0
+    null = Vt[rank:]
+    dependent: list[int] = []
+    # Eliminate from the last column backwards: a pivot found there is where a vector ends.
+    for k in reversed(range(columns)):
+        if not len(null):
+            break
+        pivot = null[:, k]
+        if np.linalg.norm(pivot) < 1e-8:
+            continue
+        dependent.append(k)
+        Q = np.linalg.qr(pivot[:, None], mode="complete").Q
+        null = (Q.T @ null)[1:]
+    independent = tuple(k for k in range(columns) if k not in set(dependent))
+    small = s[rank] if rank < columns else 0.0
+    return Dependence(
+        independent,
+        tuple(sorted(dependent)),
+        float(s[rank - 1]) if rank else np.inf,
+        float(small),
+    )
 
 
 def regrouping(

@@ -168,27 +168,6 @@ class PackedRegressor(eqx.Module):
         return xp.stack(full) if full else xp.zeros((0, self.samples))
 
     @eqx.filter_jit
-    def matvec(self, p: Float[AnyArray, " columns"]) -> Float[AnyArray, "samples joints"]:
-        r"""Return the generalised forces $\Theta p$ [N m or N] (Eq. 16).
-
-        Args:
-            p: One number for each column.
-        """
-        p = jnp.asarray(p)
-        return jnp.stack([p[self.acting(j)] @ self.rows(j) for j in range(self.joints)], axis=-1)
-
-    @eqx.filter_jit
-    def transposed_matvec(
-        self, forces: Float[AnyArray, "samples joints"]
-    ) -> Float[AnyArray, " columns"]:
-        r"""Return the products $\bar\Theta^T Q$ of all columns with forces."""
-        forces = jnp.asarray(forces)
-        total = jnp.zeros(self.columns, forces.dtype)
-        for j in range(self.joints):
-            total = total.at[self.acting(j)].add(self.rows(j) @ forces[:, j])
-        return total
-
-    @eqx.filter_jit
     def gram(
         self, weights: Float[AnyArray, " joints"] | None = None
     ) -> Float[AnyArray, "columns columns"]:

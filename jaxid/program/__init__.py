@@ -16,10 +16,7 @@ from jaxid.program.reverse_mode import Reversible as Reversible
 from jaxid.program.sincos import sine_cosine as sine_cosine
 from jaxid.program.trace import FREE as FREE
 from jaxid.program.trace import trace as trace
-from jaxid.program.xla import AbstractFence as AbstractFence
-from jaxid.program.xla import BarrierFence as BarrierFence
-from jaxid.program.xla import DivisionFence as DivisionFence
+from jaxid.program.xla import Fence as Fence
 from jaxid.program.xla import Lowered as Lowered
-from jaxid.program.xla import NoFence as NoFence
 from jaxid.program.xla import default_fence as default_fence
 from jaxid.program.xla import lower as lower

@@ -5,7 +5,7 @@ shared operation into each of them. A program of a thousand operations with hund
 would be computed many times over. A fence on a shared value stops that.
 """
 
-import abc
+import enum
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -28,68 +28,46 @@ CIRCULAR = (Operation.SINE, Operation.COSINE)
 SineCosine = Callable[[Array], tuple[Array, Array]]
 
 
-class AbstractFence(eqx.Module):
-    """A way to make XLA compute a shared value only once."""
-
-    @abc.abstractmethod
-    def anchor(self, reference: Array) -> Array:
-        """Make the number that the fences of a program use.
-
-        Args:
-            reference: Number known only at run time, in the precision of the program.
-        """
-
-    @abc.abstractmethod
-    def __call__(self, x: Array, anchor: Array) -> Array:
-        """Return x, which XLA now computes once."""
-
-
-class NoFence(AbstractFence):
-    """No fence: XLA decides."""
-
-    def anchor(self, reference: Array) -> Array:
-        """Return any number; it is not used."""
-        return reference
-
-    def __call__(self, x: Array, anchor: Array) -> Array:
-        """Return x itself."""
-        return x
-
-
-class BarrierFence(AbstractFence):
-    """An optimization barrier, which newer versions of XLA respect on a CPU."""
-
-    def anchor(self, reference: Array) -> Array:
-        """Return any number; it is not used."""
-        return reference
-
-    def __call__(self, x: Array, anchor: Array) -> Array:
-        """Return x behind a barrier of its own."""
-        return jax.lax.optimization_barrier(x)
-
-
-class DivisionFence(AbstractFence):
-    """A division by a one that XLA cannot recognise.
+class Fence(enum.Enum):
+    """A way to make XLA compute a shared value only once.
 
     XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for NaN and
-    infinities. The derivative has the same fence.
+    infinities: `DIVISION` divides by a one that XLA cannot recognise. The derivative has the same
+    fence. `BARRIER` is an optimization barrier, which newer versions of XLA respect on a CPU. With
+    `NONE` XLA decides.
     """
 
-    def anchor(self, reference: Array) -> Array:
-        """Return (sign bit of an input | 1), which is 1 for any input, NaN included."""
-        wide = reference.dtype == jnp.float64
-        bits = jax.lax.bitcast_convert_type(
-            jax.lax.stop_gradient(reference), jnp.uint64 if wide else jnp.uint32
-        )
-        sign = jax.lax.shift_right_logical(bits, jnp.full_like(bits, 63 if wide else 31))
-        return (sign | jnp.ones_like(bits)).astype(reference.dtype)
+    NONE = "none"
+    BARRIER = "barrier"
+    DIVISION = "division"
 
-    def __call__(self, x: Array, anchor: Array) -> Array:
-        """Return x divided by one."""
-        return x / anchor
+    def __call__(self, x: Array, one: Array) -> Array:
+        """Return x, which XLA now computes once.
+
+        Args:
+            x: Value.
+            one: The number that `hidden_one` makes.
+        """
+        if self is Fence.DIVISION:
+            return x / one
+        return jax.lax.optimization_barrier(x) if self is Fence.BARRIER else x
 
 
-def default_fence(backend: str, version: tuple[int, ...]) -> AbstractFence:
+def hidden_one(reference: Array) -> Array:
+    """Return (sign bit of a number | 1), which is 1 for any number, NaN included.
+
+    Args:
+        reference: Number known only at run time, in the precision of the program.
+    """
+    wide = reference.dtype == jnp.float64
+    bits = jax.lax.bitcast_convert_type(
+        jax.lax.stop_gradient(reference), jnp.uint64 if wide else jnp.uint32
+    )
+    sign = jax.lax.shift_right_logical(bits, jnp.full_like(bits, 63 if wide else 31))
+    return (sign | jnp.ones_like(bits)).astype(reference.dtype)
+
+
+def default_fence(backend: str, version: tuple[int, ...]) -> Fence:
     """Choose a fence that was measured to work (`benchmarks/fences.py`, JAX 0.10.2 and 0.12.0).
 
     In 0.10 only the division works on a CPU; in 0.12 both do, equally fast, and the barrier adds
@@ -101,8 +79,8 @@ def default_fence(backend: str, version: tuple[int, ...]) -> AbstractFence:
         version: Version of JAX as `jax.__version_info__` gives it.
     """
     if backend != "cpu":
-        return NoFence()
-    return BarrierFence() if version >= (0, 12) else DivisionFence()
+        return Fence.NONE
+    return Fence.BARRIER if version >= (0, 12) else Fence.DIVISION
 
 
 def fenced_nodes(program: Program, threshold: int = 6) -> frozenset[int]:
@@ -132,7 +110,7 @@ class Values(NamedTuple):
     Attributes:
         nodes: Array of each node.
         pairs: Sines and cosines by the positions of their angles.
-        anchor: Number that the fences use.
+        anchor: The one that the fences divide by.
     """
 
     nodes: list[Array]
@@ -154,7 +132,7 @@ class Lowered(eqx.Module):
     """
 
     program: Program = eqx.field(static=True)
-    fence: AbstractFence
+    fence: Fence = eqx.field(static=True)
     fenced: frozenset[int] = eqx.field(static=True)
     sine_cosine: SineCosine = eqx.field(static=True)
 
@@ -206,10 +184,11 @@ class Lowered(eqx.Module):
         dtype = entries[0].dtype if entries else jnp.result_type(float)
         source = next((x for x in entries if x.size), jnp.zeros((1,), dtype))
         fence = self.fence
-        anchor = fence.anchor(source[(0,) * source.ndim])
+        anchor = hidden_one(source[(0,) * source.ndim])
         circular = _fenced(self.sine_cosine, fence)
         pairs = {}
-        angles = _input_angles(self.program)
+        angles = {n.uses[0]: None for n in nodes if n.operation in CIRCULAR}
+        angles = [k for k in angles if nodes[k].operation is Operation.INPUT]
         if angles:
             rows = [entries[number][entry] for number, entry in (nodes[k].place for k in angles)]
             sines, cosines = circular(jnp.stack(rows), anchor)
@@ -268,7 +247,7 @@ def primitives(like: Array) -> dict[Operation, Callable]:
 
 def lower(
     program: Program,
-    fence: AbstractFence | None = None,
+    fence: Fence | None = None,
     sine_cosine: SineCosine = polynomial_sine_cosine,
 ) -> Lowered:
     """Prepare a program for JAX arrays.
@@ -291,13 +270,7 @@ def _entries(x: Array, shape: tuple[int, ...], batch: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch))
 
 
-def _input_angles(program: Program) -> list[int]:
-    """Return positions of the inputs whose sine or cosine is needed."""
-    angles = {n.uses[0]: None for n in program.nodes if n.operation in CIRCULAR}
-    return [k for k in angles if program.nodes[k].operation is Operation.INPUT]
-
-
-def _fenced(sine_cosine: SineCosine, fence: AbstractFence) -> Callable:
+def _fenced(sine_cosine: SineCosine, fence: Fence) -> Callable:
     """Fence the pair, and make its derivative from the fenced values."""
 
     @jax.custom_jvp

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from sample_functions import SIZE, chain, random_functions, samples
 
-from jaxid.program import BarrierFence, DivisionFence, NoFence, Reversible, lower, trace
+from jaxid.program import Fence, Reversible, lower, trace
 
-FENCES = (NoFence(), BarrierFence(), DivisionFence())
+FENCES = tuple(Fence)
 
 
 def assert_reverse_mode(lowered, *x, groups=None, tolerance=1e-12):
@@ -43,7 +43,7 @@ def test_the_same_as_jax_finds(function):
     assert_reverse_mode(lowered, *samples(1, (4,)), tolerance=1e-10)
 
 
-@pytest.mark.parametrize("fence", FENCES, ids=lambda f: type(f).__name__)
+@pytest.mark.parametrize("fence", FENCES, ids=lambda f: f.value)
 def test_behind_each_fence_and_under_vmap(fence):
     lowered = lower(trace(chain, (3,), (3,)), fence)
     x = [jnp.asarray(a) for a in samples(2, (2, 6))]
