@@ -39,8 +39,9 @@ import timing
 import jaxid as jid
 from jaxid.dynamics.projection import partial_velocities  # private: Eq. 38 as the paper forms M
 from jaxid.export.feed_forward import body_parameters, torque_program  # private: counts, timing
-from jaxid.program import CWriter, trace  # private: other forms of the same torques
-from jaxid.program.operations import Operation  # private: number of angles
+from jaxid.program import trace  # private: other forms of the same torques
+from jaxid.program.c import CWriter  # private: C of other forms
+from jaxid.program.scalar import Operation  # private: number of angles
 
 FLAGS = {"O2": ["-O2"], "O3": ["-O3", "-march=native"]}
 FRICTION = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia())

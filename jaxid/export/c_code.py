@@ -11,7 +11,8 @@ from jaxid.arrays import Float
 from jaxid.export.feed_forward import other_forces, torques
 from jaxid.identification.fit import Fit
 from jaxid.io import atomic_folder
-from jaxid.program import CWriter, Program, evaluate, trace
+from jaxid.program import Program, evaluate, trace
+from jaxid.program.c import CWriter
 
 
 class CFunction(NamedTuple):

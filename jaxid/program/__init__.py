@@ -2,21 +2,20 @@
 
 It knows nothing about robots. `trace` runs an ordinary JAX function on scalars that fold constants
 and merge equal expressions; the remaining sequence of operations is a `Program`. `lower` runs it in
-JAX, `evaluate` in NumPy, `to_python` on single floats; a `CWriter` writes it in C.
+JAX, `evaluate` in NumPy, `to_python` on single floats; `c.CWriter` writes it in C.
 """
 
-from jaxid.program.c import CWriter as CWriter
 from jaxid.program.evaluation import evaluate as evaluate
 from jaxid.program.evaluation import evaluate_packed as evaluate_packed
 from jaxid.program.evaluation import to_python as to_python
 from jaxid.program.program import OperationCounts as OperationCounts
 from jaxid.program.program import Program as Program
 from jaxid.program.program import select_outputs as select_outputs
-from jaxid.program.reverse_mode import Reversible as Reversible
 from jaxid.program.sincos import sine_cosine as sine_cosine
 from jaxid.program.trace import FREE as FREE
 from jaxid.program.trace import trace as trace
 from jaxid.program.xla import Fence as Fence
 from jaxid.program.xla import Lowered as Lowered
+from jaxid.program.xla import Reversible as Reversible
 from jaxid.program.xla import default_fence as default_fence
 from jaxid.program.xla import lower as lower

@@ -14,8 +14,8 @@ from fractions import Fraction
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.program.operations import Operation
 from jaxid.program.program import Program, Reference
+from jaxid.program.scalar import Operation
 from jaxid.program.sincos import DOUBLE, SINGLE, Precision
 
 _LIBRARY = {

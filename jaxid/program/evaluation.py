@@ -15,8 +15,8 @@ import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray
-from jaxid.program.operations import Operation
 from jaxid.program.program import Program, Reference
+from jaxid.program.scalar import Operation
 
 _BLOCK = 1024
 """Samples at a time, so that intermediate values stay in the processor's cache."""

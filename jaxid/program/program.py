@@ -11,8 +11,7 @@ import jax
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.program.operations import Operation
-from jaxid.program.scalar import Graph, Operand, Scalar, live_scalars, rewrite
+from jaxid.program.scalar import Graph, Operand, Operation, Scalar, live_scalars, rewrite
 
 Reference = int | float
 """An operand or a result: the position of a node (int) or a constant (float)."""

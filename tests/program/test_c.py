@@ -13,7 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from sample_functions import SIZE, random_functions, samples
 
 from jaxid.errors import InputError
-from jaxid.program import CWriter, evaluate, trace
+from jaxid.program import evaluate, trace
+from jaxid.program.c import CWriter
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
 HEAD = "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxid.program import evaluate, trace
-from jaxid.program.operations import Operation
 from jaxid.program.scalar import (
     Graph,
+    Operation,
     add,
     apply,
     divide,
