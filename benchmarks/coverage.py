@@ -109,8 +109,7 @@ class Study:
         import jaxid as jid
 
         # private: the table of a design, which many draws share
-        from jaxid.identification.uncertainty.spectra import row_spectra
-        from jaxid.identification.uncertainty.spectral import SpectralTable
+        from jaxid.identification.uncertainty.spectral import SpectralTable, row_spectra
 
         self.o = observations(base, p, seed, encoder)
         self.rows = jid.RegressionProblem(base, [self.o])
@@ -119,8 +118,8 @@ class Study:
         self.bias = np.asarray(self.estimate.parameters) - self.truth
         e = self.estimate
         self.w = np.asarray(e.weights)
-        (lines,) = row_spectra(self.rows, e).lines
-        self.lines, self.table = lines, SpectralTable([lines])
+        ((lines,), _, _) = row_spectra(self.rows, e)
+        self.lines, self.table = lines, SpectralTable.of([lines])
         count, n = self.o.rows, base.model.robot.joints
         A = np.zeros((count, n, base.size))
         for chunk in self.rows.chunks():

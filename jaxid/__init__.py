@@ -34,12 +34,10 @@ from jaxid.identification import devices as devices
 from jaxid.identification import estimators as estimators
 from jaxid.identification import uncertainty as uncertainty
 from jaxid.identification.batches import identify_batch as identify_batch
-from jaxid.identification.bootstrap import bootstrap as bootstrap
+from jaxid.identification.choices import choose_filter as choose_filter
+from jaxid.identification.choices import essential_parameters as essential_parameters
 from jaxid.identification.consistency import PhysicallyConsistent as PhysicallyConsistent
-from jaxid.identification.essential import essential_parameters as essential_parameters
 from jaxid.identification.estimators import WeightedLeastSquares as WeightedLeastSquares
-from jaxid.identification.filter_choice import WhitestResidual as WhitestResidual
-from jaxid.identification.filter_choice import choose_filter as choose_filter
 from jaxid.identification.fit import Fit as Fit
 from jaxid.identification.fit import load as load
 from jaxid.identification.identify import identify as identify
@@ -52,6 +50,7 @@ from jaxid.identification.runs.drive_gains import identify_drive_gains as identi
 from jaxid.identification.runs.payload import identify_payload as identify_payload
 from jaxid.identification.runs.states import identify_states as identify_states
 from jaxid.identification.runs.update import update as update
+from jaxid.identification.uncertainty.blocks import bootstrap as bootstrap
 from jaxid.measurement import filters as filters
 from jaxid.measurement import units as units
 from jaxid.measurement.columns import Columns as Columns

@@ -26,8 +26,8 @@ from jaxid.experiment.excitation_tables import Collision, Excitation
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.method_tables import FILTERS, SIDES, Effects, Logs, build_rows
 from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
+from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
-from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
 from jaxid.measurement.columns import Columns
 from jaxid.report.verdict import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO
 from jaxid.simulation.virtual import random_bodies

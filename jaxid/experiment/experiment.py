@@ -25,7 +25,7 @@ from jaxid.experiment.method_tables import (
     filter_candidates,
 )
 from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
-from jaxid.identification.essential import essential_parameters
+from jaxid.identification.choices import FilterCandidate, essential_parameters
 from jaxid.identification.estimators import (
     Complete,
     CrossValidated,
@@ -33,7 +33,6 @@ from jaxid.identification.estimators import (
     NonlinearFriction,
     WeightedLeastSquares,
 )
-from jaxid.identification.filter_choice import FilterCandidate
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.nonlinear_friction import identify_nonlinear

@@ -25,7 +25,7 @@ from jaxid.dynamics.terms import (
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import Bounds, Count, Magnitude, Positive, decode, quoted, within
 from jaxid.experiment.robot_tables import one_per_joint
-from jaxid.identification.filter_choice import FilterCandidate
+from jaxid.identification.choices import FilterCandidate
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
 from jaxid.measurement.filters import (
@@ -349,4 +349,4 @@ def filter_candidates(
     """
     if len(filters) == 1:
         return ()
-    return tuple(FilterCandidate(one, decimation) for one in filters)
+    return tuple((one, decimation) for one in filters)

@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from jaxid.experiment.decoder import within
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.progress import Stages
-from jaxid.identification.filter_choice import FilterChoice, choose_filter
+from jaxid.identification.choices import FilterChoice, choose_filter
 from jaxid.identification.fit import Fit, load
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem

@@ -18,9 +18,12 @@ from jaxid.identification.estimators import (
     Complete,
     EstimatorInWords,
 )
-from jaxid.identification.estimators.solutions import Decomposition
+from jaxid.identification.estimators.solutions import (
+    LARGEST_UNCERTAINTY,
+    Decomposition,
+    UndeterminedDirection,
+)
 from jaxid.identification.factors import Blocks
-from jaxid.identification.identifiability import LARGEST_UNCERTAINTY, UndeterminedDirection
 from jaxid.identification.model_file import checksum_of, read_model, write_model
 from jaxid.identification.uncertainty import ResidualSpectra, Uncertainty
 from jaxid.io import to_json
@@ -188,8 +191,7 @@ class Fit(eqx.Module):
     def is_least_squares(self) -> bool:
         """Whether the estimates are weighted least squares of the rows, up to rounding."""
         R, z = self.factor
-        decomposition = Decomposition.of(R, z)
-        plain = decomposition.solve(Complete().inverse(decomposition.values))
+        plain = Decomposition.of(R, z).solve()
         apart = np.linalg.norm(R @ (np.asarray(self.parameters) - plain))
         return bool(apart <= 1e-7 * np.linalg.norm(z))
 

@@ -15,10 +15,9 @@ from jaxid.identification.estimators import (
     Estimate,
     WeightedLeastSquares,
 )
-from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
+from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition, undetermined
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.identifiability import undetermined
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.uncertainty import AbstractUncertainty, SpectralSandwich
 from jaxid.measurement.observations import Observations, Progress

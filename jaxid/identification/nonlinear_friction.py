@@ -15,16 +15,18 @@ from jaxid.dynamics.terms import AbstractTerm, TemperatureScaled
 from jaxid.errors import InputError
 from jaxid.identification.estimators.friction import (
     NonlinearFriction,
-    ShapeSearch,
+    SeparableProblem,
+    Shapes,
+    join_blocks,
     project,
     search_shapes,
 )
-from jaxid.identification.estimators.friction_rows import SeparableProblem, Shapes, join_blocks
-from jaxid.identification.estimators.solutions import Complete, Decomposition
+from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Blocks
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.measurement.observations import Observations, Progress
 
 
@@ -150,47 +152,50 @@ def identify_nonlinear(
     linear_problem = RegressionProblem(base if linear is None else linear, recordings)
     before = fit_problem(linear_problem, estimator.linear)
     weights = np.asarray(before.weights)
-    separable, found = estimator.search(RegressionProblem(base, recordings), weights)
-    shapes = separable.shapes
-    shaped = shapes.set(base, found.x)
+    separable, x, notes = estimator.search(RegressionProblem(base, recordings), weights)
+    shapes, size = separable.shapes, base.size
+    shaped = shapes.set(base, x)
     fit = fit_problem(RegressionProblem(shaped, recordings), estimator.linear)
-    linearised = _with_slopes(shaped, shapes, fit.parameters)
+    linearised = _with_slopes(shaped, dataclasses.replace(shapes, model=shaped.model), x, fit)
     joint = fit_problem(RegressionProblem(linearised, recordings), estimator.linear)
-    covariance, size = np.asarray(joint.covariance), base.size
+    covariance, both = np.asarray(joint.covariance), joint.uncertainty
+    uncertainty = Uncertainty(
+        covariance[:size, :size],
+        np.asarray(both.dof)[:size],
+        np.asarray(both.naive_covariance)[:size, :size],
+        None if both.jackknife is None else np.asarray(both.jackknife)[:size],
+        both.notes,
+    )
     return NonlinearFit(
         fit=dataclasses.replace(
-            fit,
-            uncertainty=joint.uncertainty.first(size),
-            estimator=estimator,
-            notes=(*fit.notes, *found.notes),
+            fit, uncertainty=uncertainty, estimator=estimator, notes=(*fit.notes, *notes)
         ),
         names=tuple(name for name, _ in shapes.parameters),
         units=tuple(unit for _, unit in shapes.parameters),
-        shapes=found.x,
+        shapes=x,
         shape_covariance=covariance[size:, size:],
         linear=before,
-        held_out=_held_out_errors(linear_problem.blocks, separable, found, weights, progress),
+        held_out=_held_out_errors(linear_problem.blocks, separable, x, weights, progress),
     )
 
 
 def _held_out_errors(
     blocks: Blocks,
     problem: SeparableProblem,
-    found: ShapeSearch,
+    found: Float[np.ndarray, " shapes"],
     weights: Float[np.ndarray, " joints"],
     progress: Progress | None,
 ) -> HeldOutErrors:
     """Test both models on held-out blocks; searches begin at the shapes of all blocks."""
     squares, errors = weights**2, []
-    start, count = problem.shapes.values(problem.base), len(blocks.parts)
+    start, count = problem.shapes.values, len(blocks.parts)
     folds = np.array_split(np.arange(count), min(5, count))
     for fold, part in enumerate(folds):
         out = part.tolist()
         rest = [k for k in range(count) if k not in out]
-        decomposition = Decomposition.of(*join_blocks(blocks, rest).weighted(weights))
-        p = decomposition.solve(Complete().inverse(decomposition.values))
-        shaped = problem.blocks(search_shapes(problem, weights, start, found.x, rest).x)
-        c = project(problem, join_blocks(shaped, rest), weights).linear
+        p = Decomposition.of(*join_blocks(blocks, rest).weighted(weights)).solve()
+        shaped = problem.blocks(search_shapes(problem, weights, start, found, rest)[0])
+        c = project(problem, join_blocks(shaped, rest), weights)[0]
         test, linear_test = join_blocks(shaped, out), join_blocks(blocks, out)
         errors.append(
             (
@@ -210,43 +215,35 @@ class ShapeSlopes(AbstractTerm):
     Whatever computes the uncertainty of parameters then computes that of the shapes too.
 
     Attributes:
-        terms: Terms of the model.
-        changing: Shapes that change.
-        x: Shapes at which forces are linearised.
-        p: Standard parameters of the model at which forces are linearised.
+        shapes: Shapes that change, at which forces are linearised.
+        x: Their values.
+        p: Standard parameters of the terms that have shapes.
     """
 
-    terms: tuple[AbstractTerm, ...]
-    changing: Shapes
+    shapes: Shapes
     x: Float[AnyArray, " shapes"]
     p: Float[AnyArray, " standard"]
 
     def parameters(self, robot):
         """Return names and units of the shapes."""
-        return self.changing.parameters
+        return self.shapes.parameters
 
     def columns(self, robot, q, qd, qdd):
         """Return the derivatives of the shaped terms' forces."""
-        ends = np.cumsum([len(term.parameters(robot)) for term in self.terms])
-        p = np.split(np.arange(ends[-1]), ends[:-1])
 
         def forces(x):
-            terms = self.changing.set_in(self.terms, x)
-            return sum(
-                terms[i].columns(robot, q, qd, qdd) @ jnp.asarray(self.p)[p[i]]
-                for i in self.changing.terms
-            )
+            return self.shapes.columns(x, q, qd, qdd) @ jnp.asarray(self.p)
 
         return jax.jacfwd(forces)(jnp.asarray(self.x, q.dtype))
 
 
 def _with_slopes(
-    base: BaseParameters, shapes: Shapes, p: Float[AnyArray, " base"]
+    base: BaseParameters, shapes: Shapes, x: Float[np.ndarray, " shapes"], fit: Fit
 ) -> BaseParameters:
     """Return base parameters with small changes of shapes as further parameters."""
     model, n = base.model, base.model.size
-    standard = np.asarray(base.to_standard(np.asarray(p)))
-    slopes = ShapeSlopes(model.terms, shapes, shapes.values(base), standard)
+    p = np.asarray(base.to_standard(np.asarray(fit.parameters)))
+    slopes = ShapeSlopes(shapes, x, p[shapes.columns_of_terms])
     kappa = np.asarray(base.kappa)
     return dataclasses.replace(
         base,

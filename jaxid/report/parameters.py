@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from jaxid.identification.filter_choice import FilterChoice
+from jaxid.identification.choices import FilterChoice
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
 from jaxid.identification.runs.comparison import Comparison, Verdict
 from jaxid.report.style import (

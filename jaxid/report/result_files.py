@@ -11,7 +11,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from jaxid.errors import InputError
-from jaxid.identification.filter_choice import FilterChoice
+from jaxid.identification.choices import FilterChoice
 from jaxid.identification.fit import Fit, load
 from jaxid.identification.runs.comparison import LEVEL, Comparison
 from jaxid.identification.runs.estimates import Estimates

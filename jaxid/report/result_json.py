@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit
-from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
 from jaxid.identification.runs.comparison import LEVEL, Comparison
 from jaxid.identification.runs.estimates import Estimates, groups
 from jaxid.robot.robot import Robot

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
-from jaxid.identification.identifiability import LARGEST_UNCERTAINTY
 from jaxid.table import Remark, Status, percent, significant
 from jaxid.validation import Definiteness, TorqueErrors
 

@@ -12,7 +12,7 @@ import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification import normal_equations
 from jaxid.identification.batches import identify_batch
-from jaxid.identification.bootstrap import bootstrap
+from jaxid.identification.uncertainty.blocks import bootstrap
 
 SAMPLES = 150
 WEIGHTS = np.array([0.3, 2.0])

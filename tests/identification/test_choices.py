@@ -5,7 +5,6 @@ import pytest
 import virtual
 
 import jaxid as jid
-from jaxid.identification.essential import restrict
 
 ROBOT = jid.robots.planar_arm(3)
 MODEL = jid.Model(
@@ -13,7 +12,7 @@ MODEL = jid.Model(
 )
 BASE = jid.base_parameters(MODEL)
 P = virtual.standard_parameters(MODEL, seed=1)
-WLS = jid.WeightedLeastSquares(jid.estimators.Unweighted())
+WLS = jid.estimators.LeastSquares()
 
 
 def without_offsets():
@@ -44,27 +43,16 @@ def test_parameters_without_effect_are_eliminated():
 
 def test_the_path_leads_from_all_parameters_to_one_with_growing_error():
     o = virtual.observations(MODEL, without_offsets(), noise=0.3, samples=400)
-    found = jid.essential_parameters(jid.identify(BASE, o, WLS), o)
+    fit = jid.identify(BASE, o, WLS)
+    found = jid.essential_parameters(fit, o)
     assert [s.remaining for s in found.path] == list(range(BASE.size, 0, -1))
     assert found.path[0].name == ""
     assert len({s.name for s in found.path}) == BASE.size
     assert (np.diff([s.error for s in found.path]) >= -1e-12).all()
-    assert found.path[0].error == pytest.approx(found.full.residual, rel=1e-9)
+    assert found.path[0].error == pytest.approx(fit.residual, rel=1e-9)
     smallest = min(s.held_out for s in found.path)
     assert found.last.held_out <= 1.02 * smallest
     assert found.path[found.path.index(found.last) + 1].held_out > 1.02 * smallest
-
-
-def test_a_restricted_model_is_the_model_with_zeros():
-    kept = [0, 3, 5, 8]
-    base = restrict(BASE, kept)
-    p = np.zeros(BASE.size)
-    p[kept] = [1.0, 2.0, -1.0, 0.5]
-    motion = virtual.motion(3, 20)
-    np.testing.assert_allclose(
-        base.inverse_dynamics(p[kept], motion), BASE.inverse_dynamics(p, motion), atol=1e-12
-    )
-    assert base.names == tuple(BASE.names[k] for k in kept)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +75,10 @@ CUTOFFS = (0.5, 2.0, 8.0, 16.0, 60.0, 100.0)
 
 
 def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
-    candidates = jid.identification.filter_choice.butterworth_candidates(0.004, CUTOFFS)
+    candidates = [
+        (jid.ZeroPhaseButterworth(f), jid.Subsample(max(1, int(1.0 / (5.0 * f * 0.004)))))
+        for f in CUTOFFS
+    ]
     told = []
     found = jid.choose_filter(BASE, noisy_log, candidates, estimator=WLS, progress=told.append)
     best = CUTOFFS[found.best]
@@ -98,22 +89,11 @@ def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
     assert found.correlations[0] > found.correlations[-1]
     assert told[-1] == 1.0
     assert f"a cut-off of {best:.3g} Hz" in str(found)
-    # Whiteness may decide among all candidates.
-    whitest = jid.identification.filter_choice.WhitestResidual(cost=10.0).choose(
-        found.errors, found.correlations
-    )
-    good = found.curve <= 11.0 * found.curve.min()
-    assert whitest == int(np.argmin(np.where(good, np.abs(found.correlations), np.inf)))
-
-
-def test_candidates_are_decimated_to_their_band():
-    candidates = jid.identification.filter_choice.butterworth_candidates(0.001)
-    cutoffs = [c.filter.cutoff for c in candidates]
-    assert cutoffs[0] == pytest.approx(1.0)
-    assert cutoffs[-1] == pytest.approx(100.0)
-    for c in candidates:
-        c.decimation.check(c.filter.cutoff, 0.001)
-        assert 4.9 < 1000.0 / c.decimation.factor / c.filter.cutoff < 10.1
+    white = jid.choose_filter(BASE, noisy_log, candidates, estimator=WLS, criterion="whiteness")
+    np.testing.assert_array_equal(white.errors, found.errors)
+    good = found.curve <= 1.05 * found.curve.min()
+    expected = np.where(good, np.abs(found.correlations), np.inf)
+    assert white.best == int(np.argmin(expected))
 
 
 def test_invalid_choices_are_rejected():

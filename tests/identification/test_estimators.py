@@ -8,7 +8,7 @@ from virtual import dense, observations, standard_parameters
 import jaxid as jid
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
-MEASURED = jid.estimators.MeasuredForces()
+MEASURED = jid.estimators.ResidualVariances(0)
 
 
 class Known(AbstractTrajectory):

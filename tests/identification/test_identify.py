@@ -8,7 +8,7 @@ import jaxid as jid
 from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.fit import Trust
 
-WEIGHTED = jid.WeightedLeastSquares(jid.estimators.MeasuredForces())
+WEIGHTED = jid.WeightedLeastSquares(jid.estimators.ResidualVariances(0))
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from virtual import observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.runs.delay import without_delay
-from jaxid.identification.runs.left_out import block_covariance
 from jaxid.identification.runs.payload import body_columns
+from jaxid.identification.uncertainty.blocks import block_covariance
 
 LOAD = jid.Tool(
     2,

@@ -9,10 +9,10 @@ from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.identification.uncertainty import spectra
+from jaxid.identification.uncertainty import spectral
 from jaxid.identification.uncertainty.spectral import SpectralTable, sandwich
 
-ESTIMATOR = jid.WeightedLeastSquares(jid.estimators.MeasuredForces())
+ESTIMATOR = jid.WeightedLeastSquares(jid.estimators.ResidualVariances(0))
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def base():
 def row_spectra(base, recordings):
     problem = jid.RegressionProblem(base, recordings)
     estimate = ESTIMATOR(problem)
-    return spectra.row_spectra(problem, estimate), estimate
+    return spectral.row_spectra(problem, estimate)[:2], estimate
 
 
 def by_definition(base, o, weights):
@@ -60,7 +60,7 @@ def test_the_sandwich_is_its_definition(base, samples):
     o = observations(base.model, standard_parameters(base.model), samples=samples, noise=0.4)
     found, e = row_spectra(base, [o])
     covariance, dof = by_definition(base, o, np.asarray(e.weights))
-    got, got_dof, _ = sandwich(found)
+    got, got_dof, _ = sandwich(*found)
     np.testing.assert_allclose(np.diag(got), np.diag(covariance), rtol=1e-8)
     np.testing.assert_allclose(got_dof, dof, rtol=1e-8)
     size = np.sqrt(np.diag(covariance))
@@ -81,7 +81,7 @@ def coverage(base, recordings, memory, draws, seed=0):
     """Share of draws in which the 95 % interval holds the truth, by parameter; naive likewise."""
     random = np.random.default_rng(seed)
     found, e = row_spectra(base, recordings)
-    table = SpectralTable(found.lines)
+    table = SpectralTable.of(found[0])
     w = np.asarray(e.weights)
     rows = jid.RegressionProblem(base, recordings)
     error, parts = np.zeros((draws, base.size)), []
@@ -172,10 +172,10 @@ def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
     noise = coloured(np.random.default_rng(3), (1, 24000, 2), 0.3, 0.02)[0]
     o = o.replace(forces=o.forces + noise)
     whole = jid.identify(base, o, ESTIMATOR)
-    monkeypatch.setattr(spectra, "MAX_ROWS", 1500)
+    monkeypatch.setattr(spectral, "MAX_ROWS", 1500)
     divided = jid.identify(base, o, ESTIMATOR)
     np.testing.assert_allclose(divided.standard_deviations, whole.standard_deviations, rtol=0.06)
-    monkeypatch.setattr(spectra, "MAX_SAMPLES", 8000)
+    monkeypatch.setattr(spectral, "MAX_SAMPLES", 8000)
     some = jid.identify(base, o, ESTIMATOR)
     np.testing.assert_allclose(some.standard_deviations, whole.standard_deviations, rtol=0.15)
     assert np.median(whole.uncertainty.ratios) > 2
@@ -265,11 +265,11 @@ def test_many_gaps_cost_no_memory_and_change_little(base, monkeypatch):
     noise = coloured(np.random.default_rng(8), (1, o.rows, 2), 0.1, o.row_time)[0]
     o = o.replace(forces=o.forces + noise)
     shared, _ = row_spectra(base, [o])
-    assert [x.stretches for x in shared.lines] == [8]
-    monkeypatch.setattr(spectra, "MAX_LENGTHS", 8)
+    assert [x.stretches for x in shared[0]] == [8]
+    monkeypatch.setattr(spectral, "MAX_LENGTHS", 8)
     apart, _ = row_spectra(base, [o])
-    assert len(apart.lines) == 8
-    one, other = sandwich(shared), sandwich(apart)
+    assert len(apart[0]) == 8
+    one, other = sandwich(*shared), sandwich(*apart)
     ratio = np.sqrt(np.diag(one[0]) / np.diag(other[0]))
     assert ratio.min() > 0.9
     assert ratio.max() < 1.1

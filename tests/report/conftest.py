@@ -102,5 +102,5 @@ def consistent():
     forces += np.random.default_rng(0).normal(0.0, 0.05, forces.shape)
     log = jid.Recording.of(np.asarray(motion.q), forces, time=t)
     o = jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0))
-    estimator = jid.PhysicallyConsistent(jid.estimators.MeasuredForces())
+    estimator = jid.PhysicallyConsistent(jid.estimators.ResidualVariances(0))
     return jid.identify(jid.base_parameters(model), o, estimator)

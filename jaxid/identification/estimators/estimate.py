@@ -1,7 +1,7 @@
 """Estimates, the influence of single rows on them, and the family of estimators."""
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -40,38 +40,8 @@ class Channel(NamedTuple):
     counted: int
 
 
-class AbstractInfluence(eqx.Module):
-    """Influence of rows on an estimate."""
-
-    @abstractmethod
-    def channels(
-        self, chunk: RowChunk, residuals: Float[np.ndarray, "rows joints"]
-    ) -> list[Channel]:
-        """Return the equations of some rows with their weights.
-
-        Args:
-            chunk: Rows.
-            residuals: Residuals of the estimate [N m or N].
-        """
-
-
-class JointRows(AbstractInfluence):
-    """Influence of rows that are weighted by joint.
-
-    Attributes:
-        weights: Weights of the joints' rows [1/(N m) or 1/N].
-    """
-
-    weights: Float[AnyArray, " joints"]
-
-    def channels(self, chunk, residuals):
-        """Return one channel for each joint."""
-        return [
-            Channel(own, theta, theta, w * r, count)
-            for (own, theta, w, count), r in zip(
-                weighted_joints(chunk, self.weights), residuals.T, strict=True
-            )
-        ]
+Influence = Callable[[RowChunk, np.ndarray], list[Channel]]
+"""Function from rows and their residuals [rows, joints], in [N m] or [N], to weighted equations."""
 
 
 def weighted_joints(
@@ -82,6 +52,16 @@ def weighted_joints(
     for own, theta, mask, weight in joints:
         rows = np.where(mask, weight, 0.0)
         yield tuple(own), rows[:, None] * theta, rows, int(mask.sum())
+
+
+def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
+    """Return the influence of rows that are weighted by joint: one channel for each joint."""
+
+    def channels(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+        joints = zip(weighted_joints(chunk, weights), residuals.T, strict=True)
+        return [Channel(own, theta, theta, w * r, n) for (own, theta, w, n), r in joints]
+
+    return channels
 
 
 class Estimate(eqx.Module):
@@ -98,7 +78,7 @@ class Estimate(eqx.Module):
         weights: Weights of the joints' rows [1/(N m) or 1/N].
         blocks: Factors of the rows with their final weights.
         inverse: Inverse of the information, or its substitute; zero for fixed parameters.
-        influence: Influence of the rows on the estimate.
+        influence: Function from some rows and their residuals to weighted equations (`Channel`).
         solution: Solution of the weighted system.
         standard: Standard parameters, of an estimator that finds a complete set of them.
         notes: Sentences for the user.
@@ -112,7 +92,7 @@ class Estimate(eqx.Module):
     weights: Float[AnyArray, " joints"]
     blocks: Blocks
     inverse: Float[AnyArray, "base base"]
-    influence: AbstractInfluence
+    influence: Influence
     solution: AbstractSpectralSolution = Complete()
     standard: Float[AnyArray, " standard"] | None = None
     notes: tuple[str, ...] = eqx.field(static=True, default=())
@@ -125,18 +105,30 @@ class Estimate(eqx.Module):
         problem: RegressionProblem,
         weights: Float[AnyArray, " joints"],
         solution: AbstractSolution,
+        blocks: Blocks | None = None,
+        influence: Influence | None = None,
     ) -> "Estimate":
-        """Return the least-squares estimate of rows that are weighted by joint (Eqs. 28, 33)."""
-        chosen = solution.choose(problem.blocks, weights)
-        decomposition = Decomposition.of(*problem.factors.weighted(weights))
+        """Return the least-squares estimate of rows that are weighted by joint (Eqs. 28, 33).
+
+        Args:
+            problem: Regression problem.
+            weights: Weights of the joints' rows [1/(N m) or 1/N].
+            solution: Solution of the weighted system.
+            blocks: Factors by blocks of time; by default those of the problem.
+            influence: Influence of the rows; by default that of rows weighted by joint.
+        """
+        factors = problem.factors if blocks is None else blocks.total
+        blocks = problem.blocks if blocks is None else blocks
+        chosen = solution.choose(blocks, weights)
+        decomposition = Decomposition.of(*factors.weighted(weights))
         inverse = chosen.inverse(decomposition.values)
         return cls(
             base=problem.base,
             parameters=decomposition.solve(inverse),
             weights=np.asarray(weights),
-            blocks=problem.blocks,
+            blocks=blocks,
             inverse=decomposition.inverse_information(inverse),
-            influence=JointRows(weights),
+            influence=joint_rows(weights) if influence is None else influence,
             solution=chosen,
             effective_parameters=float(np.sum(inverse * np.asarray(decomposition.values) ** 2)),
         )
@@ -156,13 +148,10 @@ class AbstractEstimator(eqx.Module):
     * `problem.with_base(base)`: the same recordings with other columns, for estimators that search
       for constants of the model's terms; `problem.recordings`: motions and filters.
 
-    Problems of factors only (`problem.has_samples` is False) serve estimators that need no pass;
-    the others reject them by `problem.require_samples(...)`.
-
-    `Estimate.solve` returns the estimate of weighted least squares; use `dataclasses.replace` where
-    parts differ. A complete set of standard parameters goes to `standard`, base parameters of
-    another model to `base`. `identify` computes uncertainties, condition numbers and undetermined
-    directions from the estimate, alike for all estimators.
+    Problems of factors only serve estimators that need no pass over the rows; the others reject
+    them by `problem.require_samples(...)`. `Estimate.solve` returns the estimate of weighted least
+    squares; use `dataclasses.replace` where parts differ. `identify` computes uncertainties,
+    condition numbers and undetermined directions from the estimate, alike for all estimators.
     """
 
     @abstractmethod
@@ -185,11 +174,7 @@ class EstimatorInWords(AbstractEstimator):
     words: str = eqx.field(static=True)
 
     def __call__(self, problem):
-        """Reject the problem: only a description is left.
-
-        Raises:
-            InputError: Always.
-        """
+        """Reject the problem: only a description is left."""
         raise InputError(
             "the `estimator` of this model file held recordings or functions and is only "
             f"described: create it again to estimate again. It was {self.words:.200}"

@@ -1,4 +1,4 @@
-"""Least squares: ordinary, weighted by joint, generalised, and relative to a prior."""
+"""Least squares: ordinary, weighted, generalised, with instruments, and relative to a prior."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,27 +8,33 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.estimators.estimate import (
     AbstractEstimator,
-    AbstractInfluence,
     Channel,
     Estimate,
+    Influence,
+    weighted_joints,
 )
 from jaxid.identification.estimators.solutions import (
+    NUMERICAL,
     AbstractSolution,
+    AbstractWeights,
     Complete,
     CrossValidated,
-    Decomposition,
-)
-from jaxid.identification.estimators.weights import (
-    AbstractWeights,
     MaximumForces,
     ResidualVariances,
-    Unweighted,
 )
 from jaxid.identification.factors import Blocks, Factors, RowChunk
-from jaxid.identification.problem import RegressionProblem, Span, chunk_residuals
+from jaxid.identification.problem import (
+    RegressionProblem,
+    Span,
+    chunk_residuals,
+    reduced_rows,
+)
+from jaxid.measurement.observations import Observations
+from jaxid.trajectory.trajectory import AbstractTrajectory
 
 
 class LeastSquares(AbstractEstimator):
@@ -42,8 +48,7 @@ class LeastSquares(AbstractEstimator):
 
     def __call__(self, problem):
         """Solve the system; a newton metre counts the same at every joint."""
-        weights = Unweighted()(problem.robot, problem.factors)
-        return Estimate.solve(problem, weights, self.solution)
+        return Estimate.solve(problem, np.ones(problem.robot.joints), self.solution)
 
 
 class WeightedLeastSquares(AbstractEstimator):
@@ -61,43 +66,6 @@ class WeightedLeastSquares(AbstractEstimator):
         """Compute the weights, and solve the system."""
         weights = self.weights(problem.robot, problem.factors)
         return Estimate.solve(problem, weights, self.solution)
-
-
-class WhitenedRows(AbstractInfluence):
-    r"""Influence of the rows of all joints at one instant, multiplied by $S^{-1/2}$.
-
-    Attributes:
-        covariance: Covariance $S$ of the joints' residuals.
-    """
-
-    covariance: Float[AnyArray, "joints joints"]
-
-    def channels(self, chunk, residuals):
-        """Return combinations of joints whose residuals are not correlated."""
-        size = 1 + max((max(own) for own in chunk.indices if own), default=0)
-        rows = np.zeros((*residuals.shape, size + 1))
-        for j, own in enumerate(chunk.indices):
-            rows[:, j, list(own)] = chunk.columns[j]
-        rows[..., -1] = residuals
-        mixed = self._whiten(rows, chunk.mask)
-        found = []
-        for c in range(residuals.shape[1]):
-            Z = mixed[:, c, :-1]
-            count = int(chunk.mask[:, c].sum())
-            found.append(Channel(tuple(range(size)), Z, Z, mixed[:, c, -1], count))
-        return found
-
-    def _whiten(self, x: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Multiply rows [rows, joints, columns] by the root of the joints that count then."""
-        S, whitened = np.asarray(self.covariance), np.zeros_like(x)
-        patterns, which = np.unique(mask, axis=0, return_inverse=True)
-        for k, pattern in enumerate(patterns):
-            own = np.flatnonzero(pattern)
-            if len(own):
-                root = np.linalg.inv(np.linalg.cholesky(S[np.ix_(own, own)]))
-                rows = np.flatnonzero(which.ravel() == k)
-                whitened[np.ix_(rows, own)] = np.einsum("cj,rjk->rck", root, x[np.ix_(rows, own)])
-        return whitened
 
 
 class GeneralisedLeastSquares(AbstractEstimator):
@@ -124,31 +92,21 @@ class GeneralisedLeastSquares(AbstractEstimator):
         weights = ResidualVariances()(problem.robot, problem.factors)
         estimate = Estimate.solve(problem, weights, self.solution)
         for _ in range(self.iterations):
-            influence = WhitenedRows(_residual_covariance(problem, estimate.parameters))
-            weights = 1.0 / np.sqrt(np.diag(influence.covariance))
-            blocks = _whiten(problem, influence, np.asarray(estimate.parameters), weights)
-            solution = self.solution.choose(blocks, weights)
-            d = Decomposition.of(*blocks.total.weighted(weights))
-            inverse = solution.inverse(d.values)
-            estimate = Estimate(
-                base=problem.base,
-                parameters=d.solve(inverse),
-                weights=weights,
-                blocks=blocks,
-                inverse=d.inverse_information(inverse),
-                influence=influence,
-                solution=solution,
-            )
+            p = np.asarray(estimate.parameters)
+            S = _residual_covariance(problem, p)
+            influence, weights = whitened_rows(S), 1.0 / np.sqrt(np.diag(S))
+            blocks = _whiten(problem, influence, p, weights)
+            estimate = Estimate.solve(problem, weights, self.solution, blocks, influence)
         return estimate
 
 
 def _residual_covariance(
-    problem: RegressionProblem, p: Float[AnyArray, " base"]
+    problem: RegressionProblem, p: Float[np.ndarray, " base"]
 ) -> Float[np.ndarray, "joints joints"]:
     """Return the covariance of the joints' residuals at the same instants [N² m², N m N or N²]."""
     n = problem.robot.joints
     products, counts = np.zeros((n, n)), np.zeros((n, n))
-    for chunk, residuals in problem.residuals(np.asarray(p)):
+    for chunk, residuals in problem.residuals(p):
         r, c = np.where(chunk.mask, residuals, 0.0), chunk.mask.astype(float)
         products += r.T @ r
         counts += c.T @ c
@@ -160,15 +118,45 @@ def _residual_covariance(
     return definite * size * size[:, None]
 
 
+def whitened_rows(S: Float[np.ndarray, "joints joints"]) -> Influence:
+    """Return the influence of the joints' rows at one instant, multiplied by S^(-1/2).
+
+    The channels are combinations of joints whose residuals are not correlated.
+    """
+
+    def channels(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+        size = 1 + max((max(own) for own in chunk.indices if own), default=0)
+        rows = np.zeros((*residuals.shape, size + 1))
+        for j, own in enumerate(chunk.indices):
+            rows[:, j, list(own)] = chunk.columns[j]
+        rows[..., -1] = residuals
+        mixed = np.zeros_like(rows)
+        # Instants at which the same joints count share a root.
+        patterns, which = np.unique(chunk.mask, axis=0, return_inverse=True)
+        for k, pattern in enumerate(patterns):
+            own = np.flatnonzero(pattern)
+            if len(own):
+                root = np.linalg.inv(np.linalg.cholesky(S[np.ix_(own, own)]))
+                at = np.ix_(np.flatnonzero(which.ravel() == k), own)
+                mixed[at] = np.einsum("cj,rjk->rck", root, rows[at])
+        found = []
+        for x, mask in zip(np.moveaxis(mixed, 1, 0), chunk.mask.T, strict=True):
+            Z = x[:, :-1]
+            found.append(Channel(tuple(range(size)), Z, Z, x[:, -1], int(mask.sum())))
+        return found
+
+    return channels
+
+
 def _whiten(
-    problem: RegressionProblem, influence: WhitenedRows, p: np.ndarray, weights: np.ndarray
+    problem: RegressionProblem, influence: Influence, p: np.ndarray, weights: np.ndarray
 ) -> Blocks:
     """Return the factors of combinations of joints, as if they were the joints' own."""
     size = problem.base.size
 
     def equations(chunk: RowChunk) -> list[np.ndarray]:
         found = []
-        for c, channel in enumerate(influence.channels(chunk, chunk_residuals(chunk, p))):
+        for c, channel in enumerate(influence(chunk, chunk_residuals(chunk, p))):
             Z = np.zeros((len(chunk.mask), size))
             Z[:, list(channel.columns)] = channel.equations
             both = np.column_stack([Z, channel.disturbance + Z @ p])[chunk.mask[:, c]]
@@ -176,6 +164,87 @@ def _whiten(
         return found
 
     return problem.fold(equations, [tuple(range(size))] * len(weights))
+
+
+class InstrumentalVariables(AbstractEstimator):
+    r"""Weighted least squares with the columns of a motion without noise (IDIM-IV).
+
+    Noise of the encoders enters the regressor: least squares then see columns that are too large,
+    and bias their parameters towards zero, however long the log is. With the columns $Z$ of the
+    commanded motion, which has no such noise, $\hat p = (Z^T W^2 \Theta)^{-1} Z^T W^2 Q$ has no
+    such bias. The reference need not be followed exactly: it must be similar, and independent of
+    the encoders' noise. The instruments are kept in memory.
+
+    Attributes:
+        references: Commanded trajectory of each recording, or one for all.
+        weights: Weights of the joints; by default the reciprocals of the largest forces (Eq. 30).
+        starts: Time stamps of the recordings at which the trajectories began [s], or one for all.
+    """
+
+    references: tuple[AbstractTrajectory, ...]
+    weights: AbstractWeights = MaximumForces()
+    starts: tuple[float, ...] = eqx.field(static=True, default=(0.0,))
+
+    def __call__(self, problem):
+        """Solve with the references' columns.
+
+        Raises:
+            InputError: If only factors of the rows are known, or the number of references is wrong.
+        """
+        problem.require_samples("an estimate with instrumental variables")
+        weights = self.weights(problem.robot, problem.factors)
+        recordings, size = problem.recordings, problem.base.size
+        given = {"references": self.references, "starts": self.starts}
+        for name, values in given.items():
+            if len(values) not in (1, len(recordings)):
+                raise InputError(
+                    f"`{name}` must hold one entry, or one for each of {len(recordings)} "
+                    f"recordings, but holds {len(values)}."
+                )
+        each = [x * len(recordings) if len(x) == 1 else x for x in given.values()]
+        triples = zip(recordings, *each, strict=True)
+        instruments = [_columns(problem.base, *triple) for triple in triples]
+
+        def influence(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+            joints = weighted_joints(chunk, weights)
+            triples = zip(joints, instruments[chunk.recording], residuals.T, strict=True)
+            return [
+                Channel(own, w[:, None] * Z[chunk.rows], theta, w * r, count)
+                for (own, theta, w, count), Z, r in triples
+            ]
+
+        information, products = np.zeros((size, size)), np.zeros(size)
+        for chunk, forces in problem.residuals(np.zeros(size)):
+            for own, Z, theta, u, _ in influence(chunk, forces):
+                information[np.ix_(own, own)] += Z.T @ theta
+                products[list(own)] += Z.T @ u
+        norms = np.linalg.norm(problem.factors.weighted(weights)[0], axis=0)
+        scale = np.where(norms > NUMERICAL * norms.max(initial=0.0), norms, np.inf)
+        scaled = np.linalg.pinv(information / scale / scale[:, None], NUMERICAL)
+        inverse = scaled / scale / scale[:, None]
+        return Estimate(
+            base=problem.base,
+            parameters=inverse @ products,
+            weights=weights,
+            blocks=problem.blocks,
+            inverse=inverse,
+            influence=influence,
+        )
+
+
+def _columns(
+    base: BaseParameters, observations: Observations, reference: AbstractTrajectory, start: float
+) -> tuple[np.ndarray, ...]:
+    """Return the columns of a reference for each joint, filtered like those of the recording."""
+    time, n = np.asarray(observations.time), observations.joints
+
+    def read(samples: slice) -> tuple[Motion, np.ndarray]:
+        m = reference.motion(time[samples] - start)
+        motion = Motion(*(np.asarray(x, np.float64) for x in (m.q, m.qd, m.qdd)))
+        return motion, np.zeros((len(motion.q), n))
+
+    parts = [columns for _, columns, _ in reduced_rows(base, observations, read=read)]
+    return tuple(np.concatenate(joint) for joint in zip(*parts, strict=True))
 
 
 class RelativeTo(AbstractEstimator):

@@ -5,18 +5,22 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.identification.estimators.estimate import (
     AbstractEstimator,
-    AbstractInfluence,
     Channel,
     Estimate,
     weighted_joints,
 )
-from jaxid.identification.estimators.solutions import AbstractSolution, Complete, Decomposition
-from jaxid.identification.estimators.weights import AbstractWeights, MaximumForces
-from jaxid.identification.factors import Blocks
+from jaxid.identification.estimators.solutions import (
+    AbstractSolution,
+    AbstractWeights,
+    Complete,
+    Decomposition,
+    MaximumForces,
+)
+from jaxid.identification.factors import Blocks, RowChunk
 from jaxid.identification.problem import RegressionProblem
 
 
@@ -84,33 +88,6 @@ class Tukey(AbstractLoss):
         return np.where(u < 1.0, (1.0 - u) * (1.0 - 5.0 * u), 0.0)
 
 
-class RobustRows(AbstractInfluence):
-    """Influence of rows that are weighted by the size of their residuals.
-
-    Attributes:
-        weights: Weights of the joints' rows [1/(N m) or 1/N].
-        scale: Standard deviation of each joint's ordinary residuals [N m or N].
-        slope: Mean slope of the loss for each joint.
-        loss: Loss function.
-    """
-
-    weights: Float[AnyArray, " joints"]
-    scale: Float[AnyArray, " joints"]
-    slope: Float[AnyArray, " joints"]
-    loss: AbstractLoss
-
-    def channels(self, chunk, residuals):
-        """Return channels whose residuals are weighted, and whose equations have the mean slope."""
-        felt = self.loss.weight(residuals / self.scale) * residuals
-        joints = weighted_joints(chunk, self.weights)
-        return [
-            Channel(own, Z, slope * Z, w * r, count)
-            for (own, Z, w, count), slope, r in zip(
-                joints, np.asarray(self.slope), felt.T, strict=True
-            )
-        ]
-
-
 class IterativelyReweighted(AbstractEstimator):
     """Weighted least squares in which rows with large residuals count less (M-estimation).
 
@@ -141,14 +118,25 @@ class IterativelyReweighted(AbstractEstimator):
         """
         problem.require_samples("an iteratively reweighted estimate")
         weights = self.weights(problem.robot, problem.factors)
-        start = Estimate.solve(problem, weights, self.solution)
-        p, _ = self._iterate(problem, weights, np.asarray(start.parameters), Huber())
-        p, change = self._iterate(problem, weights, p, self.loss)
+        p = np.asarray(Estimate.solve(problem, weights, self.solution).parameters)
+        change = np.inf
+        for loss in (Huber(), self.loss):
+            p, change = self._iterate(problem, weights, p, loss)
         scale = _residual_scale(problem, p)
-        slope = np.maximum(_mean_slope(problem, p, scale, self.loss), 0.1)
+        slopes = np.zeros(len(scale))
+        for chunk, residuals in problem.residuals(p):
+            slopes += np.sum(np.where(chunk.mask, self.loss.slope(residuals / scale), 0.0), axis=0)
+        slope = np.maximum(slopes / np.maximum(problem.factors.rows, 1), 0.1)
         blocks = _reweight(problem, p, self.loss, scale)
         solution = self.solution.choose(blocks, weights)
         d = Decomposition.of(*problem.factors.weighted(weights * np.sqrt(slope)))
+
+        def influence(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+            """Weight the residuals of each row; the equations have the mean slope of the loss."""
+            felt = self.loss.weight(residuals / scale) * residuals
+            joints = zip(weighted_joints(chunk, weights), slope, felt.T, strict=True)
+            return [Channel(own, Z, k * Z, w * r, n) for (own, Z, w, n), k, r in joints]
+
         notes = ()
         if change > self.tolerance:
             notes = (
@@ -161,7 +149,7 @@ class IterativelyReweighted(AbstractEstimator):
             weights=weights,
             blocks=blocks,
             inverse=d.inverse_information(solution.inverse(d.values)),
-            influence=RobustRows(weights, scale, slope, self.loss),
+            influence=influence,
             solution=solution,
             notes=notes,
         )
@@ -175,9 +163,8 @@ class IterativelyReweighted(AbstractEstimator):
         for _ in range(self.iterations):
             blocks = _reweight(problem, p, loss, scale)
             R, z = blocks.total.weighted(weights)
-            solution = self.solution.choose(blocks, weights)
             d = Decomposition.of(R, z)
-            new = d.solve(solution.inverse(d.values))
+            new = d.solve(self.solution.choose(blocks, weights).inverse(d.values))
             rest = float(np.linalg.norm(z - R @ new))
             step = float(np.linalg.norm(R @ (new - p)))
             p, change = new, step / rest if rest > 0 else 0.0
@@ -209,12 +196,3 @@ def _residual_scale(
     floor = max(1e-12 * largest, np.finfo(float).tiny)
     # 1.4826: standard deviation of a normal variable over its median size.
     return 1.4826 * np.maximum(medians, floor)
-
-
-def _mean_slope(
-    problem: RegressionProblem, p: np.ndarray, scale: np.ndarray, loss: AbstractLoss
-) -> Float[np.ndarray, " joints"]:
-    total = np.zeros(len(scale))
-    for chunk, residuals in problem.residuals(p):
-        total += np.sum(np.where(chunk.mask, loss.slope(residuals / scale), 0.0), axis=0)
-    return total / np.maximum(problem.factors.rows, 1)

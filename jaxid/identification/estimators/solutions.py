@@ -1,16 +1,20 @@
-"""Solutions of the weighted least-squares system: complete, truncated or regularised (Eq. 33)."""
+"""The weighted system (Eqs. 29-33): weights of the joints, decomposition, and solutions."""
 
 from abc import abstractmethod
 
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, is_traced, one_or_each
+from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.factors import Blocks
+from jaxid.identification.factors import Blocks, Factors
+from jaxid.robot.robot import Robot
 
 NUMERICAL = 1e-11
 """Relative singular value below which a direction is only rounding."""
+LARGEST_UNCERTAINTY = 0.1
+"""Fraction of the forces by which an undetermined combination may be wrong."""
 
 
 class Decomposition(eqx.Module):
@@ -37,11 +41,8 @@ class Decomposition(eqx.Module):
         cls, R: Float[AnyArray, "height base"], z: Float[AnyArray, " height"]
     ) -> "Decomposition":
         """Decompose a weighted factor and its right-hand side."""
-        R, z = np.asarray(R), np.asarray(z)
-        size = R.shape[1]
-        if len(R) < size:
-            R = np.vstack([R, np.zeros((size - len(R), size))])
-            z = np.append(z, np.zeros(size - len(z)))
+        missing = max(0, np.shape(R)[1] - len(R))
+        R, z = np.pad(np.asarray(R), ((0, missing), (0, 0))), np.pad(np.asarray(z), (0, missing))
         norms = np.linalg.norm(R, axis=0)
         # Shorter columns are rounding: units may differ by less.
         present = norms > 1e-13 * norms.max(initial=0.0)
@@ -51,17 +52,23 @@ class Decomposition(eqx.Module):
         rest = float(np.sqrt(max(z @ z - forces @ forces, 0.0)))
         return cls(scale, s, Vt, forces, rest)
 
-    def solve(self, inverse: Float[AnyArray, " base"]) -> Float[np.ndarray, " base"]:
-        """Return the parameters for an inverse of the information along each direction."""
-        along = np.asarray(inverse) * np.asarray(self.values) * np.asarray(self.forces)
+    def solve(self, inverse: Float[AnyArray, " base"] | None = None) -> Float[np.ndarray, " base"]:
+        """Return the parameters for an inverse of the information along each direction.
+
+        Args:
+            inverse: Substitute of 1 / value² for each direction; by default that of `Complete`.
+        """
+        inverse = Complete().inverse(self.values) if inverse is None else np.asarray(inverse)
+        along = inverse * np.asarray(self.values) * np.asarray(self.forces)
         return np.asarray(self.directions).T @ along / np.asarray(self.scale)
 
     def inverse_information(
-        self, inverse: Float[AnyArray, " base"]
+        self, inverse: Float[AnyArray, " base"] | None = None
     ) -> Float[np.ndarray, "base base"]:
-        """Return the inverse of the information, or its substitute, in the parameters' units."""
+        """Return the inverse of the information in the parameters' units; see `solve`."""
+        inverse = Complete().inverse(self.values) if inverse is None else np.asarray(inverse)
         V = np.asarray(self.directions) / np.asarray(self.scale)
-        return (V.T * np.asarray(inverse)) @ V
+        return (V.T * inverse) @ V
 
 
 class AbstractSolution(eqx.Module):
@@ -94,7 +101,7 @@ class Complete(AbstractSpectralSolution):
 
     def inverse(self, values):
         """Return the inverse squares; zero for directions of rounding."""
-        return _truncated_inverse(values, NUMERICAL)
+        return Truncated(NUMERICAL).inverse(values)
 
 
 class Truncated(AbstractSpectralSolution):
@@ -115,7 +122,9 @@ class Truncated(AbstractSpectralSolution):
 
     def inverse(self, values):
         """Return the inverse squares; zero for weak directions."""
-        return _truncated_inverse(values, max(self.rcond, NUMERICAL))
+        s = np.asarray(values)
+        kept = s > max(self.rcond, NUMERICAL) * s.max(initial=0.0)
+        return np.where(kept, 1.0 / np.where(kept, s, 1.0) ** 2, 0.0)
 
 
 class Ridge(AbstractSpectralSolution):
@@ -157,18 +166,7 @@ class CrossValidated(AbstractSolution):
     )
 
     def choose(self, blocks, weights):
-        """Test every candidate on every block."""
-        errors = np.array(self.errors(blocks, weights))
-        total = errors.sum(axis=1)
-        best = int(np.argmin(total))
-        margin = errors[best].std(ddof=1) * np.sqrt(errors.shape[1])
-        within = np.flatnonzero(total <= total[best] + margin)
-        return self.candidates[int(within.max())]
-
-    def errors(
-        self, blocks: Blocks, weights: Float[AnyArray, " joints"]
-    ) -> Float[np.ndarray, "candidates blocks"]:
-        """Return the sums of the squared weighted residuals of each held-out block.
+        """Test every candidate on every block.
 
         Raises:
             InputError: If there are fewer than two blocks.
@@ -180,16 +178,150 @@ class CrossValidated(AbstractSolution):
         squares = np.asarray(weights) ** 2
         errors = np.empty((len(self.candidates), len(blocks.parts)))
         for k, held_out in enumerate(blocks.parts):
-            decomposition = Decomposition.of(*blocks.without(k).weighted(weights))
+            d = Decomposition.of(*blocks.without(k).weighted(weights))
             for i, candidate in enumerate(self.candidates):
-                p = decomposition.solve(candidate.inverse(decomposition.values))
+                p = d.solve(candidate.inverse(d.values))
                 errors[i, k] = squares @ held_out.residual_squares(p)
-        return errors
+        total = errors.sum(axis=1)
+        best = int(np.argmin(total))
+        margin = errors[best].std(ddof=1) * np.sqrt(errors.shape[1])
+        return self.candidates[int(np.flatnonzero(total <= total[best] + margin).max())]
 
 
-def _truncated_inverse(
-    values: Float[AnyArray, " base"], rcond: float
-) -> Float[np.ndarray, " base"]:
-    s = np.asarray(values)
-    kept = s > rcond * s.max(initial=0.0)
-    return np.where(kept, 1.0 / np.where(kept, s, 1.0) ** 2, 0.0)
+class AbstractWeights(eqx.Module):
+    """A choice of one weight for each joint: the diagonal of W (Eq. 30)."""
+
+    @abstractmethod
+    def __call__(self, robot: Robot, factors: Factors) -> Float[np.ndarray, " joints"]:
+        """Return the weights [1/(N m) or 1/N] for some observations of a robot."""
+
+
+class GivenWeights(AbstractWeights):
+    """Known weights.
+
+    Attributes:
+        weights: Weight of each joint [1/(N m) or 1/N].
+    """
+
+    weights: Float[AnyArray, " joints"] = eqx.field(converter=one_or_each)
+
+    def __check_init__(self):
+        # `in_axes` of `vmap` and tracers have no values to check.
+        if not isinstance(self.weights, AnyArray) or is_traced(self.weights):
+            return
+        w = np.asarray(self.weights)
+        if w.ndim != 1 or not (np.isfinite(w).all() and (w >= 0.0).all() and w.any()):
+            raise InputError(
+                "`weights` must be one finite number for each joint, none below zero and not all "
+                f"zero, but are {w}."
+            )
+
+    def __call__(self, robot, factors):
+        """Return the weights.
+
+        Raises:
+            InputError: If their number is not that of the joints.
+        """
+        if np.shape(self.weights) != (robot.joints,):
+            raise InputError(
+                f"`weights` must be one number for each of the {robot.joints} joints of "
+                f"`{robot.name}`, but have shape {np.shape(self.weights)}."
+            )
+        return np.asarray(self.weights)
+
+
+class MaximumForces(AbstractWeights):
+    r"""Reciprocals of the largest forces, $1 / (i_{Gj} M_{j,max})$ (Eq. 30)."""
+
+    def __call__(self, robot, factors):
+        """Return the reciprocals.
+
+        Raises:
+            InputError: If the largest force of some joint is not known.
+        """
+        return 1.0 / np.asarray(robot.max_forces)
+
+
+class ResidualVariances(AbstractWeights):
+    """Reciprocals of the residuals' standard deviations, found iteratively.
+
+    Attributes:
+        iterations: Number of times that weights and parameters are computed in turn; with 0 the
+            weights are the reciprocals of the RMS values of the forces.
+    """
+
+    iterations: int = eqx.field(static=True, default=5)
+
+    def __call__(self, robot, factors):
+        """Return the reciprocals; the iteration starts from the size of the forces."""
+        squares = factors.force_squares
+        for iteration in range(self.iterations + 1):
+            deviations = np.sqrt(squares / np.maximum(factors.rows, 1))
+            # Finite also for a joint without any force or residual.
+            floor = max(1e-9 * float(deviations.max()), np.finfo(float).tiny)
+            weights = 1.0 / np.maximum(deviations, floor)
+            if iteration < self.iterations:
+                p = Decomposition.of(*factors.weighted(weights)).solve()
+                squares = factors.residual_squares(p)
+        return weights
+
+
+class UndeterminedDirection(eqx.Module):
+    """A combination of base parameters on which the forces hardly depend.
+
+    Attributes:
+        parts: Indices of the base parameters in it, the largest first.
+        shares: Their fractions, as they count in the forces; the largest is 1.
+        singular_value: Singular value of the scaled observation matrix, relative to the largest.
+        uncertainty: Standard deviation of the forces that the parameters of this combination make
+            one by one, relative to all forces; infinite if the combination was not moved.
+    """
+
+    parts: tuple[int, ...] = eqx.field(static=True)
+    shares: tuple[float, ...] = eqx.field(static=True)
+    singular_value: float
+    uncertainty: float
+
+    def sentence(self, base: BaseParameters) -> str:
+        """Return the combination in words, with the names of five base parameters at most."""
+        names = [base.names[k] for k in self.parts]
+        if len(names) == 1:
+            return f"{names[0]} is not determined"
+        if len(names) > 5:
+            names = [*names[:4], f"{len(names) - 4} others"]
+        return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
+
+
+def undetermined(
+    blocks: Blocks, weights: Float[AnyArray, " joints"], decomposition: Decomposition
+) -> tuple[UndeterminedDirection, ...]:
+    r"""Return the directions in which the data leave more open than they tell.
+
+    Scale the parameters so that each of them alone makes forces of its own column's length. A step
+    along a singular direction changes the forces by the singular value $s$ only. The noise along it
+    is taken from how much contiguous blocks of time disagree about it, so that coloured noise and
+    errors of the model count: the sum $g_k$ of residuals times the direction's forces over block
+    $k$ gives the deviation $\sqrt{\sum g_k^2 K/(K-1)} / s^2$. Where parameters may thus make forces
+    of a tenth of the whole recording that cancel each other, the direction is not determined.
+    """
+    s, V = np.asarray(decomposition.values), np.asarray(decomposition.directions)
+    size = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
+    inverse, p = Complete().inverse(s), decomposition.solve()
+    sums = np.zeros(len(s))
+    for part in blocks.parts:
+        R, z = part.weighted(weights)
+        sums += (V @ ((R.T @ (R @ p - z)) / np.asarray(decomposition.scale))) ** 2
+    count = len(blocks.parts)
+    deviations = np.sqrt(sums * count / max(count - 1, 1)) * inverse
+    floor = np.finfo(float).eps * size
+    forces = max(size, np.finfo(float).tiny)
+    uncertainty = np.where(inverse > 0, np.maximum(deviations, floor) / forces, np.inf)
+    found = []
+    for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]:
+        share = V[k] / np.abs(V[k]).max()
+        # Parameters below 0.3 of the largest one are left out.
+        order = [int(i) for i in np.argsort(-np.abs(share), kind="stable") if abs(share[i]) >= 0.3]
+        shares = tuple(float(share[i] * np.sign(share[order[0]])) for i in order)
+        numbers = float(s[k] / s[0]), float(uncertainty[k])
+        found.append(UndeterminedDirection(tuple(order), shares, *numbers))
+    return tuple(found)

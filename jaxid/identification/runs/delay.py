@@ -17,7 +17,7 @@ from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Blocks, RowChunk
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.runs.comparison import joint_test
-from jaxid.identification.runs.left_out import block_covariance
+from jaxid.identification.uncertainty.blocks import block_covariance
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import require_finite_delay
 

@@ -19,10 +19,10 @@ from jaxid.identification.factors import Factors
 from jaxid.identification.fit import Fit
 from jaxid.identification.runs.estimates import Estimates
 from jaxid.identification.runs.least_squares import least_squares_of, require_same_base
-from jaxid.identification.runs.left_out import Block, block_covariance
 from jaxid.identification.runs.payload import body_columns
 from jaxid.identification.runs.states import own_parameters, state_maps
 from jaxid.identification.runs.tied import tied
+from jaxid.identification.uncertainty.blocks import Block, block_covariance
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Tool
 from jaxid.table import Table

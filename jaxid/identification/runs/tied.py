@@ -17,8 +17,8 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.identification.estimators import Complete
 from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
 from jaxid.identification.fit import Fit
-from jaxid.identification.runs.left_out import Block, block_covariance
 from jaxid.identification.runs.twice import refuse_shared
+from jaxid.identification.uncertainty.blocks import Block, block_covariance
 
 
 class Tied(eqx.Module):

@@ -1,6 +1,6 @@
 """Uncertainty of estimates: spectral sandwich, block jackknife, residual spectra."""
 
-from jaxid.identification.uncertainty.jackknife import BlockJackknife as BlockJackknife
+from jaxid.identification.uncertainty.blocks import BlockJackknife as BlockJackknife
 from jaxid.identification.uncertainty.result import AbstractUncertainty as AbstractUncertainty
 from jaxid.identification.uncertainty.result import IndependentRows as IndependentRows
 from jaxid.identification.uncertainty.result import ResidualSpectra as ResidualSpectra

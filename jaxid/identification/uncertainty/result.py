@@ -30,16 +30,6 @@ class Uncertainty(eqx.Module):
     jackknife: Float[AnyArray, " base"] | None = None
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
-    def first(self, count: int) -> "Uncertainty":
-        """Return the uncertainty of the first parameters only."""
-        return Uncertainty(
-            np.asarray(self.covariance)[:count, :count],
-            np.asarray(self.dof)[:count],
-            np.asarray(self.naive_covariance)[:count, :count],
-            None if self.jackknife is None else np.asarray(self.jackknife)[:count],
-            self.notes,
-        )
-
     @property
     def standard_deviations(self) -> Float[np.ndarray, " base"]:
         """Standard deviations of the estimates; infinite where nothing is known."""
@@ -132,13 +122,3 @@ class IndependentRows(AbstractUncertainty):
         """Return the naive covariance."""
         dof = float(problem.factors.rows.sum()) - len(naive)
         return Uncertainty(naive, np.full(len(naive), dof), naive), None
-
-
-def mark_unknown(
-    covariance: Float[np.ndarray, "base base"], naive: Float[np.ndarray, "base base"]
-) -> Float[np.ndarray, "base base"]:
-    """Return a covariance with infinite variances where the naive ones are infinite."""
-    covariance = covariance.copy()
-    unknown = np.isinf(np.diag(naive))
-    covariance[unknown, unknown] = np.inf
-    return covariance

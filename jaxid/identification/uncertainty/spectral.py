@@ -7,22 +7,36 @@ with the leverage $h$ of each line: the fit has explained that fraction of the e
 """
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
+from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float
-from jaxid.identification.uncertainty.jackknife import BlockJackknife, jackknife
+from jaxid.identification.estimators.estimate import Channel, Estimate
+from jaxid.identification.factors import RowChunk
+from jaxid.identification.problem import RegressionProblem, Span
+from jaxid.identification.uncertainty.blocks import BlockJackknife, jackknife
 from jaxid.identification.uncertainty.result import (
     AbstractUncertainty,
     ResidualSpectra,
     Uncertainty,
-    mark_unknown,
 )
-from jaxid.identification.uncertainty.spectra import Lines, RowSpectra, multiplicity, row_spectra
+from jaxid.measurement.observations import Observations
+
+MAX_ROWS = 2**15
+"""Largest number of rows of a stretch; longer parts of a log are divided."""
+MAX_SAMPLES = 2**20
+"""Samples up to which every stretch is transformed; of longer logs some, evenly spread."""
+MAX_LENGTHS = 4
+"""Number of different lengths up to which each has its own lines; of more, similar ones share them,
+so that memory does not grow with the number of gaps."""
+BIN_EDGES = np.concatenate([np.arange(0.0, 1.0, 0.05), 1.15 ** np.arange(0, 80)])
+"""Edges [Hz] of the bins in which spectra count as constant for correlations of parameters."""
 
 
 class SpectralSandwich(AbstractUncertainty):
@@ -43,153 +57,325 @@ class SpectralSandwich(AbstractUncertainty):
                 "given, and no spectrum of the residuals can be computed."
             )
             return dataclasses.replace(found, notes=found.notes or (note,)), None
-        spectra = row_spectra(problem, estimate)
-        covariance, dof, white = sandwich(spectra)
-        if not spectra.complete:
-            exact = np.diag(naive)
+        lines, correlated, complete = row_spectra(problem, estimate)
+        covariance, dof, white = sandwich(lines, correlated)
+        exact = np.diag(naive)
+        if not complete:
             known = (white > 0) & np.isfinite(exact)
             ratio = np.where(known, exact, 1.0) / np.where(known, white, 1.0)
             ratio = np.sqrt(np.where(known, ratio, 1.0))
             covariance = covariance * ratio * ratio[:, None]
-        found = Uncertainty(mark_unknown(covariance, naive), dof, naive, jackknife(estimate))
-        return found, residual_spectra(spectra.lines)
+        unknown = np.isinf(exact)
+        covariance[unknown, unknown] = np.inf
+        found = Uncertainty(covariance, dof, naive, jackknife(estimate))
+        return found, residual_spectra(lines)
 
 
-class Windows:
-    """Sums over windows of lines, and their transposes, for NumPy and JAX arrays.
+class Lines(NamedTuple):
+    r"""Spectra of all stretches of one length, added up.
 
-    A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four lines.
+    A stretch is a contiguous, equidistant part of the rows, which is transformed at once.
+
+    Attributes:
+        length: Rows of a stretch; shorter ones are padded with rows that do not count.
+        row_time: Time between two rows [s].
+        frequency: Frequencies of the lines [Hz].
+        multiplicity: 2, or 1 for lines without a mirror image.
+        gain: Gain (0 to 1) of the filters.
+        bins: Bin of each line.
+        energy: $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, channels, lines].
+        leverage: Fraction (0 to 1) of each line explained by the fit [channels, lines].
+        power: Periodogram of the disturbances [channels, lines].
+        residual: Periodogram of the residuals [joints, lines], in [N² m²] or [N²].
+        exposure: Number of stretches, weighted by the fraction of rows of each channel that count.
+        stretches: Number of stretches.
+    """
+
+    length: int
+    row_time: float
+    frequency: np.ndarray
+    multiplicity: np.ndarray
+    gain: np.ndarray
+    bins: np.ndarray
+    energy: np.ndarray
+    leverage: np.ndarray
+    power: np.ndarray
+    residual: np.ndarray
+    exposure: np.ndarray
+    stretches: int
+
+
+def row_spectra(
+    problem: RegressionProblem, estimate: Estimate
+) -> tuple[list[Lines], np.ndarray, bool]:
+    """Transform every stretch of the rows in one pass.
+
+    Args:
+        problem: Rows of the estimate.
+        estimate: Estimate, whose influence makes channels of the rows.
+
+    Returns:
+        Spectra of every length of stretches; energies of pairs of parameters, summed over the lines
+        of each bin [bins, channels, base, base]; whether all rows were transformed.
+    """
+    stretches, complete = _divide(problem)
+    lengths = _padded_lengths(
+        {(b - a, problem.recordings[number].row_time) for number, a, b in stretches}
+    )
+    found: dict[tuple, Lines] = {}
+    B, p = np.asarray(estimate.inverse), np.asarray(estimate.parameters)
+    correlated = np.zeros((0, 0, *B.shape))
+    for (number, a, b), parts in _gather(problem, stretches, p):
+        o = problem.recordings[number]
+        pieces = [estimate.influence(chunk, residuals) for chunk, residuals in parts]
+        if not len(correlated):
+            correlated = np.zeros((len(BIN_EDGES) + 1, len(pieces[0]), *B.shape))
+        r = np.concatenate([np.where(chunk.mask, r, 0.0) for chunk, r in parts])
+        n = lengths[b - a, o.row_time]
+        lines = _transform(n, pieces, r, B, o, correlated)
+        key = (n, o.row_time, len(lines.frequency))
+        if key in found:
+            sums = [x + y for x, y in zip(found[key][6:], lines[6:], strict=True)]
+            lines = Lines(*lines[:6], *sums)
+        found[key] = lines
+    return list(found.values()), correlated, complete
+
+
+def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
+    """Return how often a line counts: for itself, and for its mirror image."""
+    m = np.full(length // 2 + 1, 2.0)
+    m[0] = 1.0
+    if length % 2 == 0:
+        m[-1] = 1.0
+    return m
+
+
+def _transform(
+    n: int,
+    pieces: list[list[Channel]],
+    residuals: np.ndarray,
+    inverse: np.ndarray,
+    observations: Observations,
+    correlated: np.ndarray,
+) -> Lines:
+    """Return the lines of one stretch; add the energies of pairs to `correlated`."""
+    row_time = observations.row_time
+    frequency = np.fft.rfftfreq(n, row_time)
+    gain = _gain(observations, frequency)
+    # Lines with less gain carry no information.
+    last = int(np.flatnonzero(gain > 1e-3)[-1]) + 1
+    frequency, gain, m = frequency[:last], gain[:last], multiplicity(n)[:last]
+    bins = np.searchsorted(BIN_EDGES, frequency, side="right")
+    present, starts = np.unique(bins, return_index=True)
+    size, channels = len(inverse), len(pieces[0])
+    energy = np.empty((size, channels, last))
+    leverage, power = np.empty((channels, last)), np.empty((channels, last))
+    exposure = np.empty(channels)
+    for c, parts in enumerate(zip(*pieces, strict=True)):
+        own = list(parts[0].columns)
+        Z = np.concatenate([x.instruments for x in parts])
+        u = np.concatenate([x.disturbance for x in parts])
+        Zf = np.fft.rfft(Z, n, axis=0)[:last]
+        P = Zf @ inverse[:, own].T
+        energy[:, c] = (np.abs(P) ** 2 * m[:, None]).T / n
+        weighted = P * np.sqrt(m / n)[:, None]
+        for k, (a, b) in zip(present, itertools.pairwise([*starts, last]), strict=True):
+            both = np.concatenate([weighted[a:b].real, weighted[a:b].imag])
+            correlated[k, c] += both.T @ both
+        Tf = Zf
+        if any(x.equations is not x.instruments for x in parts):
+            theta = np.concatenate([x.equations for x in parts])
+            Tf = np.fft.rfft(theta, n, axis=0)[:last]
+        leverage[c] = np.real(np.sum(P[:, own].conj() * Tf, axis=1)) / n
+        power[c] = np.abs(np.fft.rfft(u, n)[:last]) ** 2 / n
+        exposure[c] = sum(x.counted for x in parts) / n
+    residual = np.abs(np.fft.rfft(residuals, n, axis=0)[:last].T) ** 2 / n
+    sums = energy, leverage, power, residual, exposure
+    return Lines(n, row_time, frequency, m, gain, bins, *sums, 1)
+
+
+def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
+    """Divide recordings into stretches; return whether they hold all rows.
+
+    Rows of different stretches count as independent: the relative error is about the correlation
+    time of the noise over the length of a stretch.
+    """
+    stretches, samples = [], 0
+    for number, o in enumerate(problem.recordings):
+        most = max(4, min(MAX_ROWS, 4 * MAX_ROWS // o.decimation.factor))
+        for a, b in o.row_segments:
+            parts = np.array_split(np.arange(a, b), math.ceil((b - a) / most))
+            stretches += [(number, int(part[0]), int(part[-1]) + 1) for part in parts]
+        samples += o.samples
+    if samples <= MAX_SAMPLES:
+        return stretches, True
+    count = max(1, len(stretches) * MAX_SAMPLES // samples)
+    chosen = np.linspace(0, len(stretches) - 1, count).round().astype(int)
+    return [stretches[k] for k in np.unique(chosen)], False
+
+
+def _padded_lengths(kinds: set[tuple[int, float]]) -> dict[tuple[int, float], int]:
+    """Return the padded length of stretches, by length and time between rows."""
+    if len(kinds) <= MAX_LENGTHS:
+        return {kind: kind[0] for kind in kinds}
+    padded = {}
+    for row_time in {t for _, t in kinds}:
+        lengths = sorted((n for n, t in kinds if t == row_time), reverse=True)
+        top = lengths[0]
+        for n in lengths:
+            top = n if n * 1.5 < top else top
+            padded[n, row_time] = top
+    return padded
+
+
+def _gain(observations: Observations, frequency: Float[np.ndarray, " lines"]) -> np.ndarray:
+    """Return the gain of filter and decimation at some frequencies [Hz]."""
+    dt = observations.sample_time
+    gain = observations.filter.low_pass(dt).gain(frequency, dt)
+    for k, factor in enumerate(observations.decimation.stages):
+        gain = gain * observations.decimation.low_pass(k).gain(frequency, dt)
+        dt *= factor
+    return gain
+
+
+def _gather(
+    problem: RegressionProblem, stretches: list[Span], p: np.ndarray
+) -> Iterator[tuple[Span, list[tuple[RowChunk, np.ndarray]]]]:
+    """Yield each stretch with its chunks and residuals, in one pass over the rows."""
+    remaining = iter(stretches)
+    stretch = next(remaining, None)
+    parts: list[tuple[RowChunk, np.ndarray]] = []
+    for chunk, residuals in problem.residuals(p, stretches):
+        start, stop = chunk.rows.start, chunk.rows.stop
+        while stretch is not None and (chunk.recording, start) < (stretch[0], stretch[2]):
+            number, first, last = stretch
+            if (chunk.recording, stop) <= (number, first):
+                break
+            own = slice(max(start, first) - start, min(stop, last) - start)
+            parts.append((chunk.part(own), residuals[own]))
+            if stop < last:
+                break
+            yield stretch, parts
+            stretch, parts = next(remaining, None), []
+
+
+def window_sums(
+    frequency: Float[np.ndarray, " lines"], longest: float
+) -> tuple[Callable[[AnyArray], AnyArray], Callable[[AnyArray], AnyArray]]:
+    """Return functions that sum over windows of lines, along the last axis, and their transposes.
+
+    A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four lines. The
+    functions take NumPy and JAX arrays; the transposed one sums over the windows that contain a
+    line.
 
     Args:
         frequency: Frequencies of the lines, in any order [Hz].
         longest: Duration of the longest stretch [s].
     """
+    order = np.argsort(frequency, kind="stable")
+    place = np.argsort(order, kind="stable")
+    f = frequency[order]
+    half = np.maximum(max(0.25, 4.0 / longest), 0.3 * f)
+    low = np.searchsorted(f, f - half * (1 + 1e-9), side="left")
+    high = np.searchsorted(f, f + half * (1 + 1e-9), side="right")
+    # Both ends of a window rise with its middle: the windows around a line are neighbours.
+    first = np.searchsorted(high, np.arange(len(f)), side="right")
+    last = np.searchsorted(low, np.arange(len(f)), side="right")
 
-    def __init__(self, frequency: Float[np.ndarray, " lines"], longest: float):
-        self._order = np.argsort(frequency, kind="stable")
-        self._place = np.argsort(self._order, kind="stable")
-        f = frequency[self._order]
-        half = np.maximum(max(0.25, 4.0 / longest), 0.3 * f)
-        self._low = np.searchsorted(f, f - half * (1 + 1e-9), side="left")
-        self._high = np.searchsorted(f, f + half * (1 + 1e-9), side="right")
-        # Both ends of a window rise with its middle: the windows around a line are neighbours.
-        places = np.arange(len(f))
-        self._first = np.searchsorted(self._high, places, side="right")
-        self._last = np.searchsorted(self._low, places, side="right")
+    def between(low: np.ndarray, high: np.ndarray) -> Callable[[AnyArray], AnyArray]:
+        def total(x: AnyArray) -> AnyArray:
+            sums = x[..., order].cumsum(axis=-1)
+            flat = (*(1,) * (x.ndim - 1), -1)
+            before = sums[..., np.maximum(low - 1, 0)] * (low > 0).astype(float).reshape(flat)
+            after = sums[..., np.maximum(high - 1, 0)] * (high > 0).astype(float).reshape(flat)
+            return (after - before)[..., place]
 
-    def sums(self, x: AnyArray) -> AnyArray:
-        """Return for each line the sum over its window, along the last axis."""
-        return self._between(x, self._low, self._high)
+        return total
 
-    def transposed_sums(self, x: AnyArray) -> AnyArray:
-        """Return for each line the sum over the windows that contain it, along the last axis."""
-        return self._between(x, self._first, self._last)
-
-    def _between(self, x: AnyArray, low: np.ndarray, high: np.ndarray) -> AnyArray:
-        sums = x[..., self._order].cumsum(axis=-1)
-        flat = (1,) * (x.ndim - 1)
-        before = sums[..., np.maximum(low - 1, 0)] * (low > 0).astype(float).reshape(*flat, -1)
-        after = sums[..., np.maximum(high - 1, 0)] * (high > 0).astype(float).reshape(*flat, -1)
-        return (after - before)[..., self._place]
-
-
-def variance_map(
-    xp: ModuleType,
-    windows: Windows,
-    half: Float[np.ndarray, " lines"],
-    exposure: Float[AnyArray, "channels lines"],
-    leverage: Float[AnyArray, "channels lines"],
-    energy: Float[AnyArray, "base channels lines"],
-) -> tuple[Float[AnyArray, "base channels lines"], Float[AnyArray, "channels lines"]]:
-    r"""Return the sandwich as a linear map of periodograms, $var_i = \sum_{jg} C_{ijg} I_{jg}$.
-
-    Args:
-        xp: NumPy or `jax.numpy`.
-        windows: Windows over which spectra are smoothed.
-        half: Half of each line's multiplicity.
-        exposure: Number of stretches, weighted by the fraction of rows that count.
-        leverage: Fraction of each line explained by the fit.
-        energy: Influence of each line on each estimate.
-
-    Returns:
-        The map, and the power that the fit leaves in each window for errors of density one.
-    """
-    rest = windows.sums(half[None] * (exposure - leverage))
-    # A fit is assumed to leave at least 2 % of a window's power.
-    least = 0.02 * windows.sums(half[None] * exposure)
-    rest = xp.maximum(rest, xp.maximum(least, 1e-300))
-    return half[None, None] * windows.transposed_sums(energy / rest[None]), rest
+    return between(low, high), between(first, last)
 
 
 class SpectralTable:
-    r"""The sandwich as one linear map, computed once for a design and applied to many draws.
+    r"""The sandwich as a linear map of periodograms, $var_i = \sum_{jf} C_{ijf} I_{jf}$.
 
-    Args:
-        lines: Spectra of every length of stretches.
+    Computed once for a design and applied to many draws; in NumPy, or in JAX where `xp` is
+    `jax.numpy`. The other arguments are those of `Lines`, of all lengths of stretches together.
 
     Attributes:
         map: $C$ [base, channels x lines].
     """
 
-    def __init__(self, lines: Sequence[Lines]):
-        frequency = np.concatenate([x.frequency for x in lines])
-        self._windows = Windows(frequency, max(x.length * x.row_time for x in lines))
-        self._half = half = np.concatenate([0.5 * x.multiplicity for x in lines])
-        leverage = np.concatenate([x.leverage for x in lines], axis=1)
-        exposure = np.concatenate(
-            [np.broadcast_to(x.exposure[:, None], x.leverage.shape) for x in lines], axis=1
-        )
-        energy = np.concatenate([x.energy for x in lines], axis=2)
-        C, self._rest = variance_map(np, self._windows, half, exposure, leverage, energy)
-        self.map = np.asarray(C).reshape(len(C), -1)
-        self._scatter = np.broadcast_to(_scatter(np, half, exposure), C.shape[1:]).ravel()
+    def __init__(
+        self,
+        xp: ModuleType,
+        frequency: Float[np.ndarray, " lines"],
+        multiplicity: Float[np.ndarray, " lines"],
+        energy: Float[AnyArray, "base channels lines"],
+        leverage: Float[AnyArray, "channels lines"],
+        exposure: Float[AnyArray, "channels lines"],
+        longest: float,
+    ):
+        self._xp = xp
+        self._sums, transposed_sums = window_sums(frequency, longest)
+        self._half = half = 0.5 * multiplicity[None]
+        # A fit is assumed to leave at least 2 % of a window's power.
+        rest = self._sums(half * (exposure - leverage))
+        least = 0.02 * self._sums(half * exposure)
+        self._rest = xp.maximum(rest, xp.maximum(least, 1e-300))
+        C = half[None] * transposed_sums(energy / self._rest[None])
+        self.map = C.reshape((len(C), -1))
+        # From a line's power to the scatter of its mean over the stretches.
+        scatter = xp.sqrt(2.0 / (half * (1.0 + xp.maximum(exposure, 1.0))))
+        self._scatter = scatter.reshape((1, -1))
+
+    @classmethod
+    def of(cls, lines: Sequence[Lines]) -> "SpectralTable":
+        """Return the table of the spectra of every length of stretches."""
+        arrays = [
+            np.concatenate([getattr(x, name) for x in lines], axis=-1)
+            for name in ("frequency", "multiplicity", "energy", "leverage")
+        ]
+        exposure = [np.broadcast_to(x.exposure[:, None], x.leverage.shape) for x in lines]
+        longest = max(x.length * x.row_time for x in lines)
+        return cls(np, *arrays, np.concatenate(exposure, axis=1), longest)
 
     def density(self, power: np.ndarray) -> np.ndarray:
         """Return the spectrum of the errors at each line, from the periodogram of residuals."""
-        return np.asarray(self._windows.sums(self._half * power) / self._rest)
+        return np.asarray(self._sums(self._half * power) / self._rest)
 
-    def __call__(self, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return variances and their degrees of freedom.
+    def __call__(self, power: AnyArray) -> tuple[AnyArray, AnyArray]:
+        """Return variances and their degrees of freedom: sums of one chi-square for each line.
 
         Args:
-            power: Periodograms of the residuals, [draws, channels, lines] or without draws.
+            power: Periodograms of the residuals [draws, channels, lines].
         """
-        flat = power.reshape(*power.shape[:-2], -1)
+        xp, flat = self._xp, power.reshape((len(power), -1))
         variance = flat @ self.map.T
         squares = (flat * self._scatter) ** 2 @ (self.map**2).T
-        return variance, np.asarray(_satterthwaite(np, variance, squares))
+        positive = squares > 0
+        dof = xp.where(positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf)
+        return variance, dof
 
 
-def _scatter(
-    xp: ModuleType, half: Float[np.ndarray, " lines"], exposure: Float[AnyArray, "channels lines"]
-) -> Float[AnyArray, "channels lines"]:
-    """Return factors from a line's power to the scatter of its mean over the stretches."""
-    return xp.sqrt(2.0 / (half[None] * (1.0 + xp.maximum(exposure, 1.0))))
-
-
-def _satterthwaite(xp: ModuleType, variance: AnyArray, squares: AnyArray) -> AnyArray:
-    """Return the degrees of freedom of variances that are sums of one chi-square per line."""
-    positive = squares > 0
-    return xp.where(positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf)
-
-
-def sandwich(spectra: RowSpectra) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sandwich(
+    lines: Sequence[Lines], correlated: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the covariance of an estimate, degrees of freedom, and variances for white errors.
 
     Args:
-        spectra: Spectra of the rows.
+        lines: Spectra of every length of stretches.
+        correlated: Energies of pairs of parameters; see `row_spectra`.
     """
-    lines, count = spectra.lines, len(spectra.correlated)
-    table = SpectralTable(lines)
+    count, table = len(correlated), SpectralTable.of(lines)
     power = np.concatenate([x.power for x in lines], axis=1)
-    variance, dof = table(power)
+    (variance,), (dof,) = table(power[None])
     bins = np.concatenate([x.bins for x in lines])
     weights = np.concatenate([x.multiplicity for x in lines])
     size = np.maximum(np.bincount(bins, weights, count), 1e-300)
     rough = np.zeros((len(variance), len(variance)))
     for c, density in enumerate(table.density(power)):
         mean = np.bincount(bins, weights * density, count) / size
-        rough += np.einsum("k,kab->ab", mean, spectra.correlated[:, c])
+        rough += np.einsum("k,kab->ab", mean, correlated[:, c])
     scale = np.sqrt(np.maximum(np.diag(rough), 1e-300))
     deviation = np.sqrt(np.maximum(variance, 0.0))
     covariance = rough / scale / scale[:, None] * deviation * deviation[:, None]
@@ -208,16 +394,12 @@ def _white_variances(lines: Sequence[Lines]) -> np.ndarray:
 
 
 def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
-    """Return spectra and whiteness of the residuals, from the stretches with the most rows.
-
-    Args:
-        lines: Spectra of every length of stretches.
-    """
+    """Return spectra and whiteness of the residuals, from the stretches with the most rows."""
     most = max(lines, key=lambda x: x.length * x.stretches)
     rows = most.length * np.maximum(np.mean(most.exposure), 1e-300)
     half = 0.5 * most.multiplicity
-    windows = Windows(most.frequency, most.length * most.row_time)
-    smooth = windows.sums(half * most.residual) / windows.sums(half)
+    sums, _ = window_sums(most.frequency, most.length * most.row_time)
+    smooth = sums(half * most.residual) / sums(half)
     # One-sided: the mirror image of a line counts with it.
     scale = 2.0 * most.row_time * most.length / rows
     passed = (most.gain > 0.5) & (most.frequency > 0)
@@ -242,13 +424,8 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     )
 
 
-class LineSums(eqx.Module):
-    """Spectra of the chunks of a data set, added up, for many draws of its forces; see `Lines`."""
-
-    energy: Float[Array, "base joints lines"]
-    leverage: Float[Array, "joints lines"]
-    power: Float[Array, "draws joints lines"]
-    exposure: Float[Array, " joints"]
+LineSums = tuple[Array, Array, Array, Array]
+"""Energy, leverage, power [draws, joints, lines], and exposure of chunks, added up; see `Lines`."""
 
 
 def line_sums(
@@ -283,8 +460,7 @@ def line_sums(
         both = real[mine] * Z.real + imaginary[mine] * Z.imag
         leverage.append(jnp.sum(both, axis=0) / length)
         power.append((r.real**2 + r.imag**2) / length)
-    stacked = jnp.stack(energy, axis=1), jnp.stack(leverage), jnp.stack(power, axis=1)
-    return LineSums(*stacked, exposure)
+    return jnp.stack(energy, axis=1), jnp.stack(leverage), jnp.stack(power, axis=1), exposure
 
 
 def variances(
@@ -297,11 +473,15 @@ def variances(
         length: Rows of a chunk.
         row_time: Time between two rows [s].
     """
-    windows = Windows(np.fft.rfftfreq(length, row_time), length * row_time)
-    half = 0.5 * multiplicity(length)
-    exposure = jnp.broadcast_to(sums.exposure[:, None], sums.leverage.shape)
-    C, _ = variance_map(jnp, windows, half, exposure, sums.leverage, sums.energy)
-    variance = jnp.einsum("djf,ijf->di", sums.power, C)
-    scattered = sums.power * _scatter(jnp, half, exposure)[None]
-    squares = jnp.einsum("djf,ijf->di", scattered**2, C**2)
-    return variance, jnp.maximum(_satterthwaite(jnp, variance, squares), 1.0)
+    energy, leverage, power, exposure = sums
+    table = SpectralTable(
+        jnp,
+        np.fft.rfftfreq(length, row_time),
+        multiplicity(length),
+        energy,
+        leverage,
+        jnp.broadcast_to(exposure[:, None], leverage.shape),
+        length * row_time,
+    )
+    variance, dof = table(power)
+    return variance, jnp.maximum(dof, 1.0)

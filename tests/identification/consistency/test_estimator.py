@@ -17,7 +17,7 @@ from virtual import observations
 
 FRICTION = (jid.ViscousFriction(), jid.CoulombFriction(), jid.RotorInertia(), jid.ConstantOffset())
 TERMS = (jid.RigidBodies(), *FRICTION)
-WEIGHTS = jid.estimators.MeasuredForces()
+WEIGHTS = jid.estimators.ResidualVariances(0)
 
 
 def case(robot, terms=TERMS, noise=3.0, samples=150):

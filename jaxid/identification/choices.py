@@ -1,0 +1,337 @@
+"""Choices by errors on held-out parts of the log: the filter, and the essential parameters."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
+from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
+from jaxid.identification.estimators.solutions import NUMERICAL
+from jaxid.identification.factors import Factors
+from jaxid.identification.fit import Fit
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem, cross_validation_folds
+from jaxid.identification.uncertainty import AbstractUncertainty
+from jaxid.measurement.decimation import AbstractDecimation, Subsample
+from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth
+from jaxid.measurement.observations import Observations, Progress, observe
+from jaxid.measurement.recording import Recording
+
+FilterCandidate = tuple[AbstractFilter, AbstractDecimation]
+"""Filter of motion, forces and columns, and decimation of forces and columns."""
+
+
+class FilterChoice(eqx.Module):
+    """Result of a choice of filters.
+
+    Attributes:
+        candidates: Filter and decimation of each candidate, in the given order.
+        cutoffs: Cut-off frequencies of forces and columns [Hz].
+        errors: Held-out error of each candidate on each part of the log, relative to the forces.
+        correlations: Mean correlation of neighbouring rows of the residuals for each candidate:
+            near zero where rows are independent.
+        best: Index of the chosen candidate.
+    """
+
+    candidates: tuple[FilterCandidate, ...]
+    cutoffs: Float[AnyArray, " candidates"]
+    errors: Float[AnyArray, "candidates folds"]
+    correlations: Float[AnyArray, " candidates"]
+    best: int = eqx.field(static=True)
+
+    @property
+    def filter(self) -> AbstractFilter:
+        """The chosen filter."""
+        return self.candidates[self.best][0]
+
+    @property
+    def decimation(self) -> AbstractDecimation:
+        """The chosen decimation."""
+        return self.candidates[self.best][1]
+
+    @property
+    def curve(self) -> Float[np.ndarray, " candidates"]:
+        """Held-out error of each candidate on the whole log."""
+        return np.sqrt(np.mean(np.asarray(self.errors) ** 2, axis=1))
+
+    def __str__(self):
+        shown = ", ".join(
+            f"{cutoff:.3g} Hz {100 * error:.2f} %"
+            for cutoff, error in zip(np.asarray(self.cutoffs), self.curve, strict=True)
+        )
+        return (
+            f"a cut-off of {np.asarray(self.cutoffs)[self.best]:.3g} Hz predicts held-out parts of "
+            f"the log best (errors by cut-off: {shown})."
+        )
+
+
+def choose_filter(
+    base: BaseParameters,
+    recordings: Recording | Sequence[Recording],
+    candidates: Sequence[FilterCandidate] | None = None,
+    *,
+    estimator: AbstractEstimator | None = None,
+    criterion: Literal["error", "whiteness"] = "error",
+    min_speed: Sequence[float] | Float[AnyArray, " joints"] | None = None,
+    progress: Progress | None = None,
+) -> FilterChoice:
+    """Choose the filter with which a model predicts held-out parts of the log best.
+
+    With each candidate the model is fitted to all parts of the log but one, and predicts the forces
+    of that part from the candidate's own motion. Measured and predicted forces are compared in the
+    *widest* band of all candidates: a filter that hides unexplained forces gains nothing.
+
+    Args:
+        base: Base parameters of the robot.
+        recordings: One or several logs.
+        candidates: Pairs of a filter and its decimation; by default zero-phase Butterworth filters
+            with nine cut-off frequencies from 1 Hz to a fifth of the sampling rate, but at most
+            100 Hz, each decimated to about five rows for each period.
+        estimator: Estimator; by default least squares weighted by the largest forces.
+        criterion: "error" for the smallest error on held-out parts; "whiteness" for the smallest
+            correlation of neighbouring residuals, among those with at most 5 % more error.
+        min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
+        progress: Callback, called with the completed fraction (0 to 1).
+
+    Raises:
+        InputError: If there are no candidates, or a log and a candidate do not fit to each other.
+    """
+    logs = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+    if candidates is None:
+        candidates = _butterworth_candidates(logs[0].sample_time)
+    if not candidates:
+        raise InputError("`candidates` must hold at least one filter, but is empty.")
+    estimator = WeightedLeastSquares() if estimator is None else estimator
+    robot, dt = base.model.robot, logs[0].sample_time
+    cutoffs = np.array([filter.low_pass(dt).cutoff for filter, _ in candidates])
+    edge = max(filter.edge(dt) for filter, _ in candidates)
+
+    def inner_observations(candidate: FilterCandidate) -> list[Observations]:
+        return [_inner_rows(observe(log, robot, *candidate, min_speed), edge) for log in logs]
+
+    widest = inner_observations(candidates[int(np.argmax(cutoffs))])
+    weights = np.asarray(estimator(RegressionProblem(base, widest)).weights)
+    errors, correlations = [], []
+    for number, candidate in enumerate(candidates):
+        own = inner_observations(candidate)
+        problem = RegressionProblem(base, own)
+        test = RegressionProblem(base, [_with_motion(*x) for x in zip(widest, own, strict=True)])
+        errors.append(_held_out_errors(problem, test, estimator, weights**2))
+        correlations.append(_correlation(problem, estimator))
+        if progress is not None:
+            progress((number + 1) / len(candidates))
+    order = whole = np.mean(np.square(errors), axis=1)
+    if criterion == "whiteness":
+        order = np.where(whole <= 1.05**2 * whole.min(), np.abs(correlations), np.inf)
+    best = int(np.argmin(order))
+    return FilterChoice(tuple(candidates), cutoffs, np.array(errors), np.array(correlations), best)
+
+
+def _butterworth_candidates(sample_time: float) -> list[FilterCandidate]:
+    """Return filters, each decimated to about five rows for each period of its cut-off."""
+    highest = min(100.0, 0.2 / sample_time)
+    cutoffs = np.geomspace(min(1.0, 0.1 * highest), highest, 9)
+    steps = [max(1, int(1.0 / (5.0 * f * sample_time))) for f in cutoffs]
+    pairs = zip(cutoffs, steps, strict=True)
+    return [(ZeroPhaseButterworth(float(f)), Subsample(step)) for f, step in pairs]
+
+
+def _inner_rows(observations: Observations, edge: int) -> Observations:
+    """Mask rows that are too close to the ends for the slowest candidate."""
+    at = observations.instants
+    far = np.zeros(len(at), bool)
+    for a, b in observations.segments:
+        far |= (at >= a + edge) & (at < b - edge)
+    return observations.replace(mask=np.asarray(observations.mask) & far[:, None])
+
+
+def _with_motion(widest: Observations, own: Observations) -> Observations:
+    """Return a candidate's motion with forces and rows of the widest band."""
+    if widest.samples != own.samples:
+        raise InputError(
+            f"the filters of `candidates` leave different parts of `{widest.name}`, whose gaps are "
+            "close together: choose on a log without, or take filters with similar edges."
+        )
+    return widest.replace(motion=own.motion)
+
+
+def _held_out_errors(
+    problem: RegressionProblem,
+    test: RegressionProblem,
+    estimator: AbstractEstimator,
+    squares: Float[np.ndarray, " joints"],
+) -> Float[np.ndarray, " folds"]:
+    """Return the errors on held-out parts, relative to the forces of all parts."""
+    folds = cross_validation_folds(problem.blocks), cross_validation_folds(test.blocks)
+    pairs = [(rest, part) for (rest, _), (_, part) in zip(*folds, strict=True)]
+    total = squares @ test.factors.force_squares / len(pairs)
+    errors = []
+    for rest, part in pairs:
+        p = estimator(RegressionProblem(problem.base, blocks=rest)).parameters
+        errors.append(np.sqrt(squares @ part.total.residual_squares(p) / total))
+    return np.array(errors)
+
+
+def _correlation(problem: RegressionProblem, estimator: AbstractEstimator) -> float:
+    """Return the correlation of neighbouring rows of the residuals, as a mean of the joints."""
+    power, product = np.zeros(problem.robot.joints), np.zeros(problem.robot.joints)
+    for chunk, residuals in problem.residuals(np.asarray(estimator(problem).parameters)):
+        e = np.where(chunk.mask, residuals, 0.0)
+        power += np.sum(e**2, axis=0)
+        product += np.sum(e[1:] * e[:-1], axis=0)
+    return float(np.mean(product / np.where(power > 0, power, 1.0)))
+
+
+class Elimination(eqx.Module):
+    """One step of backward elimination.
+
+    Attributes:
+        name: Base parameter that is eliminated; empty before the first step.
+        deviation: Its standard deviation relative to its size.
+        remaining: Number of remaining parameters.
+        error: Weighted error on the rows themselves, relative to the forces.
+        held_out: Weighted error on held-out blocks of time, relative to the forces.
+    """
+
+    name: str = eqx.field(static=True)
+    deviation: float
+    remaining: int = eqx.field(static=True)
+    error: float
+    held_out: float
+
+
+class EssentialParameters(eqx.Module):
+    """Result of backward elimination.
+
+    Attributes:
+        fit: Fit of the essential parameters alone; the others are zero.
+        path: All steps, from the full model to a single parameter.
+    """
+
+    fit: Fit
+    path: tuple[Elimination, ...]
+
+    @property
+    def last(self) -> Elimination:
+        """Last step that is taken."""
+        return self.path[len(self.eliminated)]
+
+    @property
+    def eliminated(self) -> tuple[str, ...]:
+        """Names of the parameters that are not essential, in the order of elimination."""
+        return tuple(s.name for s in self.path[1:] if s.remaining >= self.fit.base.size)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        if not self.eliminated:
+            return (str(self),)
+        return str(self), f"eliminated, and taken as zero: {', '.join(self.eliminated)}."
+
+    def __str__(self):
+        first, last = self.path[0], self.last
+        return (
+            f"{last.remaining} of {first.remaining} base parameters are essential: with them alone "
+            f"the error on held-out blocks of time is {100 * last.held_out:.2f} % of the forces, "
+            f"with all {100 * first.held_out:.2f} %."
+        )
+
+
+def essential_parameters(
+    fit: Fit,
+    observations: Observations | Sequence[Observations],
+    *,
+    cost: float = 0.02,
+    uncertainty: AbstractUncertainty | None = None,
+) -> EssentialParameters:
+    """Eliminate the parameter with the largest relative standard deviation, again and again.
+
+    Held-out errors decide where to stop: at the fewest parameters whose error exceeds the smallest
+    on the path by `cost` at most. Standard deviations are those of the fit, scaled by the change of
+    those for independent rows (Pham and Gautier, 1991).
+
+    Args:
+        fit: Fit of all base parameters.
+        observations: Observations of the fit.
+        cost: Acceptable relative increase of the held-out error.
+        uncertainty: Method for the standard deviations; by default the spectral sandwich.
+
+    Raises:
+        InputError: If `cost` is negative, or the observations are not those of the fit.
+    """
+    if not cost >= 0:
+        raise InputError(f"`cost` must be zero or more, but is {cost:g}.")
+    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    problem = RegressionProblem(fit.base, recordings)
+    if [int(n) for n in problem.factors.rows] != list(fit.rows):
+        raise InputError("`observations` must be those of the fit, but they have other rows.")
+    path, sets = _eliminate(fit, problem)
+    most = (1 + cost) * min(step.held_out for step in path)
+    kept = [k for k, step in zip(sets, path, strict=True) if step.held_out <= most][-1]
+    base = dataclasses.replace(
+        fit.base,
+        indices=tuple(fit.base.indices[k] for k in kept),
+        kappa=np.asarray(fit.base.kappa)[kept],
+    )
+    reduced = fit_problem(RegressionProblem(base, recordings), fit.estimator, uncertainty)
+    return EssentialParameters(reduced, tuple(path))
+
+
+def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination], list[list[int]]]:
+    """Return the path to a single parameter, and the remaining parameters at each step."""
+    factors, weights = problem.factors, np.asarray(fit.weights)
+    squares = weights**2
+    total = float(squares @ factors.force_squares)
+    R, z = factors.weighted(weights)
+    parts = [
+        (rest.total.weighted(weights), part.total)
+        for rest, part in cross_validation_folds(problem.blocks, 10)
+    ]
+    kept = list(range(fit.base.size))
+    naive = _estimates(factors, R, z, weights, kept)[1]
+    deviations = np.asarray(fit.standard_deviations)
+    known = np.isfinite(deviations) & (naive > 0)
+    ratio = np.where(known, deviations / np.where(naive > 0, naive, 1.0), np.inf)
+    path, sets, name, deviation = [], [], "", 0.0
+    while kept:
+        p, naive = _estimates(factors, R, z, weights, kept)
+        error = float(squares @ factors.residual_squares(p))
+        held_out = sum(squares @ part.residual_squares(_solve(*r, kept)) for r, part in parts)
+        errors = float(np.sqrt(error / total)), float(np.sqrt(held_out / total))
+        sets.append(list(kept))
+        path.append(Elimination(name, deviation, len(kept), *errors))
+        size = np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
+        relative = ratio[kept] * naive / size
+        worst = int(np.argmax(relative))
+        name, deviation = fit.base.names[kept[worst]], float(relative[worst])
+        del kept[worst]
+    return path, sets
+
+
+def _solve(R: np.ndarray, z: np.ndarray, kept: list[int]) -> np.ndarray:
+    """Return the least-squares solution in some parameters; the others are zero."""
+    p = np.zeros(R.shape[1])
+    scale = np.linalg.norm(R[:, kept], axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    p[kept] = np.linalg.lstsq(R[:, kept] / scale, z, rcond=NUMERICAL)[0] / scale
+    return p
+
+
+def _estimates(
+    factors: Factors, R: np.ndarray, z: np.ndarray, weights: np.ndarray, kept: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return estimates, and standard deviations for independent rows and joints' variances."""
+    p = _solve(R, z, kept)
+    variances = factors.residual_squares(p) / np.maximum(factors.rows, 1)
+    half = np.linalg.pinv(R[:, kept], rcond=NUMERICAL)
+    B, inner = np.zeros((R.shape[1], len(kept))), np.zeros(len(kept))
+    B[kept] = half @ half.T
+    for joint, w, variance in zip(factors.joints, weights, variances, strict=True):
+        influence = w**2 * np.asarray(joint.R)[:, :-1] @ B[list(joint.columns)]
+        inner += variance * np.sum(influence**2, axis=0)
+    return p, np.sqrt(inner)
