@@ -65,12 +65,12 @@ for k in range(1, noise.shape[1]):
 forces = exact + 0.01 * largest * noise[:, 20:]
 one = jid.Motion(*(np.asarray(x)[None] for x in (motion.q, motion.qd, motion.qdd)))
 fits = jid.identify_batch(base, one, forces[None], row_time=step)
-estimates, freedom = np.asarray(fits.parameters)[0], np.asarray(fits.freedom)[0]
+estimates, dof = np.asarray(fits.parameters)[0], np.asarray(fits.dof)[0]
 scatter = estimates.std(axis=0)
 error = np.abs(estimates - p_base)
 covered = {}
 for label, deviations, quantile in (
-    ("spectral sandwich", fits.standard_deviations, stats.t.ppf(0.975, freedom)),
+    ("spectral sandwich", fits.standard_deviations, stats.t.ppf(0.975, dof)),
     ("independent rows", fits.naive_standard_deviations, 1.96),
 ):
     deviations = np.asarray(deviations)[0]

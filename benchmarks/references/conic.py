@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 
-from jaxid.identification.consistency.feasible_set import FeasibleSet, ScaledRows
+from jaxid.identification.consistency.program import FeasibleSet, ScaledRows
 
 
 def problem(feasible: FeasibleSet, data: ScaledRows) -> tuple[cp.Problem, cp.Variable, np.ndarray]:

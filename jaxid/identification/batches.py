@@ -1,4 +1,4 @@
-"""Many data sets in one call: robots of one kind, noise draws, geometries.
+"""Many data sets in one call: robots of one kind, noise draws, geometries, any estimator.
 
 Data sets go through one compiled computation in groups, so that memory does not grow with their
 number. For each data set the rows of a joint are reduced to their products with each other and with
@@ -11,28 +11,28 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, is_traced, require_float64
+from jaxid.arrays import AnyArray, Bool, Float, is_traced, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.regressor import JointRegressor
 from jaxid.errors import InputError
-from jaxid.identification.batch_estimators import estimate_each
 from jaxid.identification.estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
-from jaxid.identification.factors import Blocks, Factors, JointFactor
-from jaxid.identification.identify import fit_problem
+from jaxid.identification.factors import Blocks, Factors, empty_factors
+from jaxid.identification.fit import Fit
+from jaxid.identification.identify import fit_problem, identify
 from jaxid.identification.normal_equations import BatchFit, DataSets, solve
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.robot_family import geometries
+from jaxid.identification.uncertainty import IndependentRows
+from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 
 IN_A_CALL = 16
 """Data sets of one call of the compiled computation."""
-BLOCKS = 10
-"""Blocks of time of a data set that is solved by orthogonal factors."""
 
 
 def identify_batch(
@@ -46,23 +46,23 @@ def identify_batch(
     row_time: float | None = None,
     estimator: AbstractEstimator | None = None,
 ) -> BatchFit:
-    """Estimates the base parameters of many data sets in one call (Eqs. 28-33).
+    """Estimate the base parameters of many data sets in one call (Eqs. 28-33).
 
     The parameters are those of `identify` with `WeightedLeastSquares` on each data set. Compiles
     once for each shape; works under `jit`, `vmap` and `grad`, where data sets that determine too
     little are only marked. Without tracing they are solved again by orthogonal factors.
 
     Args:
-        base: What can be identified on this robot.
+        base: Base parameters of the robot.
         motion: Motions [datasets, samples, joints], already filtered and decimated.
-        forces: Generalized forces [N m or N], reduced like the motion. With an axis of draws, many
+        forces: Generalised forces [N m or N], reduced like the motion. With an axis of draws, many
             sets of forces over one motion, whose columns are then evaluated and factored once.
         weights: Weights of the joints' rows [1/(N m) or 1/N], for all data sets or for each;
             reciprocals of the largest forces if None (Eq. 30).
-        mask: Which rows count: data sets of different length are filled up and masked.
-        robots: The robot of each data set, of the topology of the base parameters' robot: the
-            columns that lead its base parameters are kept.
-        row_time: Between two rows [s]. With it, standard deviations come from the spectral
+        mask: Rows that count: data sets of different length are filled up and masked.
+        robots: Robot of each data set, of the topology of the base parameters' robot: the columns
+            that lead its base parameters are kept.
+        row_time: Time between two rows [s]. With it, standard deviations come from the spectral
             sandwich; without it, rows are taken for independent.
         estimator: Another than weighted least squares: it estimates one data set after the other,
             on all cores. It has weights of its own; not with `robots`, and not while JAX traces.
@@ -77,46 +77,36 @@ def identify_batch(
     require_float64("a batch of identifications")
     robot = base.model.robot
     _check(base, motion, forces, mask, robots)
+    sets, draws = len(forces), forces.shape[1:-2]
     if estimator is not None:
         if robots is not None or weights is not None:
             raise InputError(
                 "`estimator` goes with neither `robots` nor `weights`: the estimator has its own "
                 "weights, and solves for one robot."
             )
-        return estimate_each(base, motion, forces, mask, estimator, row_time)
-    if weights is None:
-        weights = 1.0 / np.asarray(robot.max_forces)
-    if robots is None:
+        fit = _estimate_each(base, motion, forces, mask, estimator, row_time)
+    else:
         rows, numbers = base.joint_regressor, None
-    else:
-        family, numbers = geometries(base, robots)
-        n = (robot.joints,)
-        rows = JointRegressor(family, family.columns, n, n, n, (numbers.shape[1],))
-    batch = DataSets(
-        motion,
-        _without_tool(base, motion, forces).reshape(len(forces), -1, *forces.shape[-2:]),
-        jnp.broadcast_to(jnp.asarray(weights), (len(forces), robot.joints)),
-        None if mask is None else jnp.asarray(mask, float),
-        numbers,
-    )
-    if is_traced(batch):
-        fit = solve(rows, batch, row_time)
-    else:
-        fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch, row_time), row_time)
-    draws = forces.shape[1:-2]
-
-    def shaped(x: AnyArray) -> AnyArray:
-        return x.reshape(len(forces), *draws, x.shape[-1])
-
-    return BatchFit(
-        shaped(fit.parameters),
-        shaped(fit.standard_deviations),
-        shaped(fit.residual_rms),
-        fit.condition_numbers,
-        fit.determined,
-        shaped(fit.naive_standard_deviations),
-        shaped(fit.freedom),
-    )
+        if robots is not None:
+            family, numbers = _family(base, robots)
+            n = (robot.joints,)
+            rows = JointRegressor(family, family.columns, n, n, n, (numbers.shape[1],))
+        if robot.tool is not None:
+            known = base.model.tool_forces(motion)
+            forces = forces - known.reshape(sets, *(1,) * len(draws), *known.shape[-2:])
+        weights = 1.0 / np.asarray(robot.max_forces) if weights is None else weights
+        batch = DataSets(
+            motion,
+            jnp.asarray(forces).reshape(sets, -1, *forces.shape[-2:]),
+            jnp.broadcast_to(jnp.asarray(weights), (sets, robot.joints)),
+            None if mask is None else jnp.asarray(mask, float),
+            numbers,
+        )
+        if is_traced(batch):
+            fit = solve(rows, batch, row_time)
+        else:
+            fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch, row_time), row_time)
+    return jax.tree.map(lambda x: x if x.ndim == 1 else x.reshape(sets, *draws, x.shape[-1]), fit)
 
 
 def _check(base, motion, forces, mask, robots) -> None:
@@ -145,17 +135,8 @@ def _check(base, motion, forces, mask, robots) -> None:
         )
 
 
-def _without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Array:
-    if base.model.robot.tool is None:
-        return jnp.asarray(forces)
-    known = base.model.tool_forces(motion)
-    return jnp.asarray(forces) - known.reshape(
-        len(forces), *(1,) * (forces.ndim - 3), *known.shape[-2:]
-    )
-
-
 def _solve_in_parts(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
-    """Calls the compiled computation for a few data sets at a time, on all cores.
+    """Call the compiled computation for a few data sets at a time, on all cores.
 
     XLA leaves small operations to one core, so each core gets data sets of its own. Parts of equal
     size also mean that another number of data sets compiles nothing anew.
@@ -170,13 +151,10 @@ def _solve_in_parts(rows: JointRegressor, batch: DataSets, row_time: float | Non
             solve(rows, jax.tree.map(lambda x: x[chosen], batch), row_time)
         )
 
-    starts = range(0, datasets, size)
-    if jax.default_backend() == "cpu" and len(starts) > 1:
-        first = part(0)
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            fits = [first, *pool.map(part, starts[1:])]
-    else:
-        fits = [part(start) for start in starts]
+    # The first part compiles for all.
+    first, starts = part(0), range(size, datasets, size)
+    with ThreadPoolExecutor(os.cpu_count() if jax.default_backend() == "cpu" else 1) as pool:
+        fits = [first, *pool.map(part, starts)]
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:datasets], *fits)
 
 
@@ -187,52 +165,144 @@ def _solved_again(
     fit: BatchFit,
     row_time: float | None,
 ) -> BatchFit:
-    """Solves the data sets that are not well conditioned by orthogonal factors, one by one.
+    """Solve the data sets that are not well conditioned by orthogonal factors, one by one.
 
     Where standard deviations are not naive, they come from blocks of time, left out in turn.
     """
     weak = np.flatnonzero(~np.asarray(fit.determined))
     if not len(weak):
         return fit
-    p, deviations, rms, condition, determined, naive, freedom = (
-        np.array(x) for x in jax.tree.leaves(fit)
-    )
+    uncertainty = IndependentRows() if row_time is None else None
+    fit = jax.tree.map(np.array, fit)
     for k in weak:
         one = jax.tree.map(lambda x, k=k: np.asarray(x)[k], batch)
-        for draw, forces in enumerate(one.forces):
-            blocks = _blocks(rows, one, forces)
-            if blocks.total.rows.sum() <= rows.size:
-                p[k, draw], condition[k] = 0.0, np.inf
-                deviations[k, draw] = naive[k, draw] = np.inf
-                continue
-            estimator = WeightedLeastSquares(GivenWeights(one.weights))
-            again = fit_problem(RegressionProblem(base, blocks=blocks), estimator)
-            found = again.naive_standard_deviations
-            known = np.isfinite(found).all()
-            p[k, draw], naive[k, draw] = again.parameters, found
-            deviations[k, draw] = found if row_time is None else again.standard_deviations
-            if row_time is not None:
-                freedom[k, draw] = again.uncertainty.dof
-            rms[k, draw] = again.residual_rms
-            condition[k] = again.condition_numbers.scaled if known else np.inf
-            determined[k] = known
-    return BatchFit(*map(jnp.asarray, (p, deviations, rms, condition, determined, naive, freedom)))
+        problems = [RegressionProblem(base, blocks=_blocks(rows, one, Q)) for Q in one.forces]
+        if problems[0].factors.rows.sum() <= rows.size:
+            fit.parameters[k], fit.condition_numbers[k] = 0.0, np.inf
+            fit.standard_deviations[k] = fit.naive_standard_deviations[k] = np.inf
+            continue
+        estimator = WeightedLeastSquares(GivenWeights(one.weights))
+        again = _stacked([fit_problem(problem, estimator, uncertainty) for problem in problems])
+        for x, y in zip(jax.tree.leaves(fit), jax.tree.leaves(again), strict=True):
+            x[k] = y if y.ndim > 1 else y[0]
+    return jax.tree.map(jnp.asarray, fit)
 
 
 def _blocks(rows: JointRegressor, one: DataSets, forces: np.ndarray) -> Blocks:
-    """The triangular factors of one data set and one draw of its forces, by blocks of time."""
-    edges = np.linspace(0, len(forces), BLOCKS + 1).astype(int)
-    parts = []
-    for begin, end in itertools.pairwise(edges):
-        joints = [JointFactor(c, np.zeros((0, len(c) + 1)), 0) for c in rows.columns]
-        for start in range(begin, end, 65536):
-            part = slice(start, min(start + 65536, end))
-            arrays = [x[part].T for x in jax.tree.leaves(one.motion)]
-            if one.numbers is not None:
-                shape = (len(one.numbers), arrays[0].shape[-1])
-                arrays.append(np.broadcast_to(one.numbers[:, None], shape))
-            for j, columns in enumerate(rows.in_numpy(*arrays)):
-                kept = slice(None) if one.mask is None else one.mask[part, j] > 0
-                joints[j] = joints[j].append(np.column_stack([columns.T, forces[part, j]])[kept])
-        parts.append(Factors(tuple(joints), rows.size))
+    """Return the triangular factors of one data set and one draw of its forces, by time."""
+    samples = len(forces)
+    edges = np.unique(np.linspace(0, samples, max(10, -(-samples // 65536)) + 1).astype(int))
+    counted = np.ones(forces.shape, bool) if one.mask is None else one.mask > 0
+    parts: list[Factors] = []
+    for start, stop in itertools.pairwise(edges):
+        own = slice(start, stop)
+        arrays = [x[own].T for x in jax.tree.leaves(one.motion)]
+        if one.numbers is not None:
+            arrays.append(np.repeat(one.numbers[:, None], stop - start, axis=1))
+        joints = zip(rows.in_numpy(*arrays), forces[own].T, counted[own].T, strict=True)
+        equations = [np.column_stack([theta.T, Q])[kept] for theta, Q, kept in joints]
+        parts.append(empty_factors(rows.columns, rows.size).append(equations))
     return Blocks(tuple(parts))
+
+
+def _estimate_each(
+    base: BaseParameters,
+    motion: Motion,
+    forces: AnyArray,
+    mask: AnyArray | None,
+    estimator: AbstractEstimator,
+    row_time: float | None,
+) -> BatchFit:
+    """Return the estimates of `identify` for each data set and draw, on all cores."""
+    arrays = [np.asarray(x) for x in jax.tree.leaves(motion)]
+    Q = np.asarray(forces).reshape(len(forces), -1, *forces.shape[-2:])
+    counted = np.ones(arrays[0].shape, bool) if mask is None else np.asarray(mask) > 0
+    uncertainty = IndependentRows() if row_time is None else None
+
+    def one(case: tuple[int, int]) -> Fit:
+        k, draw = case
+        o = Observations.of(
+            *(x[k] for x in arrays),
+            np.where(counted[k], Q[k, draw], 0.0),
+            sample_time=1.0 if row_time is None else row_time,
+            mask=counted[k],
+            name=f"data set {k + 1}",
+        )
+        return identify(base, o, estimator, uncertainty=uncertainty)
+
+    cases = itertools.product(range(len(Q)), range(Q.shape[1]))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        fit = _stacked(list(pool.map(one, cases)))
+    return jax.tree.map(lambda x: x if x.ndim > 1 else x[:: Q.shape[1]], fit)
+
+
+def _stacked(fits: list[Fit]) -> BatchFit:
+    """Return some fits as one; only those that determine all have a condition number."""
+    known = np.array([np.isfinite(fit.naive_standard_deviations).all() for fit in fits])
+    condition = np.array([fit.condition_numbers.scaled for fit in fits])
+    return BatchFit(
+        jnp.stack([fit.parameters for fit in fits]),
+        jnp.stack([fit.standard_deviations for fit in fits]),
+        jnp.stack([fit.residual_rms for fit in fits]),
+        jnp.asarray(np.where(known, condition, np.inf)),
+        jnp.asarray(known),
+        jnp.stack([fit.naive_standard_deviations for fit in fits]),
+        jnp.stack([fit.uncertainty.dof for fit in fits]),
+    )
+
+
+GEOMETRY = ("axis", "rotation", "offset", "gravity")
+
+
+class RobotFamily(eqx.Module):
+    """Robots that differ in some numbers of their geometry, with the base columns of one of them.
+
+    Numbers that are the same for all robots stay constants of the program: robots whose lengths
+    differ cost as much as one robot.
+
+    Attributes:
+        base: The base parameters; its robot has the numbers that do not differ.
+        varying: Positions of those that do, in axes, rotations, offsets and gravity.
+    """
+
+    base: BaseParameters
+    varying: tuple[int, ...] = eqx.field(static=True)
+
+    def columns(self, q, qd, qdd, x) -> Float[AnyArray, "joints base"]:
+        """Return the base regressor of one sample and one robot with the numbers `x` (Eq. 23)."""
+        robot = self.base.model.robot
+        fixed = _geometry(robot)
+        order = np.arange(fixed.size)
+        order[list(self.varying)] = fixed.size + np.arange(len(self.varying))
+        whole = jnp.concatenate([jnp.asarray(fixed, x.dtype), x])[order]
+        shapes = [np.shape(getattr(robot, name)) for name in GEOMETRY]
+        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+        parts = zip(GEOMETRY, jnp.split(whole, ends[:-1]), shapes, strict=True)
+        changed = {name: part.reshape(shape) for name, part, shape in parts}
+        placed = eqx.tree_at(lambda b: b.model.robot, self.base, robot.replace(**changed))
+        return placed.columns(q, qd, qdd)
+
+
+def _family(
+    base: BaseParameters, robots: Sequence[Robot]
+) -> tuple[RobotFamily, Float[np.ndarray, "datasets numbers"]]:
+    """Return robots of one topology as one definition, and for each robot its own numbers."""
+    own = base.model.robot
+    for k, robot in enumerate(robots):
+        if robot.parent != own.parent or robot.revolute != own.revolute:
+            raise InputError(
+                f"`robots` must have the topology of `{own.name}`, but number {k}, "
+                f"`{robot.name}`, has other joints: identify it with its own base parameters."
+            )
+        if robot.tool is not None:
+            raise InputError(
+                f"number {k} of `robots`, `{robot.name}`, carries a known tool: subtract its "
+                "forces beforehand and take the robot without it."
+            )
+    numbers = np.array([_geometry(robot) for robot in robots])
+    varying = tuple(np.flatnonzero((numbers != _geometry(own)).any(axis=0)).tolist())
+    return RobotFamily(base, varying), numbers[:, list(varying)]
+
+
+def _geometry(robot: Robot) -> np.ndarray:
+    return np.concatenate([np.ravel(getattr(robot, x)) for x in GEOMETRY]).astype(np.float64)

@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float, Numbers
 from jaxid.errors import InputError
-from jaxid.identification.consistency.pseudo_inertia import consistency_margin, pseudo_inertia
+from jaxid.identification.consistency.pseudo_inertia import consistency_margin
 from jaxid.robot.robot import Robot
 
 
@@ -79,8 +79,17 @@ class BodyBounds(eqx.Module):
         Args:
             robot: Robot whose bodies are bounded.
         """
-        reach, neighbours = _reach(robot)
-        return cls(100.0 * reach**2, neighbours + 0.25 * reach)
+        offset = np.linalg.norm(np.asarray(robot.offset), axis=1)
+        tip = float(np.linalg.norm(np.asarray(robot.tip_offset)))
+        chains = [offset[list(chain)].sum() for chain in robot.ancestors]
+        chains[robot.tip_body] += tip
+        reach = float(max(chains)) or 1.0
+        farthest = offset.copy()
+        farthest[robot.tip_body] = max(farthest[robot.tip_body], tip)
+        for body, parent in enumerate(robot.parent):
+            if parent >= 0:
+                farthest[parent] = max(farthest[parent], offset[body])
+        return cls(100.0 * reach**2, farthest + 0.25 * reach)
 
     def replace(self, **fields: Numbers | float | None) -> "BodyBounds":
         """Return a copy with some bounds replaced; scalars count for all bodies.
@@ -95,19 +104,16 @@ class BodyBounds(eqx.Module):
             low, high = float(np.min(values)), float(np.max(values))
             return f"{high:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
-        text = (
-            f"masses up to {span(self.mass_max)} kg, bodies within {span(self.radius)} m of the "
-            "origins of their frames"
-        )
-        if np.any(self.mass_min):
-            text += f", masses from {span(self.mass_min)} kg"
-        if np.isfinite(self.centre_min).any() or np.isfinite(self.centre_max).any():
-            text += ", centres of mass in boxes"
-        if self.has_ellipsoid.any():
-            text += ", centres of mass in ellipsoids"
-        if self.total_mass is not None:
-            text += f", {self.total_mass:.4g} kg together"
-        return text
+        boxes = np.isfinite(self.centre_min) | np.isfinite(self.centre_max)
+        parts = [
+            f"masses up to {span(self.mass_max)} kg",
+            f"bodies within {span(self.radius)} m of the origins of their frames",
+            f"masses from {span(self.mass_min)} kg" if np.any(self.mass_min) else "",
+            "centres of mass in boxes" if boxes.any() else "",
+            "centres of mass in ellipsoids" if self.has_ellipsoid.any() else "",
+            "" if self.total_mass is None else f"{self.total_mass:.4g} kg together",
+        ]
+        return ", ".join(filter(None, parts))
 
     @property
     def has_ellipsoid(self) -> Bool[np.ndarray, " bodies"]:
@@ -177,21 +183,6 @@ class BodyBounds(eqx.Module):
         _ = self.inner_centres
 
 
-def _reach(robot: Robot) -> tuple[float, np.ndarray]:
-    """Return the longest chain's length [m] and each body's distance to its farthest neighbour."""
-    offset = np.linalg.norm(np.asarray(robot.offset), axis=1)
-    tip = float(np.linalg.norm(np.asarray(robot.tip_offset)))
-    chains = [offset[list(chain)].sum() for chain in robot.ancestors]
-    chains[robot.tip_body] += tip
-    neighbours = offset.copy()
-    for body, parent in enumerate(robot.parent):
-        if parent >= 0:
-            neighbours[parent] = max(neighbours[parent], offset[body])
-    neighbours[robot.tip_body] = max(neighbours[robot.tip_body], tip)
-    reach = float(max(chains))
-    return (reach if reach > 0 else 1.0), neighbours
-
-
 class EntropicPull(eqx.Module):
     r"""Pull of the bodies towards those of a prior, along directions that the data do not see.
 
@@ -219,26 +210,6 @@ class EntropicPull(eqx.Module):
                 f"directions, but body {k} is not: give it a mass and an inertia."
             )
 
-    def pseudo_inertias(
-        self, nominal: Float[np.ndarray, "bodies 4 4"]
-    ) -> Float[np.ndarray, "bodies 4 4"]:
-        """Return the pseudo-inertias of the prior's bodies.
-
-        Args:
-            nominal: Pseudo-inertias for a prior without bodies.
-
-        Raises:
-            InputError: If the number of bodies is not that of the robot.
-        """
-        if self.bodies is None:
-            return nominal
-        if len(self.bodies) != len(nominal):
-            raise InputError(
-                f"`bodies` of a prior must be one for each body of the robot ({len(nominal)}), but "
-                f"are {len(self.bodies)}."
-            )
-        return pseudo_inertia(self.bodies)
-
 
 class ParameterPrior(eqx.Module):
     r"""Standard parameters that are known roughly, each with its own standard deviation (a ridge).
@@ -261,21 +232,3 @@ class ParameterPrior(eqx.Module):
             )
         if not (np.asarray(self.deviations) > 0.0).all():
             raise InputError("`deviations` of a prior must be positive.")
-
-    def rows(self, size: int) -> tuple[Float[np.ndarray, "rows standard"], np.ndarray]:
-        """Return the prior as rows of least squares, in units of the standard deviations.
-
-        Args:
-            size: Number of standard parameters of the model.
-
-        Raises:
-            InputError: If the number of parameters is not that of the model.
-        """
-        if len(self.parameters) != size:
-            raise InputError(
-                f"`parameters` of a prior must be the {size} standard parameters of the model, but "
-                f"are {len(self.parameters)}."
-            )
-        inverse = 1.0 / np.asarray(self.deviations, np.float64)
-        known = inverse > 0.0
-        return np.diag(inverse)[known], (inverse * np.asarray(self.parameters))[known]

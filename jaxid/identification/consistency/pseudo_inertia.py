@@ -20,20 +20,14 @@ Values = Any
 """Arrays of NumPy or JAX, and NumPy scalars."""
 
 
-def _basis() -> np.ndarray:
-    basis = np.zeros((10, 4, 4))
-    basis[0, 3, 3] = 1.0
-    for k in range(3):
-        basis[1 + k, k, 3] = basis[1 + k, 3, k] = 1.0
-        basis[4 + k, range(3), range(3)] = 0.5
-        basis[4 + k, k, k] = -0.5
-    for k, (i, j) in enumerate(((1, 2), (0, 2), (0, 1))):
-        basis[7 + k, i, j] = basis[7 + k, j, i] = 1.0
-    return basis
-
-
-BASIS = _basis()
+BASIS = np.zeros((10, 4, 4))
 r"""Pseudo-inertias of unit parameters $(m, m r_c, A, B, C, D, E, F)$."""
+BASIS[0, 3, 3] = 1.0
+for _k, (_i, _j) in enumerate(((1, 2), (0, 2), (0, 1))):
+    BASIS[1 + _k, _k, 3] = BASIS[1 + _k, 3, _k] = 1.0
+    BASIS[4 + _k, range(3), range(3)] = 0.5
+    BASIS[4 + _k, _k, _k] = -0.5
+    BASIS[7 + _k, _i, _j] = BASIS[7 + _k, _j, _i] = 1.0
 
 
 def pseudo_inertia(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*batch 4 4"]:
@@ -61,13 +55,7 @@ def ball(
     centre: Float[AnyArray, "*batch 3"],
     radius: Float[AnyArray, "*batch"],
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """Return the pseudo-inertias of solid balls.
-
-    Args:
-        mass: Masses [kg].
-        centre: Centres in the body's frame [m].
-        radius: Radii [m].
-    """
+    """Return the pseudo-inertias of solid balls [kg, m]."""
     m, c = np.asarray(mass, np.float64), np.asarray(centre, np.float64)
     spread = np.asarray(radius, np.float64)[..., None, None] ** 2 / 5.0 * np.eye(3)
     P = np.empty((*m.shape, 4, 4))

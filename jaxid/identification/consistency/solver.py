@@ -22,9 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, Int, require_float64
-from jaxid.identification.consistency.cone_program import ConeProgram, indicators
-from jaxid.identification.consistency.feasible_set import Number
+from jaxid.arrays import AnyArray, Bool, Float, Int, require_float64
+from jaxid.identification.consistency.program import ConeProgram, Number, indicators
 from jaxid.identification.consistency.pseudo_inertia import (
     BASIS,
     Values,
@@ -62,7 +61,7 @@ class Optimum(eqx.Module):
     multipliers: Float[AnyArray, "*batch linear"]
 
 
-class Point(NamedTuple):
+class _Point(NamedTuple):
     """Variables, slacks, multipliers, and their distance from the optimum."""
 
     y: Values
@@ -75,7 +74,7 @@ class Point(NamedTuple):
     error: Values
 
 
-class Direction(NamedTuple):
+class _Direction(NamedTuple):
     """Changes of variables, slacks and multipliers."""
 
     y: Values
@@ -85,125 +84,69 @@ class Direction(NamedTuple):
     z: Values
 
 
-class _State(NamedTuple):
-    """State of the iteration; `best` holds the returned parts of the best point."""
-
-    point: Point
-    best: tuple[Values, Values, Values, Values]
-    iterations: Values
-    stalled: Values
-    finished: Values
-
-
-class _Backend(NamedTuple):
-    """Arithmetic by NumPy or JAX.
-
-    Attributes:
-        xp: NumPy or `jax.numpy`.
-        factor: Solver of a positive definite system; it reads the lower triangle.
-        block_diagonal: Matrix with given blocks on its diagonal.
-        choose: Result of one of two functions without arguments.
-    """
-
-    xp: ModuleType
-    factor: Callable[[Values], Callable[[Values], Values]]
-    block_diagonal: Callable[..., Values]
-    choose: Callable[[Values, Callable[[], tuple], Callable[[], tuple]], tuple]
-
-
-def _factor_in_numpy(H: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    try:
-        factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
-    except np.linalg.LinAlgError:
-        return lambda r: np.full_like(r, np.nan)
-    return lambda r: scipy.linalg.cho_solve(factor, r, check_finite=False)
-
-
-def _factor_compiled(H: Array) -> Callable[[Array], Array]:
-    L = jax.lax.linalg.cholesky(H, symmetrize_input=False)
-    return lambda r: jax.scipy.linalg.cho_solve((L, True), r)
-
-
-_NUMPY = _Backend(
-    np, _factor_in_numpy, scipy.linalg.block_diag, lambda first, a, b: a() if first else b()
-)
-_JAX = _Backend(jnp, _factor_compiled, jax.scipy.linalg.block_diag, jax.lax.cond)
-
-
 def solve_in_numpy(program: ConeProgram) -> Optimum:
     """Solve one program in NumPy: some tens of milliseconds, and nothing to compile."""
+
+    def loop(goes_on: Callable, iterate: Callable, state: tuple) -> tuple:
+        while goes_on(state):
+            state = iterate(state)
+        return state
+
     with np.errstate(all="ignore"):
-        state, gram = _first(_NUMPY, program), _information(program)
-        while not state.finished:
-            state = _next(_NUMPY, program, gram, state)
-        return _optimum(program, state)
+        return _solve(np, program, loop)
 
 
 @jax.jit
 def solve_compiled(program: ConeProgram) -> Optimum:
     """Solve one program; works under `jit` and `vmap`."""
     require_float64("the search for physically consistent parameters")
-    program = jax.tree.map(jnp.asarray, program)
-    gram = _information(program)
-    state = jax.lax.while_loop(
-        lambda x: ~x.finished,
-        lambda x: _next(_JAX, program, gram, x),
-        _first(_JAX, program),
-    )
-    return _optimum(program, state)
+    return _solve(jnp, jax.tree.map(jnp.asarray, program), jax.lax.while_loop)
 
 
-def _information(p: ConeProgram) -> Values:
-    """Return the information of the data, its diagonal raised by less than rounding."""
-    return (p.A.T @ p.A) * (1.0 + TINY * np.eye(p.A.shape[-1]))
+def _solve(xp: ModuleType, p: ConeProgram, loop: Callable) -> Optimum:
+    """Iterate until certified, or until four iterations have brought no progress."""
+    # The diagonal is raised by less than rounding.
+    gram = (p.A.T @ p.A) * (1.0 + TINY * np.eye(p.A.shape[-1]))
+
+    def is_certified(value: Values, error: Values) -> Values:
+        return error <= TOLERANCE * (p.scale + value)
+
+    def iterate(state: tuple) -> tuple:
+        point, best, iterations, stalled, _ = state
+        point, length = _step(xp, p, gram, point)
+        better = point.error < best[-1]
+        new = point.y, point.z, point.value, point.error
+        best = tuple(xp.where(better, a, b) for a, b in zip(new, best, strict=True))
+        stalled, iterations = xp.where(better, 0, stalled + 1), iterations + 1
+        finished = (
+            is_certified(point.value, point.error)
+            | ~xp.isfinite(point.error)
+            | (length < 1e-8)
+            | (stalled >= 4)
+            | (iterations >= MAX_ITERATIONS)
+        )
+        return point, best, iterations, stalled, finished
+
+    first, zero = _first_point(xp, p), xp.zeros((), int)
+    best = first.y, first.z, first.value, first.error
+    final = loop(lambda state: ~state[-1], iterate, (first, best, zero, zero, zero > 0))
+    _, (y, z, value, error), iterations, _, _ = final
+    return Optimum(y, value, error, is_certified(value, error), iterations, z)
 
 
-def _optimum(program: ConeProgram, state: _State) -> Optimum:
-    y, z, value, error = state.best
-    certified = _is_certified(program, value, error)
-    return Optimum(y, value, error, certified, state.iterations, z)
-
-
-def _is_certified(p: ConeProgram, value: Values, error: Values) -> Values:
-    return error <= TOLERANCE * (p.scale + value)
-
-
-def _first(backend: _Backend, p: ConeProgram) -> _State:
+def _first_point(xp: ModuleType, p: ConeProgram) -> _Point:
     """Return the start, with multipliers on its central path as large as its gradient."""
-    xp, y = backend.xp, p.start
-    S, s = p.slacks(xp, y)
+    S, s = p.slacks(xp, p.start)
     inverse_S = inverse(xp, S)
-    rest = p.A @ y - p.b
+    rest = p.A @ p.start - p.b
     value = 0.5 * rest @ rest
     force = xp.linalg.norm(p.adjoint(xp, inverse_S, 1.0 / s))
     most = (value + TINY) / p.complementarity
     mu = xp.clip(xp.linalg.norm(rest @ p.A) / force, 1e-6 * most, most)
-    Z = xp.maximum(_targets(xp, p), mu) * inverse_S
-    point = _point(xp, p, y, Z, mu / s)
-    zero = xp.zeros((), int)
-    return _State(point, (y, point.z, point.value, point.error), zero, zero, zero > 0)
+    return _point(xp, p, p.start, xp.maximum(_targets(xp, p), mu) * inverse_S, mu / s)
 
 
-def _next(backend: _Backend, p: ConeProgram, gram: Values, state: _State) -> _State:
-    """Perform one iteration; stop if certified, or after four iterations without progress."""
-    xp = backend.xp
-    point, length = _step(backend, p, gram, state.point)
-    better = point.error < state.best[-1]
-    new = point.y, point.z, point.value, point.error
-    y, z, value, error = (xp.where(better, a, b) for a, b in zip(new, state.best, strict=True))
-    stalled = xp.where(better, 0, state.stalled + 1)
-    iterations = state.iterations + 1
-    finished = (
-        _is_certified(p, point.value, point.error)
-        | ~xp.isfinite(point.error)
-        | (length < 1e-8)
-        | (stalled >= 4)
-        | (iterations >= MAX_ITERATIONS)
-    )
-    return _State(point, (y, z, value, error), iterations, stalled, finished)
-
-
-def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> Point:
+def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _Point:
     """Compute slacks, the residual of the optimality conditions, and the error bound."""
     S, s = p.slacks(xp, y)
     rest = p.A @ y - p.b
@@ -216,7 +159,7 @@ def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> P
         residual = residual - p.equal.T @ normal
     value = 0.5 * rest @ rest
     error = _matrix_gap(xp, p, S, Z) + s @ z + xp.sum(xp.abs(residual) * p.diameters)
-    return Point(y, S, s, Z, z, residual, value, error)
+    return _Point(y, S, s, Z, z, residual, value, error)
 
 
 def _targets(xp: ModuleType, p: ConeProgram) -> Values:
@@ -239,83 +182,67 @@ def _matrix_gap(xp: ModuleType, p: ConeProgram, S: Values, Z: Values) -> Values:
     return xp.sum(xp.where(pulled, entropic, bodies)) + xp.sum(more)
 
 
-class _NewtonSystem:
-    """Newton's equations of a program at a point."""
-
-    def __init__(self, backend: _Backend, p: ConeProgram, gram: Values, x: Point):
-        self.xp, self.p, self.x = backend.xp, p, x
-        self.inverse_S = inverse(self.xp, x.S)
-        self.ratio = x.z / x.s
-        barriers = _barriers(backend, p, self.inverse_S, x.Z, self.ratio)
-        self.solve = _equality_solver(backend, p, gram + barriers)
-
-    def direction(self, rZ: Values, rz: Values, right: Values) -> Direction:
-        """Return the direction of a right-hand side of the optimality conditions."""
-        xp, dy = self.xp, self.solve(right)
-        dS, ds = self.p.linear(xp, dy)
-        dZ = rZ - symmetric_part(xp, self.inverse_S @ dS @ self.x.Z)
-        return Direction(dy, dS, ds, dZ, rz - self.ratio * ds)
-
-    def toward(self, target: Values, mu: Values, second_Z: Values, second_z: Values) -> Direction:
-        """Return the direction towards products `target + mu`, less second-order terms."""
-        rZ = (target + mu) * self.inverse_S - self.x.Z - second_Z
-        rz = mu / self.x.s - self.x.z - second_z
-        return self.direction(rZ, rz, self.p.adjoint(self.xp, rZ, rz) - self.x.residual)
-
-    def correct(self, target: Values, mu: Values, d: Direction) -> Direction:
-        """Return the direction with the products of changes along `d`."""
-        second = symmetric_part(self.xp, self.inverse_S @ d.S @ d.Z)
-        return self.toward(target, mu, second, d.s * d.z / self.x.s)
-
-    def refine(self, d: Direction) -> Direction:
-        """Remove what rounding has left of the optimality conditions."""
-        xp, p = self.xp, self.p
-        rest = p.adjoint(xp, d.Z, d.z) - self.x.residual - (p.A @ d.y) @ p.A
-        more = self.direction(xp.zeros_like(d.Z), xp.zeros_like(d.z), rest)
-        return Direction(*(a + b for a, b in zip(d, more, strict=True)))
-
-
-def _step(backend: _Backend, p: ConeProgram, gram: Values, x: Point) -> tuple[Point, Values]:
+def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Point, Values]:
     """Take the longer step of two correctors; return the new point and the step length."""
-    xp = backend.xp
-    newton, target = _NewtonSystem(backend, p, gram, x), _targets(xp, p)
+    inverse_S, ratio, target = inverse(xp, x.S), x.z / x.s, _targets(xp, p)
+    solve = _newton_solver(xp, p, gram + _barriers(xp, p, inverse_S, x.Z, ratio))
 
-    def complementarity(S: Values, Z: Values, s: Values, z: Values) -> Values:
+    def direction(rZ: Values, rz: Values, right: Values) -> _Direction:
+        """Return the direction of a right-hand side of the optimality conditions."""
+        dy = solve(right)
+        dS, ds = p.linear(xp, dy)
+        dZ = rZ - symmetric_part(xp, inverse_S @ dS @ x.Z)
+        return _Direction(dy, dS, ds, dZ, rz - ratio * ds)
+
+    def toward(mu: Values, second_Z: Values, second_z: Values) -> _Direction:
+        """Return the direction towards products `target + mu`, less second-order terms."""
+        rZ = (target + mu) * inverse_S - x.Z - second_Z
+        rz = mu / x.s - x.z - second_z
+        return direction(rZ, rz, p.adjoint(xp, rZ, rz) - x.residual)
+
+    def correct(mu: Values, d: _Direction) -> _Direction:
+        """Return the direction with the products of changes along `d`."""
+        return toward(mu, symmetric_part(xp, inverse_S @ d.S @ d.Z), d.s * d.z / x.s)
+
+    def complementarity(S: Values, s: Values, Z: Values, z: Values) -> Values:
         matrices = xp.sum(S * Z) - 4.0 * p.bodies * p.pull
         return (xp.maximum(matrices, 0.0) + s @ z) / p.complementarity
 
-    mu = complementarity(x.S, x.Z, x.s, x.z) + 1e-300
-    predictor = newton.toward(target, 0.0, 0.0, 0.0)
+    mu = complementarity(*x[1:5]) + 1e-300
+    predictor = toward(0.0, 0.0, 0.0)
     # The predictor only decides how much to centre: a coarser choice of steps suffices.
     a = _length(xp, STEPS[::3], x, predictor)
-    ahead = complementarity(
-        x.S + a * predictor.S,
-        x.Z + a * predictor.Z,
-        x.s + a * predictor.s,
-        x.z + a * predictor.z,
-    )
+    moved = [u + a * v for u, v in zip(x[1:5], predictor[1:], strict=True)]
+    ahead = complementarity(*moved)
     centre = xp.clip((ahead / mu) ** 3, 1e-6, 1.0)
     centre = xp.where(a < 0.1, xp.maximum(centre, 0.5), centre)
-    first = newton.correct(target, centre * mu, predictor)
-    second = newton.correct(target, centre * mu, first)
+    first = correct(centre * mu, predictor)
+    second = correct(centre * mu, first)
     lengths = _length(xp, STEPS, x, first), _length(xp, STEPS, x, second)
     longer = lengths[1] > lengths[0]
-    d = Direction(*(xp.where(longer, b, a) for a, b in zip(first, second, strict=True)))
+    d = _Direction(*(xp.where(longer, b, a) for a, b in zip(first, second, strict=True)))
     length = xp.maximum(*lengths)
 
     def refined() -> tuple[Values, ...]:
-        more = newton.refine(d)
-        return *more, _length(xp, STEPS, x, more)
+        """Remove what rounding has left of the optimality conditions."""
+        rest = p.adjoint(xp, d.Z, d.z) - x.residual - (p.A @ d.y) @ p.A
+        more = direction(xp.zeros_like(d.Z), xp.zeros_like(d.z), rest)
+        total = _Direction(*(a + b for a, b in zip(d, more, strict=True)))
+        return *total, _length(xp, STEPS, x, total)
 
     # Near the boundary rounding leaves a residual that the error bound counts.
-    near = x.error <= 1e-3 * (p.scale + x.value)
-    counts = xp.sum(xp.abs(x.residual) * p.diameters) > 0.1 * x.error
-    dy, _, _, dZ, dz, length = backend.choose(near & counts, refined, lambda: (*d, length))
+    wanted = (x.error <= 1e-3 * (p.scale + x.value)) & (
+        xp.sum(xp.abs(x.residual) * p.diameters) > 0.1 * x.error
+    )
+    if xp is np:
+        dy, _, _, dZ, dz, length = refined() if wanted else (*d, length)
+    else:
+        dy, _, _, dZ, dz, length = jax.lax.cond(wanted, refined, lambda: (*d, length))
     a = 0.99 * length
     return _point(xp, p, x.y + a * dy, x.Z + a * dZ, x.z + a * dz), a
 
 
-def _length(xp: ModuleType, steps: np.ndarray, x: Point, d: Direction) -> Values:
+def _length(xp: ModuleType, steps: np.ndarray, x: _Point, d: _Direction) -> Values:
     """Return the longest of some steps that leaves everything positive."""
     fastest = xp.maximum(xp.max(-d.s / x.s), xp.max(-d.z / x.z))
     lengths = steps * xp.minimum(1.0, 1.0 / xp.maximum(fastest, 1e-300))
@@ -326,10 +253,10 @@ def _length(xp: ModuleType, steps: np.ndarray, x: Point, d: Direction) -> Values
 
 
 def _barriers(
-    backend: _Backend, p: ConeProgram, inverse_S: Values, Z: Values, ratio: Values
+    xp: ModuleType, p: ConeProgram, inverse_S: Values, Z: Values, ratio: Values
 ) -> Values:
     """Return the contribution of the bounds to the matrix of Newton's equations."""
-    xp, K, w, n = backend.xp, p.bodies, p.width, p.drives
+    K, w, n = p.bodies, p.width, p.drives
     flat = BASIS[:w].reshape(w, 16)
     bodies = flat[None] @ _products(xp, inverse_S[:K], Z[:K]) @ flat.T[None]
     count = K * p.rows.shape[-2]
@@ -337,7 +264,8 @@ def _barriers(
     bodies = symmetric_part(xp, bodies) + xp.einsum("kri,kr,krj->kij", p.rows, linear, p.rows)
     bodies = bodies * (1.0 + TINY * np.eye(w))[None]
     drives = xp.diag((1.0 + TINY) * (ratio[count : count + n] + ratio[count + n :]))
-    H = backend.block_diagonal(*bodies, drives)
+    block_diagonal = scipy.linalg.block_diag if xp is np else jax.scipy.linalg.block_diag
+    H = block_diagonal(*bodies, drives)
     if p.members.shape[-2]:
         flat = xp.reshape(p.couplings, (*p.members.shape, 16))
         more = flat @ _products(xp, inverse_S[K:], Z[K:]) @ xp.swapaxes(flat, -1, -2)
@@ -352,9 +280,22 @@ def _products(xp: ModuleType, inverse_S: Values, Z: Values) -> Values:
     return xp.reshape(product, (-1, 16, 16))
 
 
-def _equality_solver(backend: _Backend, p: ConeProgram, H: Values) -> Callable[[Values], Values]:
+def _newton_solver(xp: ModuleType, p: ConeProgram, H: Values) -> Callable[[Values], Values]:
     """Return the solver of Newton's equations within the equality constraints."""
-    xp, solve = backend.xp, backend.factor(H)
+    if xp is np:
+        try:
+            factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            return lambda r: np.full_like(r, np.nan)
+
+        def solve(r: Values) -> Values:
+            return scipy.linalg.cho_solve(factor, r, check_finite=False)
+    else:
+        L = jax.lax.linalg.cholesky(H, symmetrize_input=False)
+
+        def solve(r: Values) -> Values:
+            return jax.scipy.linalg.cho_solve((L, True), r)
+
     if not p.equal.shape[0]:
         return solve
     normal = xp.stack([solve(row) for row in p.equal], axis=1)

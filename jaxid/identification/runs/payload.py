@@ -185,13 +185,13 @@ def _possible(
         wide = BodyBounds.from_geometry(robot)
         bounds = BodyBounds(mass_max=np.max(wide.mass_max), radius=np.max(wide.radius))
     # Estimates that are known too well, as those of noiseless data, leave no digits for a proof.
-    found = consistent_body(estimate, covariance, bounds, throw=False)
-    if not found.error_bound <= LOOSE * (1.0 + found.distance**2):
+    found, distance, error_bound = consistent_body(estimate, covariance, bounds, throw=False)
+    if not error_bound <= LOOSE * (1.0 + distance**2):
         raise RuntimeError(
             "no body that could exist was proved to be the nearest to the payload's estimate, "
             f"whose mass is {estimate[0]:.4g} kg: are the runs those of the same robot?"
         )
-    return found.parameters, found.distance
+    return found, distance
 
 
 def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:

@@ -4,7 +4,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.identification.consistency.feasible_set import ScaledRows, scaled_rows
+from jaxid.identification.consistency.program import ScaledRows, scaled_rows
 from jaxid.simulation.virtual import random_bodies
 
 
@@ -21,25 +21,19 @@ def truth(model: jid.Model, seed: int) -> np.ndarray:
     return p
 
 
-def factor(
-    base: jid.BaseParameters, seed: int, noise: float = 0.05, samples: int = 200
-) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
-    """Triangle, right-hand side, number of rows, and the truth."""
+def factor(base, seed, noise=0.05, samples=200) -> tuple[np.ndarray, np.ndarray, int]:
+    """Triangle, right-hand side and number of rows."""
     model, rng = base.model, np.random.default_rng(seed)
     n = model.robot.joints
-    p = truth(model, seed)
     q, qd, qdd = (rng.uniform(-s, s, (samples, n)) for s in (3.0, 2.0, 4.0))
     theta = in_numpy(model, model.columns, q, qd, qdd)
-    forces = theta @ p
+    forces = theta @ truth(model, seed)
     scale = np.sqrt(np.mean(forces**2, axis=0))
     forces = (forces + noise * scale * rng.normal(size=forces.shape)) / scale
     rows = (theta / scale[:, None])[:, :, list(base.indices)].reshape(-1, base.size)
     R = np.linalg.qr(np.column_stack([rows, forces.ravel()]), mode="r")
-    return R[:, :-1], R[:, -1], len(rows), p
+    return R[:, :-1], R[:, -1], len(rows)
 
 
-def data(
-    base: jid.BaseParameters, seed: int, noise: float = 0.05, samples: int = 200
-) -> ScaledRows:
-    R, z, rows, _ = factor(base, seed, noise, samples)
-    return scaled_rows(np, base, R, z, rows)
+def data(base, seed, noise=0.05) -> ScaledRows:
+    return scaled_rows(np, base, *factor(base, seed, noise))

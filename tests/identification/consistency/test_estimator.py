@@ -9,7 +9,7 @@ import pytest
 
 import jaxid as jid
 from jaxid.identification.consistency import consistency_margin, solver
-from jaxid.identification.consistency.feasible_set import nominal_bodies
+from jaxid.identification.consistency.program import nominal_bodies
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))

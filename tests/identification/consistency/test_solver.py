@@ -1,0 +1,130 @@
+"""The optimum against a conic solver, its certificate, and NumPy, JAX and batches alike."""
+
+import arms
+import conic
+import jax
+import numpy as np
+import pytest
+
+import jaxid as jid
+from jaxid.identification.consistency import consistency_margin, solver
+from jaxid.identification.consistency.program import cone_program, feasible_set, nominal_bodies
+
+TERMS = (
+    jid.RigidBodies(),
+    jid.ViscousFriction(),
+    jid.CoulombFriction(),
+    jid.RotorInertia(),
+    jid.ConstantOffset(),
+)
+
+
+def planar():
+    return jid.robots.planar_arm(2, 0.5)
+
+
+def case(robot, terms=TERMS, margin=0.0, **bounds):
+    base = jid.base_parameters(jid.Model(robot, terms))
+    wide = jid.consistency.BodyBounds.from_geometry(robot)
+    return base, feasible_set(base.model, wide.replace(**bounds), margin)
+
+
+CASES = {
+    "a seven-axis arm": lambda: case(jid.robots.panda()),
+    "coupled drives": lambda: case(jid.robots.tx40(), (*TERMS, jid.terms.CoupledDrives())),
+    "a rail": lambda: case(jid.robots.tx90l_on_rail()),
+    "seven parameters": lambda: case(planar(), (jid.RigidBodies(principal_axes=True), *TERMS[1:])),
+    "all bounds": lambda: case(
+        planar(),
+        mass_min=1.0,
+        mass_max=[30.0, 9.0],
+        centre_min=[0.0, -0.1, -np.inf],
+        centre_max=[0.4, 0.2, 0.3],
+        ellipsoid_centre=[0.2, 0.0, 0.0],
+        ellipsoid_axes=[[0.3, 0.2, 0.2], [np.inf] * 3],
+        total_mass=12.0,
+        margin=0.02,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_optimum_is_a_conic_solvers(name):
+    base, feasible = CASES[name]()
+    data = arms.data(base, 3, 0.2)
+    optimum = solver.solve_in_numpy(cone_program(np, feasible, data))
+    value, p = conic.optimum(feasible, data)
+    assert optimum.certified
+    assert optimum.iterations <= 30
+    assert abs(optimum.value - value) <= 1e-6 * value
+    ours = feasible.standard_parameters(np, data, optimum.y)
+    np.testing.assert_allclose(
+        data.A @ ours, data.A @ p, atol=5e-3 * np.sqrt(value), err_msg="forces of the optimum"
+    )
+
+
+def test_noise_free_forces_are_met_exactly():
+    base, feasible = CASES["a seven-axis arm"]()
+    data = arms.data(base, 5, 0.0)
+    optimum = solver.solve_in_numpy(cone_program(np, feasible, data))
+    assert optimum.certified
+    assert optimum.value < 1e-6 * data.scale
+
+
+@pytest.mark.parametrize(("name", "strength"), [("coupled drives", 0.0), ("all bounds", 3.0)])
+def test_the_bound_holds_on_the_way(name, strength, monkeypatch):
+    base, feasible = CASES[name]()
+    prior = nominal_bodies(feasible.bounds) if strength else None
+    program = cone_program(np, feasible, arms.data(base, 7, 0.3), strength, prior)
+
+    def objective(y):
+        S = program.slacks(np, y)[0][: program.bodies]
+        away = program.A @ y - program.b
+        along = np.einsum("kab,kab->k", program.prior, S)
+        return 0.5 * away @ away + strength * np.sum(along - np.linalg.slogdet(S)[1])
+
+    optimum = solver.solve_in_numpy(program)
+    assert optimum.certified
+    for most in (1, 3, 6):
+        monkeypatch.setattr(solver, "MAX_ITERATIONS", most)
+        early = solver.solve_in_numpy(program)
+        gap = objective(early.y) - objective(optimum.y)
+        assert -1e-6 <= gap <= early.error * (1 + 1e-9)
+        assert not early.certified
+
+
+def test_numpy_and_jax_find_the_same():
+    base, feasible = case(jid.robots.tx40(), (*TERMS, jid.terms.CoupledDrives()))
+    programs = [cone_program(np, feasible, arms.data(base, seed, 0.2)) for seed in range(2)]
+    stacked = jax.tree.map(lambda *x: np.stack(x), *programs)
+    many = jax.vmap(solver.solve_compiled)(stacked)
+    for k, program in enumerate(programs):
+        one = solver.solve_in_numpy(program)
+        np.testing.assert_allclose(many.value[k], one.value, rtol=1e-6)
+        assert many.certified[k]
+        assert abs(int(many.iterations[k]) - int(one.iterations)) <= 2
+
+
+def test_a_batch_is_its_data_sets_one_by_one():
+    base, feasible = case(planar(), margin=0.1)
+    factors = [arms.factor(base, seed, 0.2, 100) for seed in range(2)]
+    R, z, rows = (np.array([f[k] for f in factors]) for k in range(3))
+    estimator = jid.PhysicallyConsistent(margin=0.1)
+    many = jid.consistency.consistent_batch(base, R, z, rows, estimator)
+    one = jid.consistency.ConsistentSolver(base, estimator)
+    assert one == jid.consistency.ConsistentSolver(base, jid.PhysicallyConsistent(margin=0.1))
+    assert one != jid.consistency.ConsistentSolver(base)
+    alone = jax.jit(one)(R[1], z[1], rows[1])
+    np.testing.assert_allclose(alone.standard, many.standard[1], rtol=1e-6, atol=1e-9)
+    for k in range(2):
+        data, program = estimator.program(np, base, feasible, R[k], z[k], rows[k])
+        optimum = solver.solve_in_numpy(program)
+        p = feasible.standard_parameters(np, data, optimum.y)
+        np.testing.assert_allclose(many.parameters[k], base.from_standard(p), rtol=1e-3, atol=1e-4)
+        free = np.linalg.norm(data.b[base.size :])
+        price = np.sqrt(2.0 * optimum.value) / free - 1.0
+        np.testing.assert_allclose(many.residual_increases[k], price, atol=1e-6)
+    assert many.certified.all()
+    assert (consistency_margin(np.asarray(many.standard)[:, :20].reshape(2, 2, 10)) > 0).all()
+    with pytest.raises(ValueError, match="`R`, `z` and `rows` must have the shapes"):
+        jid.consistency.consistent_batch(base, R[:, :, :-1], z, rows)
