@@ -65,10 +65,10 @@ from jaxid.measurement.recording import read_recording as read_recording
 from jaxid.program.cache import keep_compiled as keep_compiled
 from jaxid.robot import collision as collision
 from jaxid.robot import library as robots  # noqa: F401
-from jaxid.robot.dh import from_dh as from_dh
-from jaxid.robot.drives import Drives as Drives
-from jaxid.robot.inverse_kinematics import inverse_kinematics as inverse_kinematics
-from jaxid.robot.limits import Limits as Limits
+from jaxid.robot.joints import Drives as Drives
+from jaxid.robot.joints import Limits as Limits
+from jaxid.robot.kinematics import inverse_kinematics as inverse_kinematics
+from jaxid.robot.library import from_dh as from_dh
 from jaxid.robot.robot import Robot as Robot
 from jaxid.robot.robot import Tool as Tool
 from jaxid.robot.urdf import load_urdf as load_urdf

@@ -1,4 +1,4 @@
-"""Laws of friction, trajectories, filters and snapping, and files that come back, by Hypothesis."""
+"""Laws of friction, trajectories and filters, and files that come back, by Hypothesis."""
 
 import json
 import tempfile
@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 import jaxid as jid
 from jaxid.errors import InputError
 from jaxid.experiment.experiment import load_experiment
-from jaxid.robot.plausibility import snap_angles, snap_axis, snap_rotation
 
 ARM = jid.robots.planar_arm(2, 0.4)
 ODD = (
@@ -97,24 +96,6 @@ def test_a_zero_phase_filter_knows_no_direction_of_time(seed, cutoff, order, shi
     np.testing.assert_allclose(back[inner], there[inner], atol=1e-3)
     moved = filter.smooth(x + shift, 1e-3)
     np.testing.assert_allclose(moved, there + shift, atol=1e-9 * (1 + abs(shift)))
-
-
-@settings(max_examples=40)
-@given(seed=seeds, noise=st.sampled_from([0.0, 1e-6, 5e-5, 1e-3]))
-def test_what_is_snapped_stays_and_is_near(seed, noise):
-    rng = np.random.default_rng(seed)
-    angles = rng.integers(-4, 5, 3) * np.pi / 2 + rng.uniform(-noise, noise, 3)
-    once = snap_angles(angles, 1e-4)
-    np.testing.assert_array_equal(snap_angles(once, 1e-4), once)
-    assert np.abs(once - angles).max() <= 1e-4
-    axis = np.eye(3)[rng.integers(3)] + rng.uniform(-noise, noise, 3)
-    snapped = snap_axis(axis, 1e-4)
-    np.testing.assert_allclose(snap_axis(snapped, 1e-4), snapped, rtol=0, atol=1e-15)
-    assert abs(np.linalg.norm(snapped) - 1.0) < 1e-15
-    q, r = np.linalg.qr(np.eye(3) + rng.uniform(-noise, noise, (3, 3)))
-    R = snap_rotation(q * np.sign(np.diag(r)), 1e-4)
-    np.testing.assert_array_equal(snap_rotation(R, 1e-4), R)
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
 
 
 KEYS = {

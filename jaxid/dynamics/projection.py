@@ -14,8 +14,9 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.robot.inertia import inertia_tensor
-from jaxid.robot.kinematics import placement_in_parent, placements, skew
+from jaxid.robot.kinematics import placement_in_parent, placements
 from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import skew
 
 Vector = Float[AnyArray, "3"]
 

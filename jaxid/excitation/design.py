@@ -15,9 +15,9 @@ from jaxid.excitation.criteria import AbstractCriterion
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.problem import ExcitationProblem
 from jaxid.excitation.search import Search
-from jaxid.robot.limits import Limits
-from jaxid.trajectory.basis import AbstractBasis
+from jaxid.robot.joints import Limits
 from jaxid.trajectory.fourier import FourierBasis
+from jaxid.trajectory.trajectory import AbstractBasis
 
 
 class DesignProgress(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
-from jaxid.trajectory.basis import AbstractBasis
+from jaxid.trajectory.trajectory import AbstractBasis
 
 
 class Information(eqx.Module):

@@ -14,10 +14,10 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.errors import InputError
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.basis import AbstractBasis
 from jaxid.trajectory.fourier import complete_limits
+from jaxid.trajectory.trajectory import AbstractBasis
 
 
 class Grid(NamedTuple):

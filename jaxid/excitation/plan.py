@@ -16,8 +16,8 @@ from jaxid.excitation.criteria import CRITERIA, AbstractCriterion
 from jaxid.excitation.information import Information, standard_deviations
 from jaxid.excitation.limits import JointLimits
 from jaxid.table import Column, Remark, Status, Table, percent, significant
-from jaxid.trajectory.basis import LinearTrajectory
 from jaxid.trajectory.files import save_trajectory, write_csv
+from jaxid.trajectory.trajectory import LinearTrajectory
 
 VAGUE = 0.5
 """Relative standard deviation above which a parameter counts as hardly determined."""

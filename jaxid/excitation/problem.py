@@ -17,10 +17,10 @@ from jaxid.excitation.criteria import AbstractCriterion, DOptimal, Sharpness
 from jaxid.excitation.information import Information, information, information_map
 from jaxid.excitation.interior_point import Evaluation, map_starts
 from jaxid.excitation.limits import JointLimits, scale_samples
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.basis import AbstractBasis, LinearTrajectory
 from jaxid.trajectory.fourier import FourierBasis
+from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
 CHECKED = 8160
 """Instants at which constraints are checked."""

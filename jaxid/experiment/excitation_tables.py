@@ -28,13 +28,12 @@ from jaxid.robot.collision import (
     CollisionModel,
     HalfSpace,
 )
-from jaxid.robot.kinematics import rpy_rotation
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.basis import AbstractBasis
+from jaxid.robot.rotations import rpy_rotation
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
-from jaxid.trajectory.trajectory import count_cycles
+from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
 
 CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
     "d_optimal": DOptimal,
@@ -145,8 +144,7 @@ class Collision:
             )
         model = make()
         names = [s.name for s in (*model.capsules, *model.obstacles)]
-        contacts = [(i, len(model.capsules) + k) for i, k in model.contacts]
-        pairs = [(names[i], names[k]) for i, k in (*model.pairs, *contacts)]
+        pairs = [(names[i], names[k]) for i, k in model.pairs]
         # New shapes are to be watched too: then all pairs are found anew.
         alone = not self.capsules and not self.boxes and self.ground is None
         obstacles = [o for o in model.obstacles if self.ground is None or o.name != "ground"]

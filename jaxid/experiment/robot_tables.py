@@ -12,11 +12,10 @@ from jaxid.errors import InputError
 from jaxid.experiment.decoder import Magnitude, PerJoint, Positive, Vector, quoted
 from jaxid.robot import library
 from jaxid.robot.collision import Capsule, fit_capsules
-from jaxid.robot.dh import from_dh
-from jaxid.robot.kinematics import rpy_rotation
-from jaxid.robot.limits import Limits
-from jaxid.robot.plausibility import SNAP_TOLERANCE, far_notes, fast_notes, range_fault
+from jaxid.robot.joints import Limits, far_notes, fast_notes, range_fault
+from jaxid.robot.library import from_dh
 from jaxid.robot.robot import GRAVITY, Robot, Tool
+from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 
 BUILTIN = {

@@ -11,9 +11,9 @@ from jaxid.export.inertials import feasible_bodies, joint_dynamics
 from jaxid.identification.fit import Fit
 from jaxid.io import write_bytes
 from jaxid.robot.inertia import Inertia
-from jaxid.robot.plausibility import SNAP_TOLERANCE
 from jaxid.robot.robot import Robot
-from jaxid.robot.urdf import load_urdf, merged_links
+from jaxid.robot.rotations import SNAP_TOLERANCE
+from jaxid.robot.urdf import UrdfTree, load_urdf
 
 _COMMENT = " Inertias and friction: model of "
 """Beginning of the comment that names the model; one of an earlier model is removed."""
@@ -50,7 +50,7 @@ def export_urdf(
     robot, bodies = fit.base.model.robot, feasible_bodies(fit, "a URDF file")
     described = load_urdf(source, tip=tip, base=base, snap_tolerance=snap_tolerance)
     _require_same(robot, described, source)
-    links = merged_links(source, tip=tip, base=base, snap_tolerance=snap_tolerance)
+    carriers = UrdfTree(source, tip=tip, base=base, snap_tolerance=snap_tolerance).carriers
     dynamics, efforts = joint_dynamics(fit), np.asarray(robot.known_max_forces)
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     document = etree.parse(str(source), parser)
@@ -63,7 +63,7 @@ def export_urdf(
     moved = {joints[name].find("child").get("link"): i for i, name in enumerate(robot.joint_names)}
     for link in root.iterfind("link"):
         name = link.get("name")
-        if links.get(name, (-1, None, None))[0] < 0:
+        if name not in carriers or carriers[name][0] < 0:
             continue
         for old in link.findall("inertial"):
             link.remove(old)

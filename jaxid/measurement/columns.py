@@ -8,7 +8,7 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.measurement import units
 from jaxid.measurement.units import Quantity, Unit
-from jaxid.robot.limits import per_joint
+from jaxid.robot.joints import per_joint
 
 Selection = str | int | tuple[str | int, ...]
 """A name, a pattern with `{}` for the joint's number, a position from 0, or several."""

@@ -25,7 +25,7 @@ from jaxid.measurement.observations import (
     usable_segments,
 )
 from jaxid.measurement.timestamps import NeedsMemory, TimeGrid, find_grid, uniform_grid
-from jaxid.robot.limits import per_joint
+from jaxid.robot.joints import per_joint
 from jaxid.robot.robot import Robot
 
 AT_ONCE = 65536

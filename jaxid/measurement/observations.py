@@ -17,7 +17,7 @@ from jaxid.errors import InputError
 from jaxid.measurement.decimation import AbstractDecimation, Subsample
 from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth, high_rate_hint
 from jaxid.measurement.recording import Recording
-from jaxid.robot.limits import per_joint
+from jaxid.robot.joints import per_joint
 from jaxid.robot.robot import Robot
 
 FEWEST_ROWS = 4

@@ -21,7 +21,7 @@ from jaxid.report.style import (
     house_style,
     new_figure,
 )
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
 
 

@@ -1,65 +1,31 @@
-"""Forward kinematics: placements of all frames, and the Jacobian of the end-effector.
+"""Forward and inverse kinematics: placements of all frames, and coordinates of a pose.
 
 Placements are written on 3-vectors for one sample: batch with `jax.vmap`, differentiate with
-`jax.grad`. The Jacobian is for solvers in NumPy that evaluate few poses many times, where compiling
-would take longer than computing.
+`jax.grad`. Inverse kinematics is in NumPy: it evaluates few poses many times, where compiling would
+take longer than computing.
+
+A robot with redundant joints takes, of all coordinates that reach the pose, those nearest to a
+posture. That makes them a function of the pose alone: a closed path of the end-effector is a closed
+path of the joints, as smooth as the pose. All starts, and all poses of a path, are solved at once.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, Numbers, namespace
-from jaxid.robot.plausibility import remove_rounding
+from jaxid.arrays import AnyArray, Float, Numbers, as_array
+from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import rotation_about
 
-
-def skew(a: Float[AnyArray, "3"]) -> Float[AnyArray, "3 3"]:
-    r"""Return the matrix $\tilde a$ with $\tilde a b = a \times b$ (Eq. 3)."""
-    x, y, z = a[0], a[1], a[2]
-    o = 0.0 * x
-    return namespace(a).array([[o, -z, y], [z, o, -x], [-y, x, o]])
-
-
-def rotation_about(
-    axis: Float[AnyArray, "3"], angle: Float[AnyArray, "*batch"]
-) -> Float[AnyArray, "*batch 3 3"]:
-    """Return the rotation about a unit vector by an angle [rad].
-
-    The part of a vector along the axis stays and the rest turns: in this form a constant axis
-    leaves the fewest operations.
-    """
-    xp = namespace(axis, angle)
-    along = axis[:, None] * axis[None, :]
-    cosine, sine = xp.cos(angle)[..., None, None], xp.sin(angle)[..., None, None]
-    return along + cosine * (np.eye(3) - along) + sine * skew(axis)
-
-
-def axis_rotation(axis: Numbers, angle: float) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation about a unit vector by an angle [rad], exact for quarter turns."""
-    R = rotation_about(np.asarray(axis, np.float64), np.asarray(angle))
-    return remove_rounding(np.asarray(R))
-
-
-def rpy_rotation(rpy: Numbers) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation by roll, pitch and yaw [rad] about the fixed axes x, y, z, as in URDF."""
-    roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
-    x, y, z = np.eye(3)
-    return axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
-
-
-def rotation_vectors(R: Float[np.ndarray, "poses 3 3"]) -> Float[np.ndarray, "poses 3"]:
-    """Return axis times angle of rotations, the shorter way round [rad]."""
-    twist = np.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
-    )
-    sine, cosine = np.linalg.norm(twist, axis=1) / 2, (np.trace(R, axis1=1, axis2=2) - 1) / 2
-    angle = np.arctan2(sine, cosine)
-    # Half a turn has no twist: any direction leads away from it.
-    half_turn = (sine < 1e-7) & (cosine < 0)
-    factor = np.where(sine < 1e-7, 0.5, angle / np.where(sine < 1e-7, 1.0, 2 * sine))
-    return np.where(half_turn[:, None], [np.pi, 0.0, 0.0], twist * factor[:, None])
+_REACHED = 1e-9
+"""Distance at which a pose is reached [m, and rad], and slack of a range relative to its half."""
+_LARGEST_STEP = 0.2
+"""Largest step of a joint, relative to half its range."""
+_SINGULAR = 1e-11
+"""Regularisation of directions that no joint moves."""
 
 
 def placement_in_parent(
@@ -96,47 +62,13 @@ def tip_placement(
     return R @ robot.tip_rotation, origins[robot.tip_body] + R @ robot.tip_offset
 
 
-class TipJacobian(NamedTuple):
-    """Placements of the end-effector on the ground, and their derivatives by the joints.
+def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> tuple[np.ndarray, ...]:
+    """Return placements of the end-effector and their derivatives by the joints, in NumPy.
 
-    Attributes:
-        rotation: Attitudes of the end-effector.
-        position: Positions of its origin [m].
-        turn: Angular velocities by the rates of the joints, zero of sliding ones [rad/rad].
-        shift: Velocities of the origin by the rates of the joints [m/rad or m/m].
+    Returns:
+        Attitudes; positions [m]; velocities of the origin, and angular velocities by the rates of
+        the joints, each [poses, joints, 3].
     """
-
-    rotation: Float[np.ndarray, "poses 3 3"]
-    position: Float[np.ndarray, "poses 3"]
-    turn: Float[np.ndarray, "poses joints 3"]
-    shift: Float[np.ndarray, "poses joints 3"]
-
-    def curvature(
-        self, force: Float[np.ndarray, "poses 3"], moment: Float[np.ndarray, "poses 3"]
-    ) -> Float[np.ndarray, "poses joints joints"]:
-        """Return the second derivatives of the placement by the joints, times force and moment.
-
-        Attitudes count as rotation vectors from the attitude of the end-effector.
-
-        Args:
-            force: Weights of displacements of the origin.
-            moment: Weights of rotations.
-        """
-        # An earlier joint carries the later ones with it; of two turns, half of their bracket.
-        by_shift = np.einsum("pik,pjk->pij", np.cross(force[:, None], self.turn), self.shift)
-        by_turn = np.einsum("pik,pjk->pij", np.cross(moment[:, None], self.turn), self.turn) / 2
-        upper = np.triu(by_shift + by_turn)
-        return upper + np.swapaxes(np.triu(upper, 1), 1, 2)
-
-
-def tip_jacobian(robot: Robot, q: Float[AnyArray, "poses joints"]) -> TipJacobian:
-    """Return placements and Jacobians of the end-effector, in NumPy.
-
-    Args:
-        robot: Robot of the end-effector.
-        q: Joint coordinates, one row for each pose [rad or m].
-    """
-    q = np.asarray(q)
     poses, n = q.shape
     R, r = np.broadcast_to(np.eye(3), (poses, 3, 3)), np.zeros((poses, 3))
     turn, slide, origin = (np.zeros((poses, n, 3)) for _ in range(3))
@@ -154,4 +86,278 @@ def tip_jacobian(robot: Robot, q: Float[AnyArray, "poses joints"]) -> TipJacobia
             r = r + along * q[:, i, None]
     tip = r + R @ np.asarray(robot.tip_offset)
     shift = slide + np.cross(turn, tip[:, None] - origin)
-    return TipJacobian(R @ np.asarray(robot.tip_rotation), tip, turn, shift)
+    return R @ np.asarray(robot.tip_rotation), tip, shift, turn
+
+
+def tip_curvature(
+    shift: Float[np.ndarray, "poses joints 3"],
+    turn: Float[np.ndarray, "poses joints 3"],
+    force: Float[np.ndarray, "poses 3"],
+    moment: Float[np.ndarray, "poses 3"],
+) -> Float[np.ndarray, "poses joints joints"]:
+    """Return the second derivatives of the placement by the joints, times force and moment.
+
+    Attitudes count as rotation vectors from the attitude of the end-effector.
+    """
+    # An earlier joint carries the later ones with it; of two turns, half of their bracket.
+    by_shift = np.einsum("pik,pjk->pij", np.cross(force[:, None], turn), shift)
+    by_turn = np.einsum("pik,pjk->pij", np.cross(moment[:, None], turn), turn) / 2
+    upper = np.triu(by_shift + by_turn)
+    return upper + np.swapaxes(np.triu(upper, 1), 1, 2)
+
+
+def inverse_kinematics(
+    robot: Robot,
+    position: Numbers,
+    rotation: Numbers | None = None,
+    *,
+    posture: Numbers | None = None,
+    starts: int = 32,
+    seed: int = 0,
+) -> Float[np.ndarray, " joints"]:
+    """Return joint coordinates within the limits that bring the end-effector to a pose [rad or m].
+
+    Works for any chain, by damped least squares from many random starts. Of all solutions it
+    returns the nearest to a posture, with joints measured by their ranges.
+
+    Args:
+        robot: Robot of the end-effector.
+        position: Position of the end-effector on the ground [m].
+        rotation: Attitude on the ground, whose columns are the end-effector's axes; any if None.
+        posture: Preferred coordinates [rad or m]; the middle of the ranges if None.
+        starts: Number of random coordinates to start from.
+        seed: Seed of the starts.
+
+    Raises:
+        InputError: If the pose cannot be reached: the message says how near the end-effector comes,
+            or which limit prevents it.
+    """
+    goal = _goals(np.asarray(as_array("position", position))[None], rotation)
+    task = _task(robot, posture, starts, seed)
+    return _candidates(task, goal, "the pose")[0]
+
+
+def inverse_kinematics_along(
+    robot: Robot,
+    positions: Float[np.ndarray, "poses 3"],
+    rotation: Numbers,
+    *,
+    posture: Numbers | None = None,
+    starts: int = 32,
+    seed: int = 0,
+) -> Float[np.ndarray, "poses joints"]:
+    """Return coordinates along a path of close positions, without a jump [rad or m].
+
+    Arguments as of `inverse_kinematics`, with one rotation for all poses.
+
+    Raises:
+        InputError: If a pose cannot be reached, or only with a jump or beyond the limits.
+    """
+    task, goals = _task(robot, posture, starts, seed), _goals(positions, rotation)
+    count, faults = len(goals), []
+    for start in _candidates(task, goals[:1], f"pose 1 of {count}")[:8]:
+        q = _follow(task, goals, start)
+        fault = _path_fault(task, goals, q)
+        if fault is None:
+            return np.clip(q, task.low, task.high)
+        faults.append(fault)
+    k, reason = max(faults)
+    name = f"pose {k + 1} of {count}"
+    _candidates(task, goals[k : k + 1], name)
+    raise InputError(
+        f"`{robot.name}` cannot follow the path in one piece: at {name}, {_place(goals[k])}, "
+        f"{reason}; choose another posture, or a path nearer to the middle of its reach."
+    )
+
+
+class _Task(NamedTuple):
+    """Robot, preferred coordinates, half of the ranges, limits, and random starts."""
+
+    robot: Robot
+    posture: Float[np.ndarray, " joints"]
+    half: Float[np.ndarray, " joints"]
+    low: Float[np.ndarray, " joints"]
+    high: Float[np.ndarray, " joints"]
+    starts: Float[np.ndarray, "starts joints"]
+
+
+def _task(robot: Robot, posture: Numbers | None, starts: int, seed: int) -> _Task:
+    """Return the checked task of a robot; joints without limits get a range of their own."""
+    if starts < 1:
+        raise InputError(f"`starts` must be at least 1, but is {starts}.")
+    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
+    known = np.isfinite(low) & np.isfinite(high)
+    with np.errstate(invalid="ignore"):
+        half = np.where(known, (high - low) / 2, np.where(robot.revolute, np.pi, 1.0))
+        middle = np.clip(np.where(known, (high + low) / 2, 0.0), low, high)
+    if posture is not None:
+        middle = np.asarray(as_array("posture", posture))
+        if middle.shape != (robot.joints,):
+            raise InputError(
+                f"`posture` must hold one number for each joint ({robot.joints}), but has "
+                f"shape {middle.shape}."
+            )
+    begin = np.random.default_rng(seed).uniform(-1.0, 1.0, (starts, robot.joints))
+    begin[0] = 0.0
+    return _Task(robot, middle, half, low, high, middle + half * begin)
+
+
+def _goals(positions: np.ndarray, rotation: Numbers | None) -> Float[np.ndarray, "poses 3 columns"]:
+    """Return checked poses: the position in the first column, and then the attitude if given."""
+    if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
+        raise InputError(f"a position must hold three finite numbers [m], but is {positions}.")
+    if rotation is None:
+        return positions[:, :, None]
+    R = np.asarray(as_array("rotation", rotation))
+    proper = R.shape == (3, 3) and np.abs(R.T @ R - np.eye(3)).max() < 1e-9
+    if not proper or np.linalg.det(R) < 0:
+        raise InputError("`rotation` must be an orthonormal, right-handed matrix of 3 rows.")
+    attitudes = np.broadcast_to(R, (len(positions), 3, 3))
+    return np.concatenate([positions[:, :, None], attitudes], axis=2)
+
+
+def _place(goal: np.ndarray) -> str:
+    return f"({', '.join(f'{x:.3f}' for x in goal[:, 0])}) m"
+
+
+def _linearise(task: _Task, goals: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return distances from poses [m, rad], their Jacobians by scaled joints, shift and turn."""
+    R, r, shift, turn = tip_jacobian(task.robot, q)
+    e, J = r - goals[:, :, 0], shift
+    if goals.shape[2] > 1:
+        away = Rotation.from_matrix(R @ np.swapaxes(goals[:, :, 1:], 1, 2)).as_rotvec()
+        e, J = np.concatenate([e, away], axis=1), np.concatenate([J, turn], axis=2)
+    return e, np.swapaxes(J, 1, 2) * task.half, shift, turn
+
+
+def _distances(task: _Task, goals: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return distances [m] and angles [rad] of the end-effector from the poses."""
+    return np.linalg.norm(_linearise(task, goals, q)[0].reshape(len(q), -1, 3), axis=2)
+
+
+def _beyond(task: _Task, q: np.ndarray) -> np.ndarray:
+    """Return how far coordinates lie outside of their ranges, relative to half of them."""
+    return np.maximum(task.low - q, q - task.high) / task.half
+
+
+def _search(task: _Task, goals: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Go from the starts to the poses by steps of Levenberg and Marquardt within limits."""
+    q, eye = np.clip(task.starts, low, high), np.eye(task.robot.joints)
+    damping = np.full(len(q), 1e-2)
+    e, J, _, _ = _linearise(task, goals, q)
+    for _ in range(80):
+        H = np.swapaxes(J, 1, 2) @ J + damping[:, None, None] * eye
+        slope = np.einsum("pij,pi->pj", J, e)[..., None]
+        then = np.clip(q - task.half * np.linalg.solve(H, slope)[..., 0], low, high)
+        e_then, J_then, _, _ = _linearise(task, goals, then)
+        better = (e_then**2).sum(axis=1) < (e**2).sum(axis=1)
+        damping = np.clip(damping * np.where(better, 0.2, 4.0), 1e-12, 1e3)
+        q, e = np.where(better[:, None], then, q), np.where(better[:, None], e_then, e)
+        J = np.where(better[:, None, None], J_then, J)
+    return q
+
+
+def _descend(
+    task: _Task, goals: np.ndarray, q: np.ndarray, multipliers: np.ndarray, gauss: int, newton: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Go to the coordinates nearest to the posture, and to the multipliers of their poses.
+
+    Steps solve the linearised conditions, the last `newton` of them with the poses' curvature.
+    """
+    n, m = q.shape[1], multipliers.shape[1]
+    K = np.zeros((len(q), n + m, n + m))
+    K[:, n:, n:] = -_SINGULAR * np.eye(m)
+    for k in range(gauss + newton):
+        e, J, shift, turn = _linearise(task, goals, q)
+        K[:, :n, :n], K[:, :n, n:], K[:, n:, :n] = np.eye(n), np.swapaxes(J, 1, 2), J
+        if k >= gauss:
+            force, moment = (
+                np.pad(multipliers, ((0, 0), (0, 6 - m))).reshape(-1, 2, 3).swapaxes(0, 1)
+            )
+            H = tip_curvature(shift, turn, force, moment)
+            K[:, :n, :n] += H * (task.half[:, None] * task.half)
+        slope = (q - task.posture) / task.half + np.einsum("pij,pi->pj", J, multipliers)
+        step = np.linalg.solve(K, np.concatenate([slope, e], axis=1)[..., None])[..., 0]
+        step /= np.maximum(1.0, np.abs(step[:, :n]).max(axis=1, keepdims=True) / _LARGEST_STEP)
+        q, multipliers = q - task.half * step[:, :n], multipliers - step[:, n:]
+    return q, multipliers
+
+
+def _try_starts(task: _Task, goal: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return solutions from all starts: nearest to the posture, and as the search found them."""
+    goals = np.broadcast_to(goal, (len(task.starts), *goal.shape[1:]))
+    found = _search(task, goals, low, high)
+    none = np.zeros((len(found), 3 if goal.shape[2] == 1 else 6))
+    return np.concatenate([_descend(task, goals, found, none, 60, 6)[0], found])
+
+
+def _candidates(task: _Task, goal: np.ndarray, name: str) -> list[np.ndarray]:
+    """Return coordinates that reach a pose within the limits, the nearest to the posture first.
+
+    Raises:
+        InputError: If there are none; the message names the reason.
+    """
+    q = _try_starts(task, goal, task.low, task.high)
+    reached = _distances(task, np.broadcast_to(goal, (len(q), *goal.shape[1:])), q).max(axis=1)
+    good = q[(reached <= _REACHED) & (_beyond(task, q).max(axis=1) <= _REACHED)]
+    away = np.sum(((good - task.posture) / task.half) ** 2, axis=1)
+    kept: list[np.ndarray] = []
+    for one in good[np.argsort(away)]:
+        if all(np.abs((one - other) / task.half).max() > 1e-6 for other in kept):
+            kept.append(np.clip(one, task.low, task.high))
+    if not kept:
+        raise InputError(f"{name}, {_place(goal[0])}, {_explanation(task, goal)}")
+    return kept
+
+
+def _follow(task: _Task, goals: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return coordinates at all poses: stride by stride, then all between at once."""
+    # Strides of about 0.03 m, with both ends.
+    way = np.linalg.norm(np.diff(goals[:, :, 0], axis=0), axis=1)
+    stride = np.floor(np.concatenate([[0.0], np.cumsum(way)]) / 0.03)
+    first = np.flatnonzero(np.diff(stride, prepend=-1.0) > 0)
+    places = np.unique(np.append(first, len(goals) - 1))
+    q, multipliers = _descend(task, goals[:1], start[None], np.zeros((1, 6)), 60, 0)
+    steps = []
+    for k in places:
+        q, multipliers = _descend(task, goals[k : k + 1], q, multipliers, 0, 4)
+        steps.append(np.concatenate([q[0], multipliers[0]]))
+    every = np.arange(len(goals))
+    guess = np.stack([np.interp(every, places, x) for x in np.transpose(steps)], axis=1)
+    return _descend(task, goals, guess[:, :-6], guess[:, -6:], 0, 6)[0]
+
+
+def _path_fault(task: _Task, goals: np.ndarray, q: np.ndarray) -> tuple[int, str] | None:
+    """Return the first pose of a path that fails, and the reason; None if none does."""
+    missed = ~(_distances(task, goals, q).max(axis=1) <= _REACHED)
+    beyond = _beyond(task, q)
+    outside = beyond.max(axis=1) > _REACHED
+    jumps = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half).max(axis=1) > 0.25
+    failed = np.flatnonzero(missed | jumps | outside)
+    if not len(failed):
+        return None
+    k = int(failed[0])
+    if outside[k] and not missed[k]:
+        return k, f"joint `{task.robot.joint_names[int(beyond[k].argmax())]}` leaves its range"
+    return k, "the joints would have to jump, for the pose is singular"
+
+
+def _explanation(task: _Task, goal: np.ndarray) -> str:
+    """Return the reason why there are no coordinates for a pose, as the predicate of a sentence."""
+    robot, free = task.robot, np.full(task.robot.joints, np.inf)
+    q = _try_starts(task, goal, -free, free)
+    distances = _distances(task, np.broadcast_to(goal, (len(q), *goal.shape[1:])), q)
+    reached = distances.max(axis=1) <= _REACHED
+    if reached.any():
+        beyond = _beyond(task, q[reached])
+        least = beyond[int(beyond.max(axis=1).argmin())]
+        return (
+            f"can be reached by `{robot.name}` only beyond the range of joint "
+            f"`{robot.joint_names[int(least.argmax())]}`: choose another pose, or more `starts`."
+        )
+    nearest = distances[int(np.argmin(distances.sum(axis=1)))]
+    angle = "" if len(nearest) == 1 else f" and {nearest[1]:.3g} rad"
+    return (
+        f"is out of reach of `{robot.name}`: its end-effector comes to within {nearest[0]:.3g} m"
+        f"{angle} of it."
+    )

@@ -9,10 +9,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.drives import Drives
 from jaxid.robot.inertia import Inertia
-from jaxid.robot.limits import Limits
-from jaxid.robot.plausibility import FARTHEST, check_name, far_notes
+from jaxid.robot.joints import FARTHEST, Drives, Limits, far_notes
 from jaxid.table import Column, Table
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -141,7 +139,7 @@ class Robot(eqx.Module):
         self.name, self.joint_names = name, tuple(names)
         self.parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
         self.revolute = tuple(bool(r) for r in revolute)
-        self.axis = _unit_vectors(_checked("`axis`", axis, (n, 3)))
+        self.axis = self._unit_axes(_checked("`axis`", axis, (n, 3)))
         self.rotation = _rotations("`rotation`", rotation, (n, 3, 3))
         self.offset = _checked("`offset`", offset, (n, 3))
         self.gravity = _checked("`gravity`", gravity, (3,))
@@ -156,6 +154,15 @@ class Robot(eqx.Module):
         self._check_joints()
         self.notes = tuple(dict.fromkeys((*notes, *self._far_notes())))
 
+    def _unit_axes(self, axes: AnyArray) -> AnyArray:
+        if isinstance(axes, jax.Array):
+            return axes
+        length = np.linalg.norm(axes, axis=-1, keepdims=True)
+        if (length < 1e-9).any():
+            j = int(length.argmin()) + 1
+            raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
+        return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
+
     def _check_joints(self) -> None:
         """Reject names, parents and bodies that do not fit the number of joints."""
         n = len(self.revolute)
@@ -169,7 +176,8 @@ class Robot(eqx.Module):
                 f"`joint_names` must be {n} different names, but is {self.joint_names}."
             )
         for name in (self.name, *self.joint_names):
-            check_name("a robot or joint", name)
+            if not name.isprintable():
+                raise InputError(f"the name {name!r} must be printable: remove the characters.")
         carrier = self.tip_body if self.tool is None else self.tool.body
         for field, body in (("tip_body", self.tip_body), ("tool.body", carrier)):
             if not 0 <= body < n:
@@ -183,16 +191,14 @@ class Robot(eqx.Module):
     def _far_notes(self) -> tuple[str, ...]:
         """Reject offsets that no robot has, and return notes on those that may be in mm."""
         lengths = {"`tip_offset`": self.tip_offset}
-        if self.offset.ndim == 2 and isinstance(self.offset, np.ndarray):
+        if self.offset.ndim == 2:
             places = [f"`offset` of joint `{name}`" for name in self.joint_names]
             lengths |= dict(zip(places, self.offset, strict=True))
-        notes = []
-        for place, r in lengths.items():
-            if isinstance(r, np.ndarray) and np.abs(r).max() > FARTHEST:
+        known = {place: r for place, r in lengths.items() if isinstance(r, np.ndarray)}
+        for place, r in known.items():
+            if np.abs(r).max() > FARTHEST:
                 raise InputError(f"{place} is {np.abs(r).max():g} m long: give it in metres.")
-            if isinstance(r, np.ndarray):
-                notes += far_notes(place, r)
-        return tuple(notes)
+        return tuple(note for place, r in known.items() for note in far_notes(place, r))
 
     @property
     def joints(self) -> int:
@@ -328,16 +334,6 @@ def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
     if isinstance(array, np.ndarray) and not np.isfinite(array).all():
         raise InputError(f"{name} must hold finite numbers.")
     return array
-
-
-def _unit_vectors(axes: AnyArray) -> AnyArray:
-    if isinstance(axes, jax.Array):
-        return axes
-    length = np.linalg.norm(axes, axis=-1, keepdims=True)
-    if (length < 1e-9).any():
-        j = int(np.argwhere(length < 1e-9)[0][-2]) + 1
-        raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
-    return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
 
 
 def _rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:

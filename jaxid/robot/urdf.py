@@ -2,35 +2,24 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxid.arrays import AnyArray, Float, Numbers
 from jaxid.errors import InputError
-from jaxid.robot.kinematics import rpy_rotation
-from jaxid.robot.limits import Limits
-from jaxid.robot.plausibility import (
-    FARTHEST,
-    LARGEST_ANGLE,
-    SNAP_TOLERANCE,
-    angle_notes,
-    array_notes,
-    check_tolerance,
-    far_notes,
-    fast_notes,
-    range_fault,
-    snap_angles,
-    snap_axis,
-    snap_rotation,
-)
+from jaxid.robot.inertia import Inertia
+from jaxid.robot.joints import FARTHEST, Limits, far_notes, fast_notes, range_fault
 from jaxid.robot.robot import GRAVITY, Robot
-from jaxid.robot.urdf_tree import UrdfJoint, UrdfTree, words
+from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation, snap_angles, snap_directions
 
 _TURNING = ("revolute", "continuous")
 _ZERO = (0.0, 0.0, 0.0)
 _ENDLESS = 2e4
 """Range from which a joint turns without end [rad]."""
+_LARGEST_ANGLE = 2 * np.pi + 0.01
+"""Largest roll, pitch or yaw that can be in radians; a full turn may be rounded [rad]."""
 
 
 def load_urdf(
@@ -72,25 +61,24 @@ def load_urdf(
         InputError: If it is no URDF, is no open tree, has a mimic, floating or planar joint on
             the way, or angles or lengths in other units.
     """
-    tree = UrdfTree(path)
-    bodies = _merge(tree, base, tip, snap_tolerance)
-    limits, limit_notes = _limits(tree, bodies.joints)
-    end_body, end_rotation, end_offset = bodies.links[bodies.tip]
+    tree = UrdfTree(path, base=base, tip=tip, snap_tolerance=snap_tolerance)
+    limits, limit_notes = _limits(tree)
+    tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     robot = Robot(
         tree.name,
-        parent=tuple(bodies.parent),
-        revolute=tuple(joint.kind in _TURNING for joint in bodies.joints),
-        axis=bodies.axis,
-        rotation=bodies.rotation,
-        offset=bodies.offset,
-        joint_names=tuple(joint.name for joint in bodies.joints),
+        parent=tuple(tree.parent),
+        revolute=tuple(joint.get("type") in _TURNING for joint in tree.joints),
+        axis=tree.axis,
+        rotation=tree.rotation,
+        offset=tree.offset,
+        joint_names=tuple(joint.get("name") for joint in tree.joints),
         gravity=gravity,
         limits=limits,
-        tip_body=end_body,
-        tip_rotation=end_rotation,
-        tip_offset=end_offset,
+        tip_body=tip_body,
+        tip_rotation=tip_rotation,
+        tip_offset=tip_offset,
         source=tree.path,
-        notes=(*bodies.notes, *limit_notes, *_inertial_notes(tree, bodies)),
+        notes=(*tree.notes, *limit_notes, *_inertial_notes(tree)),
     )
     return robot.mounted(base_rotation, base_position)
 
@@ -122,215 +110,365 @@ def urdf_parameters(
         FileNotFoundError: If the file does not exist.
         InputError: If the file cannot be loaded, an inertia is not finite, or a link cannot exist.
     """
-    tree = UrdfTree(path)
-    bodies = _merge(tree, base, tip, snap_tolerance)
-    parameters = np.zeros((len(bodies.joints), 10))
-    for name, (i, R, r) in bodies.links.items():
-        inertial = tree.inertial(name) if i >= 0 else None
-        if inertial is None:
+    tree = UrdfTree(path, base=base, tip=tip, snap_tolerance=snap_tolerance)
+    parameters = np.zeros((len(tree.joints), 10))
+    for name, (body, R, r) in tree.carriers.items():
+        if body < 0 or (inertial := tree.inertial(name)) is None:
             continue
-        if check and (reason := inertial.fault()):
+        inertia, fault = inertial
+        if check and fault:
             raise InputError(
-                f"`{tree.path}`: the inertial of link `{name}` belongs to no body: {reason}; "
+                f"`{tree.path}`: the inertial of link `{name}` belongs to no body: {fault}; "
                 "correct the file, or do without its inertias."
             )
-        parameters[i] += inertial.in_link().moved(R, r).parameters
+        parameters[body] += inertia.moved(R, r).parameters
     return parameters.ravel()
 
 
-def merged_links(
-    path: str | Path,
-    *,
-    tip: str | None = None,
-    base: str | None = None,
-    snap_tolerance: float = SNAP_TOLERANCE,
-) -> dict[str, tuple[int, np.ndarray, np.ndarray]]:
-    """Return for each link the body that carries it, and its placement in the body's frame.
+class UrdfTree:
+    """Links and joints of a URDF file, with links on fixed joints merged into their bodies.
 
-    A link on the ground has body -1 and its placement in the frame of the base link.
+    Only what kinematics and inertias need is read: an error in a mesh, a transmission or the
+    element of a simulator does no harm. Arguments and errors are those of `load_urdf`.
 
-    Args:
-        path: URDF file.
-        tip: As in `load_urdf`.
-        base: As in `load_urdf`.
-        snap_tolerance: As in `load_urdf` [rad].
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        InputError: If the file cannot be loaded.
+    Attributes:
+        links: Elements of the links, by name.
+        carriers: For each link its body (-1: ground) and its placement in the body's frame.
+        joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset` as in
+            `Robot`.
+        tip: Name of the end-effector's link.
+        notes: Notes on angles and axes that were snapped.
     """
-    return _merge(UrdfTree(path), base, tip, snap_tolerance).links
 
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        base: str | None = None,
+        tip: str | None = None,
+        snap_tolerance: float = SNAP_TOLERANCE,
+    ) -> None:
+        self.path = str(path)
+        element = _read_xml(path)
+        name = element.get("name") or Path(path).stem
+        self.name = "".join(c if c.isprintable() else " " for c in name)
+        self.links = self._named(element, "link")
+        self._below: dict[str, list[Any]] = {link: [] for link in self.links}
+        self._above: dict[str, Any] = {}
+        for joint in self._named(element, "joint").values():
+            self._add(joint)
+        root = self._find_root()
+        for argument, link in (("base", base), ("tip", tip)):
+            if link is not None and link not in self.links:
+                raise InputError(
+                    f"`{argument}` must be a link of `{self.path}`, but is `{link}`; its links are "
+                    f"{_listed(list(self.links))}."
+                )
+        self.joints: list[Any] = []
+        self.parent: list[int] = []
+        self.axis: list[np.ndarray] = []
+        self.rotation: list[np.ndarray] = []
+        self.offset: list[np.ndarray] = []
+        self.notes: list[str] = []
+        self._merge(root if base is None else base, tip, snap_tolerance)
 
-class _Bodies(NamedTuple):
-    """Moving joints and, for each link, its body (-1: ground) and its placement in it."""
+    def _named(self, root: Any, tag: str) -> dict[str, Any]:
+        """Return the elements of a tag by their names."""
+        found: dict[str, Any] = {}
+        for element in root.iterfind(tag):
+            name = self._attribute(element, "name")
+            if not name.isprintable():
+                raise InputError(f"{self.place(element)}: the name {name!r} must be printable.")
+            if name in found:
+                raise InputError(f"`{self.path}` has two {tag}s named `{name}`: rename one.")
+            found[name] = element
+        return found
 
-    joints: list[UrdfJoint]
-    parent: list[int]
-    axis: list[np.ndarray]
-    rotation: list[np.ndarray]
-    offset: list[np.ndarray]
-    links: dict[str, tuple[int, np.ndarray, np.ndarray]]
-    tip: str
-    notes: tuple[str, ...]
+    def _add(self, joint: Any) -> None:
+        """Enter a joint between the links that it connects."""
+        self._attribute(joint, "type")
+        for tag in ("parent", "child"):
+            if (end := self.child(joint, tag)) is None:
+                raise InputError(f"{self.place(joint)}: the joint has no `<{tag}>`.")
+            if (link := self._attribute(end, "link")) not in self.links:
+                raise self._error(joint, f"connects link `{link}`, which the file does not define")
+        parent, child = (joint.find(tag).get("link") for tag in ("parent", "child"))
+        if child in self._above:
+            raise self._error(
+                joint,
+                f"moves link `{child}`, which joint `{self._above[child].get('name')}` moves as "
+                "well; closed loops are not supported, so open the loop by removing one of the two",
+            )
+        self._above[child] = joint
+        self._below[parent].append(joint)
 
+    def _find_root(self) -> str:
+        """Return the only link that no joint moves."""
+        roots = [link for link in self.links if link not in self._above]
+        if len(roots) > 1:
+            raise InputError(
+                f"`{self.path}` has several root links ({_listed(roots)}), but must be one tree: "
+                "connect them by fixed joints."
+            )
+        reached = list(roots)
+        for link in reached:
+            reached += [joint.find("child").get("link") for joint in self._below[link]]
+        for link in self.links:
+            if link not in reached:
+                raise self._error(
+                    self._above[link],
+                    f"is part of a closed loop: no path leads from a root link to `{link}`; "
+                    "remove one joint of the loop",
+                )
+        if not roots:
+            raise InputError(f"`{self.path}` has no links.")
+        return roots[0]
 
-def _merge(tree: UrdfTree, base: str | None, tip: str | None, snap_tolerance: float) -> _Bodies:
-    """Merge links on fixed joints into the bodies that carry them."""
-    tolerance = check_tolerance(snap_tolerance)
-    base = tree.root if base is None else tree.require_link("base", base)
-    chain = None
-    if tip is not None:
-        chain = {joint.name for joint in tree.chain(base, tree.require_link("tip", tip))}
-    out = _Bodies([], [], [], [], [], {base: (-1, np.eye(3), np.zeros(3))}, "", ())
-    notes: list[str] = []
-    length = {base: (0, 0)}
-    waiting = tree.children[base][::-1]
-    while waiting:
-        joint = waiting.pop()
-        fixed = joint.kind == "fixed"
-        if not fixed and chain is not None and joint.name not in chain:
-            continue
-        rotation, offset, origin_notes = _origin(tree, joint, tolerance)
-        carrier, R, r = out.links[joint.parent]
-        exact = snap_rotation(R @ rotation, tolerance)
-        notes += origin_notes
-        notes += array_notes(joint.name, "attitude", R @ rotation, exact)
-        placement = (exact, r + R @ offset)
-        if fixed:
-            out.links[joint.child] = (carrier, *placement)
-        else:
-            axis, axis_notes = _axis(tree, joint, tolerance)
-            notes += axis_notes
-            out.links[joint.child] = (len(out.joints), np.eye(3), np.zeros(3))
-            out.joints.append(joint)
-            out.parent.append(carrier)
-            out.axis.append(axis)
-            out.rotation.append(placement[0])
-            out.offset.append(placement[1])
-        moving, links = length[joint.parent]
-        length[joint.child] = (moving + (not fixed), links + 1)
-        waiting += tree.children[joint.child][::-1]
-    end = max(length, key=lambda link: length[link]) if tip is None else tip
-    if out.links[end][0] < 0:
-        below = f"below link `{base}`" if tip is None else f"between links `{base}` and `{tip}`"
-        raise InputError(
-            f"`{tree.path}` has no moving joint {below}: choose another `base` or `tip`."
-        )
-    return out._replace(tip=end, notes=tuple(notes))
+    def _merge(self, base: str, tip: str | None, tolerance: float) -> None:
+        """Merge links on fixed joints into the bodies that carry them, depth first."""
+        chain = None if tip is None else self._chain(base, tip)
+        self.carriers = {base: (-1, np.eye(3), np.zeros(3))}
+        length = {base: (0, 0)}
+        waiting = self._below[base][::-1]
+        while waiting:
+            joint = waiting.pop()
+            name, fixed = joint.get("name"), joint.get("type") == "fixed"
+            if not fixed and chain is not None and joint not in chain:
+                continue
+            parent, child = (joint.find(tag).get("link") for tag in ("parent", "child"))
+            rotation, offset = self._origin(joint, tolerance)
+            body, R, r = self.carriers[parent]
+            r = r + R @ offset
+            R, notes = snap_directions(name, "attitude", R @ rotation, tolerance)
+            self.notes += notes
+            if fixed:
+                self.carriers[child] = (body, R, r)
+            else:
+                self.axis.append(self._axis(joint, tolerance))
+                self.carriers[child] = (len(self.joints), np.eye(3), np.zeros(3))
+                self.joints.append(joint)
+                self.parent.append(body)
+                self.rotation.append(R)
+                self.offset.append(r)
+            moving, links = length[parent]
+            length[child] = (moving + (not fixed), links + 1)
+            waiting += self._below[child][::-1]
+        self.tip = max(length, key=lambda link: length[link]) if tip is None else tip
+        if self.carriers[self.tip][0] < 0:
+            below = f"below link `{base}`" if tip is None else f"between links `{base}` and `{tip}`"
+            raise InputError(
+                f"`{self.path}` has no moving joint {below}: choose another `base` or `tip`."
+            )
 
+    def _chain(self, base: str, tip: str) -> list[Any]:
+        """Return the joints between two links."""
+        joints, link = [], tip
+        while link != base:
+            if link not in self._above:
+                raise InputError(
+                    f"`{self.path}`: no chain leads from `base` `{base}` to `tip` `{tip}`."
+                )
+            joints.append(self._above[link])
+            link = joints[-1].find("parent").get("link")
+        return joints
 
-def _origin(
-    tree: UrdfTree, joint: UrdfJoint, tolerance: float
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    element = tree.child(joint.element, "origin")
-    offset, rpy = (tree.numbers(element, key, _ZERO) for key in ("xyz", "rpy"))
-    if np.abs(offset).max() > FARTHEST:
-        raise tree.error(
-            joint,
-            f'has `xyz="{words(offset)}"`, which is {np.abs(offset).max():g} m: lengths in a '
-            "URDF are in metres",
-        )
-    if np.abs(rpy).max() > LARGEST_ANGLE:
-        raise tree.error(
-            joint,
-            f'has `rpy="{words(rpy)}"`, which is more than a turn: angles in a URDF are in '
-            "radians, not degrees",
-        )
-    snapped = snap_angles(rpy, tolerance)
-    notes = angle_notes(joint.name, ("roll", "pitch", "yaw"), rpy, snapped)
-    return rpy_rotation(snapped), offset, notes
+    def _origin(self, joint: Any, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return attitude and origin of a joint in its parent link."""
+        element = self.child(joint, "origin")
+        offset, rpy = (self.numbers(element, key, _ZERO) for key in ("xyz", "rpy"))
+        for key, values, largest, unit in (
+            ("xyz", offset, FARTHEST, "lengths in a URDF are in metres"),
+            ("rpy", rpy, _LARGEST_ANGLE, "angles in a URDF are in radians, not degrees"),
+        ):
+            if np.abs(values).max() > largest:
+                raise self._error(
+                    joint, f'has `{key}="{_words(values)}"`, which is too large: {unit}'
+                )
+        snapped, notes = snap_angles(joint.get("name"), ("roll", "pitch", "yaw"), rpy, tolerance)
+        self.notes += notes
+        return rpy_rotation(snapped), offset
 
-
-def _axis(tree: UrdfTree, joint: UrdfJoint, tolerance: float) -> tuple[np.ndarray, tuple[str, ...]]:
-    mimic = tree.child(joint.element, "mimic")
-    fault = None
-    if joint.kind not in (*_TURNING, "prismatic"):
-        fault = f"is {joint.kind}, but only revolute, continuous and prismatic joints can be used"
-    elif mimic is not None:
-        fault = f"mimics joint `{mimic.get('joint')}`, but every joint must move freely"
-    if fault:
+    def _axis(self, joint: Any, tolerance: float) -> np.ndarray:
+        """Return the unit vector of a moving joint's axis."""
+        kind, mimic = joint.get("type"), self.child(joint, "mimic")
         cure = "choose `tip` (or `base`) so that the chain avoids it, or make it fixed"
-        raise tree.error(joint, f"{fault}: {cure}")
-    axis = tree.numbers(tree.child(joint.element, "axis"), "xyz", (1.0, 0.0, 0.0))
-    length = np.linalg.norm(axis)
-    if length < 1e-9:
-        raise tree.error(joint, "has the zero vector as its axis: give it a direction")
-    snapped = snap_axis(axis, tolerance)
-    return snapped, array_notes(joint.name, "axis", axis / length, snapped)
+        if kind not in (*_TURNING, "prismatic"):
+            usable = "only revolute, continuous and prismatic joints can be used"
+            raise self._error(joint, f"is {kind}, but {usable}: {cure}")
+        if mimic is not None:
+            other = mimic.get("joint")
+            raise self._error(
+                joint, f"mimics joint `{other}`, but every joint must move freely: {cure}"
+            )
+        axis = self.numbers(self.child(joint, "axis"), "xyz", (1.0, 0.0, 0.0))
+        length = np.linalg.norm(axis)
+        if length < 1e-9:
+            raise self._error(joint, "has the zero vector as its axis: give it a direction")
+        snapped, notes = snap_directions(joint.get("name"), "axis", axis / length, tolerance)
+        self.notes += notes
+        return snapped
 
-
-def _limits(tree: UrdfTree, joints: list[UrdfJoint]) -> tuple[Limits, tuple[str, ...]]:
-    n = len(joints)
-    values = np.full((4, n), np.inf)
-    values[0] = -np.inf
-    notes: list[str] = []
-    for i, joint in enumerate(joints):
-        element = tree.child(joint.element, "limit")
+    def inertial(self, link: str) -> tuple[Inertia, str] | None:
+        """Return a link's inertia in its own frame, and why no body has it; None if it has none."""
+        element = self.child(self.links[link], "inertial")
         if element is None:
-            continue
-        turns = joint.kind in _TURNING
-        if joint.kind != "continuous":
-            (low, high), range_notes = _range(tree, joint, element)
-            values[:2, i] = low, high
-            notes += range_notes
+            return None
+        origin, moments = self.child(element, "origin"), self.child(element, "inertia")
+        (mass,) = self.numbers(self.child(element, "mass"), "value", (0.0,))
+        rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+        tensor = np.array([[self.numbers(moments, key, (0.0,))[0] for key in row] for row in rows])
+        xyz, rpy = (self.numbers(origin, key, _ZERO) for key in ("xyz", "rpy"))
+        R = rpy_rotation(rpy)
+        fault = Inertia(mass, xyz, tensor).fault(rounding=0.01)
+        if np.abs(rpy).max() > _LARGEST_ANGLE:
+            fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
+        return Inertia(mass, xyz, R @ tensor @ R.T), fault
+
+    def place(self, element: Any) -> str:
+        """Return file and line of an element, for messages."""
+        return f"`{self.path}`, line {element.sourceline}"
+
+    def _error(self, joint: Any, complaint: str) -> InputError:
+        return InputError(f"`{self.path}`: joint `{joint.get('name')}` {complaint}.")
+
+    def _attribute(self, element: Any, key: str) -> str:
+        if element.get(key) is None:
+            raise InputError(f"{self.place(element)}: `<{element.tag}>` needs the attribute {key}.")
+        return element.get(key)
+
+    def child(self, element: Any, tag: str) -> Any:
+        """Return the only child element of a name, or None."""
+        found = element.findall(tag)
+        if len(found) > 1:
+            raise InputError(
+                f"{self.place(found[1])}: `<{element.tag}>` has a second `<{tag}>`, but only one "
+                "is allowed."
+            )
+        return found[0] if found else None
+
+    def numbers(
+        self, element: Any, key: str, default: tuple[float, ...], *, infinite: bool = False
+    ) -> np.ndarray:
+        """Return the numbers of an attribute, or the default where the element lacks it.
+
+        Raises:
+            InputError: If one is not finite, or there are too few or too many.
+        """
+        text = None if element is None else element.get(key)
+        if text is None:
+            return np.array(default)
+        try:
+            array = np.array([float(word) for word in text.split()])
+        except ValueError:
+            array = np.zeros(0)
+        wrong = np.isnan(array) if infinite else ~np.isfinite(array)
+        if array.shape != (len(default),) or wrong.any():
+            raise InputError(
+                f"{self.place(element)}: `{key}` must hold {len(default)} finite "
+                f'{"number" if len(default) == 1 else "numbers"}, but is "{text}".'
+            )
+        return array
+
+    def limit(self, joint: Any, key: str, unknown: float) -> float:
+        """Return a number of a joint's `<limit>`, which may be infinite."""
+        return float(self.numbers(self.child(joint, "limit"), key, (unknown,), infinite=True)[0])
+
+
+def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
+    values, notes = np.full((4, len(tree.joints)), np.inf), []
+    values[0] = -np.inf
+    for i, joint in enumerate(tree.joints):
+        name, turns = joint.get("name"), joint.get("type") in _TURNING
+        if joint.get("type") != "continuous":
+            low, high = values[:2, i] = _range(tree, joint)
+            if low == high == 0.0:
+                values[:2, i] = -np.inf, np.inf
+                notes.append(f"joint `{name}`: a range from 0 to 0 is taken as unknown.")
         for k, key in enumerate(("velocity", "effort"), 2):
-            value = tree.numbers(element, key, (np.inf,), infinite=True)[0]
+            value = tree.limit(joint, key, np.inf)
             if value > 0.0:
                 values[k, i] = value
             else:
-                notes.append(f"joint `{joint.name}`: {key} {value:g} is taken as unknown.")
-        notes += fast_notes(joint.name, values[2, i], turns)
+                notes.append(f"joint `{name}`: {key} {value:g} is taken as unknown.")
+        notes += fast_notes(name, values[2, i], turns)
         if not turns:
-            notes += far_notes(f"joint `{joint.name}`: an end of its range", values[:2, i])
+            notes += far_notes(f"joint `{name}`: an end of its range", values[:2, i])
     low, high, speed, force = values
-    limits = Limits(n, position_min=low, position_max=high, velocity=speed, force=force)
-    return limits, tuple(notes)
+    limits = Limits(position_min=low, position_max=high, velocity=speed, force=force)
+    return limits, notes
 
 
-def _range(
-    tree: UrdfTree, joint: UrdfJoint, element: Any
-) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """Return the range of a joint, infinite where unknown, and notes."""
-    given = {}
-    for key, unlimited in (("lower", -np.inf), ("upper", np.inf)):
-        other = tree.numbers(
-            element, "upper" if key == "lower" else "lower", (np.inf,), infinite=True
-        )
-        # A missing bound is zero if the other one is given, as the URDF standard says.
-        default = 0.0 if np.isfinite(other[0]) else unlimited
-        given[key] = float(tree.numbers(element, key, (default,), infinite=True)[0])
-    low, high = given["lower"], given["upper"]
-    if low == high == 0.0:
-        note = f"joint `{joint.name}`: a range from 0 to 0 is taken as unknown."
-        return (-np.inf, np.inf), (note,)
-    turns = joint.kind in _TURNING
+def _range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
+    """Return the range of a joint, infinite where unknown."""
+    low, high = (tree.limit(joint, key, np.nan) for key in ("lower", "upper"))
+    # A missing bound is zero if the other one is given, as the URDF standard says.
+    bounded = np.isfinite(low) or np.isfinite(high)
+    low = (0.0 if bounded else -np.inf) if np.isnan(low) else low
+    high = (0.0 if bounded else np.inf) if np.isnan(high) else high
+    turns = joint.get("type") in _TURNING
     if turns and high - low >= _ENDLESS:
-        return (-np.inf, np.inf), ()
+        return -np.inf, np.inf
     if fault := range_fault(low, high, turns):
         unit = "radians, not degrees" if turns else "metres"
-        raise tree.error(joint, f"{fault}: limits in a URDF are in {unit}")
-    if low >= high:
-        raise tree.error(
+        raise tree._error(joint, f"{fault}: limits in a URDF are in {unit}")
+    if low >= high and (low, high) != (0.0, 0.0):
+        raise tree._error(
             joint,
             f"ranges from {low:g} to {high:g}, but the lower end must be below the upper one",
         )
-    return (low, high), ()
+    return low, high
 
 
-def _inertial_notes(tree: UrdfTree, bodies: _Bodies) -> Iterator[str]:
+def _inertial_notes(tree: UrdfTree) -> Iterator[str]:
     """Yield notes on bodies without mass, and on links that cannot exist."""
-    inertials = {n: tree.inertial(n) for n, (i, _, _) in bodies.links.items() if i >= 0}
-    for i, joint in enumerate(bodies.joints):
-        carried = [inertials[name] for name in inertials if bodies.links[name][0] == i]
-        if all(inertial is None for inertial in carried):
+    inertials = {n: tree.inertial(n) for n, (body, _, _) in tree.carriers.items() if body >= 0}
+    massive = {tree.carriers[name][0] for name in inertials if inertials[name] is not None}
+    for i, joint in enumerate(tree.joints):
+        if i not in massive:
             yield (
-                f"joint `{joint.name}`: the file gives its body no mass; `urdf_parameters` takes "
-                "zero."
+                f"joint `{joint.get('name')}`: the file gives its body no mass; `urdf_parameters` "
+                "takes zero."
             )
     for name, inertial in inertials.items():
-        if inertial is not None and (reason := inertial.fault()):
+        if inertial is not None and inertial[1]:
             yield (
                 f"link `{name}`: its inertial, which identification does not need, belongs to no "
-                f"body: {reason}."
+                f"body: {inertial[1]}."
             )
+
+
+def _read_xml(path: str | Path) -> Any:
+    """Return the root element of a URDF file."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"the URDF file `{path}` does not exist: check its path.")
+    parser = etree.XMLParser(
+        resolve_entities=False, no_network=True, load_dtd=False, remove_comments=True
+    )
+    try:
+        document = etree.parse(str(path), parser)
+    except etree.XMLSyntaxError as error:
+        line = error.lineno or 1
+        raise InputError(f"`{path}`, line {line}: this is not XML ({error.msg}).") from error
+    if document.docinfo.doctype or document.docinfo.internalDTD is not None:
+        raise InputError(
+            f"`{path}` has a DOCTYPE, which a URDF does not need and which could make a parser "
+            "read other files: remove it."
+        )
+    robot = document.getroot()
+    if any("ros.org/" in str(e.tag) and "xacro" in str(e.tag) for e in robot.iter()):
+        raise InputError(
+            f"`{path}` is a xacro file: expand it first, for example with "
+            "`xacro arm.urdf.xacro -o arm.urdf`."
+        )
+    if robot.tag != "robot":
+        raise InputError(f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`.")
+    return robot
+
+
+def _words(values: np.ndarray) -> str:
+    return " ".join(f"{x:g}" for x in values)
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(f"`{name}`" for name in names[:8])
+    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"

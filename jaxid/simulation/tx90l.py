@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
-from jaxid.robot.drives import Drives
+from jaxid.robot.joints import Drives
 from jaxid.robot.robot import Robot
 from jaxid.simulation.experiment import Sensors
 from jaxid.simulation.friction import FrictionTemperature, LuGreFriction, TorqueRipple

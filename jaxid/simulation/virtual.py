@@ -11,8 +11,8 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
+from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 from jaxid.measurement.recording import Recording
-from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
 from jaxid.simulation.experiment import AbstractExperiment, Sensors, Servo
 from jaxid.simulation.friction import (
@@ -50,7 +50,7 @@ def random_bodies(
         r = along * np.asarray(end) + radius * random.standard_normal((points, 3))
         m = random.dirichlet(np.full(points, 3.0)) * mass
         r = np.append(r, np.ones((points, 1)), axis=1)
-        bodies[i] = Inertia.from_pseudo_inertia(np.einsum("k,ki,kj->ij", m, r, r)).parameters
+        bodies[i] = inertial_parameters(np.einsum("k,ki,kj->ij", m, r, r))
     return bodies
 
 

@@ -1,13 +1,15 @@
 """Files of trajectories: exact JSON for this package, CSV tables and ROS messages for others."""
 
 import json
-from collections.abc import Iterator
+import re
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import polars as pl
 
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.io import from_json, json_text, read_json, to_json, write_text
 from jaxid.robot.robot import Robot
@@ -42,24 +44,21 @@ def load_trajectory(path: str | Path) -> AbstractTrajectory:
         FileNotFoundError: If the file does not exist.
         InputError: If it holds no trajectory, or one of another version or an unknown kind.
     """
-    path = Path(path)
-    if not path.is_file():
+    if not Path(path).is_file():
         raise FileNotFoundError(f"the trajectory file `{path}` does not exist.")
     try:
         content = read_json(path)
-    except ValueError as error:
-        raise InputError(f"`{path}` is no trajectory file: {error}.") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise InputError(f'`{path}` is no trajectory file: its `format` is not "{FORMAT}".')
-    if content.get("version") != VERSION:
-        raise InputError(
-            f"`{path}` has version {content.get('version')}, but this package reads version "
-            f"{VERSION}: load it with the package that wrote it."
-        )
-    try:
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise InputError(f'its `format` is not "{FORMAT}"')
+        if content.get("version") != VERSION:
+            raise InputError(
+                f"it has version {content.get('version')}, but this package reads version "
+                f"{VERSION}: load it with the package that wrote it"
+            )
         return from_json(content.get("trajectory"), AbstractTrajectory, "trajectory")
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"`{path}` is damaged: {' '.join(map(str, error.args))}.") from error
+        reason = " ".join(map(str, error.args))
+        raise InputError(f"`{path}` is no trajectory file: {reason}.") from error
 
 
 def write_csv(
@@ -79,17 +78,13 @@ def write_csv(
         InputError: If the trajectory does not move the robot's joints, or `sample_time` is not
             positive.
     """
-    _check_joints(trajectory, robot)
-    times, motion = trajectory.sample(sample_time)
-    header = ["time [s]"]
+    times, motion = _sample(trajectory, robot, sample_time)
+    columns = {"time [s]": times}
     for symbol, rate in (("q", ""), ("qd", "/s"), ("qdd", "/s^2")):
-        header += [
-            f"{symbol}_{name} [{robot.joint_unit(j)}{rate}]"
-            for j, name in enumerate(robot.joint_names)
-        ]
-    rows = np.column_stack([times, motion.q, motion.qd, motion.qdd]).tolist()
-    lines = [",".join(map(_quote, header)), *(",".join(map(repr, row)) for row in rows)]
-    write_text(path, "\n".join(lines) + "\n")
+        for j, name in enumerate(robot.joint_names):
+            header = f"{symbol}_{name} [{robot.joint_unit(j)}{rate}]"
+            columns[header] = np.asarray(getattr(motion, symbol))[:, j]
+    write_text(path, pl.DataFrame(columns).write_csv())
 
 
 def joint_trajectory(
@@ -108,12 +103,10 @@ def joint_trajectory(
         InputError: If the trajectory does not move the robot's joints, or `sample_time` is not
             positive.
     """
-    _check_joints(trajectory, robot)
-    times, motion = trajectory.sample(sample_time)
-    nanoseconds = [round(t * 1_000_000_000) for t in times]
+    times, motion = _sample(trajectory, robot, sample_time)
     rows = (np.asarray(x).tolist() for x in (motion.q, motion.qd, motion.qdd))
     return {
-        "header": {"stamp": _ros_time(0), "frame_id": ""},
+        "header": {"stamp": _ros_time(0.0), "frame_id": ""},
         "joint_names": list(robot.joint_names),
         "points": [
             {
@@ -123,7 +116,7 @@ def joint_trajectory(
                 "effort": [],
                 "time_from_start": _ros_time(t),
             }
-            for t, q, qd, qdd in zip(nanoseconds, *rows, strict=True)
+            for t, q, qd, qdd in zip(times.tolist(), *rows, strict=True)
         ],
     }
 
@@ -143,48 +136,25 @@ def write_ros_yaml(
 
     `ros2 topic pub --once TOPIC trajectory_msgs/msg/JointTrajectory "$(cat FILE)"` publishes it.
     """
+    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
     message = joint_trajectory(trajectory, robot, sample_time=sample_time)
-    write_text(path, "\n".join(_yaml_lines(message)) + "\n")
+    points = [json.dumps(point, allow_nan=False) for point in message.pop("points")]
+    lines = [f"{key}: {json.dumps(value)}" for key, value in message.items()]
+    lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", f"- {x}") for x in points)]
+    write_text(path, "\n".join(lines) + "\n")
 
 
-def _yaml_lines(message: dict[str, Any]) -> Iterator[str]:
-    yield "header:"
-    yield f"  stamp: {_yaml_time(message['header']['stamp'])}"
-    yield '  frame_id: ""'
-    # JSON's strings are YAML's strings in double quotes.
-    yield f"joint_names: {json.dumps(message['joint_names'])}"
-    yield "points:"
-    for point in message["points"]:
-        lead = "- "
-        for key in ("positions", "velocities", "accelerations", "effort"):
-            yield f"{lead}{key}: [{', '.join(map(_yaml_number, point[key]))}]"
-            lead = "  "
-        yield f"  time_from_start: {_yaml_time(point['time_from_start'])}"
-
-
-def _ros_time(nanoseconds: int) -> dict[str, int]:
-    seconds, rest = divmod(nanoseconds, 1_000_000_000)
+def _ros_time(time: float) -> dict[str, int]:
+    seconds, rest = divmod(round(time * 1_000_000_000), 1_000_000_000)
     return {"sec": seconds, "nanosec": rest}
 
 
-def _yaml_time(time: dict[str, int]) -> str:
-    return f"{{sec: {time['sec']}, nanosec: {time['nanosec']}}}"
-
-
-def _yaml_number(x: float) -> str:
-    """Return a number of YAML 1.1, which would read `1e-05` without a point as text."""
-    digits, exponent, power = repr(x).partition("e")
-    return digits + ("" if "." in digits else ".0") + exponent + power
-
-
-def _quote(field: str) -> str:
-    """Return a field of a CSV file, in quotes if it holds a separator."""
-    return '"' + field.replace('"', '""') + '"' if {",", '"'} & set(field) else field
-
-
-def _check_joints(trajectory: AbstractTrajectory, robot: Robot) -> None:
+def _sample(
+    trajectory: AbstractTrajectory, robot: Robot, sample_time: float
+) -> tuple[np.ndarray, Motion]:
     if trajectory.joints != robot.joints:
         raise InputError(
             f"`trajectory` must move the {robot.joints} joints of `{robot.name}`, but moves "
             f"{trajectory.joints}."
         )
+    return trajectory.sample(sample_time)

@@ -9,10 +9,15 @@ from scipy.linalg import block_diag
 
 from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.basis import AbstractBasis, Envelope, LinearTrajectory, stand_outside
-from jaxid.trajectory.trajectory import as_scalar
+from jaxid.trajectory.trajectory import (
+    AbstractBasis,
+    Envelope,
+    LinearTrajectory,
+    as_scalar,
+    stand_outside,
+)
 
 
 class FourierBasis(AbstractBasis):
@@ -220,9 +225,6 @@ def complete_limits(robot: Robot) -> Limits:
 
     Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the acceleration that
     reaches the largest speed in 0.25 s.
-
-    Args:
-        robot: Robot with its joints and limits.
     """
     turns, limits = np.array(robot.revolute, bool), robot.limits
     half, speed = np.where(turns, math.pi, 1.0), np.where(turns, math.pi / 2, 0.5)

@@ -1,56 +1,46 @@
 """Leads: from standstill into a periodic motion and out of it, within the limits of the joints."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, double_precision, is_traced, namespace
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.basis import AbstractBasis, Envelope, stand_outside
 from jaxid.trajectory.fourier import FourierBasis, complete_limits
-from jaxid.trajectory.trajectory import AbstractTrajectory, as_scalar
+from jaxid.trajectory.trajectory import (
+    AbstractBasis,
+    AbstractTrajectory,
+    Envelope,
+    as_scalar,
+    stand_outside,
+)
 
 
-class LeadMotion(NamedTuple):
-    """Motion of a lead-in: the velocity is a cubic polynomial of the time since its start.
-
-    Attributes:
-        travel: Position relative to the end of the lead [rad or m].
-        velocity: Velocity [rad/s or m/s].
-        acceleration: Acceleration [rad/s² or m/s²].
-        jerk: Jerk [rad/s³ or m/s³].
-    """
-
-    travel: Any
-    velocity: Any
-    acceleration: Any
-    jerk: Any
-
-
-def lead_motion(qd: Any, qdd: Any, duration: Any, x: Any) -> LeadMotion:
-    r"""Return the motion of a lead that ends with a given velocity and acceleration.
+def _lead(q: Any, qd: Any, qdd: Any, duration: Any, x: Any, sign: int = 1) -> tuple:
+    r"""Return position, velocity, acceleration and jerk of a lead to a motion.
 
     The velocity is $\alpha x^2 + \beta x^3$; a lead-out is a lead-in that is run backwards.
 
     Args:
-        qd: Velocity at the end.
-        qdd: Acceleration at the end.
+        q: Position of the motion where the lead meets it.
+        qd: Velocity there.
+        qdd: Acceleration there.
         duration: Time of the lead [s].
-        x: Time since its start [s].
+        x: Time from the standstill [s].
+        sign: 1 for a lead-in, -1 for a lead-out.
     """
-    alpha, beta = _cubic(qd, qdd, duration)
-    return LeadMotion(
-        alpha * (x**3 - duration**3) / 3 + beta * (x**4 - duration**4) / 4,
-        alpha * x**2 + beta * x**3,
+    alpha, beta = _cubic(sign * qd, qdd, duration)
+    return (
+        q + alpha * (x**3 - duration**3) / 3 + beta * (x**4 - duration**4) / 4,
+        sign * (alpha * x**2 + beta * x**3),
         2 * alpha * x + 3 * beta * x**2,
-        2 * alpha + 6 * beta * x,
+        sign * (2 * alpha + 6 * beta * x),
     )
 
 
@@ -105,32 +95,21 @@ class LeadsBasis(AbstractBasis):
         xp = namespace(t, self.omega, self.lead)
         early, late = t < self.lead, t > self.duration - self.lead
         inner = self.series.rows(t - self.lead)
-        outer = xp.where(late[None, :, None], self._lead_out(self.duration - t), inner)
-        return xp.where(early[None, :, None], self._lead_in(t), outer)
+        outer = xp.where(late[None, :, None], self._lead_rows(self.duration - t, -1), inner)
+        return xp.where(early[None, :, None], self._lead_rows(t, 1), outer)
 
-    def _lead_in(self, t: AnyArray) -> AnyArray:
-        """Return the rows of the lead-in at times since the start."""
+    def _lead_rows(self, x: AnyArray, sign: int) -> AnyArray:
+        """Return the rows of the lead-in (1) or lead-out (-1) at times from standstill."""
         q, qd, qdd, _ = self.series.rows(np.zeros(1))
-        lead = lead_motion(qd, qdd, self.lead, t[:, None])
-        return namespace(t, self.omega).stack([q + lead.travel, *lead[1:]])
+        return namespace(x, self.omega).stack(_lead(q, qd, qdd, self.lead, x[:, None], sign))
 
-    def _lead_out(self, t: AnyArray) -> AnyArray:
-        """Return the rows of the lead-out at times before the end."""
-        q, qd, qdd, _ = self.series.rows(np.zeros(1))
-        lead = lead_motion(-qd, qdd, self.lead, t[:, None])
-        rows = [q + lead.travel, -lead.velocity, lead.acceleration, -lead.jerk]
-        return namespace(t, self.omega).stack(rows)
-
-    def envelope(self, points: int, degree: int = 4, pieces: int = 8) -> Envelope:
+    def envelope(self, points: int) -> Envelope:
         """Return samples of a period, as for any series, and control points of the leads.
 
-        A polynomial lies within the range of its control points (Bernstein).
-
-        Args:
-            points: Approximate number of rows for each order.
-            degree: Degree of the leads.
-            pieces: Parts of a lead, each of which is bounded by its own control points.
+        A polynomial lies within the range of its control points (Bernstein). A lead is split into
+        pieces, each of which is bounded by its own control points.
         """
+        degree, pieces = 4, 8
         rows, factor = self.series.envelope(points)
         u, order = np.linspace(0.0, 1.0, degree + 1), np.arange(degree + 1)
         binomials = np.array([math.comb(degree, k) for k in order])
@@ -140,7 +119,7 @@ class LeadsBasis(AbstractBasis):
         leads = []
         for start in self.lead / pieces * np.arange(pieces):
             t = start + self.lead / pieces * u
-            leads += [to_points @ self._lead_in(t), to_points @ self._lead_out(t)]
+            leads += [to_points @ self._lead_rows(t, sign) for sign in (1, -1)]
         return tuple(np.concatenate(parts) for parts in zip(rows, *leads, strict=True)), factor
 
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
@@ -199,19 +178,12 @@ def _motion_with_leads(whole: WithLeads, t: Array) -> Motion:
     last = whole.inner.motion(jnp.reshape(whole.start + whole.length, 1))
     since = jnp.clip(time - begin + lead_in, 0.0, lead_in)
     left = jnp.clip(end + lead_out - time, 0.0, lead_out)
-    rise = lead_motion(first.qd, first.qdd, lead_in, since)
-    fall = lead_motion(-last.qd, last.qdd, lead_out, left)
-    early = Motion(first.q + rise.travel, rise.velocity, rise.acceleration)
-    late = Motion(last.q + fall.travel, -fall.velocity, fall.acceleration)
-    between = whole.inner.motion(whole.start + time[:, 0] - begin)
-    return jax.tree.map(
-        lambda x, y, z: jnp.where(time < begin, x, jnp.where(time > end, z, y)).reshape(
-            *t.shape, -1
-        ),
-        early,
-        between,
-        late,
-    )
+    early = _lead(first.q, first.qd, first.qdd, lead_in, since)
+    late = _lead(last.q, last.qd, last.qdd, lead_out, left, -1)
+    inner = whole.inner.motion(whole.start + time[:, 0] - begin)
+    parts = zip(early, (inner.q, inner.qd, inner.qdd), late, strict=False)
+    values = (jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts)
+    return Motion(*(x.reshape(*t.shape, -1) for x in values))
 
 
 def with_leads(
@@ -273,27 +245,21 @@ def _shortest_leads(
     """
     T = np.geomspace(0.02, 10.0, 120)[:, None, None]
     alpha, beta = _cubic(qd, qdd, T)
-
-    def between(x: np.ndarray) -> np.ndarray:
-        return np.where(np.isfinite(x) & (x > 0) & (x < T), x, T)
-
     # The extremes lie where the next derivative is zero, or at the ends.
     with np.errstate(divide="ignore", invalid="ignore"):
-        turning, steepest = between(-alpha / beta), between(-alpha / (3 * beta))
-        fastest = between(-2 * alpha / (3 * beta))
-    place = np.stack([q + lead_motion(qd, qdd, T, x).travel for x in (0 * T, turning, T)])
-    speed = np.stack([np.abs(lead_motion(qd, qdd, T, x).velocity) for x in (fastest, T)])
-    rate = np.stack([np.abs(lead_motion(qd, qdd, T, x).acceleration) for x in (steepest, T)])
-    jerk = np.stack([np.abs(lead_motion(qd, qdd, T, x).jerk) for x in (0 * T, T)])
+        instants = [-alpha / beta, -2 * alpha / (3 * beta), -alpha / (3 * beta)]
+    inner = [np.where(np.isfinite(x) & (x > 0) & (x < T), x, T) for x in instants]
+    found = [_lead(q, qd, qdd, T, x) for x in (0 * T, *inner, T)]
+    place, speed, rate, jerk = (np.stack(values) for values in zip(*found, strict=True))
     low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     excess = np.max(
         [
             (place.max(0) - middle) / half - reach,
             (middle - place.min(0)) / half - reach,
-            speed.max(0) / limits.velocity - reach,
-            rate.max(0) / limits.acceleration - reach,
-            jerk.max(0) / limits.jerk - reach,
+            np.abs(speed).max(0) / limits.velocity - reach,
+            np.abs(rate).max(0) / limits.acceleration - reach,
+            np.abs(jerk).max(0) / limits.jerk - reach,
         ],
         axis=0,
     )

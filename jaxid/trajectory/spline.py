@@ -1,18 +1,79 @@
-"""Clamped quintic B-splines between standstills: motions with a continuous jerk."""
+"""Piecewise polynomials, and quintic B-splines between standstills with a continuous jerk."""
 
 import functools
 import math
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced
+from jaxid.arrays import AnyArray, Array, Float, Numbers, as_array, is_traced, namespace
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.trajectory.basis import AbstractBasis, Envelope, LinearTrajectory
-from jaxid.trajectory.trajectory import as_scalar, evaluate_polynomials
+from jaxid.trajectory.trajectory import (
+    AbstractBasis,
+    AbstractTrajectory,
+    Envelope,
+    LinearTrajectory,
+    as_scalar,
+)
 
 DEGREE = 5
+
+
+class PiecewisePolynomial(AbstractTrajectory):
+    """Polynomials of time that follow one another; standstill before the start and after the end.
+
+    Attributes:
+        times: Start of each polynomial, and the end of the last one [s].
+        coefficients: Coefficients of the powers of the time since a polynomial's start, highest
+            power first.
+    """
+
+    times: Float[AnyArray, " knots"]
+    coefficients: Float[AnyArray, "powers pieces joints"]
+
+    @property
+    def duration(self) -> Float[AnyArray, ""] | float:
+        """Time of the end [s]."""
+        return self.times[-1]
+
+    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
+        """Return the motion at one time or at many [s]."""
+        return _polynomial_motion(self.times, self.coefficients, jnp.asarray(t, float))
+
+
+@eqx.filter_jit
+def _polynomial_motion(times: AnyArray, coefficients: AnyArray, t: Array) -> Motion:
+    derivatives = _evaluate(times, coefficients, t.reshape(-1))[:3]
+    return Motion(*(x.reshape(*t.shape, -1) for x in derivatives))
+
+
+def _evaluate(
+    times: Float[AnyArray, " knots"],
+    coefficients: Float[AnyArray, "powers pieces columns"],
+    t: Float[AnyArray, " samples"],
+) -> Float[AnyArray, "4 samples columns"]:
+    """Return piecewise polynomials and their first three derivatives, constant outside their times.
+
+    Arguments are the fields of `PiecewisePolynomial` and the times [s].
+    """
+    xp = namespace(times, coefficients, t)
+    times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
+    # Written with `where`, because the derivative of `clip` at its ends is one half.
+    clipped = xp.where(t < times[0], times[0], xp.where(t > times[-1], times[-1], t))
+    piece = xp.clip(xp.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2)
+    x = (clipped - times[piece])[:, None]
+    c = coefficients[:, piece]
+    value, first, second, third = c[0], *(xp.zeros_like(c[0]) for _ in range(3))
+    for coefficient in c[1:]:
+        third = third * x + 3 * second
+        second = second * x + 2 * first
+        first = first * x + value
+        value = value * x + coefficient
+    inside = ((t >= times[0]) & (t <= times[-1]))[:, None]
+    return xp.stack([value, *(xp.where(inside, d, 0.0) for d in (first, second, third))])
 
 
 class RestToRestSplineBasis(AbstractBasis):
@@ -42,7 +103,7 @@ class RestToRestSplineBasis(AbstractBasis):
     def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
         """Return the motions of unit coefficients."""
         starts, coefficients = _unit_polynomials(self.points)
-        derivatives = evaluate_polynomials(starts, coefficients, t / self.duration)
+        derivatives = _evaluate(starts, coefficients, t / self.duration)
         return derivatives / (self.duration ** np.arange(4.0))[:, None, None]
 
     def envelope(self, points: int) -> Envelope:
@@ -90,11 +151,7 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
 
 
 def spline_polynomials(spline: BSpline) -> Float[np.ndarray, "powers pieces columns"]:
-    """Return the coefficients of a quintic spline's pieces in powers of the time since their start.
-
-    Args:
-        spline: Clamped spline of degree 5.
-    """
+    """Return the pieces of a clamped quintic spline in powers of the time since their start."""
     knots = spline.t[DEGREE:-DEGREE]
     lower = [spline.derivative(k)(knots[:-1]) / math.factorial(k) for k in range(1, DEGREE)]
     # The highest derivative jumps at the knots: rounding would decide which piece is evaluated.

@@ -1,7 +1,6 @@
 """Paths of the end-effector in space, the path of ISO 9283, and the joints' motion along a path."""
 
 import itertools
-from abc import abstractmethod
 
 import equinox as eqx
 import numpy as np
@@ -9,35 +8,12 @@ from scipy.interpolate import make_interp_spline
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array
 from jaxid.errors import InputError
-from jaxid.robot.inverse_kinematics import inverse_kinematics_along
+from jaxid.robot.kinematics import inverse_kinematics_along
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.spline import spline_polynomials
-from jaxid.trajectory.trajectory import PiecewisePolynomial
+from jaxid.trajectory.spline import PiecewisePolynomial, spline_polynomials
 
 
-class AbstractPiece(eqx.Module):
-    """A curve in space."""
-
-    @property
-    @abstractmethod
-    def length(self) -> float:
-        """Length of the curve [m]."""
-
-    @property
-    @abstractmethod
-    def radius(self) -> float:
-        """Radius of curvature; infinite for a line [m]."""
-
-    @abstractmethod
-    def at(self, fraction: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Return places along the curve [m].
-
-        Args:
-            fraction: Fraction of the length, from 0 to 1.
-        """
-
-
-class Line(AbstractPiece):
+class Line(eqx.Module):
     """A straight line.
 
     Attributes:
@@ -59,12 +35,12 @@ class Line(AbstractPiece):
         return np.inf
 
     def at(self, fraction: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Return places along the line [m]."""
+        """Return places at fractions of the length, from 0 to 1 [m]."""
         start = np.asarray(self.start)
         return start + np.asarray(fraction)[:, None] * (np.asarray(self.end) - start)
 
 
-class Circle(AbstractPiece):
+class Circle(eqx.Module):
     """A whole circle, run once or several times.
 
     Attributes:
@@ -98,7 +74,7 @@ class Circle(AbstractPiece):
         return float(np.linalg.norm(np.asarray(self.first)))
 
     def at(self, fraction: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Return places along the circle [m]."""
+        """Return places at fractions of the length, from 0 to 1 [m]."""
         angle = 2 * np.pi * self.rounds * np.asarray(fraction)[:, None]
         first, second = np.asarray(self.first), np.asarray(self.second)
         return np.asarray(self.centre) + np.cos(angle) * first + np.sin(angle) * second
@@ -122,7 +98,7 @@ class TipPath(eqx.Module):
             it ends, or a limit is not positive.
     """
 
-    pieces: tuple[AbstractPiece, ...] = eqx.field(converter=tuple)
+    pieces: tuple[Line | Circle, ...] = eqx.field(converter=tuple)
     rotation: Float[AnyArray, "3 3"] = eqx.field(converter=lambda x: as_array("rotation", x))
     speed: float = eqx.field(converter=float, default=1.0)
     acceleration: float = eqx.field(converter=float, default=4.0)

@@ -1,9 +1,13 @@
-"""Trajectories: motions of all joints as functions of time, with exact derivatives."""
+"""Trajectories: motions of all joints as functions of time, and bases of families of them.
+
+In a family each joint's motion is a basis of functions times the joint's coefficients.
+"""
 
 import itertools
 import math
 from abc import abstractmethod
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -49,24 +53,8 @@ class AbstractTrajectory(Hashable):
         """
         return _jerk(self, jnp.asarray(t, float))
 
-    def sample_times(self, sample_time: float) -> Float[np.ndarray, " samples"]:
-        """Return times from the start to the end, both included, at most `sample_time` apart [s].
-
-        Args:
-            sample_time: Largest time between two samples [s].
-
-        Raises:
-            InputError: If `sample_time` is not positive.
-        """
-        if not 0 < sample_time < np.inf:
-            raise InputError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
-        duration = float(self.duration)
-        # Rounding may make a duration slightly longer: that needs no further sample.
-        steps = max(math.ceil(duration / sample_time * (1 - 1e-9)), 1)
-        return np.linspace(0.0, duration, steps + 1)
-
     def sample(self, sample_time: float) -> tuple[Float[np.ndarray, " samples"], Motion]:
-        """Return times [s] from the start to the end and the motion at them.
+        """Return times [s] from the start to the end, both included, and the motion at them.
 
         Args:
             sample_time: Largest time between two samples [s].
@@ -76,70 +64,18 @@ class AbstractTrajectory(Hashable):
             RuntimeError: If JAX runs in single precision.
         """
         require_float64("sampling a trajectory")
-        times = self.sample_times(sample_time)
+        if not 0 < sample_time < np.inf:
+            raise InputError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
+        duration = float(self.duration)
+        # Rounding may make a duration slightly longer: that needs no further sample.
+        steps = max(math.ceil(duration / sample_time * (1 - 1e-9)), 1)
+        times = np.linspace(0.0, duration, steps + 1)
         return times, jax.tree.map(np.asarray, self.motion(times))
 
 
 @eqx.filter_jit
 def _jerk(trajectory: AbstractTrajectory, times: Float[Array, "*batch"]) -> Array:
     return jax.jvp(lambda t: trajectory.motion(t).qdd, (times,), (jnp.ones_like(times),))[1]
-
-
-class PiecewisePolynomial(AbstractTrajectory):
-    """Polynomials of time that follow one another; standstill before the start and after the end.
-
-    Attributes:
-        times: Start of each polynomial, and the end of the last one [s].
-        coefficients: Coefficients of the powers of the time since a polynomial's start, highest
-            power first.
-    """
-
-    times: Float[AnyArray, " knots"]
-    coefficients: Float[AnyArray, "powers pieces joints"]
-
-    @property
-    def duration(self) -> Float[AnyArray, ""] | float:
-        """Time of the end [s]."""
-        return self.times[-1]
-
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """Return the motion at one time or at many [s]."""
-        return _polynomial_motion(self.times, self.coefficients, jnp.asarray(t, float))
-
-
-@eqx.filter_jit
-def _polynomial_motion(times: AnyArray, coefficients: AnyArray, t: Array) -> Motion:
-    derivatives = evaluate_polynomials(times, coefficients, t.reshape(-1))[:3]
-    return Motion(*(x.reshape(*t.shape, -1) for x in derivatives))
-
-
-def evaluate_polynomials(
-    times: Float[AnyArray, " knots"],
-    coefficients: Float[AnyArray, "powers pieces columns"],
-    t: Float[AnyArray, " samples"],
-) -> Float[AnyArray, "4 samples columns"]:
-    """Return piecewise polynomials and their first three derivatives, constant outside their times.
-
-    Args:
-        times: Start of each piece, and the end of the last one [s].
-        coefficients: Coefficients of the powers of the time since a piece's start, highest first.
-        t: Times [s].
-    """
-    xp = namespace(times, coefficients, t)
-    times, coefficients, t = (xp.asarray(x) for x in (times, coefficients, t))
-    # Written with `where`, because the derivative of `clip` at its ends is one half.
-    clipped = xp.where(t < times[0], times[0], xp.where(t > times[-1], times[-1], t))
-    piece = xp.clip(xp.searchsorted(times, clipped, side="right") - 1, 0, len(times) - 2)
-    x = (clipped - times[piece])[:, None]
-    c = coefficients[:, piece]
-    value, first, second, third = c[0], *(xp.zeros_like(c[0]) for _ in range(3))
-    for coefficient in c[1:]:
-        third = third * x + 3 * second
-        second = second * x + 2 * first
-        first = first * x + value
-        value = value * x + coefficient
-    inside = ((t >= times[0]) & (t <= times[-1]))[:, None]
-    return xp.stack([value, *(xp.where(inside, d, 0.0) for d in (first, second, third))])
 
 
 class Segments(AbstractTrajectory):
@@ -171,21 +107,14 @@ class Segments(AbstractTrajectory):
                     f"`members` {k} and {k + 1} must move the same joints, but have "
                     f"{end.joints} and {start.joints}."
                 )
-            self._refuse_jumps(k, end, start)
-
-    def _refuse_jumps(self, k: int, end: Motion, start: Motion) -> None:
-        for name, x, y in (
-            ("coordinate", end.q, start.q),
-            ("velocity", end.qd, start.qd),
-            ("acceleration", end.qdd, start.qdd),
-        ):
-            jump = np.abs(np.asarray(y) - np.asarray(x))
-            if jump.max() > self.largest_jump:
-                raise InputError(
-                    f"the {name} of joint {int(jump.argmax()) + 1} jumps by {jump.max():.3g} "
-                    f"between `members` {k} and {k + 1}: start the second as the first ends, put "
-                    "a spline between them, or raise `largest_jump`."
-                )
+            for name, field in (("coordinate", "q"), ("velocity", "qd"), ("acceleration", "qdd")):
+                jump = np.abs(np.subtract(getattr(start, field), getattr(end, field)))
+                if jump.max() > self.largest_jump:
+                    raise InputError(
+                        f"the {name} of joint {int(jump.argmax()) + 1} jumps by {jump.max():.3g} "
+                        f"between `members` {k} and {k + 1}: start the second as the first ends, "
+                        "put a spline between them, or raise `largest_jump`."
+                    )
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
@@ -230,12 +159,145 @@ class PaddedToCycle(AbstractTrajectory):
         return self.inner.motion(jnp.minimum(jnp.asarray(t, float), self.inner.duration))
 
 
-def count_cycles(duration: float, sample_time: float, tolerance: float = 1e-6) -> int:
-    """Return the number of a controller's cycles after which a motion has ended.
+def count_cycles(duration: float, sample_time: float) -> int:
+    """Return the number of a controller's cycles [s] after which a motion [s] has ended."""
+    # A motion may end a millionth of a cycle later, for rounding.
+    return max(math.ceil(duration / sample_time - 1e-6), 1)
 
-    Args:
-        duration: Duration of the motion [s].
-        sample_time: Cycle of the controller [s].
-        tolerance: Fraction of a cycle that a motion may end later, for rounding.
+
+Envelope = tuple[tuple[Float[np.ndarray, "rows variables"], ...], float]
+"""Rows for each order of derivative, and a factor of at least 1; see `AbstractBasis.envelope`."""
+
+
+class AbstractBasis(eqx.Module):
+    """A family of trajectories: functions of time that are the same for all joints.
+
+    The coefficients of a trajectory are a matrix x [joints, variables]. Limits of position,
+    velocity, acceleration and jerk are linear in them.
+
+    Attributes:
+        duration: Time from the start of the motion to its end; the period of a periodic one [s].
     """
-    return max(math.ceil(duration / sample_time - tolerance), 1)
+
+    if TYPE_CHECKING:
+
+        @property
+        def duration(self) -> Any:
+            """Duration [s]: a field or a property of each basis."""
+    else:
+        duration: eqx.AbstractVar[float]
+
+    @abstractmethod
+    def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
+        """Return position, velocity, acceleration and jerk of every function.
+
+        Args:
+            t: Times [s]; NumPy arrays give NumPy arrays.
+        """
+
+    @abstractmethod
+    def envelope(self, points: int) -> Envelope:
+        """Return rows whose largest value bounds the motion at all times, and their factor.
+
+        For coefficients x of a joint, |f(t) - c| <= factor * max |rows[k] @ x - c| at every time t,
+        where f is the derivative of order k (from 0 to 3) of the joint's motion and c any constant.
+
+        Args:
+            points: Approximate number of rows for each order; more rows give tighter bounds.
+        """
+
+    def trajectory(self, x: Float[AnyArray, "joints variables"]) -> "LinearTrajectory":
+        """Return the trajectory with these coefficients.
+
+        Args:
+            x: Coefficients, one row for each joint.
+        """
+        return LinearTrajectory(self, x)
+
+    @property
+    def variables(self) -> int:
+        """Number of coefficients of each joint."""
+        return self.rows(np.zeros(1)).shape[2]
+
+    def times(self, samples: int) -> Float[np.ndarray, " samples"]:
+        """Return equidistant times at which a run is measured, without their end [s].
+
+        Args:
+            samples: Number of times.
+        """
+        return np.arange(samples) * (float(self.duration) / samples)
+
+    def instants(self, points: int) -> Float[np.ndarray, " points"]:
+        """Return equidistant times over the whole motion, for limits that hold throughout [s].
+
+        Args:
+            points: Number of times.
+        """
+        return self.times(points)
+
+    def retimings(
+        self, shifts: int = 40, tolerance: float = 1e-9
+    ) -> Float[np.ndarray, "retimings variables variables"]:
+        """Return maps to the coefficients of the same motion begun later or run backwards.
+
+        Only maps that stay in the family are returned: a periodic motion may begin at any time, a
+        motion between standstills may run backwards. The first map changes nothing. All of them
+        keep the limits of the joint.
+
+        Args:
+            shifts: Number of equidistant times at which the motion may begin.
+            tolerance: Largest relative deviation from the shifted motion.
+        """
+        part = -(-4 * self.variables // shifts)
+        step = float(self.duration) / (shifts * part)
+        rows = np.asarray(self.rows((np.arange(shifts * part) + 0.5) * step)[0])
+        inverse, size = np.linalg.pinv(rows), np.abs(rows).max()
+        moved = [np.roll(r, k * part, axis=0) for r in (rows, rows[::-1]) for k in range(shifts)]
+        maps = [(inverse @ wanted, wanted) for wanted in moved]
+        return np.array(
+            [T for T, wanted in maps if np.abs(rows @ T - wanted).max() <= tolerance * size]
+        )
+
+
+class LinearTrajectory(AbstractTrajectory):
+    """A trajectory of a basis.
+
+    Attributes:
+        basis: The functions of time.
+        coefficients: Coefficients of the functions, one row for each joint.
+    """
+
+    basis: AbstractBasis
+    coefficients: Float[AnyArray, "joints variables"]
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self.coefficients.shape[0]
+
+    @property
+    def duration(self) -> Float[AnyArray, ""] | float:
+        """Duration of the basis [s]."""
+        return self.basis.duration
+
+    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
+        """Return the motion at one time or at many [s]."""
+        return _linear_motion(self.basis, self.coefficients, jnp.asarray(t, float))
+
+
+@eqx.filter_jit
+def _linear_motion(basis: AbstractBasis, x: AnyArray, t: Array) -> Motion:
+    rows = jnp.asarray(basis.rows(t.reshape(-1)))
+    return Motion(*((part @ x.T).reshape(*t.shape, -1) for part in rows[:3]))
+
+
+def stand_outside(
+    rows: Callable[[AnyArray], AnyArray], t: Float[AnyArray, " samples"], duration: AnyArray | float
+) -> Float[AnyArray, "4 samples variables"]:
+    """Return rows of a motion that stands still before zero and after its duration [s]."""
+    xp = namespace(t, as_scalar(duration))
+    # Written with `where`, because the derivative of `clip` at its ends is one half.
+    inner = rows(xp.where(t < 0.0, 0.0, xp.where(t > duration, duration, t)))
+    inside = ((t >= 0.0) & (t <= duration))[None, :, None]
+    position = np.array([True, False, False, False])[:, None, None]
+    return xp.where(position | inside, inner, 0.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxid.diagnosis.limits import rate_findings, unit_findings
-from jaxid.robot.drives import Drives
+from jaxid.robot.joints import Drives
 from jaxid.robot.library import panda, planar_arm
 from jaxid.trajectory.fourier import random_fourier_series
 

@@ -13,7 +13,7 @@ from jaxid.measurement.decimation import Subsample
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
 from jaxid.measurement.recording import Recording
-from jaxid.robot.drives import Drives
+from jaxid.robot.joints import Drives
 from jaxid.robot.library import panda
 from jaxid.trajectory.fourier import random_fourier_series
 

@@ -20,9 +20,9 @@ from jaxid.dynamics.terms import (
     ViscousFriction,
 )
 from jaxid.robot import library
-from jaxid.robot.dh import from_dh
-from jaxid.robot.kinematics import axis_rotation
+from jaxid.robot.library import from_dh
 from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import axis_rotation
 
 DRIVES = (ViscousFriction(), CoulombFriction(), RotorInertia())
 SEVEN, TEN = RigidBodies(principal_axes=True), RigidBodies()

@@ -9,7 +9,7 @@ from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import LinearSpring, Tanh
-from jaxid.robot.drives import Drives
+from jaxid.robot.joints import Drives
 from jaxid.robot.library import planar_arm
 from jaxid.trajectory.fourier import random_fourier_series
 

@@ -18,7 +18,7 @@ from jaxid.dynamics.terms import (
     Tanh,
     ViscousFriction,
 )
-from jaxid.robot.drives import Drives
+from jaxid.robot.joints import Drives
 
 N, SAMPLES, EPSILON = 4, 6, 0.05
 TREE = trees.Tree(

@@ -9,8 +9,8 @@ import pytest
 import trees
 
 from jaxid.dynamics import projection
-from jaxid.robot import kinematics
 from jaxid.robot.inertia import inertia_tensor
+from jaxid.robot.rotations import skew
 
 
 @pytest.fixture(scope="module")
@@ -104,4 +104,4 @@ def test_momentum_matrix_and_tensor_hold_the_products_with_a_minus():
 def test_skew_is_the_cross_product():
     """Eq. 3."""
     a, b = np.random.default_rng(10).normal(size=(2, 3))
-    assert trees.relative(kinematics.skew(jnp.asarray(a)) @ b, np.cross(a, b)) < 1e-15
+    assert trees.relative(skew(jnp.asarray(a)) @ b, np.cross(a, b)) < 1e-15

@@ -30,7 +30,7 @@ from jaxid.dynamics.terms import (
     ViscousFriction,
 )
 from jaxid.errors import InputError
-from jaxid.robot.drives import Drives
+from jaxid.robot.joints import Drives
 from jaxid.robot.library import tx40
 
 N = 3

@@ -6,7 +6,7 @@ import pytest
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.robot import library
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 
 
 @pytest.fixture(scope="package")

@@ -21,8 +21,7 @@ from jaxid.excitation.constraints import (
 )
 from jaxid.robot import library
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
-from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Drives, Limits
 from jaxid.trajectory.fourier import random_fourier_series
 
 # Three joints in a vertical plane; the third motor turns with the second joint.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxid.excitation.limits import JointLimits
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 

@@ -12,7 +12,7 @@ from jaxid.measurement.decimation import Decimation, Subsample
 from jaxid.measurement.filters import PaperFilter, PeriodicFourier, ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.recording import Recording, read_recording
-from jaxid.robot.drives import Drives
+from jaxid.robot.joints import Drives
 from jaxid.robot.robot import Robot
 
 DT = 0.001

@@ -12,7 +12,7 @@ from jaxid.identification.estimators import LeastSquares
 from jaxid.identification.identify import identify
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
 from jaxid.simulation.experiment import Sensors
 from jaxid.simulation.friction import SmoothFriction

@@ -8,7 +8,7 @@ from forward_kinematics import body_transforms, random_configuration
 
 from jaxid.robot import library
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
-from jaxid.robot.collision.shapes import ROUNDING, segment_distance
+from jaxid.robot.shapes import ROUNDING, segment_distance
 
 ALONG = np.linspace(0.0, 1.0, 401)[:, None]
 

@@ -10,7 +10,7 @@ from forward_kinematics import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxid.robot.dh import from_dh
+from jaxid.robot.library import from_dh
 
 # A realistic mixture: quarter twists, an oblique one, theta offsets, every length.
 ROWS = np.array(

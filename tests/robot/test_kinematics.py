@@ -1,21 +1,48 @@
+"""Forward and inverse kinematics against plain NumPy, and what cannot be reached."""
+
 import jax
 import numpy as np
 import pytest
 from forward_kinematics import body_transforms, random_configuration, tip_transform
 from jax import numpy as jnp
+from scipy.spatial.transform import Rotation
 
 from jaxid.robot import library
-from jaxid.robot.kinematics import placements, tip_placement
+from jaxid.robot.joints import Limits
+from jaxid.robot.kinematics import (
+    inverse_kinematics,
+    inverse_kinematics_along,
+    placements,
+    tip_curvature,
+    tip_jacobian,
+    tip_placement,
+)
 
-ROBOTS = [library.tx90l_on_rail, library.iiwa14, library.kr300, library.planar_arm]
+RAIL = library.tx90l_on_rail()
+DOWN = np.diag([1.0, -1.0, -1.0])
 
 
-@pytest.mark.parametrize("build", ROBOTS)
-def test_placements_are_those_of_plain_numpy(build):
+def within(robot, seed, count):
+    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
+    low, high = np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)
+    return np.random.default_rng(seed).uniform(low, high, (count, robot.joints))
+
+
+def fingers(robot):
+    return robot.replace(tip_offset=np.array([0.1, -0.2, 0.3]))
+
+
+@pytest.mark.parametrize("build", [library.tx90l_on_rail, library.planar_arm])
+def test_placements_and_jacobian_are_those_of_plain_numpy(build):
     robot = build()
     batch = np.stack([random_configuration(robot, seed) for seed in range(4)])
-    rotations, origins = jax.jit(jax.vmap(lambda q: placements(robot, q)))(batch)
-    tips = jax.vmap(lambda q: tip_placement(robot, q))(batch)
+
+    @jax.jit
+    @jax.vmap
+    def place(q):
+        return placements(robot, q), tip_placement(robot, q)
+
+    (rotations, origins), tips = place(batch)
     for k, q in enumerate(batch):
         expected, tip = body_transforms(robot, q), tip_transform(robot, q)
         np.testing.assert_allclose(rotations[k], expected[:, :3, :3], atol=1e-13)
@@ -24,23 +51,93 @@ def test_placements_are_those_of_plain_numpy(build):
         np.testing.assert_allclose(tips[1][k], tip[:3, 3], atol=1e-13)
 
 
-@pytest.mark.parametrize("build", ROBOTS)
-def test_the_jacobian_of_the_tip_is_its_difference_quotient(build):
-    robot = build()
-    q = random_configuration(robot, 7)
-    jacobian = jax.jacfwd(lambda q: tip_placement(robot, q)[1])(jnp.asarray(q))
-    h = 1e-6
-    for j, step in enumerate(h * np.eye(robot.joints)):
-        ahead, behind = tip_transform(robot, q + step), tip_transform(robot, q - step)
-        quotient = (ahead[:3, 3] - behind[:3, 3]) / (2 * h)
-        np.testing.assert_allclose(jacobian[:, j], quotient, atol=1e-8)
-
-
-def test_the_tip_can_be_differentiated_with_respect_to_a_length():
+def test_the_tip_can_be_differentiated_by_coordinates_and_lengths():
     arm = library.planar_arm(2)
 
-    def height(offset):
-        return tip_placement(arm.replace(offset=offset), np.array([0.3, 0.4]))[1][1]
+    def tip(offset, q):
+        return tip_placement(arm.replace(offset=offset), q)[1][:2]
 
-    gradient = jax.grad(height)(jnp.asarray(arm.offset))
-    assert gradient[1, 0] == pytest.approx(np.sin(0.3), abs=1e-14)
+    q = jnp.array([0.3, 0.4])
+    by_offset, by_q = jax.jacfwd(tip, argnums=(0, 1))(jnp.asarray(arm.offset), q)
+    assert by_offset[1, 1, 0] == pytest.approx(np.sin(0.3), abs=1e-14)
+    np.testing.assert_allclose(by_q[:, 1], [-np.sin(0.7), np.cos(0.7)], atol=1e-14)
+
+
+def test_the_jacobian_and_curvature_are_difference_quotients():
+    robot = fingers(RAIL)
+    q, h = within(robot, 5, 1)[0], 1e-5
+    R, r, shift, turn = tip_jacobian(robot, q[None])
+    force, moment = np.random.default_rng(0).standard_normal((2, 1, 3))
+
+    def shifted(steps):
+        now = tip_transform(robot, q + steps)
+        turned = Rotation.from_matrix(now[:3, :3] @ R[0].T).as_rotvec()
+        return now[:3, 3] - r[0], turned
+
+    def work(steps):
+        return sum(x[0] @ y for x, y in zip((force, moment), shifted(steps), strict=True))
+
+    curvature = tip_curvature(shift, turn, force, moment)[0]
+    for i, a in enumerate(h * np.eye(7)):
+        ahead, behind = shifted(a), shifted(-a)
+        np.testing.assert_allclose((ahead[0] - behind[0]) / (2 * h), shift[0, i], atol=1e-9)
+        np.testing.assert_allclose((ahead[1] - behind[1]) / (2 * h), turn[0, i], atol=1e-9)
+        for k in range(7):
+            a, b = 10 * h * np.eye(7)[i], 10 * h * np.eye(7)[k]
+            mixed = work(a + b) - work(a - b) - work(b - a) + work(-a - b)
+            assert curvature[i, k] == pytest.approx(mixed / (400 * h * h), abs=1e-5)
+
+
+@pytest.mark.parametrize("build", [library.tx90l_on_rail, library.panda, library.ur10])
+def test_forward_after_inverse_is_the_pose(build):
+    robot = fingers(build())
+    for q in within(robot, 3, 3):
+        pose = tip_transform(robot, q)
+        found = inverse_kinematics(robot, pose[:3, 3], pose[:3, :3])
+        np.testing.assert_allclose(tip_transform(robot, found), pose, atol=2e-9)
+        assert (found >= robot.limits.position_min).all()
+        assert (found <= robot.limits.position_max).all()
+
+
+def test_of_all_coordinates_it_is_the_nearest_to_the_posture():
+    pose = tip_transform(RAIL, within(RAIL, 8, 1)[0])
+    posture = np.array([0.4, 0.2, 0.3, 1.2, 0.1, 0.4, 0.0])
+    q = inverse_kinematics(RAIL, pose[:3, 3], pose[:3, :3], posture=posture)
+    half = (RAIL.limits.position_max - RAIL.limits.position_min) / 2
+    _, _, shift, turn = tip_jacobian(RAIL, q[None])
+    free = np.linalg.svd(np.concatenate([shift[0], turn[0]], axis=1).T * half)[2][-1]
+    assert abs(free @ ((q - posture) / half)) < 1e-7
+    assert inverse_kinematics(RAIL, pose[:3, 3], pose[:3, :3], posture=q) == pytest.approx(q)
+
+
+def test_a_position_alone_works_in_a_plane():
+    arm = library.planar_arm(3)
+    q = inverse_kinematics(arm, [1.1, 0.7, 0.0])
+    np.testing.assert_allclose(tip_transform(arm, q)[:3, 3], [1.1, 0.7, 0.0], atol=2e-9)
+
+
+def test_a_closed_path_of_the_tip_is_a_closed_path_of_the_joints():
+    angle = np.linspace(0.0, 2 * np.pi, 200)
+    circle = np.stack([0.3 * np.cos(angle), 0.7 + 0 * angle, 0.6 + 0.2 * np.sin(angle)], axis=1)
+    q = inverse_kinematics_along(RAIL, circle, DOWN)
+    np.testing.assert_allclose(q[0], q[-1], atol=1e-9)
+    assert np.abs(np.diff(q, axis=0)).max() < 0.1
+    for row, place in zip(q[::20], circle[::20], strict=True):
+        pose = tip_transform(RAIL, row)
+        np.testing.assert_allclose(pose[:3, 3], place, atol=1e-9)
+        np.testing.assert_allclose(pose[:3, :3], DOWN, atol=1e-9)
+    # Without joints to spare the arm alone would have to follow: the rail does its part.
+    assert np.ptp(q[:, 0]) > 0.1
+
+
+def test_says_what_cannot_be_reached():
+    with pytest.raises(ValueError, match=r"comes to within 0\.\d+ m and .* rad of it"):
+        inverse_kinematics(library.ur10(), [1.9, 0.0, 0.3], np.eye(3))
+    tight = RAIL.replace(
+        limits=Limits(position_min=[-0.1, *[-0.2] * 6], position_max=[0.1, *[0.2] * 6])
+    )
+    with pytest.raises(ValueError, match="only beyond the range of joint `"):
+        inverse_kinematics(tight, [0.6, 0.0, 0.6])
+    line = np.linspace([0.0, 0.6, 0.6], [0.0, 2.5, 0.6], 60)
+    with pytest.raises(ValueError, match=r"pose \d+ of 60, .* out of reach"):
+        inverse_kinematics_along(RAIL, line, DOWN, starts=4)

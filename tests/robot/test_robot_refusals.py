@@ -8,11 +8,9 @@ from urdf_text import arm, inertial, joint, link, robot
 
 from jaxid.errors import InputError
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace, fit_capsules
-from jaxid.robot.dh import from_dh
-from jaxid.robot.drives import Drives
-from jaxid.robot.inverse_kinematics import inverse_kinematics
-from jaxid.robot.library import panda, planar_arm
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Drives, Limits
+from jaxid.robot.kinematics import inverse_kinematics
+from jaxid.robot.library import from_dh, panda, planar_arm
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 

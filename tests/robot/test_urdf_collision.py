@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from forward_kinematics import body_transforms
 
-from jaxid.robot.collision import CollisionModel, fit_capsules
-from jaxid.robot.collision.fitting import enclose
+from jaxid.robot.collision import CollisionModel, enclose, fit_capsules
 from jaxid.robot.urdf import load_urdf
 
 TEXT = """<robot name="arm">

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from jaxid.robot import library
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Limits
 from jaxid.trajectory import (
     FourierBasis,
     LeadsBasis,

@@ -20,6 +20,9 @@ GROUND = -1
 ROUNDING = 1e-6
 """Largest error of a distance, by which it is smooth at zero [m]."""
 
+Vectors = Float[AnyArray, "*batch 3"]
+Lengths = Float[Array, "*batch"]
+
 
 class Capsule(eqx.Module):
     """All points within a radius of a segment on a body; a sphere if its ends are one point.
@@ -62,9 +65,7 @@ class AbstractObstacle(eqx.Module):
     name: eqx.AbstractVar[str]
 
     @abstractmethod
-    def distance(
-        self, start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
-    ) -> Float[Array, "*batch"]:
+    def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distance between segments and the solid's surface [m].
 
         Args:
@@ -98,9 +99,7 @@ class HalfSpace(AbstractObstacle):
             raise InputError(f"`{name}` needs a `normal` that is not zero, and a finite `height`.")
         self.name, self.normal, self.height = name, n / length, np.array(height, np.float64)
 
-    def distance(
-        self, start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
-    ) -> Float[Array, "*batch"]:
+    def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the height of the lower end above the plane [m]."""
         n, start, end = (jnp.asarray(x) for x in (self.normal, start, end))
         return jnp.minimum(start @ n, end @ n) - self.height
@@ -136,9 +135,7 @@ class Box(AbstractObstacle):
         if R.shape != (3, 3) or not np.abs(R.T @ R - np.eye(3)).max() < 1e-6:
             raise InputError(f"`rotation` of box `{name}` is no rotation matrix.")
 
-    def distance(
-        self, start: Float[AnyArray, "*batch 3"], end: Float[AnyArray, "*batch 3"]
-    ) -> Float[Array, "*batch"]:
+    def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distance of the segment's deepest or nearest point [m]."""
         start, end = jnp.asarray(start), jnp.asarray(end)
         first, along = self._local(start), (end - start) @ jnp.asarray(self.rotation)
@@ -172,35 +169,24 @@ class Box(AbstractObstacle):
     def _signed(self, point: Array) -> Array:
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
         inside = jnp.minimum(jnp.max(beyond, -1), 0.0)
-        return rounded_norm(jnp.maximum(beyond, 0.0)) + inside
+        return _rounded_norm(jnp.maximum(beyond, 0.0)) + inside
 
 
-def rounded_norm(vector: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch"]:
+def _rounded_norm(vector: Vectors) -> Lengths:
     """Return lengths of vectors, smooth at zero and there at most `ROUNDING` too small [m]."""
     return jnp.sqrt(jnp.sum(vector**2, axis=-1) + ROUNDING**2) - ROUNDING
 
 
 def segment_distance(
-    start: Float[AnyArray, "*batch 3"],
-    end: Float[AnyArray, "*batch 3"],
-    other_start: Float[AnyArray, "*batch 3"],
-    other_end: Float[AnyArray, "*batch 3"],
-) -> Float[Array, "*batch"]:
-    """Return the distance between segments, which may be parallel, touch, or be points [m].
-
-    Args:
-        start: Ends of the first segments [m].
-        end: Other ends of the first segments [m].
-        other_start: Ends of the second segments [m].
-        other_end: Other ends of the second segments [m].
-    """
-    start, end = jnp.asarray(start), jnp.asarray(end)
-    other_start, other_end = jnp.asarray(other_start), jnp.asarray(other_end)
+    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
+) -> Lengths:
+    """Return the distance between segments, which may be parallel, touch, or be points [m]."""
+    start, end, other_start, other_end = map(jnp.asarray, (start, end, other_start, other_end))
     u, v = end - start, other_end - other_start
     # The closest points are found without derivatives: theirs add nothing to that of the distance,
     # and they have none at parallel axes.
     a, b = jax.lax.stop_gradient(_closest(u, v, start - other_start))
-    return rounded_norm(start + a * u - other_start - b * v)
+    return _rounded_norm(start + a * u - other_start - b * v)
 
 
 def _closest(u: Array, v: Array, r: Array) -> tuple[Array, Array]:
