@@ -29,10 +29,18 @@ import timing
 from scipy import signal
 
 import jaxid as jid
-from jaxid.identification.runs.comparison import LEVEL, Verdict  # private: levels
-from jaxid.identification.runs.estimates import groups  # private: kinds of parameters
-from jaxid.identification.runs.payload import Payload  # private: a known payload
-from jaxid.identification.runs.states import stores_energy  # private: kinds of parameters
+from jaxid.identification.comparison import (  # private: levels, kinds of parameters
+    LEVEL,
+    Verdict,
+    parameter_kinds,
+)
+from jaxid.identification.payload import (  # private: a known payload
+    CENTRAL_NAMES,
+    CENTRAL_UNITS,
+    Payload,
+)
+from jaxid.identification.states import stores_energy  # private: kinds of parameters
+from jaxid.identification.uncertainty import Uncertainty  # private: a known payload
 from jaxid.measurement.recording import remove_delay  # private: mend a log
 
 SAMPLE_TIME, MEMORY, NOISE = 0.002, 0.05, 0.01
@@ -122,7 +130,7 @@ def cold_and_warm(draws: int) -> list[str]:
     rig = Rig(base.model, omega=0.8, seed=1)
     clean = [rig.forces(p) for p in truth]
     cold_p, warm_p = (np.asarray(base.from_standard(p)) for p in truth)
-    stored, kinds = stores_energy(base), np.array(groups(base))
+    stored, kinds = stores_energy(base), np.array(parameter_kinds(base))
     verdicts, nothing, inside, states, shared, widths = [], [], [], [], [], []
     table: list[str] = []
     for seed in range(draws):
@@ -139,7 +147,7 @@ def cold_and_warm(draws: int) -> list[str]:
         states.append((tested.verdicts, both.sharing[1]))
         shared.append(_groups(cold, warm))
         apart = cold.standard_deviations[list(both.shared)]
-        widths.append(np.median(both.of("cold").standard_deviations[list(both.shared)] / apart))
+        widths.append(np.median(both.fit("cold").standard_deviations[list(both.shared)] / apart))
         if not seed:
             table = _paper_table(base, found, cold_p, warm_p)
     changed = np.array([[v is Verdict.CHANGED for v in row] for row in verdicts])
@@ -182,7 +190,7 @@ def cold_and_warm(draws: int) -> list[str]:
 
 def _groups(first: jid.Fit, second: jid.Fit) -> bool:
     """Return whether any group changed (equal states), or just friction (cold and warm)."""
-    found = {g.name: g.changed for g in jid.compare(first, second).groups}
+    found = {g["name"]: g["changed"] for g in jid.compare(first, second).groups}
     if second.name == "again":
         return any(found.values())
     return all(changed == ("friction" in name) for name, changed in found.items())
@@ -193,7 +201,7 @@ def _paper_table(base: jid.BaseParameters, found, cold: np.ndarray, warm: np.nda
         "| parameter | cold: truth | estimate | warm: truth | estimate | difference | verdict |",
         "|---|---|---|---|---|---|---|",
     ]
-    halves = [e.half_widths(LEVEL) for e in (found.first, found.second)]
+    halves = [e.uncertainty.half_widths(LEVEL) for e in (found.first, found.second)]
     for k in [0, 1, *(base.names.index(n) for n in ("fv1", "fv2", "fc1", "fc2"))]:
         a, b = (
             f"{e.parameters[k]:.3f} ± {h[k]:.3f}"
@@ -236,8 +244,8 @@ def payload(draws: int) -> list[str]:
     base, plain, loaded = panda()
     rigs = [Rig(base.model, omega=2 * np.pi / 8, seed=k + 1) for k in range(2)]
     clean = [rig.forces(p) for rig, p in zip(rigs, (plain, loaded), strict=True)]
-    truth = Payload(6, *(np.asarray(TOOL.parameters),) * 2, np.eye(10), np.ones(10), 0.0)
-    wanted = truth.central.parameters
+    known = Uncertainty(np.eye(10), np.ones(10), np.eye(10))
+    wanted, _ = Payload(6, *(np.asarray(TOOL.parameters),) * 2, known, 0.0).central
     masses, inside, estimates, distances, gains, holds = [], [], [], [], [], []
     for seed in range(draws):
         runs = [
@@ -247,7 +255,7 @@ def payload(draws: int) -> list[str]:
         found = jid.identify_payload(*runs)
         estimates.append(found.central)
         masses.append(found.mass / 3.0 - 1.0)
-        half = found.estimates.half_widths(LEVEL)
+        half = found.uncertainty.half_widths(LEVEL)
         inside.append(np.abs(found.estimate - TOOL.parameters) <= half)
         distances.append(found.distance)
         _ = found.tool
@@ -258,17 +266,17 @@ def payload(draws: int) -> list[str]:
         ]
         drives = jid.identify_drive_gains(*currents, TOOL)
         gains.append(drives.gains / true - 1.0)
-        holds.append(np.abs(drives.gains - true) <= drives.estimates.half_widths(LEVEL))
-    first = estimates[0]
+        holds.append(np.abs(drives.gains - true) <= drives.uncertainty.half_widths(LEVEL))
+    (first, known), names = estimates[0], zip(CENTRAL_NAMES, CENTRAL_UNITS, strict=True)
     lines = [
         "| parameter | truth | estimate (95 %) | largest error of all draws |",
         "|---|---|---|---|",
     ]
-    errors = np.abs(np.array([e.parameters for e in estimates]) - wanted).max(axis=0)
-    halves = first.half_widths(LEVEL)
-    for k, (name, unit) in enumerate(zip(first.names, first.units, strict=True)):
+    errors = np.abs(np.array([values for values, _ in estimates]) - wanted).max(axis=0)
+    halves = known.half_widths(LEVEL)
+    for k, (name, unit) in enumerate(names):
         lines.append(
-            f"| {name} [{unit}] | {wanted[k]:.4f} | {first.parameters[k]:.4f} ± {halves[k]:.4f} "
+            f"| {name} [{unit}] | {wanted[k]:.4f} | {first[k]:.4f} ± {halves[k]:.4f} "
             f"| {errors[k]:.4f} |"
         )
     gains = np.array(gains)

@@ -164,13 +164,14 @@ empty_fit, loaded_fit = (
 )
 payload = jid.identify_payload(empty_fit, loaded_fit)
 print(payload)
-central = payload.central
-half = central.half_widths(0.95)
+values, uncertainty = payload.central
+half = uncertainty.half_widths(0.95)
+names, units = (column.values for column in payload.summary().columns[::3])
 exact = [2.0, 0.02, -0.03, 0.16, 0.012, 0.011, 0.006, 0.0, 0.0, 0.0]
 figure, axes = plt.subplots(figsize=(11, 2.8))
 axes.axhspan(-1, 1, color="#d5dae0", lw=0)
-axes.plot(np.arange(10), (np.asarray(central.parameters) - exact) / half, "o")
-axes.set_xticks(range(10), [f"{n}\n{u}" for n, u in zip(central.names, central.units)])
+axes.plot(np.arange(10), (values - exact) / half, "o")
+axes.set_xticks(range(10), [f"{n}\n{u}" for n, u in zip(names, units)])
 axes.set_ylabel("error / half of the 95 % interval")
 axes.set_ylim(-2, 2)
 axes.grid(axis="x", visible=False)

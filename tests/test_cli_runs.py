@@ -180,7 +180,7 @@ def test_a_report_takes_later_logs(folder, run):  # noqa: F811
     assert added["fit"]["rows"] == together["fit"]["rows"]
     assert added["settings"]["identification"] == ["first", "b.csv"]
     assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
-    said = "the two runs `a` have seen the same data"
+    said = "the two fits `a` have seen the same data"
     assert refused(run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said)
     said = "a report that was given has seen the data of `a`"
     seen = ("first", "b.csv", "--verify", "a.csv", "-o", "twice")
@@ -239,9 +239,7 @@ def test_states_share_inertia(folder, run):  # noqa: F811
     expected = jid.identify_states(runs)
     estimates = {row["name"]: row["estimate"] for row in found["parameters"]}
     assert tuple(estimates) == expected.names
-    np.testing.assert_allclose(
-        list(estimates.values()), expected.estimates.parameters, rtol=1e-9, atol=1e-12
-    )
+    np.testing.assert_allclose(list(estimates.values()), expected.parameters, rtol=1e-9, atol=1e-12)
     assert set(found["shared"]) == {base.names[k] for k in expected.shared}
     assert "fv1 (warm)" in out
     said = "one log or report for each of two or more states, with different names"

@@ -12,7 +12,7 @@ from jaxid.demo.feed_forward import Timing, time_feed_forward
 from jaxid.demo.page import write_study
 from jaxid.demo.study import run_study
 from jaxid.demo.tables import error_table, paper_table, tables, temperature_table
-from jaxid.identification.runs.comparison import Verdict
+from jaxid.identification.comparison import Verdict
 
 
 @pytest.fixture(scope="module")

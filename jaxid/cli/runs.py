@@ -19,13 +19,20 @@ from jaxid.cli.options import (
 from jaxid.errors import InputError
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.session import is_report, read_run, require_plain, select_filter
+from jaxid.identification.comparison import compare as compare_fits
+from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit import Fit
-from jaxid.identification.runs.comparison import Comparison
-from jaxid.identification.runs.drive_gains import identify_drive_gains
-from jaxid.identification.runs.payload import Payload, identify_payload
-from jaxid.identification.runs.states import identify_states
-from jaxid.report.result_files import read_estimates, write_comparison, write_estimates
+from jaxid.identification.payload import (
+    CENTRAL_NAMES,
+    CENTRAL_UNITS,
+    Payload,
+    identify_payload,
+)
+from jaxid.identification.states import identify_states
+from jaxid.report.result_files import read_fit, write_comparison, write_estimates
+from jaxid.report.result_json import estimate_rows
 from jaxid.report.terminal import show, show_files, show_remarks
+from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.table import Remark, Status, significant
 
 Unloaded = Annotated[
@@ -70,8 +77,8 @@ def compare(
         raise InputError(f"`{first}` is given twice: compare two different runs.")
     refuse_foreign_folder(output, force)
     twins = first.resolve().name == second.resolve().name
-    cold, warm = (read_estimates(path, str(path) if twins else None) for path in (first, second))
-    found = Comparison.of(cold, warm, level)
+    cold, warm = (read_fit(path, str(path) if twins else None) for path in (first, second))
+    found = compare_fits(cold, warm, level)
     with open_stages(1) as stage:
         stage("drawing")
         files = write_comparison(output, found, (first, second))
@@ -113,7 +120,12 @@ def payload(
         "distance": found.distance,
     }
     sources = {"unloaded": logs, "loaded": loaded}
-    files = write_estimates(output, "payload", [found.estimates, found.central], content, sources)
+    rows = [
+        *estimate_rows(INERTIAL_NAMES, INERTIAL_UNITS, found.parameters, found.uncertainty),
+        *estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *found.central),
+    ]
+    covariance = found.uncertainty.covariance
+    files = write_estimates(output, "payload", rows, covariance, content, sources)
     console = open_console()
     show(console, found.summary())
     show_remarks(console, [Remark(text, Status.DOUBTFUL) for text in doubts])
@@ -147,7 +159,10 @@ def gains(
     found = identify_drive_gains(*pair, described.load)
     key, values = _corrected(described, np.asarray(found.gains))
     sources = {"unloaded": logs, "loaded": loaded}
-    files = write_estimates(output, "gains", [found.estimates], {key: values}, sources)
+    names = found.joint_names
+    rows = estimate_rows(names, ("1",) * len(names), found.gains, found.uncertainty)
+    covariance = found.uncertainty.covariance
+    files = write_estimates(output, "gains", rows, covariance, {key: values}, sources)
     console = open_console()
     show(console, found.summary())
     show_remarks(console, [Remark(text, Status.DOUBTFUL) for text in doubts])
@@ -192,7 +207,9 @@ def states(
         "varying": [found.base.names[k] for k in found.varying],
         "sharing_chance": chance,
     }
-    files = write_estimates(output, "states", [found.estimates], content, {"states": logs})
+    rows = estimate_rows(found.names, found.units, found.parameters, found.uncertainty)
+    covariance = found.uncertainty.covariance
+    files = write_estimates(output, "states", rows, covariance, content, {"states": logs})
     console = open_console()
     if chance < UNLIKELY:
         doubts.append(

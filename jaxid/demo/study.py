@@ -11,6 +11,7 @@ import numpy as np
 import jaxid as jid
 from jaxid.arrays import Float
 from jaxid.demo.feed_forward import Timing, time_feed_forward
+from jaxid.identification.comparison import Comparison
 from jaxid.simulation.experiment import Tracking
 from jaxid.validation import Validation
 
@@ -126,7 +127,7 @@ class Study(NamedTuple):
     consistent: Model
     true: Model
     warm: jid.Fit
-    temperature: jid.identification.runs.comparison.Comparison
+    temperature: Comparison
     coverage: tuple[Coverage, ...]
     followed: tuple[PathRun, ...]
     timing: Timing | str
@@ -220,11 +221,9 @@ def run_study(
     progress("identifying", 0.0)
     rows = jid.RegressionProblem(base, [observations[0]])
     fits = {
-        "without weights": jid.identification.identify.fit_problem(
-            rows, jid.estimators.LeastSquares()
-        ),
-        "weighted": jid.identification.identify.fit_problem(rows, jid.WeightedLeastSquares()),
-        "consistent": jid.identification.identify.fit_problem(rows, jid.PhysicallyConsistent()),
+        "without weights": jid.identify(base, rows, jid.estimators.LeastSquares()),
+        "weighted": jid.identify(base, rows, jid.WeightedLeastSquares()),
+        "consistent": jid.identify(base, rows, jid.PhysicallyConsistent()),
     }
     truth = np.asarray(base.from_standard(cold.parameters))
     fits["true parameters"] = eqx.tree_at(lambda f: f.parameters, fits["weighted"], truth)
@@ -232,9 +231,7 @@ def run_study(
     recordings = [observations[0], observations[2]]
     models = [Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()]
     progress("comparing cold and warm", 0.0)
-    warm = jid.identification.identify.fit_problem(
-        jid.RegressionProblem(base, [observations[1]]), jid.WeightedLeastSquares()
-    )
+    warm = jid.identify(base, observations[1], jid.WeightedLeastSquares())
     progress("checking intervals", 0.0)
     coverage = _check_coverage(base, played, seed, draws)
     progress("following the path with three controllers", 0.0)
@@ -322,11 +319,7 @@ def _check_coverage(
         inside = 0
         for log in logs:
             rows = jid.RegressionProblem(base, [_observe(log, quiet.robot, filter)])
-            low, high = (
-                jid.identification.identify.fit_problem(rows, jid.WeightedLeastSquares())
-                .intervals(0.95)
-                .T
-            )
+            low, high = jid.identify(base, rows, jid.WeightedLeastSquares()).intervals(0.95).T
             inside += int(np.count_nonzero((low <= truth) & (truth <= high)))
         return inside
 

@@ -10,14 +10,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.identification.delay import estimate_delay
 from jaxid.identification.estimators import GivenWeights
 from jaxid.identification.fit import Fit
-from jaxid.identification.runs.delay import estimate_delay
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 
@@ -225,7 +224,7 @@ def delay_finding(base: BaseParameters, observations: Observations, fit: Fit) ->
         delay = estimate_delay(base, observations, GivenWeights(np.asarray(fit.weights)))
     except ValueError:
         return ()
-    half = delay.standard_deviation * float(stats.t.ppf(0.975, delay.freedom))
+    half = delay.interval()[1] - delay.seconds
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     scatter = float(np.std(delay.of_joints))
     if abs(delay.seconds) < max(half, scatter, 0.1 * observations.sample_time):
@@ -234,7 +233,7 @@ def delay_finding(base: BaseParameters, observations: Observations, fit: Fit) ->
         f"the forces seem to stand {1e3 * abs(delay.seconds):.3g} ± {1e3 * half:.2g} ms "
         f"{'later' if delay.seconds > 0 else 'earlier'} in the log than the angles: "
     )
-    if delay.alike > 0.001:
+    if delay.p_value > 0.001:
         cure = f"`force_delay = {delay.seconds:.3g}` in `[recording]` removes that"
         return (f"{text}{cure}, unless the model lacks an effect instead.",)
     low, high = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))

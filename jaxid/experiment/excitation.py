@@ -30,10 +30,10 @@ from jaxid.excitation.problem import assumed_noise
 from jaxid.experiment.decoder import within
 from jaxid.experiment.excitation_tables import CRITERIA
 from jaxid.experiment.experiment import Experiment
-from jaxid.identification.runs.estimates import groups
+from jaxid.identification.comparison import parameter_kinds
 from jaxid.io import atomic_folder
 from jaxid.report.excitation import list_joints, write_excitation
-from jaxid.report.result_files import read_estimates
+from jaxid.report.result_files import read_fit
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.table import Remark, Status
 from jaxid.trajectory.files import (
@@ -321,16 +321,16 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
 
 
 def _earlier_result(experiment: Experiment, report: str) -> Nominal:
-    base, fit = experiment.base, read_estimates(experiment.path.parent / report)
-    if fit.names != base.names:
+    base, fit = experiment.base, read_fit(experiment.path.parent / report)
+    if fit.base.names != base.names:
         raise InputError(
-            f"`nominal`: the {len(fit.names)} base parameters of `{report}` are not the "
+            f"`nominal`: the {fit.base.size} base parameters of `{report}` are not the "
             f"{base.size} of this experiment: identify with the same robot and model."
         )
     covariance = np.array(fit.covariance)
     undetermined = ~np.isfinite(np.diag(covariance))
     covariance[undetermined | undetermined[:, None]] = 0.0
-    names = tuple(n for n, u in zip(fit.names, undetermined, strict=True) if u)
+    names = tuple(n for n, u in zip(base.names, undetermined, strict=True) if u)
     return Nominal(base.names, np.asarray(fit.parameters), covariance, names)
 
 
@@ -469,7 +469,7 @@ def _describe_use(finding: Finding) -> str:
 
 def _unknown_parameters(experiment: Experiment, nominal: Nominal) -> str:
     """Name the unknown parameters by effect and joint; empty if all are known."""
-    base, kinds = experiment.base, groups(experiment.base)
+    base, kinds = experiment.base, parameter_kinds(experiment.base)
     joints: dict[str, list[int]] = {}
     for k in np.flatnonzero(np.isnan(nominal.parameters)):
         number = re.search(r"\d+$", base.model.parameter_names[base.indices[k]])

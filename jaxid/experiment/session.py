@@ -14,12 +14,10 @@ from jaxid.experiment.decoder import within
 from jaxid.experiment.experiment import Experiment
 from jaxid.experiment.progress import Stages
 from jaxid.identification.choices import FilterChoice, choose_filter
+from jaxid.identification.combination import require_same_base, share_rows, update
 from jaxid.identification.fit import Fit, load
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.runs.least_squares import require_same_base
-from jaxid.identification.runs.twice import share_data
-from jaxid.identification.runs.update import update
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.measurement.timestamps import NeedsMemory
@@ -365,7 +363,7 @@ def _add_reports(experiment: Experiment, reports: Sequence[Path], fit: Fit) -> F
 
 def _refuse_seen(fit: Fit, base: BaseParameters, unseen: Sequence[Observations]) -> None:
     for log in unseen:
-        if fit.blocks is not None and share_data(fit.blocks, RegressionProblem(base, [log]).blocks):
+        if fit.blocks is not None and share_rows(fit.blocks, RegressionProblem(base, [log]).blocks):
             raise InputError(
                 f"a report that was given has seen the data of `{log.name}`: a model that has seen "
                 "a log is not verified by it; verify with another."

@@ -1,8 +1,11 @@
-"""Result of an identification: estimates, covariance, factors."""
+"""Result of an identification: estimates, covariance, factors; and its file."""
 
 import dataclasses
-import enum
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -11,48 +14,30 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.identification.consistency.estimator import Consistency
-from jaxid.identification.estimators import (
-    AbstractEstimator,
-    AbstractSpectralSolution,
-    Complete,
-    EstimatorInWords,
-)
+from jaxid.identification.estimators.estimate import AbstractEstimator, EstimatorInWords
 from jaxid.identification.estimators.solutions import (
     LARGEST_UNCERTAINTY,
+    AbstractSpectralSolution,
+    Complete,
     Decomposition,
     UndeterminedDirection,
 )
 from jaxid.identification.factors import Blocks
-from jaxid.identification.model_file import checksum_of, read_model, write_model
-from jaxid.identification.uncertainty import ResidualSpectra, Uncertainty
-from jaxid.io import to_json
+from jaxid.identification.uncertainty.result import ResidualSpectra, Uncertainty
+from jaxid.io import from_json, json_text, read_json, to_json, write_text
 from jaxid.measurement.observations import Observations
-from jaxid.table import (
-    Column,
-    Remark,
-    Status,
-    Table,
-    percent,
-    significant,
-    with_deviations,
-)
+from jaxid.table import Column, Remark, Status, Table, percent, significant, with_deviations
+
+if TYPE_CHECKING:
+    from jaxid.identification.consistency.estimator import Consistency
+else:
+    # The module of physical consistency is loaded where it is used.
+    Consistency = eqx.Module
 
 TRUSTED, DOUBTFUL = 0.1, 0.5
 """Relative standard deviations up to which an estimate is trusted, or doubtful, as fractions."""
-
-
-class Trust(enum.Enum):
-    """How far an estimate can be trusted."""
-
-    GOOD = "trusted"
-    DOUBTFUL = "doubtful"
-    NONE = "small, or not excited"
-
-    @property
-    def status(self) -> Status:
-        """Mark of the row of such an estimate."""
-        return {"GOOD": Status.GOOD, "DOUBTFUL": Status.DOUBTFUL, "NONE": Status.BAD}[self.name]
+FORMAT, VERSION = "jaxid model", 1
+"""Entries of a model file that tell what it is."""
 
 
 class ConditionNumbers(eqx.Module):
@@ -60,7 +45,7 @@ class ConditionNumbers(eqx.Module):
 
     Attributes:
         raw: As it is, in SI units.
-        weighted: With the rows weighted as they were for the fit.
+        weighted: With the weights of the fit.
         scaled: Weighted, with columns of length one: free of units.
     """
 
@@ -73,26 +58,26 @@ class Fit(eqx.Module):
     """Identified base parameters with their uncertainty.
 
     Attributes:
-        base: Which combinations of standard parameters they are.
-        parameters: The estimates, in the units of `base.units`.
-        uncertainty: Uncertainty of the estimates, and its method.
+        base: Base parameters, as combinations of standard parameters.
+        parameters: Estimates, in the units of `base.units`.
+        uncertainty: Uncertainty of the estimates.
         weights: Weights of the joints' rows [1/(N m) or 1/N].
         condition_numbers: Condition numbers of the observation matrix.
         rows: Number of rows of each joint.
         residual_rms: RMS of the residuals of each joint [N m or N].
-        residual: Norm of all residuals relative to the norm of all forces, of 1.
+        residual: Norm of all residuals relative to the norm of all forces.
         undetermined: Combinations that these observations do not determine.
-        estimator: What made the fit.
-        solution: How the system was solved in the end, with everything chosen that it chose.
+        estimator: Estimator that made the fit.
+        solution: Solution of the system, with all its settings determined.
         recordings: Names of the observations.
-        notes: What the user should know, in sentences.
-        consistency: How a physically consistent estimate came about, and which bounds decide.
+        notes: Sentences for the user.
+        consistency: Properties of a physically consistent estimate.
         full_parameters: Standard parameters, of an estimator that finds a complete set of them.
         residual_spectra: Spectra of each joint's residuals, and their whiteness; None where only
             factors of the rows were known.
         date: Day on which the fit was made, like 2026-01-31; empty if it is not known.
-        blocks: Factors of the rows by contiguous blocks of time, with which later functions go on;
-            None if they are not known.
+        blocks: Factors of the rows by contiguous blocks of time, for later functions; None if they
+            are not known.
         name: Name of the fit, such as `cold`; by default the names of its recordings.
     """
 
@@ -118,7 +103,7 @@ class Fit(eqx.Module):
 
     @property
     def covariance(self) -> Float[AnyArray, "base base"]:
-        """Of the estimates; infinite variances where nothing is known."""
+        """Covariance of the estimates; infinite variances where nothing is known."""
         return self.uncertainty.covariance
 
     @property
@@ -132,39 +117,38 @@ class Fit(eqx.Module):
         return self.uncertainty.naive_standard_deviations
 
     def intervals(self, level: float = 0.95) -> Float[np.ndarray, "base 2"]:
-        """Intervals that hold the true parameters in a share of cases.
+        """Return confidence intervals of the parameters.
 
-        They tell how far noise can take the estimates, of a model that is right: errors that every
+        They tell how far noise can take the estimates of a model that is right: errors that every
         recording of this kind would share (a wrong geometry, a missing effect) are not in them.
 
         Args:
-            level: The share, of 1.
+            level: Probability (0 to 1) that an interval contains the truth.
 
         Raises:
             InputError: If `level` is not between 0 and 1.
         """
-        half = self.uncertainty.half_widths(level)
-        p = np.asarray(self.parameters)
+        half, p = self.uncertainty.half_widths(level), np.asarray(self.parameters)
         return np.stack([p - half, p + half], axis=1)
 
     @property
     def relative_standard_deviations(self) -> Float[np.ndarray, " base"]:
-        """Standard deviations in units of the estimates' sizes, as fractions."""
+        """Standard deviations relative to the sizes of the estimates."""
         size = np.abs(np.asarray(self.parameters))
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(size > 0, self.standard_deviations / size, np.inf)
 
     @property
-    def trust(self) -> tuple[Trust, ...]:
-        """How far each estimate can be trusted; not if it is part of what is undetermined."""
-        undecided = {k for direction in self.undetermined for k in direction.parts}
+    def trust(self) -> tuple[Status, ...]:
+        """Judgement of each estimate by its relative standard deviation.
+
+        `GOOD` up to 0.1, `DOUBTFUL` up to 0.5; `BAD` above, and for all that is undetermined.
+        """
+        relative = self.relative_standard_deviations.copy()
+        relative[[k for direction in self.undetermined for k in direction.parts]] = np.inf
         return tuple(
-            Trust.NONE
-            if k in undecided or not share <= DOUBTFUL
-            else Trust.GOOD
-            if share <= TRUSTED
-            else Trust.DOUBTFUL
-            for k, share in enumerate(self.relative_standard_deviations)
+            Status.GOOD if x <= TRUSTED else Status.DOUBTFUL if x <= DOUBTFUL else Status.BAD
+            for x in relative
         )
 
     @property
@@ -191,9 +175,8 @@ class Fit(eqx.Module):
     def is_least_squares(self) -> bool:
         """Whether the estimates are weighted least squares of the rows, up to rounding."""
         R, z = self.factor
-        plain = Decomposition.of(R, z).solve()
-        apart = np.linalg.norm(R @ (np.asarray(self.parameters) - plain))
-        return bool(apart <= 1e-7 * np.linalg.norm(z))
+        error = np.linalg.norm(R @ (np.asarray(self.parameters) - Decomposition.of(R, z).solve()))
+        return bool(error <= 1e-7 * np.linalg.norm(z))
 
     @property
     def condition_number(self) -> float:
@@ -214,11 +197,9 @@ class Fit(eqx.Module):
 
     @property
     def facts(self) -> list[tuple[str, str]]:
-        """Rows, condition numbers and residual, each with its word."""
-        rows, numbers, trust = self.rows, self.condition_numbers, self.trust
-        good, fair, poor = (
-            trust.count(level) for level in (Trust.GOOD, Trust.DOUBTFUL, Trust.NONE)
-        )
+        """Rows, condition numbers, residual and trust, each with its word."""
+        rows, numbers = self.rows, self.condition_numbers
+        good, fair, poor = map(self.trust.count, (Status.GOOD, Status.DOUBTFUL, Status.BAD))
         return [
             (
                 "rows per joint",
@@ -240,26 +221,20 @@ class Fit(eqx.Module):
     @property
     def determination(self) -> list[Remark]:
         """Combinations that the logs do not determine, and what to do about them."""
-        base = self.base
-        if not self.undetermined:
+        base, count = self.base, len(self.undetermined)
+        if not count:
             return [Remark(f"These logs determine all {base.size} base parameters.", Status.GOOD)]
-        count = len(self.undetermined)
         headline = (
             f"NOT DETERMINED by these logs: {count} combination{'' if count == 1 else 's'} of the "
             f"{base.size} base parameters."
         )
         remarks = [Remark(headline, Status.BAD)]
         for direction in self.undetermined:
-            moved = np.isfinite(direction.uncertainty)
-            open_part = f"leaves {percent(direction.uncertainty)} % of the forces open"
-            remarks.append(
-                Remark(
-                    f"{direction.sentence(base)}.",
-                    Status.BAD,
-                    f"{open_part if moved else 'not moved at all'}; singular value "
-                    f"{direction.singular_value:.1e} of the largest",
-                )
-            )
+            detail = "not moved at all"
+            if np.isfinite(direction.uncertainty):
+                detail = f"leaves {percent(direction.uncertainty)} % of the forces open"
+            detail += f"; singular value {direction.singular_value:.1e} of the largest"
+            remarks.append(Remark(f"{direction.sentence(base)}.", Status.BAD, detail))
         advice = (
             "A combination counts as not determined if it leaves more than "
             f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open. Estimates of these "
@@ -277,7 +252,7 @@ class Fit(eqx.Module):
         Estimates are shown with the digits that their standard deviations leave meaningful. Beside
         them are the standard deviations that independent rows would have, and the ratio to these.
         """
-        base, trust = self.base, self.trust
+        base, trust, ratios = self.base, self.trust, self.uncertainty.ratios
         values, deviations = with_deviations(self.parameters, self.standard_deviations)
         columns = [
             Column("#", list(range(1, base.size + 1))),
@@ -287,36 +262,27 @@ class Fit(eqx.Module):
             Column("unit", base.units),
             Column("±", self.relative_standard_deviations, "%", percent),
         ]
-        ratios = self.uncertainty.ratios
-        finite = ratios[np.isfinite(ratios)]
-        remarks = [*self.determination]
+        remarks, finite = [*self.determination], ratios[np.isfinite(ratios)]
         if np.any(np.abs(finite - 1.0) > 1e-9):
+            naive = self.naive_standard_deviations
             columns += [
-                Column(
-                    "naive ±", self.naive_standard_deviations, format=lambda x: significant(x, 2)
-                ),
+                Column("naive ±", naive, format=lambda x: significant(x, 2)),
                 Column("ratio", ratios, format=lambda x: significant(x, 2)),
             ]
-            remarks.append(
-                Remark(
-                    f"Standard deviations are {significant(float(np.median(finite)), 2)} times "
-                    "(median) those of independent rows, because errors of neighbouring rows are "
-                    "correlated."
-                )
+            text = (
+                f"Standard deviations are {significant(float(np.median(finite)), 2)} times "
+                "(median) those of independent rows, because errors of neighbouring rows are "
+                "correlated."
             )
-        return Table(
-            f"{base.model.robot.name}: {base.size} base parameters",
-            *columns,
-            facts=self.facts,
-            status=[level.status for level in trust],
-            remarks=remarks,
-        )
+            remarks.append(Remark(text))
+        title = f"{base.model.robot.name}: {base.size} base parameters"
+        return Table(title, *columns, facts=self.facts, status=trust, remarks=remarks)
 
     def __str__(self) -> str:
         return str(self.summary())
 
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
-        """Forces that the model needs for a motion, without a known tool's [N m or N] (Eq. 39).
+        """Return the forces of a motion, without a known tool's [N m or N] (Eq. 39).
 
         Raises:
             InputError: If the motion is of another number of joints.
@@ -331,11 +297,11 @@ class Fit(eqx.Module):
 
     @property
     def checksum(self) -> str:
-        """Of everything that a model file of this fit holds: tells models apart."""
-        return checksum_of(to_json(self._kept()))
+        """Checksum of everything that a model file of this fit holds: tells models apart."""
+        return checksum_of(self._content())
 
     def save(self, path: str | Path) -> Path:
-        """Writes the fit to a model file (JSON) from which `load` makes the same fit again.
+        """Write the fit to a model file (JSON) from which `load` makes the same fit again.
 
         An estimator that holds recordings or functions is kept in words only.
 
@@ -346,21 +312,27 @@ class Fit(eqx.Module):
             InputError: If the model holds something that no file can hold, such as a term with
                 functions in it.
         """
-        return write_model(path, self._kept())
+        content = self._content()
+        checksum = checksum_of(content)
+        document = {"format": FORMAT, "version": VERSION, "checksum": checksum, "model": content}
+        write_text(path, json_text(document))
+        return Path(path)
 
-    def _kept(self) -> "Fit":
+    def _content(self) -> Any:
+        """Return the fit as plain JSON values."""
         try:
             to_json(self.estimator, refused=(Observations,))
         except InputError:
-            return dataclasses.replace(self, estimator=EstimatorInWords(str(self.estimator)))
-        return self
+            words = EstimatorInWords(str(self.estimator))
+            return to_json(dataclasses.replace(self, estimator=words))
+        return to_json(self)
 
 
 def load(path: str | Path) -> Fit:
-    """Reads a fit from a model file, as `Fit.save` and `jaxid identify` write it.
+    """Read a fit from a model file, as `Fit.save` and `jaxid identify` write it.
 
-    Numbers are the same to the last bit, and everything works as it did after `identify`. Terms of
-    one's own are found if the module that defines them is imported; nothing in a file is run.
+    Numbers are the same to the last bit, and everything works as it did after `identify`. Your own
+    terms are found if the module that defines them is imported; nothing in a file is executed.
 
     Args:
         path: Path of the file.
@@ -369,18 +341,90 @@ def load(path: str | Path) -> Fit:
         OSError: If the file cannot be read.
         InputError: If it is no model file, of another version, or not as it was written.
     """
-    return read_model(path, Fit, _check)
+    try:
+        document = read_json(path, _unique_keys)
+    except ValueError as error:
+        raise InputError(f"`{path}` is no model file: it cannot be read as JSON.") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise InputError(
+            f'`{path}` is no model file (`"format": "{FORMAT}"`), as `save` writes it.'
+        )
+    version = document.get("version")
+    if version is True or version != VERSION:
+        raise InputError(
+            f"`{path}` is a model file of version {version!r:.20}, but this jaxid reads version "
+            f"{VERSION}: use the jaxid that wrote it, or identify again."
+        )
+    other = set(document) ^ {"format", "version", "checksum", "model"}
+    if other:
+        raise InputError(
+            f"`{path}` must have the keys format, version, checksum, model, but differs by "
+            f"{', '.join(sorted(other))}."
+        )
+    try:
+        checksum = checksum_of(document["model"])
+    except RecursionError as error:
+        raise InputError(f"`{path}` is no model file: it is nested too deeply.") from error
+    if document["checksum"] != checksum:
+        raise InputError(
+            f"`{path}` is damaged or was changed by hand: its checksum does not fit its content; "
+            "save the model again."
+        )
+    try:
+        fit = from_json(document["model"], Fit)
+        _check(fit)
+    except (ValueError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise InputError(f"`{path}` holds no model that can be used: {reason}.") from error
+    return fit
+
+
+def checksum_of(content: Any) -> str:
+    """Return the SHA-256 of plain JSON values, whatever their layout in a file."""
+    plain = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return f"sha256:{hashlib.sha256(plain.encode()).hexdigest()}"
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        raise InputError("a key comes twice")
+    return content
 
 
 def _check(fit: Fit) -> None:
-    """Refuses arrays of a file that do not belong to its robot."""
+    """Reject arrays of a file that do not belong to its robot."""
+    from jaxid.identification.consistency.estimator import Consistency
+
+    if not isinstance(fit.consistency, Consistency | None):
+        raise InputError("`consistency` is of another class")
     n, joints = fit.base.size, fit.base.model.robot.joints
     for name, array, shape in (
         ("parameters", fit.parameters, (n,)),
-        ("uncertainty.covariance", fit.uncertainty.covariance, (n, n)),
+        ("uncertainty.covariance", fit.covariance, (n, n)),
         ("weights", fit.weights, (joints,)),
     ):
         if np.shape(array) != shape:
             raise InputError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")
     if not np.isfinite(fit.parameters).all():
         raise InputError("`parameters` must hold finite numbers")
+
+
+def interval_table(
+    title: str,
+    names: Sequence[str],
+    units: Sequence[str],
+    values: Float[AnyArray, " estimates"],
+    uncertainty: Uncertainty,
+    remarks: Iterable[Remark] = (),
+) -> Table:
+    """Return a table of estimates with their 95 % intervals."""
+    estimates, half_widths = with_deviations(values, uncertainty.half_widths())
+    return Table(
+        title,
+        Column("parameter", names),
+        Column("estimate", estimates, kind="number"),
+        Column("± (95 %)", half_widths, kind="number"),
+        Column("unit", units),
+        remarks=remarks,
+    )

@@ -9,17 +9,19 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.estimators import (
-    AbstractEstimator,
+from jaxid.identification.estimators.estimate import AbstractEstimator, Estimate
+from jaxid.identification.estimators.least_squares import WeightedLeastSquares
+from jaxid.identification.estimators.solutions import (
+    NUMERICAL,
     AbstractSpectralSolution,
-    Estimate,
-    WeightedLeastSquares,
+    Decomposition,
+    undetermined,
 )
-from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition, undetermined
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import ConditionNumbers, Fit
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.uncertainty import AbstractUncertainty, SpectralSandwich
+from jaxid.identification.uncertainty.result import AbstractUncertainty
+from jaxid.identification.uncertainty.spectral import SpectralSandwich
 from jaxid.measurement.observations import Observations, Progress
 
 
@@ -100,6 +102,7 @@ def fit_problem(
     naive = _naive_covariance(factors, R, decomposition, estimate)
     method = SpectralSandwich() if uncertainty is None else uncertainty
     errors, spectra = method(plain, estimate, naive)
+    shrinkage = _shrinkage_notes(decomposition, estimate.solution)
     return Fit(
         base=base,
         parameters=p,
@@ -116,12 +119,7 @@ def fit_problem(
         consistency=estimate.consistency,
         full_parameters=None if estimate.standard is None else np.asarray(estimate.standard),
         recordings=problem.names,
-        notes=(
-            *base.notes,
-            *_regularisation_notes(decomposition, estimate.solution),
-            *estimate.notes,
-            *errors.notes,
-        ),
+        notes=(*base.notes, *shrinkage, *estimate.notes, *errors.notes),
         date=datetime.date.today().isoformat(),
         blocks=plain.blocks,
         name=", ".join(problem.names),
@@ -159,7 +157,6 @@ def _naive_covariance(
     $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights are not the
     reciprocals of the standard deviations.
     """
-    s = np.asarray(decomposition.values)
     B, weights = np.asarray(estimate.inverse), np.asarray(estimate.weights)
     squares = factors.residual_squares(estimate.parameters)
     taken = estimate.effective_parameters
@@ -168,16 +165,14 @@ def _naive_covariance(
     free = 1.0 - taken / float(factors.rows.sum())
     covariance = np.zeros_like(B)
     for joint, w, square in zip(factors.joints, weights, squares, strict=True):
-        variance = square / max(joint.rows * free, 1.0)
         gain = w**2 * np.asarray(joint.R)[:, :-1] @ B[list(joint.columns)]
-        covariance += variance * (gain.T @ gain)
-    null = np.asarray(decomposition.directions)[s <= NUMERICAL * s.max(initial=0.0)]
-    unknown = np.sum(null**2, axis=0) > 1e-8
+        covariance += square / max(joint.rows * free, 1.0) * (gain.T @ gain)
+    unknown = decomposition.unknown
     covariance[unknown, unknown] = np.inf
     return covariance
 
 
-def _regularisation_notes(
+def _shrinkage_notes(
     decomposition: Decomposition, solution: AbstractSpectralSolution
 ) -> tuple[str, ...]:
     """Return what standard deviations leave out where a solution shrinks weak directions."""

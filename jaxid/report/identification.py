@@ -17,8 +17,24 @@ from jaxid.report.tables import (
 )
 from jaxid.report.verdict import verdict
 from jaxid.robot.robot import Robot
-from jaxid.table import MISSING, Column, Remark, Table, percent, significant, with_deviations
+from jaxid.table import (
+    MISSING,
+    Column,
+    Remark,
+    Status,
+    Table,
+    percent,
+    significant,
+    with_deviations,
+)
 from jaxid.validation import Definiteness, TorqueErrors
+
+TRUST = {
+    Status.GOOD: "trusted",
+    Status.DOUBTFUL: "doubtful",
+    Status.BAD: "small, or not excited",
+}
+"""Words for the trust in an estimate."""
 
 
 def identification_page(
@@ -164,9 +180,9 @@ def page_parameter_table(fit: Fit) -> Table:
         Column("95 %\nfrom", low, kind="number"),
         Column("95 %\nto", high, kind="number"),
         Column("±", fit.relative_standard_deviations, "%", percent),
-        Column("trust", [level.value for level in trust]),
+        Column("trust", [TRUST[level] for level in trust]),
         Column("combination", base.expressions, kind="code"),
-        status=[level.status for level in trust],
+        status=trust,
     )
 
 

@@ -10,8 +10,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from jaxid.identification.choices import FilterChoice
-from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
-from jaxid.identification.runs.comparison import Comparison, Verdict
+from jaxid.identification.comparison import Comparison, Verdict
+from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit
 from jaxid.report.style import (
     BLUE,
     GREY,
@@ -24,7 +24,7 @@ from jaxid.report.style import (
     logarithmic,
     new_figure,
 )
-from jaxid.table import significant, with_deviation
+from jaxid.table import Status, significant, with_deviation
 
 
 def parameter_figure(fit: Fit) -> Figure:
@@ -41,7 +41,7 @@ def parameter_figure(fit: Fit) -> Figure:
     finite = relative[np.isfinite(relative) & (relative > 0)]
     least = max(1e-5, float(finite.min())) if len(finite) else 1e-2
     low = min(10.0 ** math.floor(math.log10(least) - 0.1), 1e-2)
-    good = fit.trust.count(Trust.GOOD)
+    good = fit.trust.count(Status.GOOD)
     name = fit.base.model.robot.name
     with house_style():
         figure, panels = _long_list(order, 0.19, 1.35)
@@ -66,14 +66,14 @@ def comparison_figure(comparison: Comparison) -> Figure:
     Args:
         comparison: Comparison of two fits.
     """
-    first, second = comparison.first, comparison.second
+    first, second, count = comparison.first, comparison.second, len(comparison.indices)
     with house_style():
-        figure, panels = _long_list(np.arange(len(first.names)), 0.21, 1.5)
+        figure, panels = _long_list(np.arange(count), 0.21, 1.5)
         for axes, shown in panels:
             _draw_intervals(axes, comparison, shown)
         changed = comparison.verdicts.count(Verdict.CHANGED)
-        heading(figure, f"{changed} of {len(first.names)} parameters have changed")
-        _add_legend(figure, ((BLUE, first.label), (VERMILION, second.label)))
+        heading(figure, f"{changed} of {count} parameters have changed")
+        _add_legend(figure, ((BLUE, first.name), (VERMILION, second.name)))
     return figure
 
 
@@ -119,7 +119,7 @@ def _draw_deviations(
     axes: Axes, fit: Fit, relative: np.ndarray, shown: np.ndarray, low: float
 ) -> None:
     ceiling = 10.0
-    trust = {Trust.GOOD: BLUE, Trust.DOUBTFUL: ORANGE, Trust.NONE: VERMILION}
+    trust = {Status.GOOD: BLUE, Status.DOUBTFUL: ORANGE, Status.BAD: VERMILION}
     colours = np.array([trust[fit.trust[k]] for k in shown])
     places = np.arange(len(shown))
     deviations = np.nan_to_num(relative[shown], nan=np.inf, posinf=ceiling)
@@ -154,31 +154,34 @@ def _draw_deviations(
 
 def _draw_intervals(axes: Axes, comparison: Comparison, shown: np.ndarray) -> None:
     fits = comparison.first, comparison.second
-    halves = [fit.half_widths(comparison.level) for fit in fits]
-    sizes = [np.abs(fit.parameters) + half for fit, half in zip(fits, halves, strict=True)]
+    k = list(comparison.indices)
+    estimates = [np.asarray(fit.parameters)[k] for fit in fits]
+    halves = [fit.uncertainty.half_widths(comparison.level)[k] for fit in fits]
+    sizes = [np.abs(p) + half for p, half in zip(estimates, halves, strict=True)]
     # An end at infinity is off the axis, whatever the scale.
     ends = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)
     scale = np.where(ends > 0, ends, 1.0)[shown]
     places = np.arange(len(shown))
-    for fit, half, colour, shift in zip(
-        fits, halves, (BLUE, VERMILION), (-0.17, 0.17), strict=True
+    for p, half, colour, shift in zip(
+        estimates, halves, (BLUE, VERMILION), (-0.17, 0.17), strict=True
     ):
-        values = np.asarray(fit.parameters)[shown] / scale
+        values = p[shown] / scale
         low, high = (np.clip(values + s * half[shown] / scale, -2.0, 2.0) for s in (-1.0, 1.0))
         axes.hlines(places + shift, low, high, color=colour, lw=1.2)
         axes.scatter(values, places + shift, s=14, c=colour, zorder=3)
     axes.axvline(0.0, color=GREY, lw=0.7, zorder=1)
     axes.set_xlim(-1.08, 1.08)
-    axes.set_yticks(places, [fits[0].names[k] for k in shown])
+    axes.set_yticks(places, [comparison.names[i] for i in shown])
     axes.set_xlabel("estimate / farthest end of both intervals")
-    changed = [comparison.verdicts[k] is Verdict.CHANGED for k in shown]
+    verdicts = comparison.verdicts
+    changed = [verdicts[i] is Verdict.CHANGED for i in shown]
     for label, bold in zip(axes.get_yticklabels(), changed, strict=True):
         label.set_fontweight("bold" if bold else "normal")
     difference, half = comparison.difference, comparison.half_widths
-    pairs = [with_deviation(float(difference[k]), float(half[k])) for k in shown]
+    pairs = [with_deviation(float(difference[i]), float(half[i])) for i in shown]
     texts = [
-        f"{'' if a.startswith('-') else '+'}{a} ± {b} {fits[0].units[k]}"
-        for (a, b), k in zip(pairs, shown, strict=True)
+        f"{'' if a.startswith('-') else '+'}{a} ± {b} {comparison.units[i]}"
+        for (a, b), i in zip(pairs, shown, strict=True)
     ]
     _write_beside(axes, texts, changed)
 

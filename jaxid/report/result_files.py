@@ -10,11 +10,11 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 from jaxid.identification.choices import FilterChoice
+from jaxid.identification.comparison import LEVEL, Comparison
 from jaxid.identification.fit import Fit, load
-from jaxid.identification.runs.comparison import LEVEL, Comparison
-from jaxid.identification.runs.estimates import Estimates
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.report.errors import error_figure
 from jaxid.report.identification import identification_page
@@ -24,7 +24,6 @@ from jaxid.report.result_json import (
     SCHEMAS,
     Alternative,
     comparison_rows,
-    estimate_rows,
     header,
     identification_record,
     parameter_rows,
@@ -151,12 +150,12 @@ def _earlier_files(folder: Path) -> set[str]:
         return set()
 
 
-def read_estimates(folder: Path, label: str | None = None) -> Estimates:
-    """Read the base parameters and their covariance from a report.
+def read_fit(folder: Path, name: str | None = None) -> Fit:
+    """Read the fit of a report.
 
     Args:
         folder: Folder that `write_report` has written.
-        label: Name of the run; the folder's name if None.
+        name: Name of the fit; the folder's name if None.
 
     Raises:
         InputError: If the folder holds no report, or its model file is damaged.
@@ -167,9 +166,8 @@ def read_estimates(folder: Path, label: str | None = None) -> Estimates:
             f"`{folder}` must be a folder that `jaxid identify` has written, but holds no "
             f"`{MODEL}`."
         )
-    fit = load(folder / MODEL)
-    estimates = Estimates.of(fit, folder.resolve().name if label is None else label)
-    return dataclasses.replace(estimates, expressions=fit.base.expressions)
+    name = folder.resolve().name if name is None else name
+    return dataclasses.replace(load(folder / MODEL), name=name)
 
 
 def write_comparison(
@@ -189,18 +187,14 @@ def write_comparison(
         InputError: If `folder` is a file.
     """
     rows = comparison_rows(comparison)
-    keys = ("name", "parameters", "statistic", "p_value", "changed")
     content = {
-        "first": comparison.first.label,
-        "second": comparison.second.label,
+        "first": comparison.first.name,
+        "second": comparison.second.name,
         "sources": [str(source) for source in sources],
         "level": comparison.level,
         "parameters": rows,
-        "covariance_of_differences": comparison.covariance,
-        "groups": [
-            dict(zip(keys, (g.name, g.size, g.statistic, g.p_value, g.changed), strict=True))
-            for g in comparison.groups
-        ],
+        "covariance_of_differences": comparison.uncertainty.covariance,
+        "groups": comparison.groups,
     }
     figures = {"comparison.png": comparison_figure(comparison)}
     return _write_table(folder, "comparison", content, rows, figures)
@@ -209,7 +203,8 @@ def write_comparison(
 def write_estimates(
     folder: Path,
     kind: str,
-    estimates: Sequence[Estimates],
+    rows: list[dict[str, Any]],
+    covariance: AnyArray,
     content: Mapping[str, Any],
     sources: Mapping[str, Sequence[Path]],
 ) -> list[Path]:
@@ -218,7 +213,8 @@ def write_estimates(
     Args:
         folder: Folder of the files; made with its parents.
         kind: Name of both files without suffix: `payload`, `gains` or `states`.
-        estimates: Estimates, all of them rows of the table; the covariance is that of the first.
+        rows: Rows of the table, as `estimate_rows` makes them.
+        covariance: Covariance of the estimates, or of the first of them.
         content: Further content of the JSON file.
         sources: Logs and reports that were used, for the record.
 
@@ -228,12 +224,11 @@ def write_estimates(
     Raises:
         InputError: If `folder` is a file.
     """
-    rows = [row for one in estimates for row in estimate_rows(one)]
     everything = {
         "sources": {key: [str(p) for p in paths] for key, paths in sources.items()},
         "level": LEVEL,
         "parameters": rows,
-        "covariance": estimates[0].covariance,
+        "covariance": covariance,
         **content,
     }
     return _write_table(folder, kind, everything, rows, {})

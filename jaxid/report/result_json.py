@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxid.arrays import AnyArray
+from jaxid.identification.comparison import Comparison, parameter_kinds
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit
-from jaxid.identification.runs.comparison import LEVEL, Comparison
-from jaxid.identification.runs.estimates import Estimates, groups
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.robot.robot import Robot
 from jaxid.validation import Definiteness, TorqueErrors
 
@@ -205,7 +206,7 @@ def parameter_rows(fit: Fit) -> list[dict[str, Any]]:
             "name": fit.base.names,
             "expression": fit.base.expressions,
             "unit": fit.base.units,
-            "group": groups(fit.base),
+            "group": parameter_kinds(fit.base),
             "estimate": np.asarray(fit.parameters).tolist(),
             "standard_deviation": fit.standard_deviations.tolist(),
             "relative": fit.relative_standard_deviations.tolist(),
@@ -220,17 +221,17 @@ def parameter_rows(fit: Fit) -> list[dict[str, Any]]:
 
 def comparison_rows(comparison: Comparison) -> list[dict[str, Any]]:
     """Return the parameters of two fits and their differences, one row for each."""
-    first, second = comparison.first, comparison.second
+    first, second, k = comparison.first, comparison.second, list(comparison.indices)
     return _rows(
         {
-            "name": first.names,
-            "expression": first.expressions,
-            "unit": first.units,
-            "group": first.groups,
-            "first": np.asarray(first.parameters).tolist(),
-            "first_standard_deviation": first.standard_deviations.tolist(),
-            "second": np.asarray(second.parameters).tolist(),
-            "second_standard_deviation": second.standard_deviations.tolist(),
+            "name": comparison.names,
+            "expression": [first.base.expressions[i] for i in k],
+            "unit": comparison.units,
+            "group": comparison.kinds,
+            "first": np.asarray(first.parameters)[k].tolist(),
+            "first_standard_deviation": first.standard_deviations[k].tolist(),
+            "second": np.asarray(second.parameters)[k].tolist(),
+            "second_standard_deviation": second.standard_deviations[k].tolist(),
             "difference": np.asarray(comparison.difference).tolist(),
             "half_width": comparison.half_widths.tolist(),
             "p_value": comparison.p_values.tolist(),
@@ -240,15 +241,17 @@ def comparison_rows(comparison: Comparison) -> list[dict[str, Any]]:
     )
 
 
-def estimate_rows(estimates: Estimates) -> list[dict[str, Any]]:
+def estimate_rows(
+    names: Sequence[str], units: Sequence[str], values: AnyArray, uncertainty: Uncertainty
+) -> list[dict[str, Any]]:
     """Return estimates of a payload, of gains or of states, one row for each."""
     return _rows(
         {
-            "name": estimates.names,
-            "unit": estimates.units,
-            "estimate": np.asarray(estimates.parameters).tolist(),
-            "standard_deviation": estimates.standard_deviations.tolist(),
-            "half_width": estimates.half_widths(LEVEL).tolist(),
+            "name": names,
+            "unit": units,
+            "estimate": np.asarray(values).tolist(),
+            "standard_deviation": uncertainty.standard_deviations.tolist(),
+            "half_width": uncertainty.half_widths().tolist(),
         }
     )
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
-from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit, Trust
+from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit
 from jaxid.table import Remark, Status, percent, significant
 from jaxid.validation import Definiteness, TorqueErrors
 
@@ -134,9 +134,7 @@ def _judge_determination(fit: Fit) -> Remark:
 
 
 def _judge_precision(fit: Fit) -> Remark:
-    good, fair, poor = (
-        fit.trust.count(level) for level in (Trust.GOOD, Trust.DOUBTFUL, Trust.NONE)
-    )
+    good, fair, poor = map(fit.trust.count, (Status.GOOD, Status.DOUBTFUL, Status.BAD))
     return Remark(
         f"{good} of {fit.base.size} parameters are known to {100 * TRUSTED:g} %, {fair} more to "
         f"{100 * DOUBTFUL:g} %; {poor} are small, or not excited.",

@@ -6,7 +6,7 @@ from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.fit import Trust
+from jaxid.table import Status
 
 WEIGHTED = jid.WeightedLeastSquares(jid.estimators.ResidualVariances(0))
 
@@ -243,6 +243,6 @@ def test_what_is_undetermined_is_not_trusted_however_small_its_deviation(base):
     fit = jid.identify(base, observations(base.model, p, still=(1,)), jid.estimators.LeastSquares())
     parts = {k for d in fit.undetermined for k in d.parts}
     assert parts
-    assert all(fit.trust[k] is Trust.NONE for k in parts)
+    assert all(fit.trust[k] is Status.BAD for k in parts)
     good = jid.identify(base, observations(base.model, p), jid.estimators.LeastSquares())
-    assert set(good.trust) == {Trust.GOOD}
+    assert set(good.trust) == {Status.GOOD}

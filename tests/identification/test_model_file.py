@@ -11,7 +11,7 @@ import pytest
 from virtual import motion, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.model_file import checksum_of
+from jaxid.identification.fit import checksum_of
 from jaxid.io import from_json, to_json
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
+from jaxid.identification.fit import ConditionNumbers
+from jaxid.identification.uncertainty import Uncertainty
 
 
 def standard_parameters(model: jid.Model, seed: int = 0) -> np.ndarray:
@@ -70,3 +72,38 @@ def dense(
     keep = np.asarray(o.mask)
     joint = np.broadcast_to(np.arange(keep.shape[1]), keep.shape)
     return rows[keep], forces[keep], joint[keep]
+
+
+def planar_base(joints: int = 2) -> jid.BaseParameters:
+    """Base parameters of a planar arm with friction and offsets: twelve of two joints."""
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
+    limits = jid.Limits(joints, force=[40.0, 5.0, 2.0][:joints])
+    return jid.base_parameters(
+        jid.Model(jid.robots.planar_arm(joints, 0.4).replace(limits=limits), terms)
+    )
+
+
+def fit_of(base: jid.BaseParameters, parameters: np.ndarray, **fields) -> jid.Fit:
+    """A fit with given base parameters: most functions do not ask how they were found."""
+    n, joints = base.size, base.model.robot.joints
+    values = {
+        "base": base,
+        "parameters": np.asarray(parameters),
+        "uncertainty": uncertainty(np.eye(n)),
+        "weights": np.ones(joints),
+        "condition_numbers": ConditionNumbers(1.0, 1.0, 1.0),
+        "rows": (1,) * joints,
+        "residual_rms": np.ones(joints),
+        "residual": 0.0,
+        "undetermined": (),
+        "estimator": jid.estimators.LeastSquares(),
+        "solution": jid.estimators.Complete(),
+        "recordings": (),
+        "notes": (),
+    }
+    return jid.Fit(**{**values, **fields})
+
+
+def uncertainty(covariance: np.ndarray, dof: float = math.inf) -> Uncertainty:
+    """A covariance with the same degrees of freedom everywhere."""
+    return Uncertainty(covariance, np.full(len(covariance), float(dof)), covariance)

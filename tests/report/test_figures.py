@@ -15,7 +15,7 @@ from PIL import Image
 from report_samples import arm_of, errors_of
 
 import jaxid as jid
-from jaxid.identification.runs.comparison import compare
+from jaxid.identification.comparison import compare
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.errors import error_figure
 from jaxid.report.parameters import comparison_figure, parameter_figure

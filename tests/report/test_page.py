@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 import pytest
 from report_samples import arm_of, errors_of
 
+from jaxid.report.identification import TRUST
 from jaxid.report.page import Section, _align, block, facts, picture, render_page
 from jaxid.report.result_files import write_report
 from jaxid.report.torques import torque_figure
@@ -121,7 +122,7 @@ def test_every_parameter_stands_there_with_the_numbers_of_the_result(written, fi
             step = 10.0 ** -len(shown_digits.partition(".")[2])
             assert abs(float(shown_digits) - row[key]) <= 0.51 * step, (row["name"], title)
     trusts = [dict(zip(table[0], shown, strict=True))["trust"] for shown in table[1:]]
-    assert trusts == [t.value for t in fit.trust]
+    assert trusts == [TRUST[level] for level in fit.trust]
 
 
 def test_names_that_are_markup_stay_text(validated, tmp_path):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from report_samples import errors_of
 
-from jaxid.identification.runs.comparison import Comparison, Verdict, compare
+from jaxid.identification.comparison import Verdict, compare
 from jaxid.report import result_files
-from jaxid.report.result_files import read_estimates, safe_name, write_comparison, write_report
+from jaxid.report.result_files import read_fit, safe_name, write_comparison, write_report
 from jaxid.report.result_json import consistency_record, plain
 
 
@@ -118,9 +118,9 @@ def test_values_that_are_not_finite_are_null(tmp_path, fit, validation, quick):
     mixed = (float("nan"), np.float64(np.inf), np.int64(3), None, True)
     assert plain({"a": mixed}) == {"a": [None, None, 3, None, True]}
     # The model file knows better: a comparison reads that.
-    again = read_estimates(tmp_path, "again")
+    again = read_fit(tmp_path, "again")
     np.testing.assert_array_equal(again.covariance, covariance)
-    same = Comparison.of(read_estimates(tmp_path), again)
+    same = compare(read_fit(tmp_path), again)
     assert set(same.verdicts) == {Verdict.UNKNOWN, Verdict.UNCHANGED}
 
 
@@ -130,10 +130,9 @@ def test_the_model_can_be_used_again(tmp_path, fit, validation, quick):
     p = np.random.default_rng(0).standard_normal(fit.base.model.size)
     again = p[model["independent"]] + np.array(model["kappa"]) @ p[model["dependent"]]
     np.testing.assert_allclose(again, fit.base.from_standard(p), rtol=1e-14)
-    estimates = read_estimates(tmp_path)
-    assert estimates.label == tmp_path.name
-    assert estimates.expressions == fit.base.expressions
-    np.testing.assert_array_equal(estimates.parameters, fit.parameters)
+    read = read_fit(tmp_path)
+    assert read.name == tmp_path.name
+    np.testing.assert_array_equal(read.parameters, fit.parameters)
 
 
 @pytest.mark.parametrize("present", [False, True])
@@ -195,7 +194,7 @@ def test_comparisons_hold_the_numbers_exactly(tmp_path, fit, warm):
 
 def test_folders_that_are_no_reports_are_refused(tmp_path, fit, validation, quick):
     with pytest.raises(ValueError, match=r"`model.json`"):
-        read_estimates(tmp_path)
+        read_fit(tmp_path)
     (tmp_path / "report").write_text("a file")
     with pytest.raises(ValueError, match="must be a folder"):
         report(tmp_path / "report", fit, validation)

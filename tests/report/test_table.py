@@ -9,7 +9,7 @@ import pytest
 from report_samples import arm_of, errors_of
 from rich.console import Console
 
-from jaxid.identification.runs.comparison import compare
+from jaxid.identification.comparison import compare
 from jaxid.report.tables import (
     body_table,
     error_table,

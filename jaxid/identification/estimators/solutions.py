@@ -5,7 +5,7 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, is_traced, one_or_each
+from jaxid.arrays import AnyArray, Bool, Float, is_traced, one_or_each
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks, Factors
@@ -51,6 +51,13 @@ class Decomposition(eqx.Module):
         forces = U.T @ z
         rest = float(np.sqrt(max(z @ z - forces @ forces, 0.0)))
         return cls(scale, s, Vt, forces, rest)
+
+    @property
+    def unknown(self) -> Bool[np.ndarray, " base"]:
+        """Which parameters take part in directions that are only rounding."""
+        s = np.asarray(self.values)
+        null = np.asarray(self.directions)[s <= NUMERICAL * s.max(initial=0.0)]
+        return np.sum(null**2, axis=0) > 1e-8
 
     def solve(self, inverse: Float[AnyArray, " base"] | None = None) -> Float[np.ndarray, " base"]:
         """Return the parameters for an inverse of the information along each direction.

@@ -1,0 +1,192 @@
+r"""Combination of fits: least squares over several of them, from their factors alone.
+
+Fit $s$ has the base parameters $p_s = E_s x + c_s$ of common unknowns $x$: shared and own
+parameters of several states, a payload on top, known loads. The common estimate is linear in those
+of the single fits, $x = \sum_s A_s (\hat p_s - c_s)$ with $A_s = (\sum E^T G E)^{-1} E_s^T G_s$ and
+the information $G_s$ of each fit, and so is its error: the covariances of the single estimates,
+which are right for correlated errors, give that of the common one.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.errors import InputError
+from jaxid.identification.estimators import GivenWeights, WeightedLeastSquares
+from jaxid.identification.estimators.solutions import Decomposition
+from jaxid.identification.factors import Blocks
+from jaxid.identification.fit import Fit
+from jaxid.identification.identify import fit_problem
+from jaxid.identification.problem import RegressionProblem
+from jaxid.identification.uncertainty import Uncertainty
+from jaxid.identification.uncertainty.blocks import block_covariance
+
+
+def require_same_base(fits: Sequence[Fit]) -> None:
+    """Check that fits have the same base parameters.
+
+    Raises:
+        InputError: If there is no fit, or base parameters differ.
+    """
+    if not fits:
+        raise InputError("`fits` must hold at least one fit, but is empty.")
+    first, a = fits[0], fits[0].base
+    for fit in fits[1:]:
+        b = fit.base
+        if a.names == b.names and a.indices == b.indices:
+            if np.allclose(a.kappa, b.kappa, rtol=1e-6, atol=1e-9):
+                continue
+            differs = "the lengths in them differ"
+        elif a.size != b.size:
+            differs = f"{a.size} and {b.size} in number"
+        else:
+            pairs = zip(a.names, b.names, strict=True)
+            differs = "`{}` in the place of `{}`".format(*next((x, y) for x, y in pairs if x != y))
+        raise InputError(
+            f"the fits `{first.name}` and `{fit.name}` have different base parameters ({differs}): "
+            "use one robot with one geometry and the same terms for both."
+        )
+
+
+def as_least_squares(fit: Fit) -> Fit:
+    """Return weighted least squares of a fit's factors: the fit itself where it is that.
+
+    For robust, regularised or consistent estimates the factors are solved again with the same
+    weights, and standard deviations come from the block jackknife.
+
+    Raises:
+        InputError: If the fit does not hold its factors.
+    """
+    if fit.is_least_squares:
+        return fit
+    problem = RegressionProblem(fit.base, blocks=fit.blocks, names=fit.recordings)
+    plain = fit_problem(problem, WeightedLeastSquares(GivenWeights(np.asarray(fit.weights))))
+    return dataclasses.replace(plain, name=fit.name)
+
+
+def replace_estimates(
+    fit: Fit, parameters: Float[AnyArray, " base"], uncertainty: Uncertainty
+) -> Fit:
+    """Return a fit with estimates and an uncertainty that were computed from several fits."""
+    notes = tuple(note for note in fit.notes if note not in fit.uncertainty.notes)
+    return dataclasses.replace(fit, parameters=parameters, uncertainty=uncertainty, notes=notes)
+
+
+def combine(
+    fits: Sequence[Fit],
+    maps: Sequence[Float[np.ndarray, "base unknowns"]],
+    offsets: Sequence[Float[np.ndarray, " base"]] | None = None,
+) -> tuple[Float[np.ndarray, " unknowns"], Uncertainty]:
+    """Estimate common unknowns from the factors of several fits (Eq. 33).
+
+    Args:
+        fits: Weighted least squares of different data.
+        maps: For each fit the matrix that gives its base parameters from the unknowns.
+        offsets: For each fit the known part of its base parameters; zero if None.
+
+    Raises:
+        InputError: If two fits have seen the same data.
+    """
+    _require_different_rows(fits)
+    offsets = [np.zeros(fit.base.size) for fit in fits] if offsets is None else offsets
+    factors = [fit.factor for fit in fits]
+    matrix = np.vstack([R @ E for (R, _), E in zip(factors, maps, strict=True)])
+    forces = np.concatenate([z - R @ c for (R, z), c in zip(factors, offsets, strict=True)])
+    triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, forces]), mode="r"))
+    decomposition = Decomposition.of(triangle[:, :-1], triangle[:, -1])
+    B = decomposition.inverse_information()
+    covariance, scatter = np.zeros_like(B), np.zeros(len(B))
+    for fit, (R, _), E in zip(fits, factors, maps, strict=True):
+        part, dof = _propagate(fit, B @ E.T @ R.T @ R)
+        covariance += part
+        scatter += np.diag(part) ** 2 / dof
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dof = np.where(scatter > 0, np.diag(covariance) ** 2 / scatter, np.inf)
+    unknown = decomposition.unknown
+    covariance[unknown, unknown] = np.inf
+    return decomposition.solve(), Uncertainty(covariance, dof, covariance)
+
+
+def _propagate(
+    fit: Fit, A: Float[np.ndarray, "unknowns base"]
+) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
+    """Return the covariance of unknowns that a fit's errors cause, and its degrees of freedom."""
+    C, dof = np.asarray(fit.covariance), np.asarray(fit.uncertainty.dof)
+    if not np.isfinite(C).all():
+        # The fit alone does not determine everything, so not all of its estimates have a variance.
+        # The effect of its errors on others follows from blocks of time.
+        decomposition = Decomposition.of(*fit.factor)
+        p = decomposition.solve()
+        parts = (part.weighted(fit.weights) for part in fit.time_blocks.parts)
+        blocks = [(R, z - R @ p) for R, z in parts]
+        C, few = block_covariance(blocks, decomposition.inverse_information())
+        dof = np.full(len(C), few)
+    weights = A**2 * np.diag(C)
+    whole = weights.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return A @ C @ A.T, np.where(whole > 0, whole / (weights / dof).sum(axis=1), np.inf)
+
+
+def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
+    """Add a later fit to an earlier one, as if both had been identified together.
+
+    The estimates are those of the joint fit to rounding, and only factors are needed: the earlier
+    fit may come from a file. If the weights of the fits differ, each keeps its own.
+
+    Args:
+        earlier: Fit of the earlier recordings.
+        later: Fit of later recordings of the robot in the same state.
+        name: Name of both together; by default their names in a row.
+
+    Raises:
+        InputError: If the fits have different base parameters, or have seen the same data.
+    """
+    require_same_base((earlier, later))
+    earlier, later = as_least_squares(earlier), as_least_squares(later)
+    identity = np.eye(earlier.base.size)
+    p, uncertainty = combine((earlier, later), (identity, identity))
+    # The later rows are scaled so that they keep their weights under those of the earlier fit.
+    scaled = later.time_blocks.scale_joints(later.weights / earlier.weights)
+    blocks = Blocks((*earlier.time_blocks.parts, *scaled.parts))
+    names = (*earlier.recordings, *later.recordings)
+    problem = RegressionProblem(earlier.base, blocks=blocks, names=names)
+    fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(np.asarray(earlier.weights))))
+    name = f"{earlier.name}, {later.name}" if name is None else name
+    return replace_estimates(dataclasses.replace(fit, name=name), p, uncertainty)
+
+
+def _require_different_rows(fits: Sequence[Fit]) -> None:
+    for one, other in itertools.combinations(fits, 2):
+        if share_rows(one.time_blocks, other.time_blocks):
+            names = f"fits `{one.name}` and `{other.name}`"
+            which = names if one.name != other.name else f"two fits `{one.name}`"
+            raise InputError(
+                f"the {which} have seen the same data, which would count twice: give every log "
+                "once, as itself or by the report that was made of it."
+            )
+
+
+def share_rows(first: Blocks, second: Blocks) -> bool:
+    """Return whether two sets of factors were made of the same rows, at least in part.
+
+    Names do not tell: different logs may have the same, and one log several. Norms of the columns
+    and forces do, whatever the weights. Two blocks must agree: one may be a robot at rest.
+    """
+    ours, theirs = list(_column_norms(first)), list(_column_norms(second))
+    equal = sum(
+        any(m == n and a.shape == b.shape and np.abs(a - b).max() <= 1e-9 for n, b in theirs)
+        for m, a in ours
+    )
+    return equal >= max(1, min(2, len(ours), len(theirs)))
+
+
+def _column_norms(blocks: Blocks) -> Iterator[tuple[list[int], np.ndarray]]:
+    """Yield the numbers of rows of each block, and the norms relative to the joint's largest."""
+    for part in blocks.parts:
+        if part.rows.any():
+            norms = [np.linalg.norm(np.asarray(joint.R), axis=0) for joint in part.joints]
+            relative = [x / max(x.max(initial=0.0), 1e-300) for x in norms]
+            yield part.rows.tolist(), np.concatenate(relative)

@@ -1,0 +1,303 @@
+"""Comparison of two fits: which parameters have changed (Sec. 6)."""
+
+import enum
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from scipy import special
+
+from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
+from jaxid.identification.combination import require_same_base
+from jaxid.identification.fit import Fit
+from jaxid.identification.uncertainty import Uncertainty
+from jaxid.table import Column, Status, Table, significant, with_deviations
+
+LEVEL = 0.95
+"""Confidence of intervals and tests."""
+
+
+class Verdict(enum.Enum):
+    """Verdict of a comparison about one parameter."""
+
+    CHANGED = "changed"
+    PERHAPS = "perhaps changed"
+    UNCHANGED = "no change seen"
+    UNKNOWN = "not determined"
+
+
+class Comparison(eqx.Module):
+    r"""Differences of the base parameters of two fits, and which are more than chance (Sec. 6).
+
+    A parameter has changed if its difference is larger than its own uncertainty allows:
+    $|b_1 - b_2| > t \sqrt{s_1^2 + s_2^2}$. That one lies outside the other's interval says less:
+    two estimates of the same thing do so in one of six cases.
+
+    Many parameters are tested, and each test errs now and then. `CHANGED` are those that stay
+    significant with Holm's correction: if nothing has changed, the chance that *any* parameter is
+    called so is at most `1 - level`. `PERHAPS` are those whose own interval excludes zero, as one
+    in twenty does without any change.
+
+    Attributes:
+        first: Fit of one state.
+        second: Fit of the other state.
+        indices: Base parameters that are compared.
+        difference: Parameters of the second fit less those of the first.
+        uncertainty: Uncertainty of the differences.
+        level: Confidence of intervals and tests, a fraction from 0 to 1.
+    """
+
+    first: Fit
+    second: Fit
+    indices: tuple[int, ...] = eqx.field(static=True)
+    difference: Float[AnyArray, " compared"]
+    uncertainty: Uncertainty
+    level: float = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.first.base.names[k] for k in self.indices)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the parameters."""
+        return tuple(self.first.base.units[k] for k in self.indices)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of each parameter, such as `viscous friction`."""
+        kinds = parameter_kinds(self.first.base)
+        return tuple(kinds[k] for k in self.indices)
+
+    @property
+    def determined(self) -> Bool[np.ndarray, " compared"]:
+        """Which differences have a standard deviation."""
+        variances = np.diag(self.uncertainty.covariance)
+        return np.isfinite(variances) & (variances > 0)
+
+    @property
+    def standard_deviations(self) -> Float[np.ndarray, " compared"]:
+        """Standard deviations of the differences; infinite where nothing is known."""
+        known, variances = self.determined, np.diag(self.uncertainty.covariance)
+        return np.where(known, np.sqrt(np.where(known, variances, 1.0)), np.inf)
+
+    @property
+    def half_widths(self) -> Float[np.ndarray, " compared"]:
+        """Half the widths of the differences' intervals, each for itself."""
+        quantiles = special.stdtrit(np.asarray(self.uncertainty.dof), 0.5 + 0.5 * self.level)
+        return quantiles * self.standard_deviations
+
+    @property
+    def p_values(self) -> Float[np.ndarray, " compared"]:
+        """Probability of so large a difference without any change, each for itself."""
+        size = np.abs(np.asarray(self.difference)) / self.standard_deviations
+        return 2.0 * special.stdtr(np.asarray(self.uncertainty.dof), -size)
+
+    @property
+    def adjusted_p_values(self) -> Float[np.ndarray, " compared"]:
+        """The same with Holm's correction for the number of parameters that are tested."""
+        p, tested = self.p_values, np.flatnonzero(self.determined)
+        adjusted = np.ones_like(p)
+        adjusted[tested] = _holm(p[tested])
+        return adjusted
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Verdict about each parameter."""
+        verdicts = np.full(len(self.indices), Verdict.UNCHANGED)
+        verdicts[self.p_values <= 1.0 - self.level] = Verdict.PERHAPS
+        verdicts[self.adjusted_p_values <= 1.0 - self.level] = Verdict.CHANGED
+        verdicts[~self.determined] = Verdict.UNKNOWN
+        return tuple(verdicts)
+
+    @property
+    def groups(self) -> list[dict[str, Any]]:
+        """A joint test for each kind of parameter, with Holm's correction for their number.
+
+        Each has `name`, the number of determined `parameters`, the `statistic` (about that number
+        where nothing has changed), its `p_value`, and whether the group has `changed`.
+        """
+        kinds, determined = np.array(self.kinds), self.determined
+        names = list(dict.fromkeys(kinds.tolist()))
+        members = [np.flatnonzero(determined & (kinds == name)) for name in names]
+        tests = [self._test(group) for group in members]
+        changed = _holm(np.array([p for _, p in tests])) <= 1.0 - self.level
+        return [
+            {
+                "name": name,
+                "parameters": len(group),
+                "statistic": statistic,
+                "p_value": p,
+                "changed": bool(is_changed),
+            }
+            for name, group, (statistic, p), is_changed in zip(
+                names, members, tests, changed, strict=True
+            )
+        ]
+
+    def _test(self, group: np.ndarray) -> tuple[float, float]:
+        if not len(group):
+            return 0.0, 1.0
+        return joint_test(
+            np.asarray(self.difference)[group],
+            np.asarray(self.uncertainty.covariance)[np.ix_(group, group)],
+            float(np.min(np.asarray(self.uncertainty.dof)[group])),
+        )
+
+    def summary(self) -> Table:
+        """Return a table of both estimates, their differences with intervals, and verdicts."""
+        verdicts, kinds, half = self.verdicts, self.kinds, self.half_widths
+        a, b = (np.asarray(f.parameters)[list(self.indices)] for f in (self.first, self.second))
+        change, width = with_deviations(self.difference, half)
+        tested, chance = len(verdicts) - verdicts.count(Verdict.UNKNOWN), 1.0 - self.level
+        return Table(
+            f"{self.first.name} and {self.second.name}: {len(kinds)} base parameters",
+            Column("#", list(range(1, len(half) + 1))),
+            Column("parameter", self.names),
+            Column("unit", self.units),
+            Column(self.first.name, with_deviations(a, half)[0], kind="number"),
+            Column(self.second.name, with_deviations(b, half)[0], kind="number"),
+            Column(
+                "difference", [x if x.startswith("-") else f"+{x}" for x in change], kind="number"
+            ),
+            Column(f"± ({100 * self.level:g} %)", width, kind="number"),
+            Column("verdict", [verdict.value for verdict in verdicts]),
+            status=[Status.DOUBTFUL if v is Verdict.CHANGED else Status.NEUTRAL for v in verdicts],
+            rules=[k for k in range(1, len(kinds)) if kinds[k] != kinds[k - 1]],
+            remarks=[
+                f"{verdicts.count(Verdict.CHANGED)} of {tested} parameters have changed: if none "
+                f"had, the chance to call any of them so would be {100 * chance:.3g} % at most "
+                "(Holm)",
+                f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies outside "
+                f"the {100 * self.level:g} % interval of their difference; of {tested} parameters "
+                f"that never change, about {chance * tested:.2g} look so",
+            ],
+        )
+
+    def group_summary(self) -> Table:
+        """Return a table of the joint test of each kind of parameter."""
+        groups = self.groups
+        p_values = [group["p_value"] for group in groups]
+        chances = ["< 1e-6" if p < 1e-6 else significant(p, 2) for p in p_values]
+        verdicts = [Verdict.CHANGED if g["changed"] else Verdict.UNCHANGED for g in groups]
+        return Table(
+            "all parameters of a kind at once",
+            Column("kind", [group["name"] for group in groups]),
+            Column("parameters", [group["parameters"] for group in groups]),
+            Column("statistic", [group["statistic"] for group in groups]),
+            Column("chance\nwithout a change", chances, kind="number"),
+            Column("verdict", [verdict.value for verdict in verdicts]),
+            status=[Status.DOUBTFUL if g["changed"] else Status.NEUTRAL for g in groups],
+        )
+
+    def __str__(self) -> str:
+        return f"{self.summary()}\n\n{self.group_summary()}"
+
+
+def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
+    """Decide which base parameters have changed between two fits of one robot (Sec. 6).
+
+    Args:
+        first: Fit of one state, such as the cold robot.
+        second: Fit of another state, such as the warm robot, with other recordings.
+        level: Confidence of intervals and tests, a fraction from 0 to 1.
+
+    Raises:
+        InputError: If the fits are not of the same base parameters, or `level` is no fraction.
+    """
+    require_same_base((first, second))
+    none = np.zeros((first.base.size, first.base.size))
+    return compare_some(first, second, range(first.base.size), none, level)
+
+
+def compare_some(
+    first: Fit,
+    second: Fit,
+    indices: Sequence[int],
+    cross: Float[np.ndarray, "compared compared"],
+    level: float,
+) -> Comparison:
+    """Compare some base parameters of two fits.
+
+    Args:
+        first: One fit.
+        second: Another fit of the same base parameters.
+        indices: Base parameters that are compared.
+        cross: Covariance of the first with the second estimates; zero if their data differ.
+        level: Confidence of intervals and tests, a fraction from 0 to 1.
+
+    Raises:
+        InputError: If `level` is no fraction.
+    """
+    if not 0 < level < 1:
+        raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
+    k = list(indices)
+    A, B = (np.asarray(fit.covariance)[np.ix_(k, k)] for fit in (first, second))
+    m, n = (np.asarray(fit.uncertainty.dof)[k] for fit in (first, second))
+    a, b = np.diag(A), np.diag(B)
+    # Degrees of freedom of a sum of two variances (Welch, Satterthwaite).
+    with np.errstate(invalid="ignore", divide="ignore"):
+        covariance = A + B - cross - cross.T
+        dof = (a + b) ** 2 / (a**2 / m + b**2 / n)
+    dof = np.where(np.isnan(dof), np.inf, dof)
+    return Comparison(
+        first=first,
+        second=second,
+        indices=tuple(k),
+        difference=np.asarray(second.parameters)[k] - np.asarray(first.parameters)[k],
+        uncertainty=Uncertainty(covariance, dof, covariance),
+        level=level,
+    )
+
+
+def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
+    """Return p-values that are corrected for the number of tests."""
+    order, adjusted = np.argsort(p, kind="stable"), np.ones_like(p)
+    steps = p[order] * np.arange(len(p), 0, -1)
+    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return adjusted
+
+
+def joint_test(
+    difference: Float[np.ndarray, " tested"],
+    covariance: Float[np.ndarray, "tested tested"],
+    dof: float,
+) -> tuple[float, float]:
+    r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
+
+    It is chi-squared where the covariance is exact, else Hotelling's $T^2$.
+
+    Args:
+        difference: Differences of estimates.
+        covariance: Covariance of the differences, with finite variances above zero.
+        dof: Degrees of freedom of the covariance.
+    """
+    deviations = np.sqrt(np.diag(covariance))
+    correlation = covariance / deviations / deviations[:, None]
+    values, directions = np.linalg.eigh(0.5 * (correlation + correlation.T))
+    # Smaller eigenvalues are rounding.
+    kept = values > 1e-12 * values[-1]
+    along = directions.T @ (difference / deviations)
+    statistic, size = float(np.sum(along[kept] ** 2 / values[kept])), int(np.count_nonzero(kept))
+    if not np.isfinite(dof):
+        return statistic, float(special.chdtrc(size, statistic))
+    rest = dof - size + 1.0
+    if rest <= 0:
+        return statistic, 1.0
+    return statistic, float(special.fdtrc(size, rest, statistic * rest / (dof * size)))
+
+
+def parameter_kinds(base: BaseParameters) -> tuple[str, ...]:
+    """Return for each base parameter the term of its leading parameter, as `viscous friction`."""
+    model = base.model
+    kinds = [
+        re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(term).__name__).lower()
+        for term in model.terms
+        for _ in term.parameters(model.robot)
+    ]
+    return tuple(kinds[k] for k in base.indices)

@@ -1,0 +1,208 @@
+"""Payload: ten inertial parameters of a load, from a run without it and a run with it."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
+from jaxid.identification.combination import as_least_squares, combine, require_same_base
+from jaxid.identification.consistency import BodyBounds, consistency_margin, consistent_body
+from jaxid.identification.fit import Fit, interval_table
+from jaxid.identification.states import state_maps, varying_parameters
+from jaxid.identification.uncertainty import Uncertainty
+from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
+from jaxid.robot.robot import Robot, Tool
+from jaxid.table import Remark, Status, Table
+
+CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
+CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
+
+
+class Payload(eqx.Module):
+    """Mass, centre of mass and inertia of a load on a body.
+
+    Attributes:
+        body: Index of the body that carries it (0 is the first).
+        parameters: $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame: the
+            estimate, or the body nearest to it, in units of its uncertainty, that can exist.
+        estimate: Estimate from the forces, whether such a body can exist or not.
+        uncertainty: Uncertainty of the estimate.
+        distance: From the estimate to the parameters, in standard deviations: below 4 nothing
+            unusual; NaN where the runs do not determine all ten.
+    """
+
+    body: int = eqx.field(static=True)
+    parameters: Float[AnyArray, "10"]
+    estimate: Float[AnyArray, "10"]
+    uncertainty: Uncertainty
+    distance: float
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        return float(self.parameters[0])
+
+    @property
+    def centre_of_mass(self) -> Float[np.ndarray, "3"]:
+        """Centre of mass in the frame of the body [m]."""
+        return np.asarray(self.parameters)[1:4] / self.mass
+
+    @property
+    def inertia(self) -> Float[np.ndarray, "3 3"]:
+        """Inertia tensor about the centre of mass, along the body's axes [kg m²]."""
+        return np.asarray(Inertia.from_parameters(np.asarray(self.parameters)).tensor)
+
+    @property
+    def tool(self) -> Tool:
+        """The payload as a known load: `robot.replace(tool=payload.tool)`.
+
+        Raises:
+            InputError: If it is no body that can exist.
+        """
+        return Tool(
+            self.body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia
+        )
+
+    @property
+    def central(self) -> tuple[Float[np.ndarray, "10"], Uncertainty]:
+        """Mass, centre of mass, and moments about it, with their uncertainty (`CENTRAL_NAMES`)."""
+        values, J = _about_centre(np.asarray(self.parameters))
+        C = np.asarray(self.uncertainty.covariance)
+        unknown = ~np.isfinite(np.diag(C))
+        covariance = J @ np.where(np.isfinite(C), C, 0.0) @ J.T
+        lost = np.any(J[:, unknown] != 0.0, axis=1)
+        covariance[lost, lost] = np.inf
+        dof = np.asarray(self.uncertainty.dof)
+        return values, Uncertainty(covariance, dof, covariance)
+
+    def summary(self) -> Table:
+        """Return a table of mass, centre of mass and moments about it, and of their consistency."""
+        if not np.isfinite(self.distance):
+            text = (
+                "the logs do not determine all ten parameters of the payload: move the joints that "
+                "carry it in more poses, faster, and alike in both runs."
+            )
+            remark = Remark(text, Status.BAD)
+        elif self.distance == 0:
+            remark = Remark("the payload is a body that could exist.", Status.GOOD)
+        else:
+            text = (
+                "the estimate itself belongs to no body: these are the parameters of the nearest "
+                f"one that could exist, {self.distance:.2g} standard deviations away."
+            )
+            remark = Remark(text, Status.NEUTRAL if self.distance < 4.0 else Status.DOUBTFUL)
+        title = "payload in the frame of its body; moments about the centre of mass"
+        return interval_table(title, CENTRAL_NAMES, CENTRAL_UNITS, *self.central, [remark])
+
+    def __str__(self) -> str:
+        return str(self.summary())
+
+
+def identify_payload(
+    unloaded: Fit,
+    loaded: Fit,
+    *,
+    body: int | None = None,
+    varying: Sequence[str] | None = None,
+    bounds: BodyBounds | None = None,
+) -> Payload:
+    """Identify a payload from a run without it and a run with it.
+
+    Both are fitted together. What the payload adds to the base parameters depends on its ten
+    parameters alone, and these are determined all ten although the last body's own are not: the
+    robot without the payload is known from the other run. Uncertainties of both runs count.
+
+    Args:
+        unloaded: Fit of the run without the payload.
+        loaded: Fit of the run with it.
+        body: Index of the body that carries it; that of the end-effector if None.
+        varying: Names of base parameters that may differ between the runs beside the payload. If
+            None, friction and offsets: they change with load and temperature.
+        bounds: Bounds of the payload, such as `BodyBounds(mass_max=..., radius=...)`. If None,
+            wide ones from the robot's reach, which count only if the estimate could not exist.
+
+    Raises:
+        InputError: If the runs have different base parameters or have seen the same data, or the
+            model does not have ten parameters for the body.
+        RuntimeError: If no body within the bounds was proved to be the nearest.
+    """
+    require_same_base((unloaded, loaded))
+    base = unloaded.base
+    body = base.model.robot.tip_body if body is None else body
+    first, second = state_maps(base.size, varying_parameters(base, varying), 2)
+    added = body_columns(base, body)
+    maps = [np.hstack([first, np.zeros_like(added)]), np.hstack([second, added])]
+    x, known = combine([as_least_squares(unloaded), as_least_squares(loaded)], maps)
+    covariance = np.asarray(known.covariance)[-10:, -10:]
+    dof = np.full(10, np.min(np.asarray(known.dof)[-10:]))
+    p, distance = _nearest_body(x[-10:], covariance, base.model.robot, bounds)
+    return Payload(body, p, x[-10:], Uncertainty(covariance, dof, covariance), distance)
+
+
+def _nearest_body(
+    estimate: Float[np.ndarray, "10"],
+    covariance: Float[np.ndarray, "10 10"],
+    robot: Robot,
+    bounds: BodyBounds | None,
+) -> tuple[Float[np.ndarray, "10"], float]:
+    """Return the nearest parameters of a body that can exist, and their distance."""
+    if not np.isfinite(covariance).all():
+        return estimate, np.nan
+    if bounds is None:
+        if consistency_margin(estimate) >= 0:
+            return estimate, 0.0
+        wide = BodyBounds.from_geometry(robot)
+        bounds = BodyBounds(mass_max=np.max(wide.mass_max), radius=np.max(wide.radius))
+    # Estimates that are known too well, as those of noiseless data, leave no digits for a proof:
+    # a relative error of one percent of half the squared distance is good enough.
+    p, distance, error_bound = consistent_body(estimate, covariance, bounds, throw=False)
+    if not error_bound <= 0.01 * (1.0 + distance**2):
+        raise RuntimeError(
+            "no body that could exist was proved to be the nearest to the payload's estimate, "
+            f"whose mass is {estimate[0]:.4g} kg: are the runs those of the same robot?"
+        )
+    return p, distance
+
+
+def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:
+    """Return the base parameters that unit parameters of a load on a body add.
+
+    Args:
+        base: Base parameters.
+        body: Index of the body (0 is the first).
+
+    Raises:
+        InputError: If there is no such body, or the model lacks some of its ten parameters.
+    """
+    robot, names = base.model.robot, base.model.parameter_names
+    if not 0 <= body < robot.joints:
+        raise InputError(f"`body` must be from 0 to {robot.joints - 1}, but is {body}.")
+    ten = [f"{name}{body + 1}" for name in INERTIAL_NAMES]
+    missing = [name for name in ten if name not in names]
+    if missing:
+        raise InputError(
+            f"a load on body {body} has ten parameters, but the model lacks `{missing[0]}`: use "
+            "`RigidBodies()` with all ten."
+        )
+    unit = np.zeros((len(ten), base.model.size))
+    unit[range(len(ten)), [names.index(name) for name in ten]] = 1.0
+    return np.asarray(base.from_standard(unit)).T
+
+
+def _about_centre(
+    p: Float[np.ndarray, "10"],
+) -> tuple[Float[np.ndarray, "10"], Float[np.ndarray, "10 10"]]:
+    """Return mass, centre of mass, and the six moments about it; and their derivatives."""
+    m, h = p[0], p[1:4]
+    x, y, z = np.eye(3)
+    squares = np.array([np.diag(y + z), np.diag(x + z), np.diag(x + y)])
+    products = np.array([np.outer(a, b) + np.outer(b, a) for a, b in ((y, z), (x, z), (x, y))])
+    shift = np.concatenate([squares, 0.5 * products]) @ h / m
+    values = np.concatenate([[m], h / m, p[4:] - shift @ h])
+    J = np.eye(10)
+    J[1:4, 0], J[1:4, 1:4] = -h / m**2, np.eye(3) / m
+    J[4:, 0], J[4:, 1:4] = shift @ h / m, -2.0 * shift
+    return values, J

@@ -1,1 +1,0 @@
-"""Several runs of one robot: what has changed between them, and what they tell together."""

@@ -1,0 +1,215 @@
+"""Several states of one robot, cold and warm or light and loaded, identified together (Sec. 6)."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from scipy import linalg
+
+from jaxid.arrays import AnyArray, Bool, Float, Int
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.dispatch import in_numpy
+from jaxid.errors import InputError
+from jaxid.identification.combination import (
+    as_least_squares,
+    combine,
+    replace_estimates,
+    require_same_base,
+)
+from jaxid.identification.comparison import LEVEL, Comparison, compare_some, joint_test
+from jaxid.identification.fit import Fit, interval_table
+from jaxid.identification.uncertainty import Uncertainty
+from jaxid.table import Table
+
+
+class StatesFit(eqx.Module):
+    """Parameters that all states share, and those that each state has for itself.
+
+    Attributes:
+        fits: Fit of each state alone.
+        shared: Indices of the base parameters that are the same in all states.
+        varying: Indices of the others.
+        parameters: Estimates: the shared ones, then those of each state.
+        uncertainty: Uncertainty of the estimates.
+    """
+
+    fits: tuple[Fit, ...]
+    shared: tuple[int, ...] = eqx.field(static=True)
+    varying: tuple[int, ...] = eqx.field(static=True)
+    parameters: Float[AnyArray, " estimates"]
+    uncertainty: Uncertainty
+
+    @property
+    def base(self) -> BaseParameters:
+        """The base parameters of each state."""
+        return self.fits[0].base
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states."""
+        return tuple(fit.name for fit in self.fits)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all estimates, like `m1` and `fv1 (cold)`."""
+        names = self.base.names
+        own = (f"{names[k]} ({state})" for state in self.states for k in self.varying)
+        return (*(names[k] for k in self.shared), *own)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of all estimates."""
+        return tuple(self.base.units[k] for k in (*self.shared, *self.varying * len(self.states)))
+
+    def summary(self) -> Table:
+        """Return a table of all estimates with their 95 % intervals."""
+        title = "parameters that all states share, then those of each state"
+        return interval_table(title, self.names, self.units, self.parameters, self.uncertainty)
+
+    def __str__(self) -> str:
+        return str(self.summary())
+
+    def fit(self, state: str) -> Fit:
+        """Return the fit of one state: to validate, predict and report.
+
+        Raises:
+            InputError: If there is no such state.
+        """
+        k, known = self._indices(state), self.uncertainty
+        C = np.asarray(known.covariance)[np.ix_(k, k)]
+        fit = self.fits[self.states.index(state)]
+        uncertainty = Uncertainty(C, np.asarray(known.dof)[k], fit.uncertainty.naive_covariance)
+        return replace_estimates(fit, np.asarray(self.parameters)[k], uncertainty)
+
+    def compare(self, first: str, second: str, level: float = LEVEL) -> Comparison:
+        """Decide which of the parameters that vary have changed between two states.
+
+        The shared ones are the same in both by assumption; `sharing` tests that.
+
+        Args:
+            first: Name of one state.
+            second: Name of the other.
+            level: Confidence of intervals and tests, a fraction from 0 to 1.
+
+        Raises:
+            InputError: If there is no such state, or `level` is no fraction.
+        """
+        a, b = (self._indices(state)[list(self.varying)] for state in (first, second))
+        cross = np.asarray(self.uncertainty.covariance)[np.ix_(a, b)]
+        return compare_some(self.fit(first), self.fit(second), self.varying, cross, level)
+
+    @property
+    def sharing(self) -> tuple[float, float]:
+        """Statistic and p-value of a joint test whether the states agree on shared parameters.
+
+        The states' own estimates are compared with those of the first state. A small p-value says
+        that some of them have changed after all.
+        """
+        k = [k for k in self.shared if all(np.isfinite(f.covariance[k, k]) for f in self.fits)]
+        p = [np.asarray(fit.parameters)[k] for fit in self.fits]
+        first, *others = [np.asarray(fit.covariance)[np.ix_(k, k)] for fit in self.fits]
+        covariance = linalg.block_diag(*others) + np.tile(first, (len(others), len(others)))
+        dof = min(float(np.min(np.asarray(fit.uncertainty.dof)[k])) for fit in self.fits)
+        return joint_test(np.concatenate([x - p[0] for x in p[1:]]), covariance, dof)
+
+    def _indices(self, state: str) -> Int[np.ndarray, " base"]:
+        if state not in self.states:
+            raise InputError(f"`state` must be one of {', '.join(self.states)}, but is `{state}`.")
+        return state_indices(self.base.size, self.varying, self.states.index(state))
+
+
+def identify_states(
+    fits: Sequence[Fit], varying: Sequence[str] | None = None, shared: Sequence[str] | None = None
+) -> StatesFit:
+    """Identify a robot in several states at once: inertia is shared, friction is each state's.
+
+    The factors of the fits are combined, without another pass over the data. Shared parameters
+    become more precise than in any single fit, and so do those that vary, since what is mistaken
+    for friction in one state is determined by the others.
+
+    Args:
+        fits: Fit of each state, with different names.
+        varying: Names of the base parameters that each state has for itself. If None, those that
+            store no energy: friction and offsets.
+        shared: Names of the base parameters that are the same in all states; an alternative to
+            `varying`.
+
+    Raises:
+        InputError: If there are fewer than two fits, two have the same name, base parameters
+            differ, or there is no such base parameter.
+    """
+    require_same_base(fits)
+    states = [fit.name for fit in fits]
+    if len(states) < 2 or len(set(states)) < len(states):
+        raise InputError(
+            "`fits` must be two or more with different names, but are "
+            f"{', '.join(states)}: name them by their states."
+        )
+    fits = tuple(map(as_least_squares, fits))
+    base = fits[0].base
+    own = varying_parameters(base, varying, shared)
+    same = tuple(k for k in range(base.size) if k not in own)
+    return StatesFit(fits, same, own, *combine(fits, state_maps(base.size, own, len(fits))))
+
+
+def state_indices(size: int, varying: Sequence[int], state: int) -> Int[np.ndarray, " base"]:
+    """Return the place of each base parameter of a state among the unknowns of all states.
+
+    Shared parameters come first, then those of each state.
+    """
+    own = np.isin(np.arange(size), varying)
+    indices = np.cumsum(~own) - 1
+    indices[own] = size + (state - 1) * own.sum() + np.arange(own.sum())
+    return indices
+
+
+def state_maps(
+    size: int, varying: Sequence[int], states: int
+) -> list[Float[np.ndarray, "base unknowns"]]:
+    """Return for each state the matrix that gives its base parameters from all unknowns."""
+    unit = np.eye(size + (states - 1) * len(varying))
+    return [unit[state_indices(size, varying, state)] for state in range(states)]
+
+
+def varying_parameters(
+    base: BaseParameters, varying: Sequence[str] | None, shared: Sequence[str] | None = None
+) -> tuple[int, ...]:
+    """Return the indices of the base parameters that each state has for itself.
+
+    Args:
+        base: Base parameters.
+        varying: Their names; if None, those that store no energy.
+        shared: Names of the others; an alternative to `varying`.
+
+    Raises:
+        InputError: If both are given, or there is no such base parameter.
+    """
+    if varying is not None and shared is not None:
+        raise InputError("give either `varying` or `shared`, and not both.")
+    names = shared if varying is None else varying
+    if names is None:
+        return tuple(int(k) for k in np.flatnonzero(~stores_energy(base)))
+    for name in names:
+        if name not in base.names:
+            raise InputError(
+                f"`{name}` is no base parameter of `{base.model.robot.name}`: see `base.names`."
+            )
+    return tuple(k for k, x in enumerate(base.names) if (x in names) == (varying is not None))
+
+
+def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:
+    """Return which base parameters make kinetic or potential energy; friction and offsets do not.
+
+    Forces of the others neither depend on accelerations nor come from a potential, whatever the
+    terms of the model are called.
+    """
+    model = base.model
+    q, qdd = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, model.robot.joints))
+    rest = np.zeros_like(q)
+    moving, still = (in_numpy(base, base.columns, q, rest, a) for a in (qdd, rest))
+    kinetic = np.abs(moving - still).max(axis=(0, 1)) > 0
+    energies = [
+        in_numpy(model, model.potential, q, shared=(p,))
+        for p in np.eye(model.size)[list(base.indices)]
+    ]
+    return kinetic | (np.ptp(np.array(energies), axis=1) > 0)
