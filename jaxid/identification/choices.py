@@ -50,11 +50,6 @@ class FilterChoice(eqx.Module):
         return self.candidates[self.best][0]
 
     @property
-    def decimation(self) -> AbstractDecimation:
-        """The chosen decimation."""
-        return self.candidates[self.best][1]
-
-    @property
     def curve(self) -> Float[np.ndarray, " candidates"]:
         """Held-out error of each candidate on the whole log."""
         return np.sqrt(np.mean(np.asarray(self.errors) ** 2, axis=1))
@@ -144,10 +139,8 @@ def _butterworth_candidates(sample_time: float) -> list[FilterCandidate]:
 def _inner_rows(observations: Observations, edge: int) -> Observations:
     """Mask rows that are too close to the ends for the slowest candidate."""
     at = observations.instants
-    far = np.zeros(len(at), bool)
-    for a, b in observations.segments:
-        far |= (at >= a + edge) & (at < b - edge)
-    return observations.replace(mask=np.asarray(observations.mask) & far[:, None])
+    far = [(at >= a + edge) & (at < b - edge) for a, b in observations.segments]
+    return observations.replace(mask=np.asarray(observations.mask) & np.any(far, axis=0)[:, None])
 
 
 def _with_motion(widest: Observations, own: Observations) -> Observations:

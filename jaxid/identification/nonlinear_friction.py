@@ -34,34 +34,16 @@ class HeldOutErrors(eqx.Module):
     """Errors on contiguous blocks of time that were left out in turn.
 
     Attributes:
-        linear: Sums of the squared weighted errors of the linear model, for each block.
+        linear: Error of the linear model relative to the forces.
         nonlinear: The same for nonlinear friction, its shapes found without the block.
-        forces: Sums of the squared weighted forces, for each block.
+        gain: Relative reduction of the squared error by nonlinear friction; negative if it grows.
+        gain_deviation: Standard deviation of the gain, from the scatter between the blocks.
     """
 
-    linear: Float[AnyArray, " folds"]
-    nonlinear: Float[AnyArray, " folds"]
-    forces: Float[AnyArray, " folds"]
-
-    @property
-    def errors(self) -> tuple[float, float]:
-        """Errors of the linear and the nonlinear model relative to the forces."""
-        total = float(np.sum(self.forces))
-        return (
-            float(np.sqrt(np.sum(self.linear) / total)),
-            float(np.sqrt(np.sum(self.nonlinear) / total)),
-        )
-
-    @property
-    def gain(self) -> float:
-        """Relative reduction of the squared error by nonlinear friction; negative if it grows."""
-        return 1.0 - float(np.sum(self.nonlinear) / np.sum(self.linear))
-
-    @property
-    def gain_deviation(self) -> float:
-        """Standard deviation of the gain, from the scatter between the blocks."""
-        saved = np.asarray(self.linear) - np.asarray(self.nonlinear)
-        return float(saved.std(ddof=1) * np.sqrt(len(saved)) / np.sum(self.linear))
+    linear: float
+    nonlinear: float
+    gain: float
+    gain_deviation: float
 
     @property
     def pays(self) -> bool:
@@ -69,12 +51,12 @@ class HeldOutErrors(eqx.Module):
         return self.gain > max(self.gain_deviation, 0.01)
 
     def __str__(self):
-        linear, nonlinear = (f"{100 * e:.2f} %" for e in self.errors)
         verdict = "pays" if self.pays else "does not pay"
         return (
-            f"nonlinear friction {verdict}: on held-out blocks of time its error is {nonlinear} of "
-            f"the forces, that of the linear model {linear} (squared error "
-            f"{-100 * self.gain:+.1f} ± {100 * self.gain_deviation:.1f} %)."
+            f"nonlinear friction {verdict}: on held-out blocks of time its error is "
+            f"{100 * self.nonlinear:.2f} % of the forces, that of the linear model "
+            f"{100 * self.linear:.2f} % (squared error {-100 * self.gain:+.1f} ± "
+            f"{100 * self.gain_deviation:.1f} %)."
         )
 
 
@@ -107,22 +89,12 @@ class NonlinearFit(eqx.Module):
     @property
     def better(self) -> Fit:
         """The nonlinear fit if it pays, otherwise the linear one, with notes that say why."""
-        if not self.held_out.pays:
-            return dataclasses.replace(self.linear, notes=(*self.linear.notes, str(self.held_out)))
-        return dataclasses.replace(
-            self.fit, notes=(*self.fit.notes, str(self.held_out), self.sentence)
-        )
-
-    @property
-    def sentence(self) -> str:
-        """Sentence with the shapes and their standard deviations."""
-        shown = ", ".join(
-            f"{name} = {value:.3g} ± {deviation:.2g} {unit}"
-            for name, unit, value, deviation in zip(
-                self.names, self.units, self.shapes, self.shape_deviations, strict=True
-            )
-        )
-        return f"shapes of friction: {shown}."
+        fit, notes = self.linear, (str(self.held_out),)
+        if self.held_out.pays:
+            rows = zip(self.names, self.shapes, self.shape_deviations, self.units, strict=True)
+            shown = ", ".join(f"{name} = {x:.3g} ± {s:.2g} {unit}" for name, x, s, unit in rows)
+            fit, notes = self.fit, (*notes, f"shapes of friction: {shown}.")
+        return dataclasses.replace(fit, notes=(*fit.notes, *notes))
 
 
 def identify_nonlinear(
@@ -157,8 +129,8 @@ def identify_nonlinear(
     shaped = shapes.set(base, x)
     fit = fit_problem(RegressionProblem(shaped, recordings), estimator.linear)
     linearised = _with_slopes(shaped, dataclasses.replace(shapes, model=shaped.model), x, fit)
-    joint = fit_problem(RegressionProblem(linearised, recordings), estimator.linear)
-    covariance, both = np.asarray(joint.covariance), joint.uncertainty
+    both = fit_problem(RegressionProblem(linearised, recordings), estimator.linear).uncertainty
+    covariance = np.asarray(both.covariance)
     uncertainty = Uncertainty(
         covariance[:size, :size],
         np.asarray(both.dof)[:size],
@@ -187,32 +159,32 @@ def _held_out_errors(
     progress: Progress | None,
 ) -> HeldOutErrors:
     """Test both models on held-out blocks; searches begin at the shapes of all blocks."""
-    squares, errors = weights**2, []
-    start, count = problem.shapes.values, len(blocks.parts)
-    folds = np.array_split(np.arange(count), min(5, count))
-    for fold, part in enumerate(folds):
-        out = part.tolist()
+    squares, errors, count = weights**2, [], len(blocks.parts)
+    folds = [part.tolist() for part in np.array_split(np.arange(count), min(5, count))]
+    for out in folds:
         rest = [k for k in range(count) if k not in out]
         p = Decomposition.of(*join_blocks(blocks, rest).weighted(weights)).solve()
-        shaped = problem.blocks(search_shapes(problem, weights, start, found, rest)[0])
-        c = project(problem, join_blocks(shaped, rest), weights)[0]
-        test, linear_test = join_blocks(shaped, out), join_blocks(blocks, out)
-        errors.append(
-            (
-                squares @ linear_test.residual_squares(p),
-                squares @ test.residual_squares(np.append(c, np.zeros(test.size - len(c)))),
-                squares @ linear_test.force_squares,
-            )
-        )
+        x, _ = search_shapes(problem, weights, problem.shapes.values, found, rest)
+        shaped = problem.blocks(x)
+        c = np.zeros(problem.size)
+        c[: problem.base.size] = project(problem, join_blocks(shaped, rest), weights)[0]
+        tests = join_blocks(blocks, out), join_blocks(shaped, out)
+        own = [t.residual_squares(y) for t, y in zip(tests, (p, c), strict=True)]
+        errors.append([squares @ y for y in (*own, tests[0].force_squares)])
         if progress is not None:
-            progress((fold + 1) / len(folds))
-    return HeldOutErrors(*np.array(errors).T)
+            progress(len(errors) / len(folds))
+    linear, nonlinear, forces = np.array(errors).T
+    saved, total = linear - nonlinear, float(linear.sum())
+    return HeldOutErrors(
+        linear=float(np.sqrt(total / forces.sum())),
+        nonlinear=float(np.sqrt(nonlinear.sum() / forces.sum())),
+        gain=float(saved.sum() / total),
+        gain_deviation=float(saved.std(ddof=1) * np.sqrt(len(saved)) / total),
+    )
 
 
 class ShapeSlopes(AbstractTerm):
-    """Term of the forces of small changes of shapes: it makes the linearised problem ordinary.
-
-    Whatever computes the uncertainty of parameters then computes that of the shapes too.
+    """Forces of small changes of shapes: with this term the linearised problem is an ordinary one.
 
     Attributes:
         shapes: Shapes that change, at which forces are linearised.
@@ -310,21 +282,13 @@ def temperature_law(
     f = np.array([np.asarray(fit.parameters)[k] for fit, k in zip(fits, places, strict=True)])
     s = np.array([fit.standard_deviations[k] for fit, k in zip(fits, places, strict=True)])
     lines = np.full((len(names), 4), np.nan)
-    for j in range(len(names)):
-        if (f[:, j] > 0).all():
-            # Exact estimates of simulated logs get a tiny deviation.
-            lines[j] = _fit_line(warmer, np.log(f[:, j]), np.maximum(s[:, j] / f[:, j], 1e-12))
-    level, level_deviation, slope, slope_deviation = lines.T
+    for j in np.flatnonzero((f > 0).all(axis=0)):
+        # Exact estimates of simulated logs get a tiny deviation.
+        weights = 1.0 / np.maximum(s[:, j] / f[:, j], 1e-12)
+        line, covariance = np.polyfit(warmer, np.log(f[:, j]), 1, w=weights, cov="unscaled")
+        lines[j] = *line, *np.sqrt(np.diag(covariance))
+    slope, level, slope_deviation, level_deviation = lines.T
     values, rates = np.exp(level), -slope
     known = np.where(np.isfinite(rates), rates, 0.0)
     scaled = TemperatureScaled(term, known, reference, reference)
     return TemperatureLaw(names, values, values * level_deviation, rates, slope_deviation, scaled)
-
-
-def _fit_line(x: np.ndarray, y: np.ndarray, deviations: np.ndarray) -> tuple[float, ...]:
-    """Return level and slope of a line, each with its standard deviation."""
-    A = np.column_stack([np.ones_like(x), x]) / deviations[:, None]
-    covariance = np.linalg.inv(A.T @ A)
-    level, slope = covariance @ A.T @ (y / deviations)
-    a, b = np.sqrt(np.diag(covariance))
-    return float(level), float(a), float(slope), float(b)

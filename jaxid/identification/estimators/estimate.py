@@ -159,8 +159,8 @@ class AbstractEstimator(eqx.Module):
         """Return the estimate of a regression problem.
 
         Raises:
-            InputError: If weights are not known, or the estimator needs rows and only factors are
-                known.
+            InputError: If weights are not known, the estimator needs rows and only factors are
+                known, or its settings do not fit the model or the recordings.
         """
 
 

@@ -29,6 +29,7 @@ from jaxid.identification.estimators.least_squares import WeightedLeastSquares
 from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Blocks, Factors, JointFactor, RowChunk
 from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.observations import Observations
 from jaxid.program import evaluate_packed
 
 Selection = Callable[[tuple[AbstractTerm, ...]], Sequence[Any]]
@@ -53,11 +54,7 @@ class NonlinearFriction(AbstractEstimator):
     free: Selection | None = eqx.field(static=True, default=None)
 
     def __call__(self, problem):
-        """Search for the shapes, and estimate with them.
-
-        Raises:
-            InputError: If the model has no shapes, or only factors are known.
-        """
+        """Search for the shapes, and estimate with them."""
         separable, x, notes = self.search(problem, np.asarray(self.linear(problem).weights))
         base = separable.shapes.set(problem.base, x)
         estimate = self.linear(problem.with_base(base))
@@ -196,11 +193,8 @@ class SeparableProblem:
     Attributes:
         base: Base parameters of the model.
         shapes: Shapes to be found.
-        varying: Positions of the varying columns among the base parameters.
-        pairs: Varying column and shape of each derivative.
-
-    Raises:
-        InputError: If only factors are known, or the rows do not fit into memory.
+        pairs: For each derivative the column, as an index of a base parameter, and the shape.
+        size: Number of columns.
     """
 
     max_numbers = 2**28
@@ -211,28 +205,27 @@ class SeparableProblem:
         base, n = problem.base, (problem.robot.joints,)
         self._problem, self.base, self.shapes = problem, base, shapes
         shaped = shapes.columns_of_terms
-        self.varying = tuple(place for place, k in enumerate(base.indices) if k in shaped)
-        columns = [shaped.index(base.indices[k]) for k in self.varying]
+        # Place among the base parameters, and among the shaped terms' columns.
+        varying = [(k, shaped.index(i)) for k, i in enumerate(base.indices) if i in shaped]
+        self._varying = {place for place, _ in varying}
         self._program = program_of(shapes, shapes.columns_and_slopes, (shapes.size,), n, n, n)
         moved, slopes = (np.asarray(x) for x in self._program.nonzeros)
-        pairs = [(v, k) for v, c in enumerate(columns) for k in np.flatnonzero(slopes.any(0)[c])]
-        self.pairs = tuple((v, int(k)) for v, k in pairs)
-        # For each joint the columns of the factor, and the entries of the program in them.
-        entries = []
-        for j in range(problem.robot.joints):
-            own = [
-                (self.varying[v], int(np.ravel_multi_index((j, c), moved.shape)))
-                for v, c in enumerate(columns)
-                if moved[j, c]
+        pairs = [(k, c, i) for k, c in varying for i in np.flatnonzero(slopes[:, c].any(axis=0))]
+        self.pairs = [(k, int(i)) for k, _, i in pairs]
+        self.size = base.size + len(pairs)
+        # For each joint the columns that vary, with their places in the output of the program.
+        at = np.arange(moved.size + slopes.size)
+        values, derivatives = np.split(at, [moved.size])
+        values, derivatives = values.reshape(moved.shape), derivatives.reshape(slopes.shape)
+        self._entries = [
+            [(k, int(values[j, c])) for k, c in varying if moved[j, c]]
+            + [
+                (base.size + place, int(derivatives[j, c, i]))
+                for place, (_, c, i) in enumerate(pairs)
+                if slopes[j, c, i]
             ]
-            for place, (v, k) in enumerate(self.pairs):
-                if slopes[j, columns[v], k]:
-                    flat = np.ravel_multi_index((j, columns[v], k), slopes.shape)
-                    own.append((base.size + place, moved.size + int(flat)))
-            entries.append(own)
-        self._needed = sorted({entry for own in entries for _, entry in own})
-        self._columns = [[column for column, _ in own] for own in entries]
-        self._places = [[self._needed.index(entry) for _, entry in own] for own in entries]
+            for j in range(n[0])
+        ]
         self._pieces, size = [], 0
         for chunk in problem.chunks():
             self._pieces.append(self._factor(chunk))
@@ -244,17 +237,12 @@ class SeparableProblem:
                     "take a part of the log."
                 )
 
-    @property
-    def size(self) -> int:
-        """Number of columns of the factors."""
-        return self.base.size + len(self.pairs)
-
     def _factor(self, chunk: RowChunk) -> tuple[RowChunk, list[np.ndarray], list[np.ndarray]]:
         """Return orthonormal bases of each joint's fixed columns, triangles, and other forces."""
         bases, triangles, rests, indices = [], [], [], []
         joints = zip(chunk.indices, chunk.columns, chunk.forces.T, chunk.mask.T, strict=True)
         for own, theta, force, mask in joints:
-            fixed = [place for place, k in enumerate(own) if k not in self.varying]
+            fixed = [place for place, k in enumerate(own) if k not in self._varying]
             Q, R = np.linalg.qr(theta[mask][:, fixed])
             along = Q.T @ force[mask]
             bases.append(Q)
@@ -265,36 +253,37 @@ class SeparableProblem:
 
     def blocks(self, x: Float[np.ndarray, " shapes"]) -> Blocks:
         """Return the factors by blocks of time for some shapes."""
-        shaped = [self._shaped_rows(number, x) for number in range(len(self._problem.recordings))]
+        shaped = [self._shaped_rows(observations, x) for observations in self._problem.recordings]
         parts: dict[int, list[Factors]] = {}
         for chunk, triangles, rests in self._pieces:
-            rows = shaped[chunk.recording][chunk.rows]
             joints = []
             for j, (Q, R, rest) in enumerate(zip(chunk.columns, triangles, rests, strict=True)):
-                own = rows[chunk.mask[:, j]][:, self._places[j]]
+                own = shaped[chunk.recording][j][chunk.rows][chunk.mask[:, j]]
                 along = Q.T @ own
                 below = np.linalg.qr(np.column_stack([own - Q @ along, rest]), mode="r")
                 above = np.column_stack([R[:, :-1], along, R[:, -1]])
                 left = np.zeros((len(below), R.shape[1] - 1))
                 whole = np.vstack([above, np.column_stack([left, below])])
-                columns = (*chunk.indices[j], *self._columns[j])
+                columns = (*chunk.indices[j], *(column for column, _ in self._entries[j]))
                 joints.append(JointFactor(columns, whole, len(own)))
             parts.setdefault(chunk.block, []).append(Factors(tuple(joints), self.size))
         return Blocks(tuple(functools.reduce(lambda a, b: a + b, parts[k]) for k in sorted(parts)))
 
-    def _shaped_rows(self, number: int, x: Float[np.ndarray, " shapes"]) -> np.ndarray:
-        """Return the rows of everything that depends on shapes, for one recording."""
-        observations = self._problem.recordings[number]
-        rows = np.empty((observations.rows, len(self._needed)))
+    def _shaped_rows(
+        self, observations: Observations, x: Float[np.ndarray, " shapes"]
+    ) -> list[np.ndarray]:
+        """Return the rows of everything that depends on shapes, for each joint."""
+        entries = [entry for own in self._entries for _, entry in own]
+        rows = np.empty((observations.rows, len(entries)))
         for chunk in observations.chunks(RegressionProblem.samples_per_chunk):
             motion, _ = observations.read(slice(*chunk.samples))
             arrays = (np.asarray(a, np.float64).T for a in (motion.q, motion.qd, motion.qdd))
-            packed = evaluate_packed(self._program, np.asarray(x), *arrays)
-            samples = np.empty((len(motion.q), len(self._needed)), order="F")
-            for place, entry in enumerate(self._needed):
+            packed = evaluate_packed(self._program, x, *arrays)
+            samples = np.empty((len(motion.q), len(entries)), order="F")
+            for place, entry in enumerate(entries):
                 samples[:, place] = packed[entry]
             rows[slice(*chunk.rows)] = chunk.reduce(samples)
-        return rows
+        return np.split(rows, np.cumsum([len(own) for own in self._entries])[:-1], axis=1)
 
 
 def join_blocks(blocks: Blocks, chosen: Sequence[int]) -> Factors:
@@ -311,44 +300,38 @@ def search_shapes(
 ) -> tuple[Float[np.ndarray, " shapes"], tuple[str, ...]]:
     """Search for shapes by Levenberg-Marquardt over their logarithms; return notes as well.
 
-    Where the rows hardly determine a shape, a weak pull keeps it near `start`: as strong as one row
-    that tells that it differs by a factor of ten.
-
-    Args:
-        problem: Separable problem.
-        weights: Weights of the joints' rows.
-        start: Shapes to which the pull leads.
-        begin: Shapes at which the search begins.
-        blocks: Blocks of time that count; by default all.
+    Where the rows of some blocks of time (by default all) hardly determine a shape, a weak pull
+    keeps it near `start`: as strong as one row that tells that it differs by a factor of ten.
     """
     pull = np.log(10.0)
 
     @functools.lru_cache(maxsize=1)
-    def projected(x: bytes) -> tuple[Factors, np.ndarray, np.ndarray]:
-        found = problem.blocks(np.frombuffer(x))
+    def projected(u: bytes) -> tuple[Factors, np.ndarray, np.ndarray]:
+        x = start * np.exp(np.frombuffer(u))
+        found = problem.blocks(x)
         factors = found.total if blocks is None else join_blocks(found, blocks)
-        return factors, *project(problem, factors, weights)[1:]
+        _, residual, jacobian = project(problem, factors, weights)
+        return factors, residual, jacobian * x
 
-    x, steps, success = begin, 0, False
+    u, steps, success = np.log(begin / start), 0, False
     # Twice, since the strength of the pull depends on the noise, which is known at the end only.
     for _ in range(2):
-        factors, left, _ = projected(x.tobytes())
+        factors, left, _ = projected(u.tobytes())
         dof = max(float(factors.rows.sum()) - problem.base.size, 1.0)
         scale = max(float(np.linalg.norm(left)) / np.sqrt(dof), 1e-300)
 
         def residual(u: np.ndarray, scale: float = scale) -> np.ndarray:
-            return np.concatenate([projected((start * np.exp(u)).tobytes())[1] / scale, u / pull])
+            return np.append(projected(u.tobytes())[1] / scale, u / pull)
 
         def jacobian(u: np.ndarray, scale: float = scale) -> np.ndarray:
-            y = start * np.exp(u)
-            return np.vstack([projected(y.tobytes())[2] * y / scale, np.eye(len(u)) / pull])
+            return np.vstack([projected(u.tobytes())[2] / scale, np.eye(len(u)) / pull])
 
         options = {"jac": jacobian, "method": "lm", "xtol": 1e-4, "ftol": 1e-6, "max_nfev": 60}
-        found = optimize.least_squares(residual, np.log(x / start), **options)
-        x, steps, success = start * np.exp(found.x), steps + found.nfev, bool(found.success)
+        found = optimize.least_squares(residual, u, **options)
+        u, steps, success = found.x, steps + found.nfev, bool(found.success)
     if success:
-        return x, ()
-    return x, (
+        return start * np.exp(u), ()
+    return start * np.exp(u), (
         f"the search for the shapes of friction has not converged in {steps} steps: the logs "
         "hardly determine some of them; look at their standard deviations, or select fewer.",
     )
@@ -357,13 +340,7 @@ def search_shapes(
 def project(
     problem: SeparableProblem, factors: Factors, weights: Float[np.ndarray, " joints"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the best linear parameters, the weighted residual, and its derivatives by shapes.
-
-    Args:
-        problem: Separable problem.
-        factors: Factors of all columns at some shapes, of all rows or a part of them.
-        weights: Weights of the joints' rows.
-    """
+    """Return the best linear parameters, the weighted residual, and its derivatives by shapes."""
     size = problem.base.size
     R, z = factors.weighted(weights)
     missing = problem.size + 1 - len(R)
@@ -375,8 +352,7 @@ def project(
     # Derivatives of N c, and of N^T times the residual.
     forces = np.zeros((len(R), problem.shapes.size))
     products = np.zeros((size, problem.shapes.size))
-    for place, (v, k) in enumerate(problem.pairs):
-        column = problem.varying[v]
+    for place, (column, k) in enumerate(problem.pairs):
         forces[:, k] += c[column] * slopes[:, place]
         products[column, k] += slopes[:, place] @ residual
     orthogonal = forces - N @ (B @ (N.T @ forces))

@@ -27,12 +27,7 @@ from jaxid.identification.estimators.solutions import (
     ResidualVariances,
 )
 from jaxid.identification.factors import Blocks, Factors, RowChunk
-from jaxid.identification.problem import (
-    RegressionProblem,
-    Span,
-    chunk_residuals,
-    reduced_rows,
-)
+from jaxid.identification.problem import RegressionProblem, Span, reduced_rows
 from jaxid.measurement.observations import Observations
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
@@ -83,19 +78,22 @@ class GeneralisedLeastSquares(AbstractEstimator):
     iterations: int = eqx.field(static=True, default=2)
 
     def __call__(self, problem):
-        """Estimate covariance and parameters in turn.
-
-        Raises:
-            InputError: If only factors of the rows are known.
-        """
+        """Estimate covariance and parameters in turn."""
         problem.require_samples("least squares with the full covariance of the joints")
         weights = ResidualVariances()(problem.robot, problem.factors)
         estimate = Estimate.solve(problem, weights, self.solution)
+        size, n = problem.base.size, problem.robot.joints
         for _ in range(self.iterations):
-            p = np.asarray(estimate.parameters)
-            S = _residual_covariance(problem, p)
-            influence, weights = whitened_rows(S), 1.0 / np.sqrt(np.diag(S))
-            blocks = _whiten(problem, influence, p, weights)
+            S = _residual_covariance(problem, np.asarray(estimate.parameters))
+            influence, weights = whitened_rows(S, size), 1.0 / np.sqrt(np.diag(S))
+
+            def equations(chunk, influence=influence, weights=weights):
+                """Return the combinations of joints, as if they were the joints' own rows."""
+                mixed = zip(influence(chunk, chunk.forces), weights, chunk.mask.T, strict=True)
+                both = ((np.column_stack([x.equations, x.disturbance]), w, m) for x, w, m in mixed)
+                return [rows[mask] / w for rows, w, mask in both]
+
+            blocks = problem.fold(equations, [tuple(range(size))] * n)
             estimate = Estimate.solve(problem, weights, self.solution, blocks, influence)
         return estimate
 
@@ -118,14 +116,13 @@ def _residual_covariance(
     return definite * size * size[:, None]
 
 
-def whitened_rows(S: Float[np.ndarray, "joints joints"]) -> Influence:
+def whitened_rows(S: Float[np.ndarray, "joints joints"], size: int) -> Influence:
     """Return the influence of the joints' rows at one instant, multiplied by S^(-1/2).
 
     The channels are combinations of joints whose residuals are not correlated.
     """
 
     def channels(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
-        size = 1 + max((max(own) for own in chunk.indices if own), default=0)
         rows = np.zeros((*residuals.shape, size + 1))
         for j, own in enumerate(chunk.indices):
             rows[:, j, list(own)] = chunk.columns[j]
@@ -148,24 +145,6 @@ def whitened_rows(S: Float[np.ndarray, "joints joints"]) -> Influence:
     return channels
 
 
-def _whiten(
-    problem: RegressionProblem, influence: Influence, p: np.ndarray, weights: np.ndarray
-) -> Blocks:
-    """Return the factors of combinations of joints, as if they were the joints' own."""
-    size = problem.base.size
-
-    def equations(chunk: RowChunk) -> list[np.ndarray]:
-        found = []
-        for c, channel in enumerate(influence(chunk, chunk_residuals(chunk, p))):
-            Z = np.zeros((len(chunk.mask), size))
-            Z[:, list(channel.columns)] = channel.equations
-            both = np.column_stack([Z, channel.disturbance + Z @ p])[chunk.mask[:, c]]
-            found.append(both / weights[c])
-        return found
-
-    return problem.fold(equations, [tuple(range(size))] * len(weights))
-
-
 class InstrumentalVariables(AbstractEstimator):
     r"""Weighted least squares with the columns of a motion without noise (IDIM-IV).
 
@@ -186,11 +165,7 @@ class InstrumentalVariables(AbstractEstimator):
     starts: tuple[float, ...] = eqx.field(static=True, default=(0.0,))
 
     def __call__(self, problem):
-        """Solve with the references' columns.
-
-        Raises:
-            InputError: If only factors of the rows are known, or the number of references is wrong.
-        """
+        """Solve with the references' columns."""
         problem.require_samples("an estimate with instrumental variables")
         weights = self.weights(problem.robot, problem.factors)
         recordings, size = problem.recordings, problem.base.size
@@ -266,12 +241,7 @@ class RelativeTo(AbstractEstimator):
     )
 
     def __call__(self, problem):
-        """Subtract the prior's forces, estimate, and add the prior.
-
-        Raises:
-            InputError: If the number of parameters is not that of the model, or the estimator
-                rejects the problem.
-        """
+        """Subtract the prior's forces, estimate, and add the prior."""
         size = problem.base.model.size
         if np.shape(self.parameters) != (size,):
             raise InputError(

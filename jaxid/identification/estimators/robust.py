@@ -111,11 +111,7 @@ class IterativelyReweighted(AbstractEstimator):
     tolerance: float = eqx.field(static=True, default=1e-4)
 
     def __call__(self, problem):
-        """Reweight and solve until nothing changes.
-
-        Raises:
-            InputError: If only factors of the rows are known.
-        """
+        """Reweight and solve until nothing changes."""
         problem.require_samples("an iteratively reweighted estimate")
         weights = self.weights(problem.robot, problem.factors)
         p = np.asarray(Estimate.solve(problem, weights, self.solution).parameters)

@@ -104,15 +104,16 @@ class Lines(NamedTuple):
     exposure: np.ndarray
     stretches: int
 
+    def add(self, other: "Lines") -> "Lines":
+        """Return the sums with the spectra of stretches with the same lines."""
+        names = ("energy", "leverage", "power", "residual", "exposure", "stretches")
+        return self._replace(**{x: getattr(self, x) + getattr(other, x) for x in names})
+
 
 def row_spectra(
     problem: RegressionProblem, estimate: Estimate
 ) -> tuple[list[Lines], np.ndarray, bool]:
     """Transform every stretch of the rows in one pass.
-
-    Args:
-        problem: Rows of the estimate.
-        estimate: Estimate, whose influence makes channels of the rows.
 
     Returns:
         Spectra of every length of stretches; energies of pairs of parameters, summed over the lines
@@ -134,10 +135,7 @@ def row_spectra(
         n = lengths[b - a, o.row_time]
         lines = _transform(n, pieces, r, B, o, correlated)
         key = (n, o.row_time, len(lines.frequency))
-        if key in found:
-            sums = [x + y for x, y in zip(found[key][6:], lines[6:], strict=True)]
-            lines = Lines(*lines[:6], *sums)
-        found[key] = lines
+        found[key] = found[key].add(lines) if key in found else lines
     return list(found.values()), correlated, complete
 
 
@@ -216,15 +214,11 @@ def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
 
 def _padded_lengths(kinds: set[tuple[int, float]]) -> dict[tuple[int, float], int]:
     """Return the padded length of stretches, by length and time between rows."""
-    if len(kinds) <= MAX_LENGTHS:
-        return {kind: kind[0] for kind in kinds}
-    padded = {}
-    for row_time in {t for _, t in kinds}:
-        lengths = sorted((n for n, t in kinds if t == row_time), reverse=True)
-        top = lengths[0]
-        for n in lengths:
-            top = n if n * 1.5 < top else top
-            padded[n, row_time] = top
+    padded, longest = {}, {}
+    for n, row_time in sorted(kinds, reverse=True):
+        if len(kinds) <= MAX_LENGTHS or n * 1.5 < longest.get(row_time, math.inf):
+            longest[row_time] = n
+        padded[n, row_time] = longest[row_time]
     return padded
 
 
@@ -262,15 +256,10 @@ def _gather(
 def window_sums(
     frequency: Float[np.ndarray, " lines"], longest: float
 ) -> tuple[Callable[[AnyArray], AnyArray], Callable[[AnyArray], AnyArray]]:
-    """Return functions that sum over windows of lines, along the last axis, and their transposes.
+    """Return functions that sum arrays over windows of lines, and over the windows with a line.
 
-    A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four lines. The
-    functions take NumPy and JAX arrays; the transposed one sums over the windows that contain a
-    line.
-
-    Args:
-        frequency: Frequencies of the lines, in any order [Hz].
-        longest: Duration of the longest stretch [s].
+    A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four lines of the
+    longest stretch [s]. The functions take NumPy and JAX arrays, with the lines as last axis.
     """
     order = np.argsort(frequency, kind="stable")
     place = np.argsort(order, kind="stable")
@@ -331,13 +320,13 @@ class SpectralTable:
     @classmethod
     def of(cls, lines: Sequence[Lines]) -> "SpectralTable":
         """Return the table of the spectra of every length of stretches."""
-        arrays = [
-            np.concatenate([getattr(x, name) for x in lines], axis=-1)
-            for name in ("frequency", "multiplicity", "energy", "leverage")
+        parts = [
+            (x.frequency, x.multiplicity, x.energy, x.leverage, x.exposure[:, None] + 0 * x.leverage)
+            for x in lines
         ]
-        exposure = [np.broadcast_to(x.exposure[:, None], x.leverage.shape) for x in lines]
+        f, m, energy, leverage, exposure = (np.concatenate(x, -1) for x in zip(*parts, strict=True))
         longest = max(x.length * x.row_time for x in lines)
-        return cls(np, *arrays, np.concatenate(exposure, axis=1), longest)
+        return cls(np, f, m, energy, leverage, exposure, longest)
 
     def density(self, power: np.ndarray) -> np.ndarray:
         """Return the spectrum of the errors at each line, from the periodogram of residuals."""
@@ -360,12 +349,7 @@ class SpectralTable:
 def sandwich(
     lines: Sequence[Lines], correlated: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the covariance of an estimate, degrees of freedom, and variances for white errors.
-
-    Args:
-        lines: Spectra of every length of stretches.
-        correlated: Energies of pairs of parameters; see `row_spectra`.
-    """
+    """Return the covariance of an estimate, degrees of freedom, and variances for white errors."""
     count, table = len(correlated), SpectralTable.of(lines)
     power = np.concatenate([x.power for x in lines], axis=1)
     (variance,), (dof,) = table(power[None])
@@ -380,17 +364,13 @@ def sandwich(
     deviation = np.sqrt(np.maximum(variance, 0.0))
     covariance = rough / scale / scale[:, None] * deviation * deviation[:, None]
     covariance[np.diag_indices(len(variance))] = deviation**2
-    return covariance, np.maximum(dof, 1.0), _white_variances(lines)
-
-
-def _white_variances(lines: Sequence[Lines]) -> np.ndarray:
-    """Return variances for errors that are independent from row to row, of each joint's size."""
-    power = sum(np.sum(x.multiplicity * x.power, axis=1) for x in lines)
+    # White errors have one level for each joint.
     rows = sum(x.length * x.exposure for x in lines)
     explained = sum(np.sum(x.multiplicity * x.leverage, axis=1) for x in lines)
-    fraction = np.sum(explained) / max(np.sum(rows), 1.0)
-    level = power / np.maximum(rows * (1.0 - fraction), 1.0)
-    return np.sum([np.einsum("icf,c->i", x.energy, level) for x in lines], axis=0)
+    level = sum(np.sum(x.multiplicity * x.power, axis=1) for x in lines)
+    level = level / np.maximum(rows * (1.0 - np.sum(explained) / max(np.sum(rows), 1.0)), 1.0)
+    white = np.sum([np.einsum("icf,c->i", x.energy, level) for x in lines], axis=0)
+    return covariance, np.maximum(dof, 1.0), white
 
 
 def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
@@ -437,16 +417,10 @@ def line_sums(
     forces: list[Array],
     exposure: Float[Array, " joints"],
 ) -> LineSums:
-    """Return the spectra of consecutive rows, in JAX.
+    """Return the spectra of consecutive rows of some estimates, in JAX.
 
-    Args:
-        own: Base parameters that can act on each joint.
-        weights: Weights of the joints' rows.
-        inverse: Inverse of the information.
-        p: Estimates.
-        columns: Columns of each joint [columns, rows], zero where a row does not count.
-        forces: Forces of each joint [draws, rows], likewise.
-        exposure: Fraction (0 to 1) of each joint's rows that count.
+    Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row does not
+    count; the columns belong to its own parameters; `exposure` is the fraction of rows that count.
     """
     length = columns[0].shape[-1]
     m = multiplicity(length)[None]
@@ -466,22 +440,10 @@ def line_sums(
 def variances(
     sums: LineSums, length: int, row_time: float
 ) -> tuple[Float[Array, "draws base"], Float[Array, "draws base"]]:
-    """Return the variances of estimates and their degrees of freedom, in JAX.
-
-    Args:
-        sums: Spectra of all chunks.
-        length: Rows of a chunk.
-        row_time: Time between two rows [s].
-    """
+    """Return variances and degrees of freedom from chunks of `length` rows, in JAX."""
     energy, leverage, power, exposure = sums
-    table = SpectralTable(
-        jnp,
-        np.fft.rfftfreq(length, row_time),
-        multiplicity(length),
-        energy,
-        leverage,
-        jnp.broadcast_to(exposure[:, None], leverage.shape),
-        length * row_time,
-    )
+    frequency, m = np.fft.rfftfreq(length, row_time), multiplicity(length)
+    each = jnp.broadcast_to(exposure[:, None], leverage.shape)
+    table = SpectralTable(jnp, frequency, m, energy, leverage, each, length * row_time)
     variance, dof = table(power)
-    return variance, jnp.maximum(dof, 1.0)
+    return jnp.asarray(variance), jnp.maximum(dof, 1.0)
