@@ -5,21 +5,23 @@ from jaxid.identification.estimators.estimate import Channel as Channel
 from jaxid.identification.estimators.estimate import Estimate as Estimate
 from jaxid.identification.estimators.estimate import EstimatorInWords as EstimatorInWords
 from jaxid.identification.estimators.friction import NonlinearFriction as NonlinearFriction
+from jaxid.identification.estimators.least_squares import AbstractLoss as AbstractLoss
 from jaxid.identification.estimators.least_squares import (
     GeneralisedLeastSquares as GeneralisedLeastSquares,
 )
+from jaxid.identification.estimators.least_squares import Huber as Huber
 from jaxid.identification.estimators.least_squares import (
     InstrumentalVariables as InstrumentalVariables,
 )
+from jaxid.identification.estimators.least_squares import (
+    IterativelyReweighted as IterativelyReweighted,
+)
 from jaxid.identification.estimators.least_squares import LeastSquares as LeastSquares
 from jaxid.identification.estimators.least_squares import RelativeTo as RelativeTo
+from jaxid.identification.estimators.least_squares import Tukey as Tukey
 from jaxid.identification.estimators.least_squares import (
     WeightedLeastSquares as WeightedLeastSquares,
 )
-from jaxid.identification.estimators.robust import AbstractLoss as AbstractLoss
-from jaxid.identification.estimators.robust import Huber as Huber
-from jaxid.identification.estimators.robust import IterativelyReweighted as IterativelyReweighted
-from jaxid.identification.estimators.robust import Tukey as Tukey
 from jaxid.identification.estimators.solutions import AbstractSolution as AbstractSolution
 from jaxid.identification.estimators.solutions import (
     AbstractSpectralSolution as AbstractSpectralSolution,

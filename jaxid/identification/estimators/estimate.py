@@ -143,15 +143,13 @@ class AbstractEstimator(eqx.Module):
     * `problem.factors`: for each joint the R factor of its columns and forces, which is sufficient
       for least squares with weights of the joints; `problem.blocks`: the same by contiguous blocks
       of time, for cross-validation;
-    * `problem.chunks()`, `problem.residuals(p)`: passes over the rows, bounded in memory;
-      `problem.fold(...)`, `problem.reweighted(...)`: factors of transformed or weighted rows;
-    * `problem.with_base(base)`: the same recordings with other columns, for estimators that search
-      for constants of the model's terms; `problem.recordings`: motions and filters.
+    * `problem.chunks()`, `problem.residuals(p)`, `problem.fold(...)`, `problem.reweighted(...)`:
+      passes over the rows, where these are known (`problem.require_samples(...)`);
+    * `problem.with_base(base)`: the same recordings with other columns.
 
-    Problems of factors only serve estimators that need no pass over the rows; the others reject
-    them by `problem.require_samples(...)`. `Estimate.solve` returns the estimate of weighted least
-    squares; use `dataclasses.replace` where parts differ. `identify` computes uncertainties,
-    condition numbers and undetermined directions from the estimate, alike for all estimators.
+    `Estimate.solve` returns the estimate of weighted least squares; use `dataclasses.replace` where
+    parts differ. `identify` computes uncertainties, condition numbers and undetermined directions
+    from the estimate, alike for all estimators.
     """
 
     @abstractmethod

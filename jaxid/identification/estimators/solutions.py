@@ -5,7 +5,7 @@ from abc import abstractmethod
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, is_traced, one_or_each
+from jaxid.arrays import AnyArray, Bool, Float, one_or_each
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks, Factors
@@ -173,11 +173,7 @@ class CrossValidated(AbstractSolution):
     )
 
     def choose(self, blocks, weights):
-        """Test every candidate on every block.
-
-        Raises:
-            InputError: If there are fewer than two blocks.
-        """
+        """Test every candidate on every block; reject a single block."""
         if len(blocks.parts) < 2:
             raise InputError(
                 "cross-validation needs at least two `blocks` of rows, but there is one."
@@ -212,40 +208,22 @@ class GivenWeights(AbstractWeights):
 
     weights: Float[AnyArray, " joints"] = eqx.field(converter=one_or_each)
 
-    def __check_init__(self):
-        # `in_axes` of `vmap` and tracers have no values to check.
-        if not isinstance(self.weights, AnyArray) or is_traced(self.weights):
-            return
-        w = np.asarray(self.weights)
-        if w.ndim != 1 or not (np.isfinite(w).all() and (w >= 0.0).all() and w.any()):
-            raise InputError(
-                "`weights` must be one finite number for each joint, none below zero and not all "
-                f"zero, but are {w}."
-            )
-
     def __call__(self, robot, factors):
-        """Return the weights.
-
-        Raises:
-            InputError: If their number is not that of the joints.
-        """
-        if np.shape(self.weights) != (robot.joints,):
+        """Return the weights; reject those that are not one number for each joint."""
+        w = np.asarray(self.weights)
+        if w.shape != (robot.joints,) or not (np.isfinite(w).all() and w.min() >= 0 and w.any()):
             raise InputError(
-                f"`weights` must be one number for each of the {robot.joints} joints of "
-                f"`{robot.name}`, but have shape {np.shape(self.weights)}."
+                f"`weights` must be one finite number for each of the {robot.joints} joints of "
+                f"`{robot.name}`, none below zero and not all zero, but are {w}."
             )
-        return np.asarray(self.weights)
+        return w
 
 
 class MaximumForces(AbstractWeights):
     r"""Reciprocals of the largest forces, $1 / (i_{Gj} M_{j,max})$ (Eq. 30)."""
 
     def __call__(self, robot, factors):
-        """Return the reciprocals.
-
-        Raises:
-            InputError: If the largest force of some joint is not known.
-        """
+        """Return the reciprocals; reject a robot whose largest forces are not known."""
         return 1.0 / np.asarray(robot.max_forces)
 
 
@@ -261,16 +239,17 @@ class ResidualVariances(AbstractWeights):
 
     def __call__(self, robot, factors):
         """Return the reciprocals; the iteration starts from the size of the forces."""
-        squares = factors.force_squares
-        for iteration in range(self.iterations + 1):
-            deviations = np.sqrt(squares / np.maximum(factors.rows, 1))
-            # Finite also for a joint without any force or residual.
-            floor = max(1e-9 * float(deviations.max()), np.finfo(float).tiny)
-            weights = 1.0 / np.maximum(deviations, floor)
-            if iteration < self.iterations:
-                p = Decomposition.of(*factors.weighted(weights)).solve()
-                squares = factors.residual_squares(p)
+        weights = self._reciprocals(factors, factors.force_squares)
+        for _ in range(self.iterations):
+            p = Decomposition.of(*factors.weighted(weights)).solve()
+            weights = self._reciprocals(factors, factors.residual_squares(p))
         return weights
+
+    def _reciprocals(self, factors: Factors, squares: np.ndarray) -> np.ndarray:
+        deviations = np.sqrt(squares / np.maximum(factors.rows, 1))
+        # Finite also for a joint without any force or residual.
+        floor = max(1e-9 * float(deviations.max()), np.finfo(float).tiny)
+        return 1.0 / np.maximum(deviations, floor)
 
 
 class UndeterminedDirection(eqx.Module):

@@ -410,7 +410,7 @@ LineSums = tuple[Array, Array, Array, Array]
 
 def line_sums(
     own: tuple[tuple[int, ...], ...],
-    weights: Float[Array, " joints"],
+    weights: Float[AnyArray, " joints"],
     inverse: Float[Array, "base base"],
     p: Float[Array, "draws base"],
     columns: list[Array],
