@@ -321,7 +321,13 @@ class SpectralTable:
     def of(cls, lines: Sequence[Lines]) -> "SpectralTable":
         """Return the table of the spectra of every length of stretches."""
         parts = [
-            (x.frequency, x.multiplicity, x.energy, x.leverage, x.exposure[:, None] + 0 * x.leverage)
+            (
+                x.frequency,
+                x.multiplicity,
+                x.energy,
+                x.leverage,
+                x.exposure[:, None] + 0 * x.leverage,
+            )
             for x in lines
         ]
         f, m, energy, leverage, exposure = (np.concatenate(x, -1) for x in zip(*parts, strict=True))
