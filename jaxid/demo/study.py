@@ -12,7 +12,7 @@ import jaxid as jid
 from jaxid.arrays import Float
 from jaxid.demo.feed_forward import Timing, time_feed_forward
 from jaxid.identification.comparison import Comparison
-from jaxid.simulation.experiment import Tracking
+from jaxid.simulation.virtual import Tracking
 from jaxid.validation import Validation
 
 HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800

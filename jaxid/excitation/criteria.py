@@ -1,4 +1,4 @@
-"""Criteria: one number that says how well a motion determines the base parameters (Eq. 36)."""
+"""Information of a motion about the base parameters, and criteria that make one number of it."""
 
 import functools
 from abc import abstractmethod
@@ -11,10 +11,123 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float
-from jaxid.excitation.information import Information
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.motion import Motion
+from jaxid.trajectory.trajectory import AbstractBasis
 
 Sharpness = Float[Array, ""] | float | None
 """Closeness of a smooth maximum to the exact one: larger is closer; None is exact."""
+
+
+class Information(eqx.Module):
+    r"""Information of an experiment, as criteria need it.
+
+    Attributes:
+        plain: The paper's $\Lambda = \Theta_B^T \Theta_B$ (Eq. 36).
+        weighted: The same in units of the noise, $\Theta_B^T W^2 \Theta_B$, plus prior information;
+            its inverse is the covariance of weighted least squares.
+        sizes: Typical size of each parameter, in its unit.
+    """
+
+    plain: Float[AnyArray, "*batch base base"]
+    weighted: Float[AnyArray, "*batch base base"]
+    sizes: Float[AnyArray, " base"]
+
+
+def information(
+    base: BaseParameters,
+    motion: Motion,
+    weights: Float[AnyArray, " joints"],
+    prior: Float[AnyArray, "base base"] | None = None,
+    sizes: Float[AnyArray, " base"] | None = None,
+) -> Information:
+    """Return the information of one motion, computed in NumPy (Eq. 36).
+
+    Args:
+        base: Base parameters.
+        motion: All samples that will be measured.
+        weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
+        prior: Information of earlier experiments; none if None.
+        sizes: Typical size of each parameter; one if None.
+    """
+    plain = np.zeros((base.size, base.size))
+    weighted = plain.copy() if prior is None else np.array(prior, np.float64)
+    columns = base.joint_regressor.columns
+    for own, theta, w in zip(
+        columns, base.regressor_rows(motion), np.asarray(weights), strict=True
+    ):
+        gram = theta.T @ theta
+        place = np.ix_(own, own)
+        plain[place] += gram
+        weighted[place] += w**2 * gram
+    return Information(plain, weighted, np.ones(base.size) if sizes is None else sizes)
+
+
+def information_map(
+    base: BaseParameters,
+    basis: AbstractBasis,
+    *,
+    samples: int,
+    measured: int,
+    weights: Float[AnyArray, " joints"],
+    prior: Float[AnyArray, "base base"],
+) -> Callable[[Float[Array, "starts joints variables"]], tuple[Array, Array]]:
+    """Return a function from many trajectories' coefficients to plain and weighted information.
+
+    Args:
+        base: Base parameters.
+        basis: Family of trajectories.
+        samples: Number of samples at which motions are evaluated.
+        measured: Number of measured samples for which they stand.
+        weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
+        prior: Information of earlier experiments.
+    """
+    rows = base.joint_regressor.for_gradients
+    motion = np.asarray(basis.rows(basis.times(samples))[:3])
+
+    def evaluate(x: Float[Array, "starts joints variables"]) -> tuple[Array, Array]:
+        arrays = [jnp.einsum("sk,bjk->jbs", part, x) for part in motion]
+        plain = jnp.zeros((x.shape[0], rows.size, rows.size), x.dtype)
+        weighted = plain
+        for own, columns, w in zip(rows.columns, rows(*arrays), weights, strict=True):
+            k = np.array(own, int)
+            gram = measured / samples * jnp.asarray(_gram(columns))
+            plain = plain.at[:, k[:, None], k].add(gram)
+            weighted = weighted.at[:, k[:, None], k].add(w**2 * gram)
+        return plain, weighted + prior[None]
+
+    return evaluate
+
+
+@jax.custom_vjp
+def _gram(
+    columns: Float[Array, "starts columns samples"],
+) -> Float[Array, "starts columns columns"]:
+    """Return products of columns; the derivative takes one product instead of two."""
+    return jnp.einsum("bis,bjs->bij", columns, columns)
+
+
+_gram.defvjp(
+    lambda columns: (_gram(columns), columns),
+    lambda columns, g: (jnp.einsum("bij,bjs->bis", g + jnp.swapaxes(g, 1, 2), columns),),
+)
+
+
+def standard_deviations(weighted: Float[AnyArray, "base base"]) -> Float[np.ndarray, " base"]:
+    """Return standard deviations from weighted information; infinite for undetermined parameters.
+
+    Args:
+        weighted: Weighted information.
+    """
+    weighted = np.asarray(weighted, np.float64)
+    square = np.diag(weighted)
+    scale = 1.0 / np.sqrt(np.where(square > 0, square, 1.0))
+    values, U = np.linalg.eigh(scale[:, None] * weighted * scale[None])
+    lost = values < 1e-12 * values[-1]
+    variances = (U[:, ~lost] ** 2 / values[None, ~lost]).sum(axis=1)
+    # A parameter is undetermined if it takes part in a direction without information.
+    undetermined = (np.abs(U[:, lost]) > 1e-3).any(axis=1)
+    return np.where(undetermined, np.inf, scale * np.sqrt(variances))
 
 
 class AbstractCriterion(eqx.Module):
@@ -60,27 +173,25 @@ class ConditionNumber(AbstractCriterion):
 
 
 class WeightedConditionNumber(AbstractCriterion):
-    r"""Condition number of $\Theta_B^T W^2 \Theta_B$, the matrix of weighted least squares."""
+    r"""Condition number of $\Theta_B^T W^2 \Theta_B$, the matrix of weighted least squares.
 
-    name: ClassVar[str] = "condition number, weighted"
-
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
-        """Return the logarithm of the condition number."""
-        return jnp.asarray(spectral(log_condition, information.weighted, sharpness))
-
-
-class ScaledConditionNumber(AbstractCriterion):
-    """Condition number of the weighted information after scaling its columns to unit length.
-
-    It does not depend on units. Without the scales it measures how similar columns are.
+    Attributes:
+        scaled: Whether columns are scaled to unit length: then it does not depend on units, and
+            measures how similar columns are.
     """
 
-    name: ClassVar[str] = "condition number, weighted, columns scaled"
+    scaled: bool = eqx.field(static=True, default=False)
+
+    @property
+    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Name of the number in tables."""
+        return f"condition number, weighted{', columns scaled' if self.scaled else ''}"
 
     def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the condition number."""
-        scaled = _unit_diagonal(jnp.asarray(information.weighted))[0]
-        return jnp.asarray(spectral(log_condition, scaled, sharpness))
+        matrix = jnp.asarray(information.weighted)
+        matrix = _unit_diagonal(matrix)[0] if self.scaled else matrix
+        return jnp.asarray(spectral(log_condition, matrix, sharpness))
 
 
 class DOptimal(AbstractCriterion):
@@ -114,7 +225,7 @@ class AOptimal(AbstractCriterion):
     def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the root mean square."""
         scaled = _divide_by_sizes(information, self.sizes)
-        return 0.5 * jnp.asarray(spectral(_log_mean_inverse, scaled, None))
+        return 0.5 * jnp.asarray(spectral(log_mean_inverse, scaled, None))
 
 
 class EOptimal(AbstractCriterion):
@@ -136,7 +247,7 @@ class EOptimal(AbstractCriterion):
 CRITERIA = (
     ConditionNumber(),
     WeightedConditionNumber(),
-    ScaledConditionNumber(),
+    WeightedConditionNumber(scaled=True),
     DOptimal(),
     AOptimal(),
     EOptimal(),
@@ -150,16 +261,11 @@ def spectral(
     matrix: Float[Array, "size size"],
     sharpness: Sharpness,
 ) -> Float[Array, ""]:
-    r"""Return a function of the logarithms of a positive matrix's eigenvalues.
+    r"""Return a symmetric function of the logarithms of a positive matrix's eigenvalues.
 
     For $f(\Lambda) = \varphi(\lambda)$ with $\Lambda = U \operatorname{diag}(\lambda) U^T$ the
     gradient is $U \operatorname{diag}(\varphi'(\lambda)) U^T$: it needs no derivatives of
     eigenvectors, also where eigenvalues are equal.
-
-    Args:
-        function: Symmetric function of the logarithms, in ascending order, and the sharpness.
-        matrix: Symmetric positive matrix.
-        sharpness: Argument of the function.
     """
     return _spectral_forward(function, matrix, sharpness)[0]
 
@@ -174,11 +280,7 @@ def _spectral_forward(
     return value, (U * (slopes / kept)[None]) @ U.T
 
 
-def _spectral_backward(function: Callable, gradient: Array, g: Array) -> tuple[Array, None]:
-    return g * gradient, None
-
-
-spectral.defvjp(_spectral_forward, _spectral_backward)
+spectral.defvjp(_spectral_forward, lambda function, gradient, g: (g * gradient, None))
 
 
 def log_condition(logs: Float[Array, " size"], sharpness: Sharpness) -> Float[Array, ""]:
@@ -193,7 +295,7 @@ def log_largest_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Fl
     return -logs[0] if sharpness is None else _softmax(-logs, sharpness)
 
 
-def _log_mean_inverse(logs: Array, sharpness: Sharpness) -> Array:
+def log_mean_inverse(logs: Float[Array, " size"], sharpness: Sharpness) -> Float[Array, ""]:
     """Return the logarithm of the inverse's mean eigenvalue."""
     return jax.nn.logsumexp(-logs) - np.log(logs.shape[-1])
 
@@ -230,8 +332,4 @@ def _log_determinant_forward(matrix: Array) -> tuple[Array, Array]:
     return value, inverse.T @ inverse
 
 
-def _log_determinant_backward(inverse: Array, g: Array) -> tuple[Array]:
-    return (g * inverse,)
-
-
-_log_determinant.defvjp(_log_determinant_forward, _log_determinant_backward)
+_log_determinant.defvjp(_log_determinant_forward, lambda inverse, g: (g * inverse,))

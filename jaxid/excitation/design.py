@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -46,23 +46,16 @@ def design_excitation(
     basis: AbstractBasis | None = None,
     criterion: AbstractCriterion | None = None,
     constraints: tuple[AbstractConstraint, ...] = (),
-    starts: int = 32,
-    generations: int = 12,
-    polish: int = 4,
-    key: PRNGKeyArray | None = None,
     noise: Float[AnyArray, " joints"] | None = None,
     prior: Float[AnyArray, "base base"] | None = None,
-    nominal: Float[AnyArray, " base"] | None = None,
     samples: int = 800,
-    progress: Callable[[DesignProgress], None] | None = None,
-    state: str | Path | None = None,
-    resume: bool = False,
-    throw: bool = True,
+    **settings: Any,
 ) -> ExcitationPlan:
     r"""Find the motion that determines the base parameters best within all limits (Eq. 36).
 
-    The problem is an `ExcitationProblem`, which `minimise` solves. The limits of the joints hold
-    for all times, not only at samples. The same key gives the same motion.
+    The problem is an `ExcitationProblem`, which `minimise` solves: that names further settings. The
+    limits of the joints hold for all times, not only at samples. The same key gives the same
+    motion.
 
     Args:
         base: Base parameters to be determined.
@@ -74,21 +67,13 @@ def design_excitation(
             `harmonics` and `omega` are not used then.
         criterion: Criterion to be minimised; D-optimality if None.
         constraints: Constraints beside the limits of the joints.
-        starts: Number of random motions to start from.
-        generations: Number of generations.
-        polish: Number of the best motions that are polished; 0 for the path in JAX alone.
-        key: Key of the random motions; `jax.random.key(0)` if None.
         noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
             if None. Its inverse weights the criterion, like the estimator.
         prior: Information of earlier experiments in the same noise, the inverse of their
             covariance; the design adds to it.
-        nominal: Base parameters as far as they are known, NaN where not, for relative deviations.
         samples: Number of measured samples of one run of the motion.
-        progress: Callback, called with the progress after each step.
-        state: File in which the design keeps its state, so that it can be resumed.
-        resume: Whether to go on from the state file if there is one.
-        throw: Whether to raise an error if no feasible motion is found; otherwise the plan says
-            which limits are not kept.
+        settings: Arguments of `minimise`: `starts`, `generations`, `polish`, `key`, `nominal`,
+            `progress`, `state`, `resume`, `throw`.
 
     Raises:
         InputError: If arguments do not fit, or no motion keeps all constraints: the message says
@@ -96,28 +81,11 @@ def design_excitation(
         KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
         RuntimeError: If JAX runs in single precision.
     """
+    basis = FourierBasis(harmonics, omega) if basis is None else basis
     problem = ExcitationProblem(
-        base,
-        FourierBasis(harmonics, omega) if basis is None else basis,
-        limits,
-        criterion,
-        constraints,
-        noise=noise,
-        prior=prior,
-        samples=samples,
+        base, basis, limits, criterion, constraints, noise=noise, prior=prior, samples=samples
     )
-    return minimise(
-        problem,
-        starts=starts,
-        generations=generations,
-        polish=polish,
-        key=key,
-        nominal=nominal,
-        progress=progress,
-        state=state,
-        resume=resume,
-        throw=throw,
-    )
+    return minimise(problem, **settings)
 
 
 def minimise(
@@ -150,71 +118,44 @@ def minimise(
         progress: Callback, called with the progress after each step.
         state: File in which the design keeps its state, so that it can be resumed.
         resume: Whether to go on from the state file if there is one.
-        throw: Whether to raise an error if no feasible motion is found.
+        throw: Whether to raise an error if no feasible motion is found; otherwise the plan says
+            which limits are not kept.
 
     Raises:
         InputError: If a number is too small, or no motion keeps all constraints.
         KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
     """
-    for name, value, least in (
-        ("starts", starts, 1),
-        ("generations", generations, 0),
-        ("polish", polish, 0),
-    ):
-        if value < least:
-            raise InputError(f"`{name}` must be at least {least}, but is {value}.")
+    least = {"starts": (starts, 1), "generations": (generations, 0), "polish": (polish, 0)}
+    for name, (value, low) in least.items():
+        if value < low:
+            raise InputError(f"`{name}` must be at least {low}, but is {value}.")
     key = jax.random.key(0) if key is None else key
     search = Search(problem, key, starts, generations, polish)
     path = None if state is None else Path(state)
     if resume and path is not None and path.is_file():
         search.resume(path)
+
+    def report() -> None:
+        if progress is not None:
+            first = int(search.best.order()[0])
+            task = "searching from many starts" if search.searching else "polishing the best"
+            value, kept = search.best.value[first], search.best.excess[first] <= 0.0
+            progress(DesignProgress(search.fraction, task, float(np.exp(value)), bool(kept)))
+
     interrupted = False
     try:
-        _report(search, progress)
+        report()
         while search.done < search.steps:
             search.advance()
             if path is not None:
                 search.save(path)
-            _report(search, progress)
+            report()
     except KeyboardInterrupt:
         interrupted = True
     search.finish()
-    plan = _plan(search, problem, key, nominal, interrupted)
-    if throw and not plan.feasible:
-        unkept = "; ".join(plan.diagnosis)
-        if interrupted:
-            raise KeyboardInterrupt(f"stopped before a motion kept all limits: {unkept}")
-        if path is not None:
-            # The design is complete: resuming it would end in the same place.
-            path.unlink(missing_ok=True)
-        raise InputError(f"no motion was found that keeps all limits: {unkept}")
-    return plan
-
-
-def _report(search: Search, progress: Callable[[DesignProgress], None] | None) -> None:
-    if progress is not None:
-        first = int(search.best.order()[0])
-        progress(
-            DesignProgress(
-                search.fraction,
-                "searching from many starts" if search.searching else "polishing the best",
-                float(np.exp(search.best.value[first])),
-                bool(search.best.excess[first] <= 0.0),
-            )
-        )
-
-
-def _plan(
-    search: Search,
-    problem: ExcitationProblem,
-    key: PRNGKeyArray,
-    nominal: Float[AnyArray, " base"] | None,
-    interrupted: bool,
-) -> ExcitationPlan:
     x = np.asarray(search.best.x[int(search.best.order()[0])])
-    starts = len(search.first)
     median = int(np.argsort(np.asarray(search.first))[starts // 2])
-    return ExcitationPlan(
+    plan = ExcitationPlan(
         base=problem.base,
         trajectory=problem.trajectory(x),
         criterion=problem.criterion,
@@ -227,3 +168,12 @@ def _plan(
         nominal=None if nominal is None else np.asarray(nominal),
         interrupted=interrupted,
     )
+    if throw and not plan.feasible:
+        unkept = "; ".join(plan.diagnosis)
+        if interrupted:
+            raise KeyboardInterrupt(f"stopped before a motion kept all limits: {unkept}")
+        if path is not None:
+            # The design is complete: resuming it would end in the same place.
+            path.unlink(missing_ok=True)
+        raise InputError(f"no motion was found that keeps all limits: {unkept}")
+    return plan

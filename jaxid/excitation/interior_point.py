@@ -11,13 +11,27 @@ Cholesky factor for each start. Curvature is a damped BFGS matrix [1, procedure 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bool, Float, Int
 from jaxid.excitation.limits import Grid
+
+STIFFNESS = 0.3
+"""Initial curvature: small, so that first steps are large."""
+TO_BOUNDARY = 0.995
+"""Fraction of the way to the next limit that a step may go."""
+DECREASE = 1e-4
+"""Fraction of the promised decrease that a step must give."""
+DAMPING = 0.1
+"""Fraction of the expected curvature along a step below which it is damped."""
+PATIENCE = 8
+"""Refused steps in a row after which the curvature is forgotten."""
+COOLING = 0.9
+"""Factor of the barrier after a good step."""
+INSIDE = 0.985
+"""Fraction of the bound within which a stage starts."""
 
 
 class Evaluation(NamedTuple):
@@ -80,286 +94,251 @@ class State(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """Bounds and barrier of one run of the method.
+    """One run of the method.
 
     Attributes:
         bound: Multiple to which limits are relaxed or tightened.
         barrier: Weight of the logarithmic barrier at the start.
         least: Weight below which the barrier does not fall.
+        iterations: Largest number of iterations.
+        sharpness: Sharpness of smooth extremes in the objective.
         penalty: Penalty of the slack by which constraints are exceeded.
     """
 
     bound: Float[Array, ""] | float
     barrier: Float[Array, ""] | float
     least: Float[Array, ""] | float
+    iterations: Int[Array, ""] | int
+    sharpness: Float[Array, ""] | float = 4.0
     penalty: Float[Array, ""] | float = 10.0
 
 
-class InteriorPoint(eqx.Module):
-    """The method within limits of the joints.
+def begin(grid: Grid, y: Float[AnyArray, "starts scaled"], constraints: int = 0) -> State:
+    """Return the state of some starts before the first stage.
 
-    Attributes:
+    Args:
         grid: Rows of the limits.
-        stiffness: Initial curvature: small, so that first steps are large.
-        to_boundary: Fraction of the way to the next limit that a step may go.
-        decrease: Fraction of the promised decrease that a step must give.
-        damping: Fraction of the expected curvature along a step below which it is damped.
-        patience: Refused steps in a row after which the curvature is forgotten.
-        cooling: Factor of the barrier after a good step.
-        inside: Fraction of the bound within which a stage starts.
+        y: Scaled coefficients of the starts.
+        constraints: Number of constraints that are not linear.
+    """
+    starts, size = np.shape(y)
+    slacks = 1 if constraints else 0
+    none, flat = jnp.zeros(starts), jnp.zeros((starts, size))
+    duals = Inequalities(
+        jnp.zeros((starts, 2, *grid.c.shape)),
+        jnp.zeros((starts, constraints)),
+        jnp.zeros((starts, slacks)),
+    )
+    slopes = jnp.zeros((starts, constraints, size))
+    return State(
+        y=jnp.asarray(y),
+        slack=duals.slack,
+        evaluation=Evaluation(none, flat, duals.constraints, slopes),
+        duals=duals,
+        curvature=jnp.tile(STIFFNESS * jnp.eye(size), (starts, 1, 1)),
+        barrier=none,
+        step=jnp.zeros((starts, size + slacks)),
+        dual_step=duals,
+        length=none,
+        dual_length=none,
+        slope=none,
+        refused=jnp.zeros(starts, int),
+        fresh=jnp.ones(starts, bool),
+    )
+
+
+def run(grid: Grid, objective: Callable[[Array], Evaluation], state: State, stage: Stage) -> State:
+    """Move the starts inside the bound of a stage, then iterate until all have converged.
+
+    Args:
+        grid: Rows of the limits.
+        objective: Function from scaled coefficients of all starts to their evaluation.
+        state: State of the starts.
+        stage: Bounds and barrier.
     """
 
-    grid: Grid
-    stiffness: float = 0.3
-    to_boundary: float = 0.995
-    decrease: float = 1e-4
-    damping: float = 0.1
-    patience: int = 8
-    cooling: float = 0.9
-    inside: float = 0.985
-
-    def init(self, y: Float[AnyArray, "starts scaled"], constraints: int = 0) -> State:
-        """Return the state of some starts before the first stage.
-
-        Args:
-            y: Scaled coefficients of the starts.
-            constraints: Number of constraints that are not linear.
-        """
-        starts, size = np.shape(y)
-        slacks = 1 if constraints else 0
-        none, flat = jnp.zeros(starts), jnp.zeros((starts, size))
-        duals = Inequalities(
-            jnp.zeros((starts, 2, *self.grid.c.shape)),
-            jnp.zeros((starts, constraints)),
-            jnp.zeros((starts, slacks)),
-        )
-        slopes = jnp.zeros((starts, constraints, size))
-        return State(
-            y=jnp.asarray(y),
-            slack=duals.slack,
-            evaluation=Evaluation(none, flat, duals.constraints, slopes),
-            duals=duals,
-            curvature=jnp.tile(self.stiffness * jnp.eye(size), (starts, 1, 1)),
-            barrier=none,
-            step=jnp.zeros((starts, size + slacks)),
-            dual_step=duals,
-            length=none,
-            dual_length=none,
-            slope=none,
-            refused=jnp.zeros(starts, int),
-            fresh=jnp.ones(starts, bool),
-        )
-
-    def run(
-        self,
-        objective: Callable[[Array], Evaluation],
-        state: State,
-        stage: Stage,
-        iterations: Int[Array, ""] | int,
-    ) -> State:
-        """Move the starts inside the bound of a stage, then iterate until all have converged.
-
-        Args:
-            objective: Function from scaled coefficients of all starts to their evaluation.
-            state: State of the starts.
-            stage: Bounds and barrier.
-            iterations: Largest number of iterations.
-        """
-
-        def proceed(carry: tuple[Array, State]) -> Array:
-            number, state = carry
-            return (number < iterations) & ~jnp.all(self.converged(state, stage))
-
-        def iterate(carry: tuple[Array, State]) -> tuple[Array, State]:
-            number, state = carry
-            return number + 1, self.step(objective, state, stage)
-
-        begun = jax.vmap(lambda one: self._begin(one, stage))(state)
-        return jax.lax.while_loop(proceed, iterate, (jnp.asarray(0), begun))[1]
-
-    def converged(self, state: State, stage: Stage) -> Bool[Array, " starts"]:
-        """Return which starts cannot be improved further: the promised decrease is rounding."""
+    def proceed(carry: tuple[Array, State]) -> Array:
+        number, state = carry
+        # The promised decrease is rounding.
         settled = (state.barrier <= stage.least) & ~state.fresh
         scale = 1.0 + jnp.abs(state.evaluation.value)
-        return settled & (jnp.abs(state.slope) <= 1e-14 * scale)
+        converged = settled & (jnp.abs(state.slope) <= 1e-14 * scale)
+        return (number < stage.iterations) & ~jnp.all(converged)
 
-    def step(self, objective: Callable[[Array], Evaluation], state: State, stage: Stage) -> State:
-        """Evaluate the next trial of every start; take it, or shorten its step.
-
-        Args:
-            objective: Function from scaled coefficients of all starts to their evaluation.
-            state: State of the starts.
-            stage: Bounds and barrier.
-        """
+    def iterate(carry: tuple[Array, State]) -> tuple[Array, State]:
+        number, state = carry
         trial = state.y + state.length[:, None] * state.step[:, : state.y.shape[-1]]
 
         def update(old: State, trial: Array, evaluation: Evaluation) -> State:
-            return self._update(old, trial, evaluation, stage)
+            return _update(grid, stage, old, trial, evaluation)
 
-        return map_starts(update, state, trial, objective(trial))
+        return number + 1, map_starts(update, state, trial, objective(trial))
 
-    def _begin(self, one: State, stage: Stage) -> State:
-        """Move one start inside the bound, with multipliers on the central path."""
-        bound = stage.bound * self.grid.bound
-        y = self.grid.scale_into_limits(one.y, self.inside * bound)
-        central = stage.barrier / self._room(y, stage)
-        duals = jnp.clip(one.duals.limits, central / 1e3, central * 1e3)
-        moved = jnp.all(one.duals.limits == 0) | jnp.any(y != one.y)
-        return one._replace(
-            y=y,
-            duals=one.duals._replace(limits=jnp.where(moved, central, duals)),
-            barrier=jnp.asarray(stage.barrier, float),
-            step=jnp.zeros_like(one.step),
-            dual_step=jax.tree.map(jnp.zeros_like, one.dual_step),
-            length=jnp.zeros_like(one.length),
-            dual_length=jnp.zeros_like(one.dual_length),
-            fresh=jnp.ones((), bool),
-        )
-
-    def _update(self, old: State, trial: Array, evaluation: Evaluation, stage: Stage) -> State:
-        """Take the step of one start, or shorten it."""
-        size = old.y.shape[-1]
-        slack = _cheapest_slack(old.slack, evaluation.excess, stage.penalty, old.barrier)
-        room = self._rooms(trial, slack, evaluation.excess, stage)
-        before = self._rooms(old.y, old.slack, old.evaluation.excess, stage)
-        merit = _merit(old.evaluation.value, old.slack, before, stage.penalty, old.barrier)
-        new = _merit(evaluation.value, slack, room, stage.penalty, old.barrier)
-        promised = self.decrease * old.length * old.slope
-        good = new <= merit + promised + 1e-10 * jnp.abs(merit)
-        finite = jnp.isfinite(evaluation.value) & jnp.all(jnp.isfinite(evaluation.gradient))
-        good = (good & finite) | old.fresh
-        taken = self._taken(old, trial, slack, evaluation, room, stage)
-        # A refused step is shortened to the minimum of a parabola through what is known.
-        rise = 2 * (new - merit - old.slope * old.length)
-        shorter = -old.slope * old.length**2 / rise
-        least, most = 0.1 * old.length, 0.5 * old.length
-        shorter = jnp.where(jnp.isfinite(shorter), jnp.clip(shorter, least, most), least)
-        forget = old.refused >= self.patience
-        flat = jnp.eye(size) * jnp.trace(old.curvature) / size
-        kept = old._replace(
-            curvature=jnp.where(forget, flat, old.curvature),
-            refused=jnp.where(forget, 0, old.refused + 1),
-        )
-        state = jax.tree.map(lambda a, b: jnp.where(good, a, b), taken, kept)
-        turned = self._directed(state, stage)
-        straight = state._replace(length=shorter)
-        return jax.tree.map(lambda a, b: jnp.where(good | forget, a, b), turned, straight)
-
-    def _taken(
-        self,
-        old: State,
-        trial: Array,
-        slack: Array,
-        evaluation: Evaluation,
-        room: Inequalities,
-        stage: Stage,
-    ) -> State:
-        """Return the state of one start after its step was taken."""
-        barrier = jnp.where(old.length > 0.1, old.barrier * self.cooling, old.barrier)
-        barrier = jnp.where(old.fresh, old.barrier, jnp.maximum(stage.least, barrier))
-        central = jax.tree.map(lambda x: barrier / x, room)
-        moved = jax.tree.map(
-            lambda dual, step, c: jnp.clip(dual + old.dual_length * step, c / 1e3, c * 1e3),
-            old.duals,
-            old.dual_step,
-            central,
-        )
-        begun = central._replace(limits=old.duals.limits)
-        duals = jax.tree.map(lambda a, b: jnp.where(old.fresh, a, b), begun, moved)
-        # Curvature is that of the Lagrangian: of the value and of constraints that bend.
-        change = evaluation.gradient - old.evaluation.gradient
-        change = change + duals.constraints @ (evaluation.slopes - old.evaluation.slopes)
-        curvature = self._damped_bfgs(old.curvature, trial - old.y, change)
-        return old._replace(
-            y=trial,
-            slack=slack,
-            evaluation=evaluation,
-            duals=duals,
-            curvature=jnp.where(old.fresh, old.curvature, curvature),
-            barrier=barrier,
-            refused=jnp.zeros((), old.refused.dtype),
-            fresh=jnp.zeros((), bool),
-        )
-
-    def _directed(self, state: State, stage: Stage) -> State:
-        """Return one start with the step to the barrier's minimum, and how far it may go."""
-        evaluation, size, R = state.evaluation, state.y.shape[-1], self.grid.R
-        room = self._rooms(state.y, state.slack, evaluation.excess, stage)
-        ratio = jax.tree.map(lambda dual, x: dual / x, state.duals, room)
-        central = jax.tree.map(lambda x: state.barrier / x, room)
-        blocks = jnp.einsum("jrk,jr,jrl->jkl", R, ratio.limits[0] + ratio.limits[1], R)
-        stiff = ratio.constraints[:, None] * evaluation.slopes
-        H = state.curvature + _block_diagonal(blocks) + evaluation.slopes.T @ stiff
-        ridge = 1e-9 * jnp.trace(H) / size
-        push = jnp.einsum("jrk,jr->jk", R, central.limits[0] - central.limits[1]).reshape(size)
-        downhill = -(evaluation.gradient + push + central.constraints @ evaluation.slopes)
-        one = jnp.ones_like(state.slack)
-        across = -jnp.outer(jnp.sum(stiff, axis=0), one)
-        corner = jnp.diag(jnp.sum(ratio.constraints) + ratio.slack)
-        H = jnp.block([[H, across], [across.T, corner]]) + ridge * jnp.eye(size + len(one))
-        spare = one * (jnp.sum(central.constraints) - stage.penalty) + central.slack
-        downhill = jnp.concatenate([downhill, spare])
-        step = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(H), True), downhill)
-        # Where rounding makes the matrix indefinite, its diagonal alone decides.
-        step = jnp.where(jnp.all(jnp.isfinite(step)), step, downhill / jnp.diagonal(H))
-        more = step[size:]
-        change = Inequalities(
-            self._along(step[:size]), evaluation.slopes @ step[:size] - jnp.sum(more), -more
-        )
-        dual_step = jax.tree.map(
-            lambda c, dual, r, x: c - dual + r * x, central, state.duals, ratio, change
-        )
-        approach = jax.tree.map(lambda x, y: x / y, change, room)
-        dual_approach = jax.tree.map(lambda x, y: -x / y, dual_step, state.duals)
-        return state._replace(
-            step=step,
-            dual_step=dual_step,
-            length=self._longest(approach),
-            dual_length=self._longest(dual_approach),
-            slope=-jnp.sum(downhill * step),
-        )
-
-    def _along(self, y: Float[Array, " scaled"]) -> Float[Array, "2 joints rows"]:
-        """Return rows times coefficients, upwards and downwards."""
-        rows = jnp.einsum("jrk,jk->jr", self.grid.R, y.reshape(np.shape(self.grid.constant)))
-        return jnp.stack([rows, -rows])
-
-    def _room(self, y: Float[Array, " scaled"], stage: Stage) -> Float[Array, "2 joints rows"]:
-        """Return the distances from the limits of the joints."""
-        centre = np.stack([self.grid.c, -self.grid.c])
-        return stage.bound * self.grid.bound - (self._along(y) - centre)
-
-    def _rooms(self, y: Array, slack: Array, excess: Array, stage: Stage) -> Inequalities:
-        return Inequalities(self._room(y, stage), jnp.sum(slack) - excess, slack)
-
-    def _longest(self, approach: Inequalities) -> Array:
-        """Return the longest step, at most 1, that stays inside all bounds."""
-        nearest = jnp.max(jnp.stack([jnp.max(x, initial=1e-12) for x in approach]))
-        return jnp.minimum(1.0, self.to_boundary / nearest)
-
-    def _damped_bfgs(self, B: Array, s: Array, change: Array) -> Array:
-        """Return the damped BFGS update, which stays positive definite [1, procedure 18.2]."""
-        Bs = B @ s
-        expected, actual = s @ Bs, s @ change
-        damped = self.damping * expected
-        mix = jnp.where(actual >= damped, 1.0, (expected - damped) / (expected - actual))
-        r = mix * change + (1.0 - mix) * Bs
-        new = B - jnp.outer(Bs, Bs) / expected + jnp.outer(r, r) / (s @ r)
-        return jnp.where((expected > 1e-16) & jnp.all(jnp.isfinite(new)), new, B)
+    begun = jax.vmap(lambda one: _begin_stage(grid, stage, one))(state)
+    return jax.lax.while_loop(proceed, iterate, (jnp.asarray(0), begun))[1]
 
 
 def map_starts(function: Callable, *arguments: Any) -> Any:
     """Apply a function of one start to many: at once, or on a CPU one by one.
 
     There the matrices of one start stay in the cache, and its products are not loops of XLA.
-
-    Args:
-        function: Function of one start.
-        *arguments: Arguments with a leading axis for the starts.
     """
     if jax.default_backend() == "cpu":
         return jax.lax.map(lambda one: function(*one), arguments)
     return jax.vmap(function)(*arguments)
+
+
+def _begin_stage(grid: Grid, stage: Stage, one: State) -> State:
+    """Move one start inside the bound, with multipliers on the central path."""
+    y = grid.scale_into_limits(one.y, INSIDE * (stage.bound * grid.bound))
+    central = stage.barrier / _room(grid, stage, y)
+    duals = jnp.clip(one.duals.limits, central / 1e3, central * 1e3)
+    moved = jnp.all(one.duals.limits == 0) | jnp.any(y != one.y)
+    return one._replace(
+        y=y,
+        duals=one.duals._replace(limits=jnp.where(moved, central, duals)),
+        barrier=jnp.asarray(stage.barrier, float),
+        step=jnp.zeros_like(one.step),
+        dual_step=jax.tree.map(jnp.zeros_like, one.dual_step),
+        length=jnp.zeros_like(one.length),
+        dual_length=jnp.zeros_like(one.dual_length),
+        fresh=jnp.ones((), bool),
+    )
+
+
+def _update(grid: Grid, stage: Stage, old: State, trial: Array, evaluation: Evaluation) -> State:
+    """Take the step of one start, or shorten it."""
+    size = old.y.shape[-1]
+    slack = _cheapest_slack(old.slack, evaluation.excess, stage.penalty, old.barrier)
+    room = _rooms(grid, stage, trial, slack, evaluation.excess)
+    before = _rooms(grid, stage, old.y, old.slack, old.evaluation.excess)
+    merit = _merit(old.evaluation.value, old.slack, before, stage.penalty, old.barrier)
+    new = _merit(evaluation.value, slack, room, stage.penalty, old.barrier)
+    promised = DECREASE * old.length * old.slope
+    good = new <= merit + promised + 1e-10 * jnp.abs(merit)
+    finite = jnp.isfinite(evaluation.value) & jnp.all(jnp.isfinite(evaluation.gradient))
+    good = (good & finite) | old.fresh
+    taken = _taken(stage, old, trial, slack, evaluation, room)
+    # A refused step is shortened to the minimum of a parabola through what is known.
+    rise = 2 * (new - merit - old.slope * old.length)
+    shorter = -old.slope * old.length**2 / rise
+    least, most = 0.1 * old.length, 0.5 * old.length
+    shorter = jnp.where(jnp.isfinite(shorter), jnp.clip(shorter, least, most), least)
+    forget = old.refused >= PATIENCE
+    flat = jnp.eye(size) * jnp.trace(old.curvature) / size
+    kept = old._replace(
+        curvature=jnp.where(forget, flat, old.curvature),
+        refused=jnp.where(forget, 0, old.refused + 1),
+    )
+    state = jax.tree.map(lambda a, b: jnp.where(good, a, b), taken, kept)
+    turned = _directed(grid, stage, state)
+    straight = state._replace(length=shorter)
+    return jax.tree.map(lambda a, b: jnp.where(good | forget, a, b), turned, straight)
+
+
+def _taken(
+    stage: Stage,
+    old: State,
+    trial: Array,
+    slack: Array,
+    evaluation: Evaluation,
+    room: Inequalities,
+) -> State:
+    """Return the state of one start after its step was taken."""
+    barrier = jnp.where(old.length > 0.1, old.barrier * COOLING, old.barrier)
+    barrier = jnp.where(old.fresh, old.barrier, jnp.maximum(stage.least, barrier))
+    central = jax.tree.map(lambda x: barrier / x, room)
+    moved = jax.tree.map(
+        lambda dual, step, c: jnp.clip(dual + old.dual_length * step, c / 1e3, c * 1e3),
+        old.duals,
+        old.dual_step,
+        central,
+    )
+    begun = central._replace(limits=old.duals.limits)
+    duals = jax.tree.map(lambda a, b: jnp.where(old.fresh, a, b), begun, moved)
+    # Curvature is that of the Lagrangian: of the value and of constraints that bend.
+    change = evaluation.gradient - old.evaluation.gradient
+    change = change + duals.constraints @ (evaluation.slopes - old.evaluation.slopes)
+    curvature = _damped_bfgs(old.curvature, trial - old.y, change)
+    return old._replace(
+        y=trial,
+        slack=slack,
+        evaluation=evaluation,
+        duals=duals,
+        curvature=jnp.where(old.fresh, old.curvature, curvature),
+        barrier=barrier,
+        refused=jnp.zeros((), old.refused.dtype),
+        fresh=jnp.zeros((), bool),
+    )
+
+
+def _directed(grid: Grid, stage: Stage, state: State) -> State:
+    """Return one start with the step to the barrier's minimum, and how far it may go."""
+    evaluation, size, R = state.evaluation, state.y.shape[-1], grid.R
+    room = _rooms(grid, stage, state.y, state.slack, evaluation.excess)
+    ratio = jax.tree.map(lambda dual, x: dual / x, state.duals, room)
+    central = jax.tree.map(lambda x: state.barrier / x, room)
+    blocks = jnp.einsum("jrk,jr,jrl->jkl", R, ratio.limits[0] + ratio.limits[1], R)
+    joints = jnp.eye(len(blocks))[:, None, :, None]
+    stiff = ratio.constraints[:, None] * evaluation.slopes
+    H = state.curvature + (joints * blocks[:, :, None, :]).reshape(size, size)
+    H = H + evaluation.slopes.T @ stiff
+    ridge = 1e-9 * jnp.trace(H) / size
+    push = jnp.einsum("jrk,jr->jk", R, central.limits[0] - central.limits[1]).reshape(size)
+    downhill = -(evaluation.gradient + push + central.constraints @ evaluation.slopes)
+    one = jnp.ones_like(state.slack)
+    across = -jnp.outer(jnp.sum(stiff, axis=0), one)
+    corner = jnp.diag(jnp.sum(ratio.constraints) + ratio.slack)
+    H = jnp.block([[H, across], [across.T, corner]]) + ridge * jnp.eye(size + len(one))
+    spare = one * (jnp.sum(central.constraints) - stage.penalty) + central.slack
+    downhill = jnp.concatenate([downhill, spare])
+    step = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(H), True), downhill)
+    # Where rounding makes the matrix indefinite, its diagonal alone decides.
+    step = jnp.where(jnp.all(jnp.isfinite(step)), step, downhill / jnp.diagonal(H))
+    more = step[size:]
+    rows = grid.rows(step[:size])
+    change = Inequalities(
+        jnp.stack([rows, -rows]), evaluation.slopes @ step[:size] - jnp.sum(more), -more
+    )
+    dual_step = jax.tree.map(
+        lambda c, dual, r, x: c - dual + r * x, central, state.duals, ratio, change
+    )
+    approach = jax.tree.map(lambda x, y: x / y, change, room)
+    dual_approach = jax.tree.map(lambda x, y: -x / y, dual_step, state.duals)
+    return state._replace(
+        step=step,
+        dual_step=dual_step,
+        length=_longest(approach),
+        dual_length=_longest(dual_approach),
+        slope=-jnp.sum(downhill * step),
+    )
+
+
+def _room(grid: Grid, stage: Stage, y: Float[Array, " scaled"]) -> Float[Array, "2 joints rows"]:
+    """Return the distances from the limits of the joints, upwards and downwards."""
+    rows = grid.rows(y)
+    return stage.bound * grid.bound - (jnp.stack([rows, -rows]) - np.stack([grid.c, -grid.c]))
+
+
+def _rooms(grid: Grid, stage: Stage, y: Array, slack: Array, excess: Array) -> Inequalities:
+    return Inequalities(_room(grid, stage, y), jnp.sum(slack) - excess, slack)
+
+
+def _longest(approach: Inequalities) -> Array:
+    """Return the longest step, at most 1, that stays inside all bounds."""
+    nearest = jnp.max(jnp.stack([jnp.max(x, initial=1e-12) for x in approach]))
+    return jnp.minimum(1.0, TO_BOUNDARY / nearest)
+
+
+def _damped_bfgs(B: Array, s: Array, change: Array) -> Array:
+    """Return the damped BFGS update, which stays positive definite [1, procedure 18.2]."""
+    Bs = B @ s
+    expected, actual = s @ Bs, s @ change
+    damped = DAMPING * expected
+    mix = jnp.where(actual >= damped, 1.0, (expected - damped) / (expected - actual))
+    r = mix * change + (1.0 - mix) * Bs
+    new = B - jnp.outer(Bs, Bs) / expected + jnp.outer(r, r) / (s @ r)
+    return jnp.where((expected > 1e-16) & jnp.all(jnp.isfinite(new)), new, B)
 
 
 def _cheapest_slack(like: Array, excess: Array, penalty: Any, barrier: Any) -> Array:
@@ -382,8 +361,3 @@ def _merit(value: Array, slack: Array, room: Inequalities, penalty: Any, barrier
     """Return the merit function, which a step must decrease."""
     logs = sum(jnp.sum(jnp.log(jnp.maximum(x, 1e-300))) for x in room)
     return value + penalty * jnp.sum(slack) - barrier * logs
-
-
-def _block_diagonal(blocks: Float[Array, "joints k l"]) -> Float[Array, "size size"]:
-    n, k, _ = blocks.shape
-    return (jnp.eye(n)[:, None, :, None] * blocks[:, :, None, :]).reshape(n * k, n * k)

@@ -37,6 +37,10 @@ class Grid(NamedTuple):
     bound: float
     constant: Float[np.ndarray, "joints variables"]
 
+    def rows(self, y: Float[Array, " scaled"]) -> Float[Array, "joints rows"]:
+        """Return the rows of a motion, R y."""
+        return jnp.einsum("jrk,jk->jr", self.R, y.reshape(np.shape(self.constant)))
+
     def scale_into_limits(
         self, y: Float[Array, " scaled"], bound: Array | float | None = None, growth: float = 1.0
     ) -> Float[Array, " scaled"]:
@@ -50,24 +54,18 @@ class Grid(NamedTuple):
             growth: Largest factor by which a motion may be enlarged where limits leave room.
         """
         bound = self.bound if bound is None else bound
-        motion, q, peak = self._motion(y)
+        q, peak = self._positions(y)
         s = jnp.minimum(growth, bound / jnp.maximum(peak, 1e-12))
         low, high = self._shifts(q, s, bound)
         shift = jnp.clip((1.0 - s) * q.mean(axis=1), low, jnp.maximum(low, high))
-        return (s[:, None] * motion + shift[:, None] * self.constant).reshape(y.shape)
+        return self._moved(y, s, shift)
 
     def shrink(
         self, y: Float[Array, " scaled"], fraction: Array | float
     ) -> Float[Array, " scaled"]:
-        """Return the same motion made smaller, each joint's about its mean position.
-
-        Args:
-            y: Scaled coefficients of one trajectory.
-            fraction: Remaining fraction of its size.
-        """
-        motion, q, _ = self._motion(y)
-        shift = (1.0 - fraction) * q.mean(axis=1)
-        return (fraction * motion + shift[:, None] * self.constant).reshape(y.shape)
+        """Return a motion made smaller by a factor, each joint's about its mean position."""
+        q, _ = self._positions(y)
+        return self._moved(y, fraction, (1.0 - fraction) * q.mean(axis=1))
 
     def fill(
         self, y: Float[Array, " scaled"], places: Float[Array, " joints"], size: Array | float
@@ -79,37 +77,47 @@ class Grid(NamedTuple):
             places: Place of each joint in the range that is left, from 0 to 1.
             size: Size relative to a motion that uses 95 % of the limits.
         """
-        motion, q, peak = self._motion(y)
+        q, peak = self._positions(y)
         bound = 0.95 * self.bound
         s = size * bound / peak
         low, high = self._shifts(q, s, bound)
-        shift = low + (high - low) * places
-        return (s[:, None] * motion + shift[:, None] * self.constant).reshape(y.shape)
+        return self._moved(y, s, low + (high - low) * places)
 
-    def _motion(self, y: Array) -> tuple[Array, Array, Array]:
-        """Return the coefficients by joint, the positions, and the largest use of a limit."""
-        motion = y.reshape(np.shape(self.constant))
-        rows = jnp.einsum("jrk,jk->jr", self.R, motion)
-        positions = len(self.kinds[0])
+    def _positions(self, y: Array) -> tuple[Array, Array]:
+        """Return the positions, and the largest use of a limit by each joint."""
+        rows, positions = self.rows(y), len(self.kinds[0])
         q, rest = rows[:, :positions], rows[:, positions:]
         half = 0.5 * (q.max(axis=1) - q.min(axis=1))
-        return motion, q, jnp.maximum(jnp.abs(rest).max(axis=1), half)
+        return q, jnp.maximum(jnp.abs(rest).max(axis=1), half)
 
     def _shifts(self, q: Array, s: Array, bound: Array | float) -> tuple[Any, Any]:
         """Return the least and largest shift that keep scaled positions in their range."""
         centre = self.c[:, 0]
         return centre - bound - s * q.min(axis=1), centre + bound - s * q.max(axis=1)
 
+    def _moved(self, y: Array, s: Array | float, shift: Array) -> Array:
+        """Return the motion of each joint times a factor, and shifted."""
+        motion = y.reshape(np.shape(self.constant))
+        scaled = jnp.reshape(jnp.asarray(s), (-1, 1)) * motion
+        return (scaled + shift[:, None] * self.constant).reshape(y.shape)
+
 
 class JointLimits(eqx.Module):
     """Limits of all joints on the trajectories of a basis.
 
-    Attributes:
+    Args:
+        robot: Robot whose joints move.
         basis: Family of trajectories.
+        limits: Limits in place of the robot's; unknown ones are assumed.
+
+    Attributes:
         limits: Finite ranges, speeds and accelerations; a jerk may be infinite.
         scale: Scale of the coefficients, x = scale * y.
         constant: Scaled coefficients of a constant motion at half of each joint's range.
         assumed: Fields of the limits and joints (from 0) whose numbers were not given.
+
+    Raises:
+        InputError: If no trajectory of the basis stands still anywhere else than at zero.
     """
 
     basis: AbstractBasis
@@ -119,16 +127,6 @@ class JointLimits(eqx.Module):
     assumed: tuple[tuple[str, int], ...] = eqx.field(static=True)
 
     def __init__(self, robot: Robot, basis: AbstractBasis, limits: Limits | None = None):
-        """Make the limits of a robot, or others; unknown ones are assumed.
-
-        Args:
-            robot: Robot whose joints move.
-            basis: Family of trajectories.
-            limits: Limits in place of the robot's.
-
-        Raises:
-            InputError: If no trajectory of the basis stands still anywhere else than at zero.
-        """
         limits = robot.limits if limits is None else limits
         self.basis, self.limits = basis, complete_limits(robot.replace(limits=limits))
         self.assumed = tuple(
@@ -197,12 +195,9 @@ class JointLimits(eqx.Module):
         return Grid(R, c, kinds, 1 / factor, np.asarray(self.constant))
 
     def use(self, x: Float[AnyArray, "joints variables"]) -> Float[np.ndarray, "4 joints"]:
-        """Return the largest used fraction of each limit, certified for all times.
+        """Return the largest used fraction of each limit by coefficients, for all times.
 
         The used fraction of a range is the distance from its middle, over half of the range.
-
-        Args:
-            x: Coefficients.
         """
         rows, factor = self.basis.envelope(scale_samples(512, self.basis))
         centre = np.vstack([self._middles, np.zeros((3, len(self._middles)))])
@@ -233,10 +228,5 @@ class JointLimits(eqx.Module):
 
 
 def scale_samples(samples: int, basis: AbstractBasis) -> int:
-    """Return a number of samples that grows with the coefficients beyond those of five harmonics.
-
-    Args:
-        samples: Number of samples for few coefficients.
-        basis: Basis of the motion.
-    """
+    """Return a number of samples that grows with the coefficients beyond five harmonics."""
     return samples * max(11, basis.variables) // 11

@@ -12,10 +12,14 @@ import numpy as np
 from jaxid.arrays import AnyArray, Bool, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.excitation.constraints import Finding
-from jaxid.excitation.criteria import CRITERIA, AbstractCriterion
-from jaxid.excitation.information import Information, standard_deviations
+from jaxid.excitation.criteria import (
+    CRITERIA,
+    AbstractCriterion,
+    Information,
+    standard_deviations,
+)
 from jaxid.excitation.limits import JointLimits
-from jaxid.table import Column, Remark, Status, Table, percent, significant
+from jaxid.table import MISSING, Column, Remark, Status, Table, percent, significant
 from jaxid.trajectory.files import save_trajectory, write_csv
 from jaxid.trajectory.trajectory import LinearTrajectory
 
@@ -24,13 +28,7 @@ VAGUE = 0.5
 
 
 class Comparison(NamedTuple):
-    """One criterion before and after the design.
-
-    Attributes:
-        name: Name of the criterion.
-        before: Value for a random motion that fills the same limits: the median of the starts.
-        after: Value for the designed motion.
-    """
+    """A criterion's name, its value for a random motion in the same limits, and for the design."""
 
     name: str
     before: float
@@ -46,7 +44,8 @@ class ExcitationPlan(eqx.Module):
         criterion: Criterion that was minimised.
         limits: Limits of the joints, with those that were assumed.
         information: Information of one run of the motion.
-        reference: Information of a random motion that fills the same limits.
+        reference: Information of a random motion that fills the same limits: the median of the
+            starts.
         noise: Assumed standard deviation of the forces' noise by joint [N m or N].
         samples: Number of measured samples of one run.
         findings: Use of the constraints beside the limits of the joints.
@@ -136,58 +135,55 @@ class ExcitationPlan(eqx.Module):
             return ()
         return self._names((relative > VAGUE) & np.isfinite(self.standard_deviations))
 
-    def summary(self) -> Table:
-        """Return a table of all criteria, with what must be known of the design."""
-        names = [row.name for row in self.criteria]
-        remarks = [Remark(text, Status.BAD) for text in self.diagnosis]
+    def _names(self, chosen: Bool[np.ndarray, " base"]) -> tuple[str, ...]:
+        return tuple(name for name, k in zip(self.base.names, chosen, strict=True) if k)
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the tables of criteria, expected deviations, and use of the limits."""
+        criteria, base, relative = self.criteria, self.base, self.relative_deviations
+        columns = [] if relative is None else [Column("±", relative, "%", percent)]
+        vague = [] if relative is None else [bool(r > VAGUE) for r in relative]
+        kinds = ("range", "speed", "acceleration", "jerk")
+        tables = [
+            Table(
+                f"criteria: smaller is better; this motion was designed by the "
+                f"{self.criterion.name}",
+                Column("criterion", [c.name for c in criteria]),
+                Column("random motion", [float(c.before) for c in criteria]),
+                Column("this motion", [float(c.after) for c in criteria]),
+            ),
+            Table(
+                "expected standard deviations",
+                Column("#", list(range(1, base.size + 1))),
+                Column("parameter", base.names),
+                Column("±", self.standard_deviations),
+                Column("unit", base.units),
+                Column("better than\nrandom", self.gains, "factor", lambda gain: f"{gain:.2f}"),
+                *columns,
+                status=[Status.DOUBTFUL if x else Status.NEUTRAL for x in vague],
+            ),
+            Table(
+                "use of the limits, for all times",
+                Column("joint", base.model.robot.joint_names),
+                *(
+                    Column(kind, 100 * part, "%", lambda x: f"{x:.1f}")
+                    for kind, part in zip(kinds, self.use, strict=True)
+                    if (part > 0).any()
+                ),
+            ),
+        ]
+        return (*tables, _findings_table(self.findings)) if self.findings else tuple(tables)
+
+    def __str__(self) -> str:
+        """Return all tables as text, and what must be known of the design."""
+        gain = f"Standard deviations are {self.mean_gain:.3g} times smaller than a random motion's"
+        remarks = [Remark(gain), *(Remark(text, Status.BAD) for text in self.diagnosis)]
         if self.undetermined:
             text = f"This motion does not determine: {', '.join(self.undetermined)}"
             remarks.append(Remark(text, Status.BAD))
         if self.interrupted:
             remarks.append(Remark("The design was stopped before its end", Status.DOUBTFUL))
-        gain = f"Standard deviations are {self.mean_gain:.3g} times smaller than a random motion's"
-        return Table(
-            "criteria: smaller is better",
-            Column("criterion", names),
-            Column("random motion", [row.before for row in self.criteria]),
-            Column("this motion", [row.after for row in self.criteria]),
-            remarks=[gain, *remarks],
-        )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return the tables of criteria, expected deviations, and use of the limits."""
-        tables = self.summary(), self._deviation_table(), self._use_table()
-        return (*tables, findings_table(self.findings)) if self.findings else tables
-
-    def __str__(self) -> str:
-        """Return all tables as text."""
-        return "\n\n".join(map(str, self.tables()))
-
-    def _deviation_table(self) -> Table:
-        relative, status = self.relative_deviations, []
-        columns = [
-            Column("parameter", self.base.names),
-            Column("±", self.standard_deviations),
-            Column("unit", self.base.units),
-            Column("better than\nrandom", self.gains, format=lambda gain: f"{gain:.2f}x"),
-        ]
-        if relative is not None:
-            columns.append(Column("±", relative, "%", percent))
-            status = [Status.BAD if r > VAGUE else Status.NEUTRAL for r in relative]
-        return Table("standard deviations to expect", *columns, status=status)
-
-    def _use_table(self) -> Table:
-        kinds, use = ("range", "speed", "acceleration", "jerk"), self.use
-        columns = [
-            Column(kind, 100 * part, "%", lambda x: f"{x:.1f}")
-            for kind, part in zip(kinds, use, strict=True)
-            if (part > 0).any()
-        ]
-        names = Column("joint", self.base.model.robot.joint_names)
-        return Table("use of the limits", names, *columns)
-
-    def _names(self, chosen: Bool[np.ndarray, " base"]) -> tuple[str, ...]:
-        return tuple(name for name, k in zip(self.base.names, chosen, strict=True) if k)
+        return "\n\n".join(map(str, (*self.tables(), Table("", remarks=remarks))))
 
     def to_csv(self, path: str | Path, *, sample_time: float | None = None) -> None:
         """Write the motion as a table of samples; see `write_csv`.
@@ -207,23 +203,16 @@ class ExcitationPlan(eqx.Module):
             save_trajectory(jax.tree.map(np.asarray, self.trajectory), path)
 
 
-def findings_table(findings: tuple[Finding, ...] | list[Finding]) -> Table:
-    """Return a table of how near a motion comes to the limits of constraints.
-
-    Args:
-        findings: Findings of the constraints.
-    """
-    limits = [f"{'≥' if f.least else '≤'} {f.limit:.4g} {f.unit}" for f in findings]
+def _findings_table(findings: tuple[Finding, ...]) -> Table:
+    """Return a table of how near a motion comes to the limits of constraints."""
+    limits = [f"{'≥' if one.least else '≤'} {one.limit:.4g} {one.unit}" for one in findings]
+    used = [f"{100 * x.used:.1f}" if math.isfinite(x.used) else MISSING for x in findings]
     return Table(
-        "use of the other limits",
-        Column("quantity", [f.name.removeprefix("the ") for f in findings]),
-        Column("reaches", [f"{significant(f.reached, 4)} {f.unit}" for f in findings]),
+        "use of the other limits, at the instants that were checked",
+        Column("quantity", [one.name.removeprefix("the ") for one in findings]),
+        Column("reaches", [f"{significant(x.reached, 4)} {x.unit}" for x in findings]),
         Column("limit", limits),
-        Column("use", [100 * f.used for f in findings], "%", _use_text),
-        Column("origin", [f.note for f in findings]),
-        status=[Status.BAD if f.value > 0 else Status.NEUTRAL for f in findings],
+        Column("use", used, "%", kind="number"),
+        Column("made of", [one.note for one in findings]),
+        status=[Status.BAD if one.value > 0 else Status.GOOD for one in findings],
     )
-
-
-def _use_text(value: float) -> str:
-    return f"{value:.1f}" if math.isfinite(value) else significant(math.nan)

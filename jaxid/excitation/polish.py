@@ -12,9 +12,16 @@ import numpy as np
 import scipy.optimize
 
 from jaxid.arrays import AnyArray, Array, Bool, Float
-from jaxid.excitation.candidates import Candidates, evaluate_within_limits
 from jaxid.excitation.limits import scale_samples
-from jaxid.excitation.problem import CHECKED, MARGIN, WATCHED, ExcitationProblem
+from jaxid.excitation.problem import (
+    CHECKED,
+    MARGIN,
+    PEAKS,
+    WATCHED,
+    Candidates,
+    ExcitationProblem,
+    evaluate_within_limits,
+)
 
 
 def polish(problem: ExcitationProblem, start: Float[AnyArray, " scaled"]) -> Candidates:
@@ -29,7 +36,7 @@ def polish(problem: ExcitationProblem, start: Float[AnyArray, " scaled"]) -> Can
     rows = np.zeros((2, *grid.c.shape), bool)
     for kind in grid.kinds:
         rows[:, :, kind.start : kind.stop : max(1, len(kind) // 12)] = True
-    instants = np.zeros((CHECKED, problem.conditions // (WATCHED + 10)), bool)
+    instants = np.zeros((CHECKED, problem.conditions // (len(WATCHED) + PEAKS)), bool)
     best = evaluate_within_limits(problem, x[None])
     rounds = ((8.0, 5), (None, 8)) if problem.criterion.extreme else ((None, 8),)
     for sharpness, runs in rounds:
@@ -60,7 +67,12 @@ def _minimise(
     rows: Bool[np.ndarray, "2 joints rows"],
     watched: Bool[np.ndarray, "checked values"],
 ) -> Any:
-    G, h = _linear_limits(problem, rows)
+    grid = problem.limits.grid()
+    side, joint, row = np.nonzero(rows)
+    sign = 1.0 - 2.0 * side
+    G = np.zeros((len(side), *problem.limits.shape))
+    G[np.arange(len(side)), joint] = sign[:, None] * grid.R[joint, row]
+    G, h = G.reshape(len(side), -1), grid.bound + sign * grid.c[joint, row]
     conditions = [{"type": "ineq", "fun": lambda z: h - G @ z, "jac": lambda z: -G}]
     if watched.any():
 
@@ -90,18 +102,6 @@ def _minimise(
     )
 
 
-def _linear_limits(
-    problem: ExcitationProblem, rows: Bool[np.ndarray, "2 joints rows"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return G and h of the limits G x <= h that the solver sees."""
-    grid = problem.limits.grid()
-    side, joint, row = np.nonzero(rows)
-    sign = 1.0 - 2.0 * side
-    G = np.zeros((len(side), *problem.limits.shape))
-    G[np.arange(len(side)), joint] = sign[:, None] * grid.R[joint, row]
-    return G.reshape(len(side), -1), grid.bound + sign * grid.c[joint, row]
-
-
 def _add_peaks(
     problem: ExcitationProblem,
     x: np.ndarray,
@@ -126,8 +126,8 @@ def _add_instants(
         return peaks
     values = problem.checked(x)
     peaks |= _are_peaks(values, 0) & (values > -0.3)
-    watched, step = peaks.copy(), CHECKED // WATCHED
-    watched[::step] |= values[::step] > -0.6
+    watched = peaks.copy()
+    watched[WATCHED] |= values[WATCHED] > -0.6
     return watched
 
 
@@ -149,9 +149,7 @@ def _linearise(
     return values[watched[instants]], slopes[watched[instants]]
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _linearised(problem: ExcitationProblem, x: Array, instants: AnyArray) -> tuple:
-    return problem.linearise(x, instants)
+_linearised = jax.jit(ExcitationProblem.linearise, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -1,8 +1,8 @@
-"""Design problem: criterion, trajectories, limits and constraints as functions of one vector."""
+"""Design problem: criterion, limits and constraints as functions of one vector; its candidates."""
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,14 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, Finding
-from jaxid.excitation.criteria import AbstractCriterion, DOptimal, Sharpness
-from jaxid.excitation.information import Information, information, information_map
+from jaxid.excitation.criteria import (
+    AbstractCriterion,
+    DOptimal,
+    Information,
+    Sharpness,
+    information,
+    information_map,
+)
 from jaxid.excitation.interior_point import Evaluation, map_starts
 from jaxid.excitation.limits import JointLimits, scale_samples
 from jaxid.robot.joints import Limits
@@ -24,12 +30,14 @@ from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
 CHECKED = 8160
 """Instants at which constraints are checked."""
-WATCHED = 48
-"""Equidistant instants at which constraints are always watched during a search."""
+WATCHED = np.arange(0, CHECKED, CHECKED // 48)
+"""Equidistant instants among them at which constraints are always watched during a search."""
 PEAKS = 10
 """Further watched instants for each value of the constraints: its highest peaks."""
 MARGIN = 1e-3
 """Relative distance that is kept from constraints, for what happens between instants."""
+PENALTY = 3.0
+"""Penalty of a relative excess beside the criterion's logarithm, where it is to be improved."""
 SEARCHED = 64
 """Samples on which motions with few coefficients are evaluated during a search."""
 
@@ -41,16 +49,27 @@ class ExcitationProblem:
     joint near one. `value`, `inequalities` and `violation` are functions of x that run under `jit`,
     `vmap` and `grad`, so that any solver can be put around them.
 
-    Attributes:
+    Args:
         base: Base parameters to be determined.
-        limits: Limits of the joints on the trajectories of the basis.
-        criterion: Criterion to be minimised.
+        basis: Family of trajectories; Fourier series of five harmonics at 0.8 rad/s if None.
+        limits: Limits of the joints, and of their forces for constraints that keep those; the
+            robot's if None. Unknown limits are assumed as in `random_fourier_series`.
+        criterion: Criterion to be minimised; D-optimality if None.
         constraints: Constraints beside the limits of the joints.
-        noise: Standard deviation of each joint's force noise [N m or N].
-        prior: Information of earlier experiments.
+        noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces
+            if None. Its inverse weights the criterion, like the estimator.
+        prior: Information of earlier experiments in the same noise, the inverse of their
+            covariance; the design adds to it.
         samples: Number of measured samples of one run.
+
+    Attributes:
+        limits: Limits of the joints on the trajectories of the basis.
         sizes: Typical sizes of the base parameters: the standard deviation of each in random
             motions if it were the only unknown one.
+
+    Raises:
+        InputError: If arguments do not fit.
+        RuntimeError: If JAX runs in single precision.
     """
 
     def __init__(
@@ -65,55 +84,49 @@ class ExcitationProblem:
         prior: Float[AnyArray, "base base"] | None = None,
         samples: int = 800,
     ):
-        """Check the arguments and prepare the functions.
-
-        Args:
-            base: Base parameters to be determined.
-            basis: Family of trajectories; Fourier series of five harmonics at 0.8 rad/s if None.
-            limits: Limits of the joints, and of their forces for constraints that keep those; the
-                robot's if None. Unknown limits are assumed as in `random_fourier_series`.
-            criterion: Criterion to be minimised; D-optimality if None.
-            constraints: Constraints beside the limits of the joints.
-            noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest
-                forces if None. Its inverse weights the criterion, like the estimator.
-            prior: Information of earlier experiments in the same noise, the inverse of their
-                covariance; the design adds to it.
-            samples: Number of measured samples of one run.
-
-        Raises:
-            InputError: If arguments do not fit.
-            RuntimeError: If JAX runs in single precision.
-        """
         require_float64("designing a motion")
         robot = base.model.robot
         self.base, self.criterion = base, DOptimal() if criterion is None else criterion
         self.limits = JointLimits(robot, FourierBasis(5, 0.8) if basis is None else basis, limits)
+        self.basis = self.limits.basis
         self.constraints, self.samples = tuple(constraints), samples
         self.noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
         self.prior = np.zeros((base.size, base.size)) if prior is None else np.asarray(prior)
-        _check(self, given_prior=prior is not None)
+        self._check(given_prior=prior is not None)
         # Constraints ask the robot for its limits of force.
         self._robot = robot.replace(limits=self.limits.limits)
         self._rows = np.asarray(self.basis.rows(self.basis.instants(CHECKED))[:3])
         self._maps: dict[int, Callable] = {}
         self._checked = jax.jit(self._constrained)
         self.sizes = np.ones(base.size)
-        self.sizes = self._typical_sizes()
+        motions = self.limits.random(jax.random.key(0), 8)
+        squares = np.mean([np.diag(self.information(x).weighted) for x in motions], axis=0)
+        self.sizes = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
 
-    @property
-    def basis(self) -> AbstractBasis:
-        """Family of trajectories."""
-        return self.limits.basis
+    def _check(self, given_prior: bool) -> None:
+        size, joints = self.base.size, self.base.model.robot.joints
+        if self.noise.shape != (joints,) or not (self.noise > 0).all():
+            raise InputError(
+                f"`noise` must hold one positive number for each joint ({joints}), but is "
+                f"{self.noise}."
+            )
+        if self.samples < 2:
+            raise InputError(f"`samples` must be at least 2, but is {self.samples}.")
+        if self.prior.shape != (size, size):
+            raise InputError(
+                f"`prior` must be a matrix of the {size} base parameters, but has shape "
+                f"{self.prior.shape}."
+            )
+        if given_prior and not self.criterion.weighted:
+            raise InputError(
+                f"`prior` is in units of the noise, which the {self.criterion.name} does not use: "
+                "choose a weighted criterion."
+            )
 
     @property
     def size(self) -> int:
         """Number of scaled coefficients."""
         return int(np.prod(self.limits.shape))
-
-    @property
-    def search_samples(self) -> int:
-        """Number of samples on which motions are evaluated during a search."""
-        return scale_samples(SEARCHED, self.basis)
 
     def trajectory(self, x: Float[AnyArray, " scaled"]) -> LinearTrajectory:
         """Return the trajectory of scaled coefficients."""
@@ -132,7 +145,7 @@ class ExcitationProblem:
             x: Scaled coefficients.
             sharpness: Sharpness of smooth extremes of eigenvalues; exact if None.
             samples: Number of evaluated samples, which stand for all measured ones; all of them if
-                None, `search_samples` are mostly enough.
+                None.
         """
         return self.values(jnp.asarray(x)[None], sharpness, samples)[0]
 
@@ -145,12 +158,12 @@ class ExcitationProblem:
         Args:
             x: Scaled coefficients.
         """
-        grid, y = self.limits.grid(SEARCHED), jnp.asarray(x).reshape(self.limits.shape)
-        rows = jnp.einsum("jrk,jk->jr", grid.R, y) - grid.c
+        grid = self.limits.grid(SEARCHED)
+        rows = grid.rows(jnp.asarray(x)) - grid.c
         limits = jnp.concatenate([rows.reshape(-1), -rows.reshape(-1)]) / grid.bound - 1.0
         if not self.constraints:
             return limits
-        watched = self._constrained_at(jnp.asarray(x), self._watched)
+        watched = self._constrained(jnp.asarray(x), WATCHED)
         return jnp.concatenate([limits, watched.reshape(-1) + MARGIN])
 
     def violation(self, x: Float[AnyArray, " scaled"]) -> Float[Array, ""]:
@@ -159,12 +172,11 @@ class ExcitationProblem:
         Args:
             x: Scaled coefficients.
         """
-        grid, y = self.limits.grid(), jnp.asarray(x).reshape(self.limits.shape)
-        rows = jnp.einsum("jrk,jk->jr", grid.R, y) - grid.c
-        excess = jnp.max(jnp.abs(rows)) / grid.bound - 1.0
+        grid = self.limits.grid()
+        excess = jnp.max(jnp.abs(grid.rows(jnp.asarray(x)) - grid.c)) / grid.bound - 1.0
         if not self.constraints:
             return excess
-        return jnp.maximum(excess, jnp.max(self._tops(self._constrained(jnp.asarray(x)))))
+        return jnp.maximum(excess, jnp.max(_tops(self._constrained(jnp.asarray(x)))))
 
     def values(
         self,
@@ -195,7 +207,6 @@ class ExcitationProblem:
         x: Float[Array, "starts scaled"],
         sharpness: Sharpness,
         instants: Int[Array, "starts instants"],
-        samples: int | None = None,
     ) -> Evaluation:
         """Return the criterion and the constraints of several motions, with their derivatives.
 
@@ -203,9 +214,8 @@ class ExcitationProblem:
             x: Scaled coefficients.
             sharpness: Sharpness of smooth extremes of eigenvalues; exact if None.
             instants: Checked instants at which constraints are evaluated, from `watched_instants`.
-            samples: Number of evaluated samples; `search_samples` if None.
         """
-        count = self.search_samples if samples is None else samples
+        count = scale_samples(SEARCHED, self.basis)
         values, pull = jax.vjp(lambda y: self.values(y, sharpness, count), x)
         evaluation = Evaluation.unconstrained(values, pull(jnp.ones_like(values))[0])
         if not self.constraints:
@@ -214,9 +224,9 @@ class ExcitationProblem:
         starts, size = x.shape
         # At the peaks of one value only this value counts: the others have their own peaks.
         entries = excess.shape[-1]
-        always = np.arange(WATCHED * entries)
+        always = len(WATCHED) * entries
         peaks = np.arange(PEAKS * entries) * entries + np.repeat(np.arange(entries), PEAKS)
-        chosen = np.concatenate([always, WATCHED * entries + peaks])
+        chosen = np.concatenate([np.arange(always), always + peaks])
         return evaluation._replace(
             excess=excess.reshape(starts, -1)[:, chosen] + MARGIN,
             slopes=slopes.reshape(starts, -1, size)[:, chosen],
@@ -225,12 +235,7 @@ class ExcitationProblem:
     def linearise(
         self, x: Float[Array, " scaled"], instants: Int[AnyArray, " instants"]
     ) -> tuple[Float[Array, "instants values"], Float[Array, "instants values scaled"]]:
-        """Return all constraints of one motion at checked instants, and their derivatives.
-
-        Args:
-            x: Scaled coefficients.
-            instants: Indices of checked instants.
-        """
+        """Return all constraints of one motion at checked instants, and their derivatives."""
         rows = jnp.asarray(self._rows)[:, instants]
         coefficients = self.limits.coefficients(x)
         motion = [part @ coefficients.T for part in rows]
@@ -249,7 +254,7 @@ class ExcitationProblem:
     def conditions(self) -> int:
         """Number of values that `evaluate` gives for the constraints of one motion."""
         entries = sum(len(c.entries(self._robot)) for c in self.constraints)
-        return (WATCHED + PEAKS) * entries
+        return (len(WATCHED) + PEAKS) * entries
 
     def watched_instants(self, x: Float[Array, "starts scaled"]) -> Int[Array, "starts instants"]:
         """Return the instants at which constraints are watched: equidistant, and highest peaks."""
@@ -260,13 +265,13 @@ class ExcitationProblem:
             values = self._constrained(x).T
             peak = (values >= jnp.roll(values, 1, 1)) & (values >= jnp.roll(values, -1, 1))
             highest = jax.lax.top_k(jnp.where(peak, values, -jnp.inf), PEAKS)[1]
-            return jnp.concatenate([jnp.asarray(self._watched, highest.dtype), highest.reshape(-1)])
+            return jnp.concatenate([jnp.asarray(WATCHED, highest.dtype), highest.reshape(-1)])
 
         return jax.lax.map(one, x)
 
     def watched_excess(self, x: Float[Array, "starts scaled"]) -> Float[Array, " starts"]:
         """Return the largest excess of the constraints at the equidistant watched instants."""
-        return jax.lax.map(lambda y: jnp.max(self._constrained_at(y, self._watched)), x)
+        return jax.lax.map(lambda y: jnp.max(self._constrained(y, WATCHED)), x)
 
     def checked(self, x: Float[AnyArray, " scaled"]) -> Float[np.ndarray, "checked values"]:
         """Return all constraints of one motion at all checked instants."""
@@ -285,73 +290,160 @@ class ExcitationProblem:
 
     def excess(self, x: Float[AnyArray, " scaled"]) -> float:
         """Return the largest excess over constraints for all times; minus infinity if none."""
-        return float(self._tops(self.checked(x)).max()) if self.constraints else -np.inf
+        return float(_tops(self.checked(x)).max()) if self.constraints else -np.inf
 
     def findings(self, x: Float[AnyArray, " scaled"]) -> list[Finding]:
         """Return all limited quantities with their largest values."""
-        if not self.constraints:
-            return []
-        tops, found = self._tops(self.checked(x)), []
+        found: list[Finding] = []
+        tops = _tops(self.checked(x)) if self.constraints else np.zeros(0)
         for constraint in self.constraints:
             width, start = len(constraint.entries(self._robot)), len(found)
             found += constraint.describe(self._robot, tops[start : start + width])
         return found
 
-    @functools.cached_property
-    def _watched(self) -> Int[np.ndarray, " watched"]:
-        return np.arange(0, CHECKED, CHECKED // WATCHED)
-
-    def _constrained(self, x: AnyArray) -> Float[Array, "checked values"]:
-        return self._constrained_at(jnp.asarray(x), slice(None))
-
-    def _constrained_at(self, x: Array, instants: Any) -> Float[Array, "instants values"]:
-        coefficients = self.limits.coefficients(x)
+    def _constrained(
+        self, x: AnyArray, instants: Any = slice(None)
+    ) -> Float[Array, "instants values"]:
+        coefficients = self.limits.coefficients(jnp.asarray(x))
         return self._evaluated(Motion(*(part[instants] @ coefficients.T for part in self._rows)))
 
     def _evaluated(self, motion: Motion) -> Float[Array, "*batch values"]:
         return jnp.concatenate([c(self._robot, motion) for c in self.constraints], axis=-1)
 
-    def _tops(self, values: AnyArray) -> Float[AnyArray, " values"]:
-        """Return the highest of each value, also between instants: the tops of parabolas."""
-        xp = np if isinstance(values, np.ndarray) else jnp
-        before, peak, after = values[:-2], values[1:-1], values[2:]
-        bend = 2 * peak - before - after
-        top = (peak >= before) & (peak >= after) & (bend > 0)
-        rise = xp.where(top, (after - before) ** 2 / (8 * xp.where(top, bend, 1.0)), 0.0)
-        return xp.maximum((peak + rise).max(axis=0), xp.maximum(values[0], values[-1]))
 
-    def _typical_sizes(self) -> Float[np.ndarray, " base"]:
-        motions = self.limits.random(jax.random.key(0), 8)
-        squares = np.mean([np.diag(self.information(x).weighted) for x in motions], axis=0)
-        return 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
+def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
+    """Return standard deviations of the forces' noise where none are given [N m or N]."""
+    return 0.01 * np.asarray(robot.max_forces)
 
 
-def assumed_noise(robot: Robot, fraction: float = 0.01) -> Float[np.ndarray, " joints"]:
-    """Return standard deviations of the forces' noise where none are given [N m or N].
+def _tops(values: AnyArray) -> Float[AnyArray, " values"]:
+    """Return the highest of each value, also between instants: the tops of parabolas."""
+    xp = np if isinstance(values, np.ndarray) else jnp
+    before, peak, after = values[:-2], values[1:-1], values[2:]
+    bend = 2 * peak - before - after
+    top = (peak >= before) & (peak >= after) & (bend > 0)
+    rise = xp.where(top, (after - before) ** 2 / (8 * xp.where(top, bend, 1.0)), 0.0)
+    return xp.maximum((peak + rise).max(axis=0), xp.maximum(values[0], values[-1]))
+
+
+class Candidates(NamedTuple):
+    """The best motion of each start so far, certified to keep the limits of the joints.
+
+    Attributes:
+        x: Scaled coefficients.
+        value: Logarithm of the criterion, exact.
+        excess: Relative excess of the worst constraint; not positive where all are kept.
+    """
+
+    x: Float[AnyArray, "starts scaled"]
+    value: Float[AnyArray, " starts"]
+    excess: Float[AnyArray, " starts"]
+
+    @property
+    def broken(self) -> Float[np.ndarray, " starts"]:
+        """Excess where a constraint is not kept; zero elsewhere."""
+        return np.maximum(np.asarray(self.excess), 0.0)
+
+    def order(self) -> np.ndarray:
+        """Return the starts from best to worst; motions that keep their constraints come first."""
+        return np.lexsort((np.asarray(self.value), self.broken))
+
+    def promising(self) -> np.ndarray:
+        """Return the starts, the most promising first: a small excess is soon mended."""
+        return np.argsort(np.asarray(self.value) + PENALTY * self.broken, kind="stable")
+
+    def improved(self, other: "Candidates", where: Any = True) -> "Candidates":
+        """Return start by start the better of two; this one where they are equal.
+
+        Args:
+            other: As many motions, or one.
+            where: Starts that may be replaced.
+        """
+        a, b = self.broken, other.broken
+        better = where & ((b < a) | ((b == a) & (other.value < self.value)))
+        return Candidates(
+            np.where(better[:, None], other.x, self.x),
+            np.where(better, other.value, self.value),
+            np.where(better, other.excess, self.excess),
+        )
+
+    def survivors(self, other: "Candidates", tolerance: float = 2e-5) -> "Candidates":
+        """Return as many of both together as these are, the best first, duplicates last.
+
+        Args:
+            other: Candidates of the same problem.
+            tolerance: Difference of values up to which two motions count as one found twice.
+        """
+        both = Candidates(*(np.concatenate([a, b]) for a, b in zip(self, other, strict=True)))
+        order = both.order()
+        again = np.diff(both.value[order], prepend=np.nan) <= tolerance
+        again &= np.diff(both.broken[order], prepend=np.nan) == 0.0
+        order = np.concatenate([order[~again], order[again]])[: len(self.value)]
+        return Candidates(*(np.asarray(part)[order] for part in both))
+
+
+def evaluate(problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]) -> Candidates:
+    """Return motions as they are, with their exact values."""
+    x = np.asarray(x)
+    values = np.array([problem.exact_value(one) for one in x])
+    excess = np.array([problem.excess(one) for one in x])
+    finite = np.isfinite(values) & ~np.isnan(excess)
+    return Candidates(x, np.where(finite, values, np.inf), np.where(finite, excess, np.inf))
+
+
+def evaluate_within_limits(
+    problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]
+) -> Candidates:
+    """Return motions after they were made to keep the limits of the joints for all times.
+
+    Where they almost keep the other constraints, they are made smaller until they do; without
+    constraints they fill their limits where that is better.
+    """
+
+    def mended(y: np.ndarray) -> np.ndarray:
+        if not 0.0 < problem.excess(y) <= 0.1:
+            return y
+        fractions = (0.9995, 0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9)
+        smaller = (np.asarray(_shrink(problem, y, fraction)) for fraction in fractions)
+        return next((z for z in smaller if problem.excess(z) <= 0.0), y)
+
+    # A larger motion mostly tells more, but a condition number may well become worse by it.
+    growths = (1.0,) if problem.constraints else (1.0, 1.05)
+    scaled = (np.asarray(_scale_into_limits(problem, growth, x)) for growth in growths)
+    found = [evaluate(problem, np.array([mended(y) for y in some])) for some in scaled]
+    return functools.reduce(Candidates.improved, found)
+
+
+def shrink_to_constraints(
+    problem: ExcitationProblem, x: Float[AnyArray, " scaled"], step: float = 0.05
+) -> Candidates:
+    """Return a motion made so small that it keeps all constraints; unchanged if no size does.
 
     Args:
-        robot: Robot with its largest forces.
-        fraction: Standard deviation as a fraction of the largest forces.
+        problem: Criterion, limits and constraints.
+        x: Scaled coefficients of a motion that keeps the limits of the joints.
+        step: First step of the size, which is then halved.
     """
-    return fraction * np.asarray(robot.max_forces)
+
+    def keeps(fraction: float) -> bool:
+        return problem.excess(np.asarray(_shrink(problem, x, fraction))) <= 0.0
+
+    low = next((s for s in np.arange(1.0 - step, 0.0, -step) if keeps(s)), None)
+    if low is None:
+        return evaluate(problem, np.asarray(x)[None])
+    high = low + step
+    for _ in range(6):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if keeps(middle) else (low, middle)
+    return evaluate(problem, np.asarray(_shrink(problem, x, low))[None])
 
 
-def _check(problem: ExcitationProblem, given_prior: bool) -> None:
-    base, noise, prior = problem.base, problem.noise, problem.prior
-    joints = base.model.robot.joints
-    if noise.shape != (joints,) or not (noise > 0).all():
-        raise InputError(
-            f"`noise` must hold one positive number for each joint ({joints}), but is {noise}."
-        )
-    if problem.samples < 2:
-        raise InputError(f"`samples` must be at least 2, but is {problem.samples}.")
-    if prior.shape != (base.size, base.size):
-        raise InputError(
-            f"`prior` must be a matrix of the {base.size} base parameters, but has shape "
-            f"{prior.shape}."
-        )
-    if given_prior and not problem.criterion.weighted:
-        raise InputError(
-            f"`prior` is in units of the noise, which the {problem.criterion.name} does not use: "
-            "choose a weighted criterion."
-        )
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _scale_into_limits(problem: ExcitationProblem, growth: float, x: AnyArray) -> Array:
+    grid = problem.limits.grid()
+    return jax.vmap(lambda y: grid.scale_into_limits(y, growth=growth))(x)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _shrink(problem: ExcitationProblem, x: Array, fraction: Any) -> Array:
+    return problem.limits.grid().shrink(x, fraction)

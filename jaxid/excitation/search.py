@@ -9,24 +9,27 @@ import functools
 import hashlib
 import io
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, PRNGKeyArray
+from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.errors import InputError
-from jaxid.excitation.candidates import (
+from jaxid.excitation import interior_point
+from jaxid.excitation.interior_point import Stage, State
+from jaxid.excitation.limits import scale_samples
+from jaxid.excitation.polish import polish
+from jaxid.excitation.problem import (
     PENALTY,
+    SEARCHED,
+    ExcitationProblem,
     evaluate,
     evaluate_within_limits,
     shrink_to_constraints,
 )
-from jaxid.excitation.interior_point import InteriorPoint, Stage, State
-from jaxid.excitation.polish import polish
-from jaxid.excitation.problem import SEARCHED, ExcitationProblem
 from jaxid.io import write_bytes
 
 FINE = 256
@@ -34,53 +37,29 @@ FINE = 256
 POLISHING = 4
 """Time of polishing one motion, relative to a step of the schedule."""
 
-
-class ScheduleStep(NamedTuple):
-    """One step of the search schedule: a run of the interior point method.
-
-    Attributes:
-        bound: Multiple to which limits are relaxed or tightened; 0.998 leaves room for rounding.
-        barrier: Weight of the barrier at the start.
-        least: Weight below which it does not fall.
-        iterations: Number of iterations.
-        sharpness: Sharpness of smooth extremes.
-        evaluated: Whether the results are compared with the best so far.
-        penalty: Penalty of exceeding constraints.
-    """
-
-    bound: float
-    barrier: float
-    least: float
-    iterations: int
-    sharpness: float
-    evaluated: bool = False
-    penalty: float = 10.0
-
-
 SCHEDULE = (
-    ScheduleStep(2.0, 1e-2, 1e-3, 80, 4.0),
-    ScheduleStep(1.5, 1e-3, 1e-3, 40, 4.0),
-    ScheduleStep(1.25, 1e-3, 1e-3, 40, 4.0),
-    ScheduleStep(1.1, 1e-3, 1e-3, 40, 4.0),
-    ScheduleStep(0.998, 1e-3, 1e-5, 100, 4.0),
-    ScheduleStep(0.998, 1e-3, 1e-6, 100, 4.0, evaluated=True),
-    ScheduleStep(0.998, 1e-3, 1e-6, 150, 8.0),
-    ScheduleStep(0.998, 1e-3, 1e-6, 150, 8.0, evaluated=True),
-    ScheduleStep(1.3, 1e-3, 1e-3, 60, 8.0),
-    ScheduleStep(0.998, 1e-3, 1e-6, 125, 8.0),
-    ScheduleStep(0.998, 1e-3, 1e-6, 125, 8.0, evaluated=True),
-    ScheduleStep(0.998, 1e-3, 1e-6, 150, 20.0, evaluated=True),
+    Stage(2.0, 1e-2, 1e-3, 80),
+    Stage(1.5, 1e-3, 1e-3, 40),
+    Stage(1.25, 1e-3, 1e-3, 40),
+    Stage(1.1, 1e-3, 1e-3, 40),
+    Stage(0.998, 1e-3, 1e-5, 100),
+    Stage(0.998, 1e-3, 1e-6, 100),
+    Stage(0.998, 1e-3, 1e-6, 150, 8.0),
+    Stage(0.998, 1e-3, 1e-6, 150, 8.0),
+    Stage(1.3, 1e-3, 1e-3, 60, 8.0),
+    Stage(0.998, 1e-3, 1e-6, 125, 8.0),
+    Stage(0.998, 1e-3, 1e-6, 125, 8.0),
+    Stage(0.998, 1e-3, 1e-6, 150, 20.0),
 )
-"""Relaxed limits, then the limits; slightly relaxed once more; sharper in the end."""
-
-SETTLING = tuple(
-    ScheduleStep(0.998, 1e-4, 1e-6, n, 20.0, evaluated=True, penalty=100.0) for n in (100, 50, 50)
-)
-"""Further steps where there are constraints: their peaks move, and exceeding them is expensive."""
-
-GENERATION = ScheduleStep(0.998, 1e-3, 1e-6, 150, 20.0, evaluated=True, penalty=100.0)
+"""Relaxed limits, then the limits (0.998 leaves room for rounding); slightly relaxed once more;
+sharper in the end."""
+SETTLING = tuple(Stage(0.998, 1e-4, 1e-6, n, 20.0, 100.0) for n in (100, 50, 50))
+"""Further stages where there are constraints: their peaks move, and exceeding them is expensive."""
+EVALUATED = frozenset({5, 7, 10, 11, 12, 13, 14})
+"""Stages of both whose results are compared with the best so far."""
+GENERATION = Stage(0.998, 1e-3, 1e-6, 150, 20.0, 100.0)
 """Improvement of children."""
-LAST = ScheduleStep(0.998, 1e-4, 1e-6, 300, 20.0, evaluated=True, penalty=100.0)
+LAST = Stage(0.998, 1e-4, 1e-6, 300, 20.0, 100.0)
 """Last improvement, on the fine grid."""
 
 
@@ -111,6 +90,7 @@ class Search:
         self._problem, self._key = problem, key
         self._schedule = SCHEDULE + SETTLING if problem.constraints else SCHEDULE
         self._generations, self._polished = generations, min(polished, starts)
+        self._searching = len(self._schedule) + generations + 1
         x = problem.limits.random(key, starts)
         self.done, self.best = 0, evaluate(problem, x)
         self.first = self.best.value
@@ -134,52 +114,46 @@ class Search:
         total = self._searching + POLISHING * self._polished
         return (self.done - polished + POLISHING * polished) / total
 
-    @property
-    def _searching(self) -> int:
-        return len(self._schedule) + self._generations + 1
-
     def advance(self) -> None:
         """Do the next step."""
-        number, generation = self.done, self.done - len(self._schedule)
+        problem, number, generation = self._problem, self.done, self.done - len(self._schedule)
         if generation < 0:
-            self._improve_starts(self._schedule[number])
+            if number == len(SCHEDULE):
+                self._restart_broken()
+            self._state = _improve(problem, SEARCHED, self._state, self._schedule[number])
+            if number in EVALUATED:
+                self.best = self.best.improved(evaluate_within_limits(problem, self._state.y))
         elif generation < self._generations:
             key = jax.random.fold_in(self._key, generation)
-            children = _improve(self._problem, SEARCHED, self._children(key), GENERATION)
-            self.best = self.best.survivors(evaluate_within_limits(self._problem, children.y))
+            children = crossover(problem, jnp.asarray(self.best.x), key)
+            found = _improve(problem, SEARCHED, _begin(problem, SEARCHED, children), GENERATION)
+            self.best = self.best.survivors(evaluate_within_limits(problem, found.y))
         elif generation == self._generations:
-            start = _begin(self._problem, FINE, self.best.x)
-            found = _improve(self._problem, FINE, start, LAST)
-            self.best = self.best.improved(evaluate_within_limits(self._problem, found.y))
+            found = _improve(problem, FINE, _begin(problem, FINE, self.best.x), LAST)
+            self.best = self.best.improved(evaluate_within_limits(problem, found.y))
         else:
             place = int(self._order[number - self._searching])
-            better = polish(self._problem, np.asarray(self.best.x[place]))
-            self.best = self.best.improved_at(place, better)
+            better = polish(problem, np.asarray(self.best.x[place]))
+            self.best = self.best.improved(better, np.arange(len(self.first)) == place)
         self.done = number + 1
         if self.done <= self._searching:
             self._order = self.best.promising()
 
     def finish(self) -> None:
         """Make motions smaller where no other keeps all constraints."""
-        if not (np.asarray(self.best.excess) <= 0.0).any():
+        if self.best.broken.all():
             for place, x in enumerate(np.asarray(self.best.x)):
-                self.best = self.best.improved_at(place, shrink_to_constraints(self._problem, x))
+                small = shrink_to_constraints(self._problem, x)
+                self.best = self.best.improved(small, np.arange(len(self.first)) == place)
 
     def save(self, path: str | Path) -> None:
-        """Write the state of the search.
-
-        Args:
-            path: Path of the file.
-        """
+        """Write the state of the search."""
         buffer = io.BytesIO()
         eqx.tree_serialise_leaves(buffer, (self._digest(), self._content()))
         write_bytes(path, buffer.getvalue())
 
     def resume(self, path: str | Path) -> None:
         """Go on from a state that was saved for the same problem and settings.
-
-        Args:
-            path: Path of the file.
 
         Raises:
             InputError: If the file is no state, or belongs to another search.
@@ -214,23 +188,14 @@ class Search:
             digest.update(np.asarray(leaf).tobytes() if eqx.is_array_like(leaf) else b"")
         return np.frombuffer(digest.digest(), np.uint8)
 
-    def _improve_starts(self, step: ScheduleStep) -> None:
-        if self.done == len(SCHEDULE):
-            self._restart(np.asarray(self.best.excess) > 0)
-        self._state = _improve(self._problem, SEARCHED, self._state, step)
-        if step.evaluated:
-            found = evaluate_within_limits(self._problem, self._state.y)
-            self.best = self.best.improved(found)
-
-    def _restart(self, broken: Bool[np.ndarray, " starts"]) -> None:
+    def _restart_broken(self) -> None:
         """Start again where constraints are broken, from small motions that keep them best."""
+        broken = self.best.broken > 0
         if not broken.any():
             return
-        limits = self._problem.limits
         sizes = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
-        many = jnp.concatenate(
-            [limits.random(jax.random.key(k), 16, size) for k, size in enumerate(sizes)]
-        )
+        random = self._problem.limits.random
+        many = jnp.concatenate([random(jax.random.key(k), 16, s) for k, s in enumerate(sizes)])
         best = jnp.argsort(jnp.maximum(_watched_excess(self._problem, many), 0.0))
         chosen = many[best[np.arange(len(broken)) % len(many)]]
         self._state = jax.tree.map(
@@ -239,48 +204,35 @@ class Search:
             self._state,
         )
 
-    def _children(self, key: PRNGKeyArray) -> State:
-        children = crossover(self._problem, jnp.asarray(self.best.x), key)
-        return _begin(self._problem, SEARCHED, children)
-
 
 def _begin(problem: ExcitationProblem, points: int, x: AnyArray) -> State:
-    return InteriorPoint(problem.limits.grid(points)).init(x, problem.conditions)
+    return interior_point.begin(problem.limits.grid(points), x, problem.conditions)
 
 
-def _improve(problem: ExcitationProblem, points: int, state: State, step: ScheduleStep) -> State:
-    """Run one step of the schedule; with constraints in parts, whose peaks are found anew."""
-    part = 25 if problem.constraints else step.iterations
-    for start in range(0, step.iterations, part):
-        barrier = max(step.least, step.barrier * 0.9**start)
-        stage = Stage(step.bound, barrier, step.least, step.penalty)
-        numbers = jax.tree.map(lambda x: jnp.asarray(x, float), (stage, step.sharpness))
-        iterations = jnp.asarray(min(part, step.iterations - start))
-        instants = _watched_instants(problem, state.y)
-        state = _run(problem, points, state, *numbers, iterations, instants)
+def _improve(problem: ExcitationProblem, points: int, state: State, stage: Stage) -> State:
+    """Run one stage; with constraints in parts, whose peaks are found anew."""
+    whole = int(stage.iterations)
+    part = 25 if problem.constraints else whole
+    for start in range(0, whole, part):
+        barrier = max(stage.least, stage.barrier * interior_point.COOLING**start)
+        now = stage._replace(barrier=barrier, iterations=min(part, whole - start))
+        numbers = Stage(*(jnp.asarray(x, float) for x in now))
+        state = _run(problem, points, state, numbers, _watched_instants(problem, state.y))
     return jax.block_until_ready(state)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _run(
-    problem: ExcitationProblem, points: int, state: State, stage, sharpness, iterations, instants
+    problem: ExcitationProblem, points: int, state: State, stage: Stage, instants: Array
 ) -> State:
-    solver = InteriorPoint(problem.limits.grid(points))
-
     def objective(x: Array) -> Any:
-        return problem.evaluate(x, sharpness, instants)
+        return problem.evaluate(x, stage.sharpness, instants)
 
-    return solver.run(objective, state, stage, iterations)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _watched_instants(problem: ExcitationProblem, x: Array) -> Array:
-    return problem.watched_instants(x)
+    return interior_point.run(problem.limits.grid(points), objective, state, stage)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _watched_excess(problem: ExcitationProblem, x: Array) -> Array:
-    return problem.watched_excess(x)
+_watched_instants = jax.jit(ExcitationProblem.watched_instants, static_argnums=0)
+_watched_excess = jax.jit(ExcitationProblem.watched_excess, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
@@ -302,15 +254,12 @@ def crossover(
     """
     retimings = jnp.asarray(problem.basis.retimings())
 
-    def penalised(children: Array) -> Array:
-        value = problem.values(children, None, problem.search_samples)
-        if problem.constraints:
-            value = value + PENALTY * jnp.maximum(problem.watched_excess(children), 0.0)
-        return jnp.where(jnp.isnan(value), jnp.inf, value)
-
     def another(best: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
         children = _draw_children(problem, retimings, x, key)
-        value = penalised(children)
+        value = problem.values(children, None, scale_samples(SEARCHED, problem.basis))
+        if problem.constraints:
+            value = value + PENALTY * jnp.maximum(problem.watched_excess(children), 0.0)
+        value = jnp.where(jnp.isnan(value), jnp.inf, value)
         better = value < best[1]
         return (jnp.where(better[:, None], children, best[0]), jnp.minimum(value, best[1])), None
 

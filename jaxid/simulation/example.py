@@ -13,9 +13,8 @@ from jaxid.errors import InputError
 from jaxid.io import atomic_folder
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
-from jaxid.simulation.experiment import Sensors
 from jaxid.simulation.friction import SmoothFriction
-from jaxid.simulation.virtual import VirtualRobot, random_bodies
+from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 
 FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")

@@ -7,7 +7,6 @@ standstill, a joint that sticks stays where it is, and no small steps are needed
 
 import dataclasses
 from abc import abstractmethod
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,22 +19,6 @@ from jaxid.robot.robot import Robot
 Joints = Float[AnyArray, " joints"]
 EPSILON = 0.01
 """Width of the smooth sign in the model's columns of dry friction [rad/s or m/s]."""
-
-
-class StepFriction(NamedTuple):
-    r"""Friction $F_0 + s \dot q^+$ over one step, while bristles bend to $z_0 + r \dot q^+$.
-
-    Attributes:
-        force: $F_0$ [N m or N].
-        slope: $s$ [N m s/rad or N s/m].
-        deflection: $z_0$ [rad or m].
-        rate: $r$ [s].
-    """
-
-    force: Joints
-    slope: Joints
-    deflection: Joints
-    rate: Joints
 
 
 class AbstractGearFriction(Hashable):
@@ -54,24 +37,25 @@ class AbstractGearFriction(Hashable):
         """Return friction at constant speeds [N m or N]."""
 
     @abstractmethod
-    def over_step(self, qd: Joints, expected: Joints, z: Joints, step: float) -> StepFriction:
-        """Return friction during the next step.
+    def over_step(
+        self, qd: Joints, expected: Joints, z: Joints, step: float
+    ) -> tuple[Joints, Joints, Joints, Joints]:
+        r"""Return friction during the next step, affine in the speed $\dot q^+$ at its end.
 
         Args:
             qd: Speeds at its start [rad/s or m/s].
             expected: Expected speeds at its end [rad/s or m/s].
             z: Deflections of the bristles at its start [rad or m].
             step: Length of the step [s].
+
+        Returns:
+            $F_0$, $s$, $z_0$ and $r$: friction is $F_0 + s \dot q^+$ [N m or N], while bristles
+            bend to $z_0 + r \dot q^+$ [rad or m].
         """
 
     @abstractmethod
     def scaled(self, viscous: Joints, dry: Joints) -> "AbstractGearFriction":
-        """Return the same law with other levels, as temperature changes them.
-
-        Args:
-            viscous: Factors of the viscous friction.
-            dry: Factors of all dry friction.
-        """
+        """Return the same law with viscous and all dry friction times factors."""
 
     def settled(self, qd: Joints) -> Joints:
         """Return deflections of the bristles at constant speeds [rad or m]."""
@@ -120,7 +104,7 @@ class SmoothFriction(AbstractGearFriction):
         slope = self.coulomb / EPSILON * (1.0 - sign**2)
         dry = self.coulomb * sign + self._fading(expected)
         force = dry - slope * expected + 0.5 * self.viscous * qd
-        return StepFriction(force, slope + 0.5 * self.viscous, z, 0.0 * z)
+        return force, slope + 0.5 * self.viscous, z, 0.0 * z
 
     def scaled(self, viscous, dry):
         """Return the law with scaled levels; the Stribeck part is dry."""
@@ -181,12 +165,8 @@ class LuGreFriction(AbstractGearFriction):
         kept = 1.0 / (1.0 + step * self._stiffness * jnp.abs(expected) / level)
         damping = self.damping_time * self._stiffness * fading
         bent = (self._stiffness + damping / step) * kept
-        return StepFriction(
-            force=bent * z - damping / step * z + 0.5 * self.viscous * qd,
-            slope=bent * step + 0.5 * self.viscous,
-            deflection=kept * z,
-            rate=kept * step,
-        )
+        force = bent * z - damping / step * z + 0.5 * self.viscous * qd
+        return force, bent * step + 0.5 * self.viscous, kept * z, kept * step
 
     def scaled(self, viscous, dry):
         """Return the law with scaled levels; bristles let go at the same deflection."""
@@ -221,26 +201,13 @@ class FrictionTemperature(eqx.Module):
     reference: float = 20.0
     ambient: float = 20.0
 
-    def factors(
-        self, temperature: Float[AnyArray, "*batch joints"]
-    ) -> tuple[Float[np.ndarray, "*batch joints"], Float[np.ndarray, "*batch joints"]]:
+    def factors(self, temperature: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Return the factors of viscous and dry friction at a temperature [°C]."""
         warmer = np.asarray(temperature) - self.reference
         return np.exp(-self.viscous_rate * warmer), np.exp(-self.dry_rate * warmer)
 
-    def warm_up(
-        self,
-        temperature: Float[AnyArray, " joints"],
-        power: Float[AnyArray, " joints"],
-        duration: float,
-    ) -> Float[np.ndarray, " joints"]:
-        """Return temperatures after some time with constant power of friction [°C].
-
-        Args:
-            temperature: Temperatures at the start [°C].
-            power: Power of the friction [W].
-            duration: Duration [s].
-        """
+    def warm_up(self, temperature: Joints, power: Joints, duration: float) -> np.ndarray:
+        """Return temperatures [°C] after some time [s] with constant power of friction [W]."""
         final = self.ambient + np.asarray(self.resistance) * np.asarray(power)
         return final + (np.asarray(temperature) - final) * np.exp(-duration / self.time)
 

@@ -1,9 +1,10 @@
-"""One time step of a robot with drives: bodies, motors, gears and friction, solved together."""
+"""Time steps of a robot with drives: bodies, motors, gears and friction together; its servo."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,39 +12,12 @@ from jaxid.arrays import AnyArray, Float, Hashable
 from jaxid.dynamics import projection
 from jaxid.dynamics.dispatch import program_of, solve_symmetric
 from jaxid.dynamics.model import Model
+from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.program import to_python
-from jaxid.simulation.experiment import AbstractPlant
 from jaxid.simulation.friction import AbstractDisturbance, AbstractGearFriction
 
 Joints = Float[AnyArray, " joints"]
-
-
-class MotorMomentum(NamedTuple):
-    r"""Momentum of the motors over a step: $a \dot\theta^+ = b - \tau$.
-
-    Attributes:
-        inertia: $a$, rotors and friction [N m s/rad or N s/m].
-        drive: $b$, torques and momentum at the step's start [N m or N].
-    """
-
-    inertia: Joints
-    drive: Joints
-
-
-class GearForce(NamedTuple):
-    r"""Force on a joint $\tau = f - c\,\dot q^+$, while its motor turns at $w + s\,\dot q^+$.
-
-    Attributes:
-        force: $f$ [N m or N].
-        slope: $c$ [N m s/rad or N s/m].
-        speed: $w$ [rad/s or m/s].
-        ratio: $s$.
-    """
-
-    force: Joints
-    slope: Joints
-    speed: Joints
-    ratio: Joints
 
 
 class AbstractGear(Hashable):
@@ -51,33 +25,36 @@ class AbstractGear(Hashable):
 
     @abstractmethod
     def transmit(
-        self, twist: Joints, rate: Joints, motors: MotorMomentum, step: float
-    ) -> GearForce:
-        """Return the force over the next step, affine in the joint's speed at its end.
+        self, twist: Joints, rate: Joints, inertia: Joints, drive: Joints, step: float
+    ) -> tuple[Joints, Joints, Joints, Joints]:
+        r"""Return the force over the next step, affine in the joint's speed $\dot q^+$ at its end.
+
+        Motors have the momentum $a \dot\theta^+ = b - \tau$ there.
 
         Args:
             twist: Angle of the motor less that of the joint, at the step's start [rad or m].
             rate: Rate of the twist [rad/s or m/s].
-            motors: Momentum of the motors.
+            inertia: $a$, rotors and friction [N m s/rad or N s/m].
+            drive: $b$, torques and momentum at the step's start [N m or N].
             step: Length of the step [s].
+
+        Returns:
+            $f$, $c$, $w$ and $s$: the force on the joint is $\tau = f - c\,\dot q^+$ [N m or N],
+            while its motor turns at $\dot\theta^+ = w + s\,\dot q^+$ [rad/s or m/s].
         """
 
     @abstractmethod
     def twist(self, forces: Joints) -> Joints:
-        """Return the twist of the gears under constant forces [rad or m].
-
-        Args:
-            forces: Forces on the joints [N m or N].
-        """
+        """Return the twist of the gears under constant forces on the joints [rad or m]."""
 
 
 class RigidGear(AbstractGear):
     """Rigid connection of motor and joint."""
 
-    def transmit(self, twist, rate, motors, step):
+    def transmit(self, twist, rate, inertia, drive, step):
         """Return what the motor does not need itself."""
-        none = 0.0 * motors.drive
-        return GearForce(motors.drive, motors.inertia, none, none + 1.0)
+        none = 0.0 * drive
+        return drive, inertia, none, none + 1.0
 
     def twist(self, forces):
         """Return zeros."""
@@ -85,66 +62,39 @@ class RigidGear(AbstractGear):
 
 
 class FlexibleGear(AbstractGear):
-    """Spring with a damper between motor and joint (Spong, 1987).
-
-    Attributes:
-        stiffness: Stiffness [N m/rad or N/m].
-        damping: Damping [N m s/rad or N s/m].
-    """
-
-    stiffness: Joints
-    damping: Joints
-
-    def transmit(self, twist, rate, motors, step):
-        """Return the mean of the spring's force at both ends of the step, which damps nothing."""
-        slope = 0.25 * step * self.stiffness + 0.5 * self.damping
-        return _eliminate_motor(self.stiffness * twist + slope * rate, slope, motors)
-
-    def twist(self, forces):
-        """Return the force divided by the stiffness."""
-        return forces / self.stiffness
-
-
-class BacklashGear(AbstractGear):
-    """Spring with a damper and backlash.
+    """Spring with a damper between motor and joint (Spong, 1987), with backlash if there is play.
 
     Attributes:
         stiffness: Stiffness [N m/rad or N/m].
         damping: Damping while the flanks touch [N m s/rad or N s/m].
-        play: Play from flank to flank [rad or m].
+        play: Play from flank to flank; none if None [rad or m].
     """
 
     stiffness: Joints
     damping: Joints
-    play: Joints
+    play: Joints | None = None
 
-    def transmit(self, twist, rate, motors, step):
-        """Return the force of the spring on one of the flanks, or zero between them."""
-        ahead = twist + 0.5 * step * rate
-        half = 0.5 * self.play
+    def transmit(self, twist, rate, inertia, drive, step):
+        """Return the mean of the spring's force at both ends of the step, which damps nothing."""
         slope = 0.25 * step * self.stiffness + 0.5 * self.damping
-        touches = jnp.abs(ahead) > half
-        force = self.stiffness * (twist - jnp.sign(ahead) * half) + slope * rate
-        none = jnp.zeros_like(force)
-        force, slope = jnp.where(touches, force, none), jnp.where(touches, slope, none)
-        return _eliminate_motor(force, slope, motors)
+        if self.play is None:
+            force = self.stiffness * twist + slope * rate
+        else:
+            # The spring acts on one of the flanks, or not at all between them.
+            ahead, half = twist + 0.5 * step * rate, 0.5 * self.play
+            touches = jnp.abs(ahead) > half
+            force = self.stiffness * (twist - jnp.sign(ahead) * half) + slope * rate
+            none = jnp.zeros_like(force)
+            force, slope = jnp.where(touches, force, none), jnp.where(touches, slope, none)
+        # The motor's speed is eliminated from the force f + c (theta' - q').
+        speed = (drive - force) / (inertia + slope)
+        ratio = slope / (inertia + slope)
+        return force + slope * speed, slope * (1.0 - ratio), speed, ratio
 
     def twist(self, forces):
-        """Return half of the play and the force divided by the stiffness."""
-        return forces / self.stiffness + 0.5 * self.play * jnp.sign(forces)
-
-
-def _eliminate_motor(force: Joints, slope: Joints, motors: MotorMomentum) -> GearForce:
-    r"""Eliminate the motor's speed from $\tau = f + c (\dot\theta^+ - \dot q^+)$.
-
-    Args:
-        force: $f$ [N m or N].
-        slope: $c$ [N m s/rad or N s/m].
-        motors: Momentum of the motors.
-    """
-    speed = (motors.drive - force) / (motors.inertia + slope)
-    ratio = slope / (motors.inertia + slope)
-    return GearForce(force + slope * speed, slope * (1.0 - ratio), speed, ratio)
+        """Return the force divided by the stiffness, and half of the play."""
+        bent = forces / self.stiffness
+        return bent if self.play is None else bent + 0.5 * self.play * jnp.sign(forces)
 
 
 class DriveTrain(Hashable):
@@ -197,20 +147,20 @@ class DriveTrain(Hashable):
         n, dt = u.shape[0], self.step
         M, h = bodies[: n * n].reshape(n, n), bodies[n * n :]
         q, qd, theta, w, wd, z = (state[k] for k in (0, 1, 3, 4, 5, 6))
-        law = self.friction.over_step(w, w + dt * wd, z, dt)
-        acting = u - law.force
+        rub, damping, bent, bending = self.friction.over_step(w, w + dt * wd, z, dt)
+        acting = u - rub
         halfway = theta + 0.5 * dt * w, w + 0.5 * dt * wd
         for disturbance in self.disturbances:
             acting = acting + disturbance.forces(self.model.robot, *halfway)
-        motors = MotorMomentum(self.rotors / dt + law.slope, self.rotors / dt * w + acting)
-        gear = self.gear.transmit(theta - q, w - qd, motors, dt)
+        inertia, drive = self.rotors / dt + damping, self.rotors / dt * w + acting
+        force, slope, speed, ratio = self.gear.transmit(theta - q, w - qd, inertia, drive, dt)
         M = M - jnp.diag(self.rotors)
-        new_qd = solve_symmetric(M / dt + jnp.diag(gear.slope), M @ (qd / dt) + gear.force - h)
-        new_w = gear.speed + gear.ratio * new_qd
+        new_qd = solve_symmetric(M / dt + jnp.diag(slope), M @ (qd / dt) + force - h)
+        new_w = speed + ratio * new_qd
         new_q = q + 0.5 * dt * (qd + new_qd)
         new_theta = theta + 0.5 * dt * (w + new_w)
         new_qdd, new_wd = (new_qd - qd) / dt, (new_w - w) / dt
-        new_z = law.deflection + law.rate * new_w
+        new_z = bent + bending * new_w
         return jnp.stack(
             [
                 *(new_q, new_qd, new_qdd, new_theta, new_w, new_wd, new_z),
@@ -220,8 +170,8 @@ class DriveTrain(Hashable):
         )
 
 
-class SimulatedPlant(AbstractPlant):
-    """One simulation of a robot, step by step.
+class SimulatedPlant:
+    """One simulation of a robot, step by step; all numbers are on the joint side.
 
     Args:
         drives: Bodies, motors, gears and friction.
@@ -262,3 +212,77 @@ class SimulatedPlant(AbstractPlant):
         """Return angles of the motors; positions, velocities, accelerations of the joints."""
         n = self._joints
         return self._state[3 * n : 4 * n], self._state[: 3 * n]
+
+
+class Servo(eqx.Module):
+    r"""Controller of every joint by itself, at a fixed rate.
+
+    $u = Q_{m,d} + K_p e + K_d \dot e$ with the error $e$ of the encoder's angle. Its rate is a
+    difference behind a first-order low-pass; $u$ is constant until the next tick.
+
+    Attributes:
+        proportional: $K_p$ [N m/rad or N/m].
+        derivative: $K_d$ [N m s/rad or N s/m].
+        sample_time: Time between two ticks [s].
+        smoothing: Time constant of the low-pass; 0 for none [s].
+    """
+
+    proportional: Joints
+    derivative: Joints
+    sample_time: float = 1e-3
+    smoothing: float = 2e-3
+
+
+def follow(
+    plant: Any,
+    servo: Servo,
+    desired: Motion,
+    forward: np.ndarray,
+    limits: Joints,
+    resolution: Joints,
+    substeps: int,
+) -> tuple[Motion, np.ndarray, np.ndarray]:
+    """Let a servo follow a motion, from its start and without an initial error.
+
+    Returns:
+        True motion of the joints, angles of the motors [rad or m], and forces of the drives after
+        each tick [N m or N].
+
+    Raises:
+        InputError: If the motion diverges.
+    """
+    ticks, n = forward.shape
+    goals, known = np.asarray(desired.q).tolist(), forward.tolist()
+    kp, kd, limit, step = (
+        np.asarray(x, np.float64).tolist()
+        for x in (servo.proportional, servo.derivative, limits, resolution)
+    )
+    keep = float(np.exp(-servo.sample_time / servo.smoothing)) if servo.smoothing else 0.0
+    gain = (1.0 - keep) / servo.sample_time
+    joints = range(n)
+    plant.start(*(np.asarray(x)[0] for x in (desired.q, desired.qd, desired.qdd)))
+    motors, motion, forces = [], [], []
+    last, rate = None, [0.0] * n
+    try:
+        for k in range(ticks):
+            (angles, state), goal = plant.read(), goals[k]
+            error = [goal[i] - step[i] * round(angles[i] / step[i]) for i in joints]
+            # The first tick has no error to compare with, and a constant error no rate.
+            before = error if last is None else last
+            rate = [keep * rate[i] + gain * (error[i] - before[i]) for i in joints]
+            u = [known[k][i] + kp[i] * error[i] + kd[i] * rate[i] for i in joints]
+            u = [min(max(u[i], -limit[i]), limit[i]) for i in joints]
+            last = error
+            motors.append(list(angles))
+            motion.append(list(state))
+            forces.append(u)
+            for _ in range(substeps):
+                plant.step(u)
+    except (ArithmeticError, ValueError) as failure:
+        raise InputError(
+            f"the simulated robot diverged after {len(forces) * servo.sample_time:g} s: make the "
+            "`servo` softer or `substeps` larger, and check that the bodies can exist."
+        ) from failure
+    q, qd, qdd = np.split(np.array(motion), 3, axis=1)
+    after = np.concatenate([qdd[1:], np.array(plant.read()[1]).reshape(3, n)[2:]])
+    return Motion(q, qd, 0.5 * (qdd + after)), np.array(motors), np.array(forces)

@@ -1,5 +1,6 @@
 """The same experiment on MuJoCo, which is independent of this package (extra `mujoco`)."""
 
+import dataclasses
 import importlib
 from collections.abc import Sequence
 from typing import Any
@@ -10,12 +11,10 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.export.mjcf import mjcf_text
-from jaxid.robot.robot import Robot
-from jaxid.simulation.experiment import AbstractExperiment, AbstractPlant, Sensors, Servo
 from jaxid.simulation.virtual import VirtualRobot
 
 
-class MujocoRobot(AbstractExperiment):
+class MujocoRobot(VirtualRobot):
     """A virtual robot whose bodies, rotors and friction are simulated by MuJoCo.
 
     Viscous friction is MuJoCo's damping, dry friction its friction loss, which holds a joint at
@@ -25,34 +24,22 @@ class MujocoRobot(AbstractExperiment):
         virtual: Robot whose bodies, rotors and friction (at its present temperature) are simulated.
     """
 
-    robot: Robot
-    sensors: Sensors
-    virtual: VirtualRobot
-
     def __init__(self, virtual: VirtualRobot):
-        self.virtual, self.robot, self.sensors = virtual, virtual.robot, virtual.sensors
-
-    def servo(
-        self, frequency: float = 8.0, damping: float = 1.0, sample_time: float = 1e-3
-    ) -> Servo:
-        """Return the servo of the virtual robot, with the same arguments."""
-        return self.virtual.servo(frequency, damping, sample_time)
+        for field in dataclasses.fields(VirtualRobot):
+            setattr(self, field.name, getattr(virtual, field.name))
 
     def plant(self, step: float) -> "MujocoPlant":
-        """Return a simulation of the robot.
-
-        Args:
-            step: Time step [s].
+        """Return a simulation of the robot with a time step [s].
 
         Raises:
             InputError: If the equations of motion contain more than bodies and rotors.
             ModuleNotFoundError: If MuJoCo is not installed.
         """
-        library, friction = _mujoco(), self.virtual.present_friction
+        library, friction = _mujoco(), self.present_friction
         text = mjcf_text(
             self.robot,
-            self._bodies(),
-            armature=self.virtual.rotors,
+            self._all_bodies(),
+            armature=self.rotors,
             damping=np.asarray(friction.viscous),
             friction=np.asarray(friction.coulomb),
             timestep=step,
@@ -63,10 +50,10 @@ class MujocoRobot(AbstractExperiment):
         model.opt.disableflags |= library.mjtDisableBit.mjDSBL_LIMIT
         return MujocoPlant(model, self.robot.joint_names)
 
-    def _bodies(self) -> Float[np.ndarray, "joints 10"]:
+    def _all_bodies(self) -> Float[np.ndarray, "joints 10"]:
         """Return ten parameters of each body, with a known tool."""
-        virtual, robot = self.virtual, self.robot
-        parts = zip(virtual.terms, virtual.bodies.split(virtual.values), strict=True)
+        robot = self.robot
+        parts = zip(self.terms, self.bodies.split(self.values), strict=True)
         (first, own), *others = [(term, np.asarray(p)) for term, p in parts]
         known = all(term.drive_matrices(robot)[0].any() or not p.any() for term, p in others)
         size = first.body_parameters
@@ -86,16 +73,13 @@ class MujocoRobot(AbstractExperiment):
 
         MuJoCo's dry friction depends on the solver of its constraints [N m or N].
 
-        Args:
-            motion: Joint motion.
-
         Raises:
             ModuleNotFoundError: If MuJoCo is not installed.
         """
         return self.plant(1e-3).inverse(motion)
 
 
-class MujocoPlant(AbstractPlant):
+class MujocoPlant:
     """One simulation of MuJoCo.
 
     Args:

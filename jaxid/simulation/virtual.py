@@ -1,11 +1,14 @@
 """A virtual robot: bodies that can exist, friction beyond the model, sensors with noise."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import numpy as np
+from scipy import signal
 
-from jaxid.arrays import AnyArray, Float, require_float64
+from jaxid.arrays import AnyArray, Float, Hashable, require_float64
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
@@ -14,15 +17,25 @@ from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.simulation.experiment import AbstractExperiment, Sensors, Servo
 from jaxid.simulation.friction import (
     AbstractDisturbance,
     AbstractGearFriction,
     FrictionTemperature,
     SmoothFriction,
 )
-from jaxid.simulation.mechanics import AbstractGear, DriveTrain, RigidGear, SimulatedPlant
+from jaxid.simulation.mechanics import (
+    AbstractGear,
+    DriveTrain,
+    RigidGear,
+    Servo,
+    SimulatedPlant,
+    follow,
+)
 from jaxid.trajectory.trajectory import AbstractTrajectory
+
+Samples = Float[np.ndarray, "samples joints"]
+FeedForward = Callable[[Motion], Float[AnyArray, "samples joints"]]
+"""Function from a desired motion to forces: `fit.predict`, or a model with its parameters."""
 
 
 def random_bodies(
@@ -54,7 +67,90 @@ def random_bodies(
     return bodies
 
 
-class VirtualRobot(AbstractExperiment):
+class Sensors(eqx.Module):
+    """Encoders and torque measurements of a log.
+
+    Attributes:
+        encoder_step: Resolution of the logged angles [rad or m].
+        white_noise: Standard deviation of the white noise of the forces, on the joint side
+            [N m or N].
+        coloured_noise: Standard deviation of the coloured noise of the forces [N m or N].
+        memory: Time constant of the coloured noise [s].
+        motor_side: Whether the log contains angles and torques of the motors.
+    """
+
+    encoder_step: float
+    white_noise: Float[AnyArray, " joints"]
+    coloured_noise: Float[AnyArray, " joints"]
+    memory: float = 0.02
+    motor_side: bool = eqx.field(static=True, default=False)
+
+    def resolution(self, robot: Robot) -> Float[np.ndarray, " joints"]:
+        """Return the steps of the encoders on the joint side [rad or m]."""
+        turns = np.abs(np.diag(robot.drives.reduction)) if self.motor_side else 1.0
+        return np.broadcast_to(self.encoder_step / turns, robot.joints)
+
+    def record(
+        self,
+        robot: Robot,
+        angles: Float[AnyArray, "samples joints"],
+        forces: Float[AnyArray, "samples joints"],
+        *,
+        sample_time: float,
+        seed: int,
+        name: str,
+    ) -> Recording:
+        """Make a recording of true angles [rad or m] and forces [N m or N] of the joint side."""
+        random = np.random.default_rng(seed)
+        angles, forces = np.asarray(angles), np.asarray(forces)
+        white, drive = random.standard_normal((2, *forces.shape))
+        kept = np.exp(-sample_time / self.memory)
+        initial = random.standard_normal((1, forces.shape[1]))
+        coloured, _ = signal.lfilter(
+            [np.sqrt(1.0 - kept**2)], [1.0, -kept], drive, axis=0, zi=kept * initial
+        )
+        forces = forces + white * np.asarray(self.white_noise)
+        forces = forces + coloured * np.asarray(self.coloured_noise)
+        if self.motor_side:
+            angles = np.asarray(robot.drives.motor_angles(angles))
+            forces = np.asarray(robot.drives.motor_torques(forces))
+        return Recording.of(
+            self.encoder_step * np.round(angles / self.encoder_step),
+            forces,
+            sample_time=sample_time,
+            angles_on_motor_side=self.motor_side,
+            forces_on_motor_side=self.motor_side,
+            name=name,
+        )
+
+
+class Tracking(eqx.Module):
+    """Result of an experiment with a servo.
+
+    Attributes:
+        time: Times of the samples [s].
+        desired: Desired motion.
+        actual: True motion of the joints; accelerations, which jump, are the mean of both sides.
+        forces: Forces of the drives on the joint side, without the sensors' noise, as the mean of
+            before and after the sample [N m or N].
+        recording: Recording of the sensors.
+        saturated: Fraction of the servo's ticks at which a drive was at its limit, from 0 to 1.
+    """
+
+    time: Float[AnyArray, " samples"]
+    desired: Motion
+    actual: Motion
+    forces: Float[AnyArray, "samples joints"]
+    recording: Recording
+    saturated: Float[AnyArray, " joints"]
+
+    @property
+    def tracking_error(self) -> Samples:
+        """Desired minus true positions [rad or m]."""
+        return np.asarray(self.desired.q) - np.asarray(self.actual.q)
+
+
+class VirtualRobot(Hashable):
     """A robot whose parameters are known, with the imperfections of every measurement.
 
     It can follow a motion without error (`measure`), which is fast, or by its servo (`track`),
@@ -69,7 +165,7 @@ class VirtualRobot(AbstractExperiment):
         gear: Gears between motors and joints.
         disturbances: Further forces.
         heating: Dependence of friction on temperature; none if None.
-        temperature: Temperatures of the gears [°C].
+        temperature: Temperatures of the gears [°C]; None without `heating`.
     """
 
     robot: Robot
@@ -83,18 +179,16 @@ class VirtualRobot(AbstractExperiment):
     temperature: Float[AnyArray, " joints"] | None = None
 
     def __check_init__(self):
-        size, n = self.bodies.size, self.robot.joints
+        size, shape = self.bodies.size, None if self.heating is None else (self.robot.joints,)
         if self.values.shape != (size,):
             raise InputError(
                 f"`values` must hold one number for each parameter of `terms` ({size}), but has "
                 f"shape {self.values.shape}."
             )
-        if (self.heating is None) != (self.temperature is None):
-            raise InputError("`heating` and `temperature` need each other: give both, or neither.")
-        if self.temperature is not None and self.temperature.shape != (n,):
+        if (None if self.temperature is None else self.temperature.shape) != shape:
             raise InputError(
-                f"`temperature` must hold one number for each gear ({n}), but has shape "
-                f"{self.temperature.shape}."
+                "`temperature` must hold one number for each gear if there is `heating`, and be "
+                "None otherwise."
             )
 
     @property
@@ -145,16 +239,7 @@ class VirtualRobot(AbstractExperiment):
         Raises:
             InputError: If friction does not depend on temperature.
         """
-        self._require_heating()
         return self.replace(temperature=np.full(self.robot.joints, temperature, np.float64))
-
-    def _require_heating(self) -> FrictionTemperature:
-        if self.heating is None:
-            raise InputError(
-                "friction of this robot does not depend on temperature: give it `heating` and a "
-                "`temperature`."
-            )
-        return self.heating
 
     def warming(
         self, trajectory: AbstractTrajectory, *, duration: float, interval: float = 30.0
@@ -170,16 +255,13 @@ class VirtualRobot(AbstractExperiment):
             Times from now on [s], and temperatures [°C].
 
         Raises:
-            InputError: If friction does not depend on temperature, or a time is not positive.
+            InputError: If friction does not depend on temperature.
             RuntimeError: If JAX runs in single precision.
         """
         require_float64("warming a virtual robot")
-        heating = self._require_heating()
-        if not (duration > 0 and interval > 0):
-            raise InputError(
-                f"`duration` and `interval` must be positive [s], but are {duration:g} and "
-                f"{interval:g}."
-            )
+        heating = self.heating
+        if heating is None:
+            raise InputError("friction does not depend on temperature: give the robot `heating`.")
         # The power of friction is averaged over 2000 instants of the motion.
         _, motion = trajectory.sample(float(trajectory.duration) / 2000)
         steps = max(1, round(duration / interval))
@@ -195,18 +277,13 @@ class VirtualRobot(AbstractExperiment):
         return np.linspace(0.0, duration, steps + 1), np.array(temperatures)
 
     def warmed(self, trajectory: AbstractTrajectory, *, duration: float) -> "VirtualRobot":
-        """Return the same robot after a motion has been repeated for some time.
+        """Return the same robot after a motion has been repeated for some time; see `warming`.
 
         Args:
             trajectory: Repeated motion.
             duration: Duration [s]; the paper's robot is warm after 1800 s.
-
-        Raises:
-            InputError: If friction does not depend on temperature, or the time is not positive.
-            RuntimeError: If JAX runs in single precision.
         """
-        _, temperatures = self.warming(trajectory, duration=duration)
-        return self.replace(temperature=temperatures[-1])
+        return self.replace(temperature=self.warming(trajectory, duration=duration)[1][-1])
 
     def resistance(
         self, q: Float[AnyArray, " joints"], qd: Float[AnyArray, " joints"]
@@ -262,15 +339,7 @@ class VirtualRobot(AbstractExperiment):
             frequency: Natural frequency of each joint by itself [Hz].
             damping: Damping ratio; 1 for no overshoot.
             sample_time: Time between two ticks [s].
-
-        Raises:
-            InputError: If frequency or damping are not positive.
         """
-        if not (frequency > 0 and damping > 0):
-            raise InputError(
-                "`frequency` and `damping` must be positive, but are "
-                f"{frequency:g} Hz and {damping:g}."
-            )
         model, turns = self.bodies, np.array(self.robot.revolute)
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, self.robot.joints)) * turns
         M = in_numpy(model, model.inertia, q, shared=(np.asarray(self.values),))
@@ -278,11 +347,8 @@ class VirtualRobot(AbstractExperiment):
         w = 2.0 * np.pi * frequency
         return Servo(w**2 * inertia, 2.0 * damping * w * inertia, sample_time)
 
-    def plant(self, step: float) -> SimulatedPlant:
-        """Return a simulation of the robot.
-
-        Args:
-            step: Time step [s].
+    def plant(self, step: float) -> Any:
+        """Return a simulation of the robot with a time step [s]: `start`, `step`, `read`.
 
         Raises:
             InputError: If an elastic gear has a motor without inertia.
@@ -296,3 +362,82 @@ class VirtualRobot(AbstractExperiment):
         friction = self.present_friction
         drives = DriveTrain(self.bodies, self.rotors, friction, self.gear, self.disturbances, step)
         return SimulatedPlant(drives, self.values)
+
+    def track(
+        self,
+        trajectory: AbstractTrajectory,
+        *,
+        seed: int,
+        servo: Servo | None = None,
+        feed_forward: FeedForward | None = None,
+        duration: float | None = None,
+        sample_time: float | None = None,
+        substeps: int = 1,
+        name: str = "virtual",
+    ) -> Tracking:
+        """Follow a trajectory by a servo and record what the sensors measure.
+
+        The robot starts in the desired motion. Gears keep their temperature, since seconds do not
+        warm them: use `warmed` for that.
+
+        Args:
+            trajectory: Desired motion.
+            seed: Seed of the sensors' noise.
+            servo: Controller; `self.servo()` if None.
+            feed_forward: Function from the desired motion to forces that are fed forward, such as
+                `fit.predict`; no feed-forward if None.
+            duration: Duration of the recording [s]; that of the trajectory if None.
+            sample_time: Sample time of the recording [s], a multiple of the servo's; that of the
+                servo if None.
+            substeps: Steps of the simulation in one tick of the servo.
+            name: Name of the recording.
+
+        Raises:
+            InputError: If the times do not fit together, or the motion diverges.
+            RuntimeError: If JAX runs in single precision.
+        """
+        require_float64("a virtual experiment")
+        servo = self.servo() if servo is None else servo
+        tick = servo.sample_time
+        duration = float(trajectory.duration) if duration is None else duration
+        sample_time = tick if sample_time is None else sample_time
+        every = max(round(sample_time / tick), 1)
+        if not abs(every * tick - sample_time) < 1e-6 * tick or not duration >= tick:
+            raise InputError(
+                f"`sample_time` must be a multiple of the servo's ({tick:g} s), and `duration` at "
+                f"least that, but they are {sample_time:g} s and {duration:g} s."
+            )
+        time = tick * np.arange(round(duration / tick))
+        motion = trajectory.motion(time)
+        desired = Motion(*(np.asarray(x) for x in (motion.q, motion.qd, motion.qdd)))
+        forward = np.zeros(desired.q.shape)
+        if feed_forward is not None:
+            forward = np.asarray(feed_forward(desired), np.float64)
+            if forward.shape != desired.q.shape or not np.isfinite(forward).all():
+                raise InputError(
+                    "`feed_forward` must give one finite force for each sample and joint "
+                    f"{desired.q.shape}, but gives shape {forward.shape}."
+                )
+        limits = np.asarray(self.robot.known_max_forces)
+        resolution = self.sensors.resolution(self.robot)
+        plant = self.plant(tick / substeps)
+        actual, motors, forces = follow(
+            plant, servo, desired, forward, limits, resolution, substeps
+        )
+        mean_forces = 0.5 * (forces + np.concatenate([forces[:1], forces[:-1]]))
+        kept = slice(None, None, every)
+        return Tracking(
+            time=time[kept],
+            desired=Motion(desired.q[kept], desired.qd[kept], desired.qdd[kept]),
+            actual=Motion(actual.q[kept], actual.qd[kept], actual.qdd[kept]),
+            forces=mean_forces[kept],
+            recording=self.sensors.record(
+                self.robot,
+                motors[kept],
+                mean_forces[kept],
+                sample_time=every * tick,
+                seed=seed,
+                name=name,
+            ),
+            saturated=(np.abs(forces) >= limits).mean(axis=0),
+        )

@@ -5,8 +5,8 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-
 from jaxid.excitation.candidates import evaluate, shrink_to_constraints
+
 from jaxid.excitation.constraints import Clearance, JointForces, NominalForces, TipSpeed
 from jaxid.excitation.design import design_excitation
 from jaxid.excitation.limits import JointLimits

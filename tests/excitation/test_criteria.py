@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from jaxid.dynamics.motion import Motion
-from jaxid.excitation import criteria as members
-from jaxid.excitation.criteria import CRITERIA, log_condition, spectral
 from jaxid.excitation.information import (
     Information,
     information,
     information_map,
     standard_deviations,
 )
+
+from jaxid.dynamics.motion import Motion
+from jaxid.excitation import criteria as members
+from jaxid.excitation.criteria import CRITERIA, log_condition, spectral
 from jaxid.trajectory.fourier import FourierBasis
 
 SIZE = 7

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxid.excitation.information import information
 
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints import AbstractConstraint, Clearance, Finding
 from jaxid.excitation.criteria import ConditionNumber, DOptimal
 from jaxid.excitation.design import design_excitation, minimise
-from jaxid.excitation.information import information
 from jaxid.excitation.problem import ExcitationProblem
 from jaxid.excitation.search import Search
 from jaxid.robot.collision import GROUND, Capsule, CollisionModel

@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 import pytest
-
 from jaxid.excitation.candidates import PENALTY, Candidates, evaluate, evaluate_within_limits
+
 from jaxid.excitation.constraints import TipSpeed
 from jaxid.excitation.criteria import ConditionNumber, DOptimal
 from jaxid.excitation.problem import ExcitationProblem

@@ -14,9 +14,8 @@ from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
 from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
-from jaxid.simulation.experiment import Sensors
 from jaxid.simulation.friction import SmoothFriction
-from jaxid.simulation.virtual import VirtualRobot, random_bodies
+from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 from jaxid.validation import Validation, validate
 

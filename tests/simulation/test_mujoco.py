@@ -11,10 +11,9 @@ from jaxid.measurement.decimation import Subsample
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
 from jaxid.robot import library
-from jaxid.simulation.experiment import Sensors
 from jaxid.simulation.friction import SmoothFriction
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
-from jaxid.simulation.virtual import VirtualRobot, random_bodies
+from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra `mujoco`)")
