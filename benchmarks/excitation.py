@@ -181,8 +181,9 @@ def constrained(part, keys, options):
     if part == "rest":
         settings["basis"] = jid.trajectories.RestToRestBasis(5, 0.8)
     if part == "forces":
-        nominal = jid.constraints.NominalForces(bases[0], bases[0].from_standard(p))
-        settings["constraints"] = (jid.constraints.JointForces(nominal, margin=MARGIN),)
+        nominal = bases[0].from_standard(p)
+        limits = jid.constraints.ForceLimits(bases[0], nominal, margin=MARGIN)
+        settings["constraints"] = (limits,)
 
     def figures(plan):
         t = plan.trajectory

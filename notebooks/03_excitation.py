@@ -103,7 +103,7 @@ plt.show()
 # motion, but hardly smaller deviations. The deviations of the other two designs are far below those of all random motions.
 
 # %%
-from jaxid.excitation.information import information, standard_deviations
+from jaxid.excitation.criteria import information, standard_deviations
 
 measured = np.linspace(0, 2 * np.pi / 0.8, 400, endpoint=False)
 

@@ -12,19 +12,14 @@ from jaxid.arrays import Float, double_precision
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import (
     AbstractConstraint,
-    AbstractForceLimits,
     Clearance,
     Finding,
-    JointForces,
-    MotorTorques,
-    NominalForces,
-    TipAcceleration,
-    TipSpeed,
-    Workspace,
+    ForceLimits,
+    TipLimits,
 )
 from jaxid.excitation.criteria import CRITERIA as ALL_CRITERIA
+from jaxid.excitation.criteria import information
 from jaxid.excitation.design import DesignProgress, design_excitation
-from jaxid.excitation.information import information
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.problem import assumed_noise
 from jaxid.experiment.decoder import within
@@ -229,12 +224,10 @@ def find_constraints(
     constraints: list[AbstractConstraint] = []
     if experiment.collision is not None:
         constraints.append(Clearance(experiment.collision, experiment.clearance))
-    if table.tip_speed is not None:
-        constraints.append(TipSpeed(table.tip_speed))
-    if table.tip_acceleration is not None:
-        constraints.append(TipAcceleration(table.tip_acceleration))
-    if table.workspace is not None:
-        constraints.append(Workspace(*table.workspace))
+    if table.tip_speed or table.tip_acceleration or table.workspace is not None:
+        box = ((-np.inf,) * 3, (np.inf,) * 3) if table.workspace is None else table.workspace
+        speeds = table.tip_speed or np.inf, table.tip_acceleration or np.inf
+        constraints.append(TipLimits(*speeds, *box))
     if table.force_margin is None:
         return tuple(constraints)
     if nominal is None:
@@ -243,26 +236,16 @@ def find_constraints(
             "earlier result of `jaxid identify` is."
         )
     forces = _force_limits(experiment, nominal, table.force_margin)
-    if not forces:
+    if not forces.entries(experiment.robot):
         raise InputError(
             "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
         )
-    return (*constraints, *forces)
+    return (*constraints, forces)
 
 
-def _force_limits(
-    experiment: Experiment, nominal: Nominal, margin: float
-) -> tuple[AbstractForceLimits, ...]:
-    """Return limits of joints' forces and motors' torques, as far as the robot has them."""
-    robot = experiment.robot
+def _force_limits(experiment: Experiment, nominal: Nominal, margin: float) -> ForceLimits:
     parameters = np.nan_to_num(nominal.parameters)
-    forces = NominalForces(experiment.base, parameters, nominal.covariance)
-    limits: list[AbstractForceLimits] = []
-    if np.isfinite(robot.limits.force).any():
-        limits.append(JointForces(forces, margin))
-    if np.isfinite(robot.drives.max_torques).any():
-        limits.append(MotorTorques(forces, margin))
-    return tuple(limits)
+    return ForceLimits(experiment.base, parameters, nominal.covariance, margin)
 
 
 def _earlier_information(
@@ -443,11 +426,10 @@ def force_remarks(
 
 def _force_use(experiment: Experiment, nominal: Nominal, played: AbstractTrajectory) -> Remark:
     robot = experiment.robot
-    findings: list[Finding] = []
     with double_precision():
         motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
-        for limit in _force_limits(experiment, nominal, 0.0):
-            findings += limit.describe(robot, np.asarray(limit(robot, motion)))
+        limits = _force_limits(experiment, nominal, 0.0)
+        findings = limits.describe(robot, np.asarray(limits(robot, motion)))
     exceeded = [_describe_use(one) for one in findings if one.value > 0]
     if exceeded:
         return Remark(

@@ -14,7 +14,6 @@ from jaxid.excitation.criteria import (
     ConditionNumber,
     DOptimal,
     EOptimal,
-    ScaledConditionNumber,
     WeightedConditionNumber,
 )
 from jaxid.experiment.decoder import Bounds, Count, Positive, Vector
@@ -41,7 +40,7 @@ CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
     "e_optimal": EOptimal,
     "condition_number": ConditionNumber,
     "weighted_condition_number": WeightedConditionNumber,
-    "scaled_condition_number": ScaledConditionNumber,
+    "scaled_condition_number": lambda: WeightedConditionNumber(scaled=True),
 }
 
 

@@ -1,6 +1,5 @@
 """Tables, remarks and page of a designed excitation motion."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.arrays import double_precision
-from jaxid.excitation.constraints import Finding
 from jaxid.excitation.plan import VAGUE, ExcitationPlan
 from jaxid.io import atomic_folder
 from jaxid.report.motion import joint_figure, tip_figure
@@ -17,18 +15,8 @@ from jaxid.report.page import Section, block, picture, provenance, render_page
 from jaxid.report.robot_figures import path_figure, pose_figure
 from jaxid.report.style import save
 from jaxid.robot.robot import Robot
-from jaxid.table import MISSING, Column, Remark, Status, Table, percent, significant
+from jaxid.table import Column, Remark, Status, Table, significant
 from jaxid.trajectory.trajectory import AbstractTrajectory
-
-
-def criteria_table(plan: ExcitationPlan) -> Table:
-    """Return all criteria of a random motion and of the designed one."""
-    return Table(
-        f"criteria: smaller is better; this motion was designed by the {plan.criterion.name}",
-        Column("criterion", [c.name for c in plan.criteria]),
-        Column("random motion", [float(c.before) for c in plan.criteria]),
-        Column("this motion", [float(c.after) for c in plan.criteria]),
-    )
 
 
 def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
@@ -62,62 +50,11 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
     )
 
 
-def deviation_table(plan: ExcitationPlan) -> Table:
-    """Return the expected standard deviations of every base parameter, before the experiment."""
-    base, relative = plan.base, plan.relative_deviations
-    known = relative is not None
-    columns = [Column("±", np.asarray(relative), "%", percent)] if known else []
-    vague = np.asarray(relative) > VAGUE if known else np.array([], bool)
-    return Table(
-        "expected standard deviations",
-        Column("#", list(range(1, base.size + 1))),
-        Column("parameter", base.names),
-        Column("±", np.asarray(plan.standard_deviations)),
-        Column("unit", base.units),
-        Column("better than\nrandom", plan.gains, "factor", lambda gain: f"{gain:.2f}"),
-        *columns,
-        status=[Status.DOUBTFUL if x else Status.NEUTRAL for x in vague],
-        remarks=[expectation(plan)],
-    )
-
-
-def use_table(plan: ExcitationPlan) -> Table:
-    """Return the fraction of each limit that the motion uses, over all times."""
-    kinds = ("range", "speed", "acceleration", "jerk")
-    shown = [k for k in range(4) if (plan.use[k] > 0).any()]
-    return Table(
-        "use of the limits, for all times",
-        Column("joint", plan.base.model.robot.joint_names),
-        *(
-            Column(kinds[k], 100 * np.asarray(plan.use[k]), "%", lambda x: f"{x:.1f}")
-            for k in shown
-        ),
-    )
-
-
-def findings_table(findings: Sequence[Finding]) -> Table:
-    """Return how near a motion comes to limits other than those of the joints' motion.
-
-    Args:
-        findings: Findings of the constraints.
-    """
-    limits = [f"{'≥' if one.least else '≤'} {one.limit:.4g} {one.unit}" for one in findings]
-    used = [f"{100 * x.used:.1f}" if math.isfinite(x.used) else MISSING for x in findings]
-    return Table(
-        "use of the other limits, at the instants that were checked",
-        Column("quantity", [one.name.removeprefix("the ") for one in findings]),
-        Column("reaches", [f"{significant(x.reached, 4)} {x.unit}" for x in findings]),
-        Column("limit", limits),
-        Column("use", used, "%", kind="number"),
-        Column("made of", [one.note for one in findings]),
-        status=[Status.BAD if one.value > 0 else Status.GOOD for one in findings],
-    )
-
-
 def plan_tables(plan: ExcitationPlan) -> list[Table]:
-    """Return all tables of a designed motion."""
-    tables = [criteria_table(plan), deviation_table(plan), use_table(plan)]
-    return [*tables, findings_table(plan.findings)] if plan.findings else tables
+    """Return all tables of a designed motion, with what the expected deviations assume."""
+    criteria, deviations, *use = plan.tables()
+    deviations.remarks = (Remark(expectation(plan)),)
+    return [criteria, deviations, *use]
 
 
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:

@@ -1,12 +1,15 @@
-"""A small arm whose programs compile in a second, and its base parameters."""
+"""Small arms whose programs compile in a second, and one finished design of each kind."""
 
+import jax
 import numpy as np
 import pytest
 
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
+from jaxid.excitation.problem import ExcitationProblem
 from jaxid.robot import library
-from jaxid.robot.joints import Limits
+from jaxid.robot.limits import Limits
+from jaxid.trajectory.fourier import FourierBasis
 
 
 @pytest.fixture(scope="package")
@@ -26,6 +29,17 @@ def arm():
 @pytest.fixture(scope="package")
 def base(arm):
     return base_parameters(Model(arm))
+
+
+@pytest.fixture(scope="package")
+def free(base):
+    """The design problem of the arm without constraints."""
+    return ExcitationProblem(base, FourierBasis(3, 1.1), noise=np.ones(2), samples=200)
+
+
+@pytest.fixture(scope="package")
+def parents(free):
+    return free.limits.random(jax.random.key(1), 6)
 
 
 @pytest.fixture(scope="package")

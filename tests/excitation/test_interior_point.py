@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 
-from jaxid.excitation.interior_point import Evaluation, InteriorPoint, Stage
+from jaxid.excitation import interior_point
+from jaxid.excitation.interior_point import Evaluation, Stage
 from jaxid.excitation.limits import JointLimits
 from jaxid.trajectory.fourier import FourierBasis
 
@@ -20,13 +21,12 @@ def problem(arm):
     return limits, wish, 0.1 * A @ A.T + np.eye(size)
 
 
-def solved(limits, objective, constraints=0, stages=()):
+def solved(limits, objective, *stages, constraints=0):
     grid, size = limits.grid(64), limits.scale.size
-    solver = InteriorPoint(grid)
-    state = solver.init(0.1 * RANDOM.standard_normal((3, size)), constraints)
-    run = jax.jit(lambda *arguments: solver.run(objective, *arguments))
-    for stage, iterations in stages or ((Stage(2.0, 1.0, 1e-3), 40), (Stage(1.0, 1.0, 1e-8), 200)):
-        state = run(state, jax.tree.map(float, stage), iterations)
+    state = interior_point.begin(grid, 0.1 * RANDOM.standard_normal((3, size)), constraints)
+    run = jax.jit(lambda *arguments: interior_point.run(grid, objective, *arguments))
+    for bound, barrier, least, iterations in stages:
+        state = run(state, Stage(bound, barrier, least, iterations, penalty=100.0))
     rows = np.zeros((*grid.c.shape, 2, limits.shape[1]))
     for j in range(2):
         rows[j, :, j] = grid.R[j]
@@ -55,7 +55,7 @@ def test_reaches_the_constrained_minimum_from_every_start(arm):
         away = y - wish[None]
         return Evaluation.unconstrained(0.5 * jnp.einsum("bi,ij,bj->b", away, H, away), away @ H)
 
-    state, G, c, bound = solved(limits, objective)
+    state, G, c, bound = solved(limits, objective, (2.0, 1.0, 1e-3, 40), (1.0, 1.0, 1e-8, 200))
     best = by_scipy(wish, H, G, c, bound)
     assert best.success
     np.testing.assert_allclose(state.evaluation.value, best.fun, rtol=1e-4)
@@ -83,8 +83,8 @@ def test_keeps_constraints_that_are_not_linear(arm):
     limits, wish, H = problem(arm)
     radii = np.array([1.4, 1.6, 1.8])
     objective, places = curved(wish, H, radii)
-    stages = ((Stage(1.0, 1e-1, 1e-3, 100.0), 80), (Stage(1.0, 1e-3, 1e-8, 100.0), 300))
-    state, G, c, bound = solved(limits, objective, 3, stages)
+    stages = (1.0, 1e-1, 1e-3, 80), (1.0, 1e-3, 1e-8, 300)
+    state, G, c, bound = solved(limits, objective, *stages, constraints=3)
     ball = {
         "type": "ineq",
         "fun": lambda y: 1 - ((y - places) ** 2).sum(1) / radii**2,
@@ -102,8 +102,8 @@ def test_what_cannot_be_kept_is_exceeded_as_little_as_can_be(arm):
     limits, wish, H = problem(arm)
     radii = np.array([0.5, 0.6])
     objective, places = curved(wish, H, radii)
-    stages = ((Stage(1.0, 1.0, 1e-2, 100.0), 100), (Stage(1.0, 1e-2, 1e-6, 100.0), 400))
-    state, G, c, bound = solved(limits, objective, 2, stages)
+    stages = (1.0, 1.0, 1e-2, 100), (1.0, 1e-2, 1e-6, 400)
+    state, G, c, bound = solved(limits, objective, *stages, constraints=2)
 
     def excess(y):
         return ((y - places) ** 2).sum(1) / radii**2 - 1

@@ -11,7 +11,6 @@ from jaxid.robot import library
 from jaxid.robot.robot import Robot
 from jaxid.simulation.friction import LuGreFriction, SmoothFriction
 from jaxid.simulation.mechanics import (
-    BacklashGear,
     DriveTrain,
     FlexibleGear,
     RigidGear,
@@ -189,7 +188,7 @@ def test_an_elastic_gear_swings_as_its_eigenvalues_say():
 
 def test_backlash_lets_the_joint_rattle_within_the_play():
     play = np.array([0.01, 0.02])
-    gear = BacklashGear(np.array([1e6, 4e3]), np.array([50.0, 1.0]), play)
+    gear = FlexibleGear(np.array([1e6, 4e3]), np.array([50.0, 1.0]), play)
     machine = plant(LUGRE, gear)
     machine.start(ZERO, ZERO, ZERO)
     twists = []

@@ -5,7 +5,8 @@ import pytest
 
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
-from jaxid.robot.joints import Drives, Limits
+from jaxid.robot.drives import Drives
+from jaxid.robot.limits import Limits
 from jaxid.simulation.tx90l import cad_tx90l_on_rail, virtual_tx90l_on_rail
 from jaxid.simulation.virtual import Sensors, Servo
 from jaxid.trajectory.fourier import random_fourier_series
@@ -119,11 +120,9 @@ REFUSALS = [
     ("`sample_time`", lambda v, m: v.track(m, sample_time=0.0015, seed=0)),
     ("`duration`", lambda v, m: v.track(m, duration=0.0, seed=0)),
     ("`feed_forward`", lambda v, m: v.track(m, feed_forward=lambda x: x.q[:, :3], seed=0)),
-    ("`frequency`", lambda v, m: v.servo(frequency=0.0)),
-    ("`smoothing`", lambda v, m: Servo(np.ones(7), np.ones(7), smoothing=-1.0)),
     ("`temperature`", lambda v, m: v.replace(temperature=None)),
     ("`values`", lambda v, m: v.replace(values=np.ones(3))),
-    ("`heating`", lambda v, m: v.replace(heating=None, temperature=None).at(30.0)),
+    ("`temperature`", lambda v, m: v.replace(heating=None, temperature=None).at(30.0)),
     ("`servo`", lambda v, m: diverge(v, m)),
 ]
 
