@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxid.excitation.information import information
 
 from jaxid.excitation.constraints import AbstractConstraint, Clearance, Finding
 from jaxid.excitation.criteria import ConditionNumber, DOptimal, information

@@ -5,8 +5,7 @@ import pytest
 
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
-from jaxid.robot.drives import Drives
-from jaxid.robot.limits import Limits
+from jaxid.robot.joints import Drives, Limits
 from jaxid.simulation.tx90l import cad_tx90l_on_rail, virtual_tx90l_on_rail
 from jaxid.simulation.virtual import Sensors, Servo
 from jaxid.trajectory.fourier import random_fourier_series
