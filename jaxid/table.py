@@ -1,49 +1,13 @@
-"""Tables of results: facts, columns with units, remarks; as text, CSV and rows for HTML pages.
+"""Tables of results: facts, columns with units, remarks; as text, and as rows for pages.
 
-Every result makes one by its method `summary()` and prints it by `__str__`:
-
-```python
-def summary(self) -> Table:
-    robot = self.robot
-    return Table(
-        f"Torque errors of {robot.name}",
-        Column("joint", robot.joint_names),
-        Column("RMS", self.rms, "N m"),
-        Column("RMS of max", self.rms / self.max_forces, "%", percent),
-        facts=[("recording", self.name), ("rows", len(self.time))],
-        status=[Status.GOOD if x < 5 else Status.DOUBTFUL for x in self.rms_percent],
-        remarks=[Remark("The mass matrix is positive definite.", Status.GOOD)],
-    )
-
-def __str__(self) -> str:
-    return str(self.summary())
-```
-
-prints
-
-```
-Torque errors of cart
-recording  first run
-rows       799
-
-   joint    RMS  RMS of max
-          [N m]         [%]
-✓  rail   5.21          2.6
-!  swing  0.482         6.1
-
-✓  The mass matrix is positive definite.
-```
-
-Columns hold numbers or texts. Numbers are formatted by the column's function (`significant`,
-`percent`, or your own) and aligned at their decimal points. Estimates and their deviations are
-rounded together: `values, deviations = with_deviations(p, s)` are texts for two columns of
-`kind="number"`. A table without columns holds facts and remarks only.
+A result returns one by its method `summary()` and prints it by `__str__`. Columns hold numbers or
+texts; numbers are formatted by the column's function and aligned at their decimal points.
+Estimates and their deviations are rounded together: `values, deviations = with_deviations(p, s)`
+are texts for two columns of `kind="number"`.
 """
 
-import csv
 import dataclasses
 import enum
-import io
 import math
 import shutil
 import textwrap
@@ -153,7 +117,9 @@ class Column:
     kind: Literal["number", "text", "code", ""] = ""
 
     def __post_init__(self) -> None:
-        values = tuple(x.item() if isinstance(x, np.generic) else x for x in _listed(self.values))
+        listed = isinstance(self.values, list | tuple)
+        values = self.values if listed else np.asarray(self.values).tolist()
+        values = tuple(x.item() if isinstance(x, np.generic) else x for x in values)
         object.__setattr__(self, "values", values)
         if not self.kind:
             numeric = bool(values) and all(isinstance(x, int | float) for x in values)
@@ -214,22 +180,10 @@ class Table:
         """Rows of formatted texts."""
         return list(zip(*(column.texts for column in self.columns), strict=True))
 
-    def csv(self) -> str:
-        """Return the columns as comma-separated values: all digits, units in the header."""
-        file = io.StringIO()
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(
-            " ".join(c.name.split()) + (f" [{c.unit}]" if c.unit else "") for c in self.columns
-        )
-        writer.writerows(zip(*(column.values for column in self.columns), strict=True))
-        return file.getvalue()
-
     def text(self, width: int | None = None) -> str:
-        """Return the table as plain text.
+        """Return the table as plain text, in lines as wide as the terminal or `width`.
 
-        Args:
-            width: Characters of a line; those of the terminal by default. The widest columns of
-                texts are shortened to fit, remarks are wrapped.
+        The widest columns of texts are shortened to fit, remarks are wrapped.
         """
         return "\n".join("".join(part for part, _ in line).rstrip() for line in self.lines(width))
 
@@ -240,9 +194,6 @@ class Table:
         """Yield the lines of the text as parts with a style each, for renderers with colours.
 
         A style is a `Status`, `title`, `header`, `dim`, or empty.
-
-        Args:
-            width: Characters of a line; those of the terminal by default.
         """
         width = shutil.get_terminal_size((100, 24)).columns if width is None else width
         groups = (self._facts(width), self._grid(width), self._remarks(width))
@@ -263,38 +214,30 @@ class Table:
     def _grid(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
         if not self.columns:
             return
-        texts = [column.texts for column in self.columns]
-        headers = [column.header for column in self.columns]
-        widths = [
-            max(map(_width, (*head, *cells))) for head, cells in zip(headers, texts, strict=True)
-        ]
+        texts, headers = zip(*((c.texts, c.header) for c in self.columns), strict=True)
+        widths = [max(map(_width, (*h, *cells))) for h, cells in zip(headers, texts, strict=True)]
+        right = [column.kind == "number" for column in self.columns]
         margin = 3 if self.status else 0
-        _shrink(widths, [column.kind == "number" for column in self.columns], width - margin)
-        for head in zip(*_bottom_aligned(headers), strict=True):
-            if any(head):
-                yield [(" " * margin + self._line(head, widths), "header")]
+        _shrink(widths, right, width - margin)
+
+        def line(cells: Sequence[str]) -> str:
+            return "  ".join(map(_padded, cells, widths, right))
+
+        height = max(map(len, headers))
+        padded = ([""] * (height - len(header)) + header for header in headers)
+        for head in zip(*padded, strict=True):
+            yield [(" " * margin + line(head), "header")]
         for k, row in enumerate(zip(*texts, strict=True)):
             if k in self.rules:
                 yield [("─" * min(width, margin + sum(widths) + 2 * len(widths) - 2), "dim")]
             mark = self.status[k] if self.status else Status.NEUTRAL
-            yield [(f"{mark.value}  "[:margin], mark), (self._line(row, widths), "")]
-
-    def _line(self, cells: Sequence[str], widths: Sequence[int]) -> str:
-        padded = (
-            _padded(_cut(cell, width), width, column.kind == "number")
-            for cell, width, column in zip(cells, widths, self.columns, strict=True)
-        )
-        return "  ".join(padded)
+            yield [(f"{mark.value}  "[:margin], mark), (line(row), "")]
 
     def _remarks(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
         for remark in self.remarks:
             text = f"{remark.text} ({remark.detail})" if remark.detail else remark.text
             for k, line in enumerate(_wrapped(text, width - 3)):
                 yield [("   " if k else f"{remark.status.value}  ", remark.status), (line, "")]
-
-
-def _listed(values: Any) -> Sequence[Any]:
-    return values if isinstance(values, list | tuple) else np.asarray(values).tolist()
 
 
 def _width(text: str) -> int:
@@ -304,14 +247,11 @@ def _width(text: str) -> int:
 
 
 def _padded(text: str, width: int, right: bool = False) -> str:
-    blanks = " " * (width - _width(text))
-    return blanks + text if right else text + blanks
-
-
-def _cut(text: str, width: int) -> str:
+    """Return a text that takes so many places, cut if it is longer."""
     while _width(text) > width:
         text = text.removesuffix("…")[:-1] + "…"
-    return text
+    blanks = " " * (width - _width(text))
+    return blanks + text if right else text + blanks
 
 
 def _wrapped(text: str, width: int) -> list[str]:
@@ -326,8 +266,3 @@ def _shrink(widths: list[int], numbers: Sequence[bool], available: int) -> None:
         if widths[widest] <= 12:
             return
         widths[widest] -= 1
-
-
-def _bottom_aligned(headers: Sequence[list[str]]) -> list[list[str]]:
-    tallest = max(map(len, headers))
-    return [[""] * (tallest - len(head)) + head for head in headers]

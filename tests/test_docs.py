@@ -29,7 +29,7 @@ from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, rep
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
 from jaxid.measurement.columns import Columns
-from jaxid.report.verdict import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO
+from jaxid.report.identification import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation import POSES
 
@@ -245,7 +245,7 @@ def test_the_example_in_the_readme_runs(given, tmp_path):
 THRESHOLDS = {
     "3.": (f"{LARGEST_UNCERTAINTY:.0%}",),
     "4.": (f"below {LARGE_CONDITION:.0f}",),
-    "5.": (f"up to {RMS_ERROR[0]:.0%} of the forces, tolerable to {RMS_ERROR[1]:.0%}",),
+    "5.": (f"up to {RMS_ERROR[0]:.0f}% of the forces, tolerable to {RMS_ERROR[1]:.0f}%",),
     "6.": (
         f"up to {MEAN_ERROR[0]:.0f}% of the largest force, tolerable to {MEAN_ERROR[1]:.0f}%",
         f"up to {UNSEEN_RATIO[0]} times those of the fit, tolerable to {UNSEEN_RATIO[1]:.0f} times",

@@ -13,7 +13,7 @@ from jaxid.excitation.criteria import CRITERIA
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.progress import designing
-from jaxid.report.excitation import ordered, plan_remarks, plan_tables, side_by_side_table
+from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
 from jaxid.report.terminal import show, show_files, show_remarks
 from jaxid.table import Remark, Status
 
@@ -60,7 +60,7 @@ def excite(
     written = write_design(excited, output, _command_line(experiment, output, all_criteria))
     if not excited.plan.interrupted:
         state.unlink(missing_ok=True)
-    show(console, *plan_tables(excited.plan))
+    show(console, *excited.plan.tables())
     show_remarks(console, ordered((*plan_remarks(excited.plan), *excited.aside.remarks)))
     names = [str(path.relative_to(output.parent)) for path in written]
     show_files(console, output.parent, names)

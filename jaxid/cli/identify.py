@@ -1,5 +1,6 @@
 """The commands `jaxid inspect` and `jaxid identify`."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -14,12 +15,12 @@ from jaxid.cli.options import (
     open_stages,
     refuse_foreign_folder,
 )
+from jaxid.diagnosis import Diagnosis
 from jaxid.errors import InputError
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.progress import Stages
 from jaxid.experiment.session import (
     Identification,
-    LoadedLog,
     identify_logs,
     is_report,
     load_log,
@@ -27,17 +28,17 @@ from jaxid.experiment.session import (
 )
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import identify as estimate
-from jaxid.report.result_files import write_report
-from jaxid.report.tables import (
+from jaxid.measurement.observations import Observations
+from jaxid.measurement.recording import Recording
+from jaxid.report.identification import (
     alternative_table,
-    base_table,
     body_table,
-    log_table,
     motor_tables,
     residual_table,
 )
+from jaxid.report.result_files import write_report
 from jaxid.report.terminal import show, show_files, show_remarks
-from jaxid.table import Remark, Status, Table
+from jaxid.table import Remark, Status, Table, significant
 
 
 def inspect(
@@ -60,22 +61,30 @@ def inspect(
         _ = loaded.base.expressions
         loaded, _ = select_filter(loaded, paths, stage)
         examined = [_examine(loaded, path, stage) for path in paths]
-    show(console, loaded.robot.summary(), *motor_tables(loaded.robot), base_table(loaded.base))
+    show(console, loaded.robot.summary(), *motor_tables(loaded.robot), loaded.base.summary())
     show_remarks(console, loaded.notes)
-    for log, fit, findings in examined:
-        show(console, log_table(log.recording, log.diagnosis, findings))
-        show(console, Table("", facts=fit.facts, remarks=fit.determination))
+    for log, diagnosis, fit in examined:
+        gaps = len(log.segments) - 1
+        facts = [
+            ("samples", f"{log.samples} at {significant(1 / log.sample_time, 4)} Hz"),
+            ("duration", f"{significant(log.duration, 4)} s"),
+            ("gaps", str(gaps or "none")),
+        ]
+        show(console, diagnosis.summary())
+        remarks = [*map(Remark, log.notes), *fit.determination]
+        show(console, Table("", facts=[*facts, *fit.facts], remarks=remarks))
 
 
 def _examine(
     experiment: Experiment, path: Path, stage: Stages
-) -> tuple[LoadedLog, Fit, tuple[str, ...]]:
+) -> tuple[Recording | Observations, Diagnosis, Fit]:
     log = load_log(experiment, path, stage)
     stage(f"factorising {path.name}")
     progress = stage.through(log.recording.samples)
     fit = estimate(experiment.base, log.observations, experiment.estimation.plain, progress)
     stage(f"looking for mistakes in {path.name}")
-    return log, fit, log.diagnosis.fit_findings(fit)
+    findings = dict.fromkeys((*log.diagnosis.findings, *log.diagnosis.fit_findings(fit)))
+    return log.recording, dataclasses.replace(log.diagnosis, findings=tuple(findings)), fit
 
 
 def identify(

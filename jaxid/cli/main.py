@@ -80,9 +80,8 @@ def demo(
     Base parameters, optimal excitation, measurement cold and warm, identification, verification on
     the path of ISO 9283, and how well the path is followed with and without the model.
     """
-    from jaxid.demo.page import write_study
+    from jaxid.demo.results import remarks, tables, write_study
     from jaxid.demo.study import run_study
-    from jaxid.demo.tables import remarks, tables
     from jaxid.report.terminal import show, show_remarks
 
     console = open_console()

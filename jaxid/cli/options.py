@@ -15,7 +15,7 @@ from rich.console import Console
 from jaxid.errors import InputError
 from jaxid.experiment.progress import Stages, stages
 from jaxid.io import read_json, require_writable
-from jaxid.report.result_json import SCHEMAS
+from jaxid.report.result_files import SCHEMAS
 from jaxid.trajectory.files import load_trajectory
 
 WIDTH = 100

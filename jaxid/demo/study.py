@@ -1,8 +1,15 @@
 """The paper's experiments, one after the other, on the virtual TX90L on its rail."""
 
+import ctypes
 import dataclasses
+import os
+import statistics
+import subprocess
+import tempfile
+import time
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +17,6 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.arrays import Float
-from jaxid.demo.feed_forward import Timing, time_feed_forward
 from jaxid.identification.comparison import Comparison
 from jaxid.simulation.virtual import Tracking
 from jaxid.validation import Validation
@@ -29,7 +35,7 @@ AT_REST = 0.02
 
 
 class Model(NamedTuple):
-    """A set of parameters and its errors on identification and verification.
+    """Set of parameters and its errors on identification (0) and verification (1).
 
     Attributes:
         name: Name of the estimator.
@@ -42,11 +48,7 @@ class Model(NamedTuple):
     validation: Validation
 
     def mean_errors(self, recording: int) -> list[float]:
-        """Return the mean errors of all axes [% of the largest torque] (Eq. 37).
-
-        Args:
-            recording: 0 for identification, 1 for verification.
-        """
+        """Return the mean errors of all axes [% of the largest torque] (Eq. 37)."""
         return [float(x) for x in self.validation.errors[recording].mean_percent]
 
 
@@ -74,20 +76,6 @@ class PathRun(NamedTuple):
         return np.sqrt(np.mean(np.asarray(self.run.tracking_error) ** 2, axis=0))
 
 
-class Coverage(NamedTuple):
-    """Number of 95 % intervals that hold the true parameter.
-
-    Attributes:
-        filter: Filter of the recordings, in words.
-        inside: Number of intervals that hold the truth.
-        total: Number of intervals.
-    """
-
-    filter: str
-    inside: int
-    total: int
-
-
 class Study(NamedTuple):
     """Results of the demo.
 
@@ -98,19 +86,19 @@ class Study(NamedTuple):
         plans: Motions with the least condition number (Eq. 36), and D-optimal; none if a motion
             was given.
         played: Motion of the identification, from standstill to standstill.
-        path: Path of the end-effector for verification.
-        joint_path: The same path in joint coordinates.
-        runs: Measurements: identification cold, identification warm, verification.
-        observations: Filtered recordings of the three runs.
+        joint_path: Path of the verification in joint coordinates.
+        observations: Filtered recordings: identification cold, identification warm, verification.
         unweighted: Least squares without weights.
         weighted: Least squares with the weights of Eq. 30.
         consistent: Estimate of physically consistent bodies.
         true: Parameters of the robot itself: their errors are all due to disturbances.
         warm: Fit of the warm robot.
         temperature: Comparison of the cold with the warm robot.
-        coverage: Coverage of intervals where nothing but noise disturbs, for two filters.
+        coverage: Where nothing but noise disturbs: a filter in words, the number of 95 % intervals
+            that hold the true parameter, and the number of all.
         followed: Runs along the path with no model, CAD values, and the identified model.
-        timing: Cost of feed-forward torques; a sentence where it was not measured.
+        timing: Compiler, and cost of a feed-forward torque [s]; a sentence where it was not
+            measured.
     """
 
     seed: int
@@ -118,9 +106,7 @@ class Study(NamedTuple):
     truth: Float[np.ndarray, " base"]
     plans: tuple[jid.ExcitationPlan, ...]
     played: jid.trajectories.WithLeads
-    path: jid.trajectories.TipPath
     joint_path: jid.trajectories.AbstractTrajectory
-    runs: tuple[Tracking, ...]
     observations: tuple[jid.Observations, ...]
     unweighted: Model
     weighted: Model
@@ -128,32 +114,19 @@ class Study(NamedTuple):
     true: Model
     warm: jid.Fit
     temperature: Comparison
-    coverage: tuple[Coverage, ...]
+    coverage: tuple[tuple[str, int, int], ...]
     followed: tuple[PathRun, ...]
-    timing: Timing | str
+    timing: dict[str, Any] | str
 
     @property
     def models(self) -> tuple[Model, ...]:
         """All sets of parameters whose errors are compared."""
         return self.unweighted, self.weighted, self.consistent, self.true
 
-    def moving(self, recording: int) -> np.ndarray:
-        """Return which rows count where joints at rest are left out [rows, joints].
-
-        Args:
-            recording: 0 for identification, 1 for verification.
-        """
-        motion = self.observations[2 * recording].reduced_motion
-        return np.abs(np.asarray(motion.qd)) > AT_REST
-
     def moving_errors(self, model: Model, recording: int) -> list[float]:
-        """Return the mean errors of all axes while they move [% of the largest torque].
-
-        Args:
-            model: Set of parameters.
-            recording: 0 for identification, 1 for verification.
-        """
-        errors, moving = model.validation.errors[recording], self.moving(recording)
+        """Return the mean errors of all axes while they move [% of the largest torque]."""
+        errors = model.validation.errors[recording]
+        moving = np.abs(self.observations[2 * recording].reduced_motion.qd) > AT_REST
         sums = np.where(moving, np.abs(np.asarray(errors.errors)), 0.0).sum(axis=0)
         mean = sums / np.maximum(moving.sum(axis=0), 1)
         return [float(x) for x in 100.0 * mean / np.asarray(errors.max_forces)]
@@ -163,8 +136,7 @@ class Study(NamedTuple):
         """Largest speed [m/s] and acceleration [m/s²] of the end-effector in the identification."""
         series = self.played.inner
         times = np.linspace(0.0, float(series.duration), 4000, endpoint=False)
-        tip = jid.constraints.tip_motion(self.base.model.robot, series.motion(times))
-        rates = (tip.velocity, tip.acceleration)
+        _, *rates = jid.constraints.tip_motion(self.base.model.robot, series.motion(times))
         speed, acceleration = (float(np.linalg.norm(x, axis=1).max()) for x in rates)
         return speed, acceleration
 
@@ -173,7 +145,6 @@ def run_study(
     seed: int,
     progress: Callable[[str, float], None],
     *,
-    starts: int = 2,
     draws: int = 4,
     periods: int = 2,
     motion: jid.trajectories.AbstractTrajectory | None = None,
@@ -183,49 +154,43 @@ def run_study(
     Args:
         seed: Seed of all random numbers.
         progress: Callback, called with the name of a stage and its completed fraction (0 to 1).
-        starts: Number of random motions from which a design starts.
         draws: Number of recordings with which intervals are checked.
         periods: Number of periods of the excitation that are measured.
         motion: Motion to identify with; designed if None.
     """
     progress("finding base parameters", 0.0)
-    cold, hot = (
-        jid.simulation.virtual_tx90l_on_rail(),
-        jid.simulation.virtual_tx90l_on_rail(warm=True),
-    )
+    cold = jid.simulation.virtual_tx90l_on_rail()
+    hot = jid.simulation.virtual_tx90l_on_rail(warm=True)
     robot, base = cold.robot, jid.base_parameters(cold.model)
     _ = base.expressions
     plans: tuple[jid.ExcitationPlan, ...] = ()
     if motion is None:
-        plans = _design(base, seed, starts, progress)
-        motion = jid.trajectories.FourierBasis(HARMONICS, OMEGA).trajectory(
-            plans[0].trajectory.coefficients
-        )
+        plans = _design(base, seed, progress)
+        basis = jid.trajectories.FourierBasis(HARMONICS, OMEGA)
+        motion = basis.trajectory(plans[0].trajectory.coefficients)
     progress("adding the leads", 0.0)
     played = jid.trajectories.with_leads(motion, robot, periods=periods)
     progress("inverse kinematics of the verification path", 0.0)
-    path = verification_path()
+    path = _verification_path()
     joints = jid.trajectories.joint_path(robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0))
-    runs = []
-    for k, (name, virtual, trajectory) in enumerate(
-        (
-            ("identification, cold", cold, played),
-            ("identification, warm", hot, played),
-            ("verification", cold, joints),
-        )
+    observations = []
+    for virtual, trajectory, name in (
+        (cold, played, "identification, cold"),
+        (hot, played, "identification, warm"),
+        (cold, joints, "verification"),
     ):
         progress(f"measuring: {name}", 0.0)
-        options = {"sample_time": SAMPLE_TIME, "seed": 10 * seed + k, "name": name}
-        runs.append(virtual.track(trajectory, **options))
-    observations = [_observe(run.recording, robot, jid.filters.PaperFilter()) for run in runs]
+        number = 10 * seed + len(observations)
+        run = virtual.track(trajectory, sample_time=SAMPLE_TIME, seed=number, name=name)
+        observations.append(_observe(run.recording, robot, jid.filters.PaperFilter()))
     progress("identifying", 0.0)
     rows = jid.RegressionProblem(base, [observations[0]])
+    truth = np.asarray(base.from_standard(cold.parameters))
     fits = {
         "without weights": jid.identify(base, rows, jid.estimators.LeastSquares()),
         "weighted": jid.identify(base, rows, jid.WeightedLeastSquares()),
         "consistent": jid.identify(base, rows, jid.PhysicallyConsistent()),
     }
-    truth = np.asarray(base.from_standard(cold.parameters))
     fits["true parameters"] = eqx.tree_at(lambda f: f.parameters, fits["weighted"], truth)
     progress("predicting torques", 0.0)
     recordings = [observations[0], observations[2]]
@@ -243,9 +208,7 @@ def run_study(
         truth,
         plans,
         played,
-        path,
         joints,
-        tuple(runs),
         tuple(observations),
         *models,
         warm=warm,
@@ -256,8 +219,8 @@ def run_study(
     )
 
 
-def verification_path() -> jid.trajectories.TipPath:
-    """Return the path of ISO 9283 of the demo; the tool points along the rail (Fig. 8)."""
+def _verification_path() -> jid.trajectories.TipPath:
+    """Return the path of ISO 9283; the tool points along the rail (Fig. 8)."""
     forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     return jid.trajectories.iso9283_path(
         CUBE, EDGE, forward, leans_along=1, speed=SPEED, acceleration=ACCELERATION
@@ -271,7 +234,7 @@ def _observe(
 
 
 def _design(
-    base: jid.BaseParameters, seed: int, starts: int, progress: Callable[[str, float], None]
+    base: jid.BaseParameters, seed: int, progress: Callable[[str, float], None]
 ) -> tuple[jid.ExcitationPlan, ...]:
     """Return a motion with the least condition number, and a D-optimal one."""
     limits = base.model.robot.limits
@@ -291,7 +254,7 @@ def _design(
             basis=jid.trajectories.FourierBasis(HARMONICS, OMEGA),
             limits=limits,
             constraints=(jid.constraints.Clearance(jid.robots.tx90l_on_rail_collision()),),
-            starts=starts,
+            starts=2,
             generations=0,
             polish=0,
             samples=SAMPLES,
@@ -305,29 +268,30 @@ def _design(
 
 def _check_coverage(
     base: jid.BaseParameters, excitation: jid.trajectories.WithLeads, seed: int, draws: int
-) -> tuple[Coverage, ...]:
+) -> tuple[tuple[str, int, int], ...]:
     """Count the intervals that hold the truth, for a robot with noise and encoders only."""
     quiet = jid.simulation.virtual_tx90l_on_rail(disturbed=False)
     truth = np.asarray(base.from_standard(quiet.parameters))
-    duration = float(excitation.duration)
     seeds = range(1000 * (seed + 1), 1000 * (seed + 1) + draws)
     logs = [
-        quiet.measure(excitation, duration=duration, sample_time=SAMPLE_TIME, seed=k) for k in seeds
+        quiet.measure(
+            excitation, duration=float(excitation.duration), sample_time=SAMPLE_TIME, seed=k
+        )
+        for k in seeds
     ]
-
-    def count(filter: jid.filters.AbstractFilter) -> int:
-        inside = 0
-        for log in logs:
-            rows = jid.RegressionProblem(base, [_observe(log, quiet.robot, filter)])
-            low, high = jid.identify(base, rows, jid.WeightedLeastSquares()).intervals(0.95).T
-            inside += int(np.count_nonzero((low <= truth) & (truth <= high)))
-        return inside
-
     filters = {
         "the paper's filter, which lags and smooths accelerations twice": jid.filters.PaperFilter(),
         "a zero-phase Butterworth filter of 15 Hz": jid.ZeroPhaseButterworth(15.0),
     }
-    return tuple(Coverage(name, count(f), draws * base.size) for name, f in filters.items())
+    counts = []
+    for name, filter in filters.items():
+        inside = 0
+        for log in logs:
+            fit = jid.identify(base, _observe(log, quiet.robot, filter))
+            low, high = fit.intervals(0.95).T
+            inside += int(np.count_nonzero((low <= truth) & (truth <= high)))
+        counts.append((name, inside, draws * base.size))
+    return tuple(counts)
 
 
 def _follow(
@@ -352,3 +316,66 @@ def _follow(
         distance = np.linalg.norm(tip - path.positions(np.asarray(run.time)), axis=1)
         runs.append(PathRun(name, run, distance))
     return tuple(runs)
+
+
+_LOOPS = """#include "arm.c"
+#define LOOP(form) \\
+void loop_##form(long calls, long states, const double *q, const double *qd, const double *qdd, \\
+                 double *tau) \\
+{ \\
+    long k; \\
+    for (k = 0; k < calls; ++k) { \\
+        const long row = k % states * ARM_JOINTS; \\
+        arm_##form(q + row, qd + row, qdd + row, MORE_##form tau + row); \\
+    } \\
+}
+#define MORE_torque
+#define MORE_torque_of_masses
+#define MORE_torque_of_parameters arm_parameters,
+LOOP(torque)
+LOOP(torque_of_parameters)
+LOOP(torque_of_masses)
+"""
+
+
+def time_feed_forward(
+    fit: jid.Fit, trajectory: jid.trajectories.AbstractTrajectory
+) -> dict[str, Any] | str:
+    """Return the cost of a feed-forward torque in C on states of a motion [s] (Sec. 7).
+
+    `literal` is the base regressor times the base parameters, as printed (Eq. 39), `factored` the
+    same as a recursion on base parameters, `full` mass matrix and bias forces (Eq. 38). A sentence
+    is returned where they cannot be measured.
+
+    Args:
+        fit: Model with a complete set of standard parameters.
+        trajectory: Trajectory whose torques are computed.
+    """
+    compiler = os.environ.get("CC", "cc")
+    motion = trajectory.motion(np.linspace(0.0, float(trajectory.duration), 256))
+    states = [np.ascontiguousarray(x, np.float64) for x in (motion.q, motion.qd, motion.qdd)]
+    forms = {"literal": "torque_of_parameters", "factored": "torque", "full": "torque_of_masses"}
+    with tempfile.TemporaryDirectory(prefix="jaxid-") as folder:
+        jid.export_c(fit, folder, name="arm")
+        (Path(folder) / "loops.c").write_text(_LOOPS, encoding="ascii")
+        words = [compiler, "-O2", "-shared", "-fPIC", "loops.c", "-o", "loops.so", "-lm"]
+        try:
+            subprocess.run(words, cwd=folder, check=True, capture_output=True)
+        except (OSError, subprocess.CalledProcessError) as failure:
+            return f"feed-forward torques were not timed: {failure}"
+        library = ctypes.CDLL(str(Path(folder) / "loops.so"))
+    # All forms in turn, so that other work on the machine disturbs them alike.
+    turns = [[_cost(library, form, states) for form in forms.values()] for _ in range(21)]
+    medians = (statistics.median(column) for column in zip(*turns, strict=True))
+    return {"where": f"C, {compiler} -O2", **dict(zip(forms, medians, strict=True))}
+
+
+def _cost(library: ctypes.CDLL, form: str, states: list[np.ndarray], calls: int = 4096) -> float:
+    """Return the time of one call [s]."""
+    loop = getattr(library, f"loop_{form}")
+    loop.restype = None
+    arrays = (*states, np.empty_like(states[0]))
+    places = [ctypes.c_void_p(x.ctypes.data) for x in arrays]
+    begin = time.perf_counter()
+    loop(ctypes.c_long(calls), ctypes.c_long(len(states[0])), *places)
+    return (time.perf_counter() - begin) / calls

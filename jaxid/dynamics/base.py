@@ -25,7 +25,7 @@ from jaxid.dynamics.rank import (
 from jaxid.dynamics.regressor import JointRegressor, PackedRegressor, rows_in_numpy
 from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
-from jaxid.table import Column, Table
+from jaxid.table import MISSING, Column, Remark, Status, Table
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
@@ -211,19 +211,22 @@ class BaseParameters(Hashable):
 
     def summary(self) -> Table:
         """Return a table of the base parameters, with their combinations and units."""
-        lengths = ", ".join(f"{name} = {value:.4g}" for name, value in self.lengths.items())
-        facts: list[tuple[str, Any]] = [("standard parameters", self.model.size)]
-        facts.append(("base parameters", self.size))
-        if lengths:
+        facts = []
+        for kind in Identifiability:
+            each = zip(self.model.parameter_names, self.identifiability, strict=True)
+            found = [name for name, verdict in each if verdict is kind]
+            facts.append((f"{kind.value} ({len(found)})", ", ".join(found) or MISSING))
+        if lengths := ", ".join(f"{name} = {value:.4g}" for name, value in self.lengths.items()):
             facts.append(("lengths", f"{lengths} (m; m/s² for g)"))
+        count = f"{self.size} base parameters of {self.model.size} standard parameters"
         return Table(
-            f"Base parameters of {self.model.robot.name}",
+            f"{self.model.robot.name}: {count}",
             Column("no.", list(range(1, self.size + 1))),
             Column("parameter", self.names),
             Column("combination", self.expressions, kind="code"),
             Column("unit", self.units),
             facts=facts,
-            remarks=self.notes,
+            remarks=[Remark(note, Status.DOUBTFUL) for note in self.notes],
         )
 
     def __str__(self) -> str:

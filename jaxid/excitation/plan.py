@@ -174,8 +174,9 @@ class ExcitationPlan(eqx.Module):
         ]
         return (*tables, _findings_table(self.findings)) if self.findings else tuple(tables)
 
-    def __str__(self) -> str:
-        """Return all tables as text, and what must be known of the design."""
+    @property
+    def remarks(self) -> list[Remark]:
+        """Gain of the design, limits that are not kept, and parameters that are not determined."""
         gain = f"Standard deviations are {self.mean_gain:.3g} times smaller than a random motion's"
         remarks = [Remark(gain), *(Remark(text, Status.BAD) for text in self.diagnosis)]
         if self.undetermined:
@@ -183,7 +184,11 @@ class ExcitationPlan(eqx.Module):
             remarks.append(Remark(text, Status.BAD))
         if self.interrupted:
             remarks.append(Remark("The design was stopped before its end", Status.DOUBTFUL))
-        return "\n\n".join(map(str, (*self.tables(), Table("", remarks=remarks))))
+        return remarks
+
+    def __str__(self) -> str:
+        """Return all tables as text, and what must be known of the design."""
+        return "\n\n".join(map(str, (*self.tables(), Table("", remarks=self.remarks))))
 
     def to_csv(self, path: str | Path, *, sample_time: float | None = None) -> None:
         """Write the motion as a table of samples; see `write_csv`.

@@ -21,9 +21,8 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.measurement.timestamps import NeedsMemory
-from jaxid.report.result_files import MODEL
-from jaxid.report.result_json import Alternative
-from jaxid.report.tables import solution_name
+from jaxid.report.identification import solution_name
+from jaxid.report.result_files import MODEL, Alternative
 from jaxid.validation import Validation, comparison_step, torque_errors, validate
 
 

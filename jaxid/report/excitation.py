@@ -1,4 +1,4 @@
-"""Tables, remarks and page of a designed excitation motion."""
+"""Page and remarks of a designed excitation motion."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from jaxid.arrays import double_precision
 from jaxid.excitation.plan import VAGUE, ExcitationPlan
 from jaxid.io import atomic_folder
-from jaxid.report.motion import joint_figure, tip_figure
-from jaxid.report.page import Section, block, picture, provenance, render_page
-from jaxid.report.robot_figures import path_figure, pose_figure
+from jaxid.report.motion import joint_figure, path_figure, pose_figure, tip_figure
+from jaxid.report.page import picture, provenance, render_page
 from jaxid.report.style import save
 from jaxid.robot.robot import Robot
 from jaxid.table import Column, Remark, Status, Table, significant
@@ -22,59 +21,54 @@ from jaxid.trajectory.trajectory import AbstractTrajectory
 def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
     """Return all criteria of motions that minimise one of them each, and their deviations."""
     criteria = plans[0].criteria
+    names = [c.name for c in criteria]
+    numbers = [names.index(plan.criterion.name) + 1 for plan in plans]
     remarks = [
-        Remark(f"#{k + 1} does not keep all limits: {'; '.join(plan.diagnosis)}", Status.DOUBTFUL)
-        for k, plan in enumerate(plans)
-        if not plan.feasible
+        "`random` is the median of random motions that fill the same limits; the last row is the "
+        "geometric mean over the base parameters"
     ]
-    remarks += [
-        Remark(f"#{k + 1} was stopped before its end", Status.DOUBTFUL)
-        for k, plan in enumerate(plans)
-        if plan.interrupted
-    ]
+    for number, plan in zip(numbers, plans, strict=True):
+        doubts = [*plan.diagnosis, *(["stopped before its end"] if plan.interrupted else [])]
+        remarks += [Remark(f"by #{number}: {text}", Status.DOUBTFUL) for text in doubts]
     return Table(
         "motions that minimise one of the criteria each",
-        Column("#", [*(str(k + 1) for k in range(len(criteria))), ""], kind="number"),
-        Column("criterion", [*(c.name for c in criteria), "deviations, times smaller than random"]),
+        Column("#", [*map(str, range(1, len(names) + 1)), ""], kind="number"),
+        Column("criterion", [*names, "deviations, times smaller than random"]),
         Column("random", [*(float(c.before) for c in criteria), 1.0]),
         *(
-            Column(f"by #{k + 1}", [*(float(c.after) for c in plan.criteria), plan.mean_gain])
-            for k, plan in enumerate(plans)
+            Column(f"by #{k}", [*(float(c.after) for c in plan.criteria), plan.mean_gain])
+            for k, plan in zip(numbers, plans, strict=True)
         ),
-        rules=[len(criteria)],
-        remarks=[
-            "few starts and no polishing for each; `random` is the median of random motions that "
-            "fill the same limits; the last row is the geometric mean over the base parameters",
-            *remarks,
-        ],
+        rules=[len(names)],
+        remarks=remarks,
     )
 
 
-def plan_tables(plan: ExcitationPlan) -> list[Table]:
-    """Return all tables of a designed motion, with what the expected deviations assume."""
-    criteria, deviations, *use = plan.tables()
-    deviations.remarks = (Remark(expectation(plan)),)
-    return [criteria, deviations, *use]
-
-
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
-    """Return the remarks on a designed motion that follow from its plan."""
-    published = plan.limits.limits.assumed
-    gain = f"{plan.mean_gain:.3g}"
-    found = [Remark(f"Standard deviations are {gain} times smaller than a random motion's")]
-    for text in (
-        published and f"Limits that nobody published, assumed: {', '.join(published)}",
-        plan.limits.assumed and f"Assumed, because not given: {', '.join(assumed_limits(plan))}",
+    """Return what must be known of a design, what it assumes, and what it leaves vague."""
+    published = ", ".join(plan.limits.limits.assumed)
+    assumed = ", ".join(_assumed_limits(plan))
+    doubts = (
+        published and f"Limits that nobody published, assumed: {published}",
+        assumed and f"Assumed, because not given: {assumed}",
         plan.vague
         and f"Deviations above {100 * VAGUE:g} % of the nominal value: {', '.join(plan.vague)}",
         plan.interrupted and "The design was stopped: `--resume` goes on where it was",
-    ):
-        if text:
-            found.append(Remark(str(text), Status.DOUBTFUL))
-    if plan.undetermined:
-        text = f"This motion does not determine: {', '.join(plan.undetermined)}"
-        found.append(Remark(text, Status.BAD))
-    return [*found, *(Remark(text, Status.BAD) for text in plan.diagnosis)]
+    )
+    found = [Remark(text, Status.DOUBTFUL) for text in doubts if text]
+    robot = plan.base.model.robot
+    start, then = plan.limits.basis.times(plan.samples)[:2]
+    step = float(then - start)
+    noise = {
+        j: f"{significant(float(s))} {robot.force_unit(j)}"
+        for j, s in enumerate(np.asarray(plan.noise))
+    }
+    text = (
+        f"Expected deviations are those of {plan.samples} samples in {plan.samples * step:.4g} s "
+        f"({1 / step:.4g} Hz), of one run, with white noise of the forces: standard deviation "
+        f"{', '.join(_grouped(robot, noise))}; of n runs they are √n times smaller."
+    )
+    return [*plan.remarks, Remark(text), *found]
 
 
 def ordered(remarks: Iterable[Remark]) -> list[Remark]:
@@ -83,62 +77,32 @@ def ordered(remarks: Iterable[Remark]) -> list[Remark]:
     return sorted(remarks, key=lambda remark: order.index(remark.status))
 
 
-def expectation(plan: ExcitationPlan) -> str:
-    """Return the noise and the samples that the expected deviations assume, as a sentence."""
-    robot = plan.base.model.robot
-    start, then = plan.limits.basis.times(plan.samples)[:2]
-    step = float(then - start)
-    noise = [
-        f"{significant(float(s))} {robot.force_unit(j)}"
-        for j, s in enumerate(np.asarray(plan.noise))
-    ]
-    return (
-        f"Expected deviations are those of {plan.samples} samples in {plan.samples * step:.4g} s "
-        f"({1 / step:.4g} Hz), of one run, with white noise of the forces: standard deviation "
-        f"{', '.join(grouped(robot, noise))}; of n runs they are √n times smaller."
-    )
-
-
-def assumed_limits(plan: ExcitationPlan) -> list[str]:
+def _assumed_limits(plan: ExcitationPlan) -> list[str]:
     """Return the limits that were assumed because nobody gave them, with their values."""
-    robot, limits = plan.base.model.robot, plan.limits.limits
-    texts = []
-    for field, (words, per) in {
-        "position_min": ("lower end of the range", ""),
-        "position_max": ("upper end of the range", ""),
-        "velocity": ("speed", "/s"),
-        "acceleration": ("acceleration", "/s²"),
-    }.items():
-        values: list[str | None] = [None] * robot.joints
-        for name, joint in plan.limits.assumed:
-            if name == field:
-                value = float(np.asarray(getattr(limits, field))[joint])
-                values[joint] = f"{value:.4g} {robot.joint_unit(joint)}{per}"
-        texts += [f"{words} of {text}" for text in grouped(robot, values)]
+    robot, texts = plan.base.model.robot, []
+    for field, words, per in (
+        ("position_min", "lower end of the range", ""),
+        ("position_max", "upper end of the range", ""),
+        ("velocity", "speed", "/s"),
+        ("acceleration", "acceleration", "/s²"),
+    ):
+        limits = np.asarray(getattr(plan.limits.limits, field))
+        joints = [joint for name, joint in plan.limits.assumed if name == field]
+        values = {j: f"{float(limits[j]):.4g} {robot.joint_unit(j)}{per}" for j in joints}
+        texts += [f"{words} of {text}" for text in _grouped(robot, values)]
     return texts
 
 
-def grouped(robot: Robot, values: Sequence[str | None]) -> list[str]:
-    """Return joints with the same text together, like `all joints (8 rad/s²)`.
-
-    Args:
-        robot: Robot of the joints.
-        values: A text for each joint; None for those that are left out.
-    """
-    texts = []
-    for value in dict.fromkeys(v for v in values if v is not None):
-        joints = [j for j, v in enumerate(values) if v == value]
-        texts.append(f"{list_joints(robot, joints)} ({value})")
-    return texts
+def _grouped(robot: Robot, texts: Mapping[int, str]) -> list[str]:
+    """Return joints with the same text together, like `all joints (8 rad/s²)`."""
+    return [
+        f"{list_joints(robot, [j for j, other in texts.items() if other == text])} ({text})"
+        for text in dict.fromkeys(texts.values())
+    ]
 
 
 def list_joints(robot: Robot, joints: Iterable[int]) -> str:
-    """Return the names of joints in a sentence, or `all joints`.
-
-    Args:
-        robot: Robot of the joints.
-        joints: Indices of the joints, from 0.
-    """
+    """Return the names of joints (from 0) in a sentence, or `all joints`."""
     names = [robot.joint_names[j] for j in joints]
     if len(names) == robot.joints > 1:
         return "all joints"
@@ -152,14 +116,10 @@ def write_excitation(
     remarks: Sequence[Remark] = (),
     settings: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write the page of a design and its figures: joints, end-effector and its path.
+    """Write the page of a design and its figures; return the files.
 
-    Args:
-        folder: Folder of the files.
-        plan: Designed motion.
-        played: Motion with its leads, drawn in place of the designed one.
-        remarks: Further remarks of the page.
-        settings: Origin of the design: `facts`, `command` and `experiment_text`.
+    The motion with its leads is drawn where there is one. `settings` tell the origin of the design
+    as in `provenance`.
     """
     robot, shown = plan.base.model.robot, plan.trajectory if played is None else played
     with double_precision():
@@ -185,29 +145,20 @@ def excitation_page(
     remarks: Sequence[Remark] = (),
     settings: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return the page of a designed motion as HTML.
-
-    Args:
-        plan: Designed motion.
-        figures: Figures of the motion, by the names of their files without suffix.
-        remarks: Further remarks of the page.
-        settings: Origin of the design: `facts`, `command` and `experiment_text`.
-    """
+    """Return the page of a designed motion as HTML."""
     robot, base = plan.base.model.robot, plan.base
     captions = {"path": "Circle: start; square: end.", "poses": "Earlier poses are paler."}
-    criteria, deviations, *use = (block("table", table) for table in plan_tables(plan))
-    text = "A random motion that fills the same limits is shown beside this one."
+    criteria, deviations, *use = plan.tables()
     every = ordered((*plan_remarks(plan), *remarks))
+    text = "A random motion that fills the same limits is shown beside this one."
     return render_page(
         f"{robot.name}: a motion to record",
         [
-            Section(
-                "Verdict", [block("headline", _headline(plan, remarks)), block("remarks", every)]
-            ),
-            Section("The motion", [picture(f, captions.get(n, "")) for n, f in figures.items()]),
-            Section("Use of the limits", use),
-            Section("Gain over a random motion", [block("paragraph", text), criteria]),
-            Section("Expected standard deviations", [deviations]),
+            ("Verdict", [_headline(plan, remarks), every]),
+            ("The motion", [picture(f, captions.get(name, "")) for name, f in figures.items()]),
+            ("Use of the limits", use),
+            ("Gain over a random motion", [text, criteria]),
+            ("Expected standard deviations", [deviations]),
             provenance(settings or {}),
         ],
         f"Designed to determine {base.size} base parameters of {robot.joints} joints.",

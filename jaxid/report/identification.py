@@ -1,24 +1,20 @@
-"""Page of an identification: task, estimates, errors and the verdict on the model."""
+"""Page of an identification: verdict, task, estimates, errors; and the tables of its results."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxid.identification.consistency.estimator import Consistency
+from jaxid.identification.estimators import AbstractSpectralSolution
+from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit
-from jaxid.report.page import Section, block, facts, picture, provenance, render_page
-from jaxid.report.tables import (
-    body_table,
-    error_table,
-    lengths_sentence,
-    motor_table,
-    residual_table,
-)
-from jaxid.report.verdict import verdict
+from jaxid.identification.uncertainty import ResidualSpectra
+from jaxid.report.page import provenance, render_page
 from jaxid.robot.robot import Robot
 from jaxid.table import (
-    MISSING,
     Column,
     Remark,
     Status,
@@ -35,6 +31,14 @@ TRUST = {
     Status.BAD: "small, or not excited",
 }
 """Words for the trust in an estimate."""
+MEAN_ERROR = (1.0, 3.0)
+"""Mean errors up to which forces are predicted well, and tolerably [% of the largest forces]."""
+RMS_ERROR = (5.0, 15.0)
+"""RMS errors that are good, and tolerable [% of the RMS forces]."""
+UNSEEN_RATIO = (1.5, 3.0)
+"""Errors on new motions, relative to those of the fit, that are good, and tolerable."""
+LARGE_CONDITION = 1e3
+"""Condition number, with scaled columns, above which parameters are hard to tell apart."""
 
 
 def identification_page(
@@ -47,60 +51,48 @@ def identification_page(
     notes: Sequence[str] = (),
     doubts: Sequence[str] = (),
 ) -> str:
-    """Return the page of an identification as HTML.
-
-    Args:
-        fit: Identified parameters.
-        identification: Errors on the recordings of the fit.
-        verification: Errors on recordings that the fit has not seen.
-        definiteness: Definiteness of the mass matrix.
-        settings: Origin of the result.
-        figures: Figures by the names of their files, without suffix.
-        notes: Notes for the reader, in sentences.
-        doubts: Doubts about the logs, in sentences.
-    """
+    """Return the page of an identification as HTML; the arguments are those of `write_report`."""
     base, robot = fit.base, fit.base.model.robot
-    every_note = dict.fromkeys((*robot.notes, *fit.notes, *notes))
     overall, *criteria = verdict(fit, identification, verification, definiteness, doubts)
-    remarks = [Remark(note) for note in every_note if note not in doubts]
-    tables = [error_table(errors, robot) for errors in (*identification, *verification)]
+    every_note = dict.fromkeys((*robot.notes, *fit.notes, *notes))
+    tables = tuple(error_table(errors, robot) for errors in (*identification, *verification))
+    lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
     sections = [
-        Section("Verdict", [block("headline", overall), block("remarks", criteria)]),
-        Section("Task", [_settings_block(fit, settings), block("remarks", remarks)]),
-        Section("Robot and drives", _robot_blocks(robot)),
-        Section(
+        ("Verdict", [overall, criteria]),
+        ("Task", [_task_table(fit, settings), [Remark(n) for n in every_note if n not in doubts]]),
+        ("Robot and drives", [_robot_table(robot), *motor_tables(robot)]),
+        (
             "Errors",
             [
-                block(
-                    "paragraph",
-                    "Predicted less measured forces. Bars: the mean of their absolute values "
-                    "(Eq. 37, Fig. 10 of the paper); marks: their RMS.",
-                ),
-                picture(figures["errors"]),
-                block("abreast", *(block("table", table) for table in tables)),
+                "Predicted less measured forces. Bars: the mean of their absolute values (Eq. 37, "
+                "Fig. 10 of the paper); marks: their RMS.",
+                figures["errors"],
+                tables,
             ],
         ),
-        Section("Measured and predicted forces", _torque_blocks(figures, robot.joints)),
-        Section(f"{base.size} base parameters", _parameter_blocks(fit, figures["parameters"])),
+        ("Measured and predicted forces", _torque_blocks(figures, robot.joints)),
+        (
+            f"{base.size} base parameters",
+            [
+                *([fit.determination] if fit.undetermined else []),
+                figures["parameters"],
+                parameter_table(fit),
+                *([f"In the combinations: {lengths} (m; m/s² for g)."] if lengths else []),
+            ],
+        ),
     ]
     if fit.consistency is not None:
-        bodies = body_table(fit.consistency, robot.joint_names)
-        sections.append(Section("Bodies", [block("table", bodies, titled=False)]))
+        sections.append(("Bodies", [body_table(fit.consistency, robot.joint_names)]))
     if fit.residual_spectra is not None:
         text = (
             "The residuals of a good model are noise. Power at low frequencies, or residuals that "
             "resemble their neighbours more than the filters explain (dashed), mean that an effect "
             "is missing."
         )
-        blocks = [
-            block("paragraph", text),
-            picture(figures["residuals"]),
-            picture(figures["autocorrelation"]),
-            block("table", residual_table(fit.residual_spectra, robot)),
-        ]
-        sections.append(Section("Residuals", blocks))
+        shown = [figures["residuals"], figures["autocorrelation"]]
+        sections.append(("Residuals", [text, *shown, residual_table(fit.residual_spectra, robot)]))
     if "filter" in figures:
-        sections.append(Section("Choice of the filter", [picture(figures["filter"])]))
+        sections.append(("Choice of the filter", [figures["filter"]]))
     logs = f"{len(fit.recordings)} log{'' if len(fit.recordings) == 1 else 's'}"
     return render_page(
         f"{robot.name}: identified parameters",
@@ -110,66 +102,41 @@ def identification_page(
     )
 
 
-def _settings_block(fit: Fit, settings: Mapping[str, Any]) -> str:
+def _task_table(fit: Fit, settings: Mapping[str, Any]) -> Table:
     rows = [
         ("experiment", settings.get("experiment")),
         ("identified with", ", ".join(settings.get("identification", ())) or None),
         ("verified with", ", ".join(settings.get("verification", ())) or None),
-        ("split", settings.get("split")),
-        ("filter", settings.get("filter")),
-        ("decimation", settings.get("decimation")),
+        *((key, settings.get(key)) for key in ("split", "filter", "decimation")),
         ("estimator", fit.estimator),
         ("solution", fit.solution),
         *fit.facts[:-1],
     ]
-    return facts((word, text) for word, text in rows if text is not None)
+    return Table("", facts=[(word, text) for word, text in rows if text is not None])
 
 
-def _robot_blocks(robot: Robot) -> list[str]:
-    blocks = [block("table", Table("", *robot.summary().columns))]
-    if not robot.drives.is_direct:
-        blocks.append(block("table", motor_table(robot)))
-    rows = [
-        ("source", robot.source),
-        ("gravity [m/s²]", ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))),
-        ("assumed", ", ".join(robot.limits.assumed)),
-    ]
-    if robot.tool is not None:
-        where = robot.joint_names[robot.tool.body]
-        rows.append(("known load", f"{float(robot.tool.mass):g} kg on the body of {where}"))
-    return [*blocks, facts((word, text) for word, text in rows if text)]
+def _robot_table(robot: Robot) -> Table:
+    table, assumed = robot.summary(), ", ".join(robot.limits.assumed)
+    gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
+    facts = [*table.facts, ("gravity [m/s²]", gravity)]
+    return Table("", *table.columns, facts=[*facts, *([("assumed", assumed)] if assumed else [])])
 
 
-def _torque_blocks(figures: Mapping[str, Figure], joints: int) -> list[str]:
-    """Return pictures of the first recordings (42 panels at most), and the files of the others."""
+def _torque_blocks(figures: Mapping[str, Figure], joints: int) -> list[Figure | str]:
+    """Return figures of the first recordings (42 panels at most), and the files of the others."""
     names = [name for name in figures if name.startswith("torque_")]
     shown = max(1, 42 // joints)
-    blocks = [picture(figures[name]) for name in names[:shown]]
-    if names[shown:]:
-        others = ", ".join(f"{name}.png" for name in names[shown:])
-        text = f"Figures of more recordings lie beside this page: {others}."
-        blocks.append(block("paragraph", text))
+    blocks: list[Figure | str] = [figures[name] for name in names[:shown]]
+    if others := ", ".join(f"{name}.png" for name in names[shown:]):
+        blocks.append(f"Figures of more recordings lie beside this page: {others}.")
     return blocks
 
 
-def _parameter_blocks(fit: Fit, figure: Figure) -> list[str]:
-    blocks = [block("remarks", fit.determination)] if fit.undetermined else []
-    blocks += [picture(figure), block("table", page_parameter_table(fit))]
-    if fit.base.lengths:
-        blocks.append(block("paragraph", lengths_sentence(fit.base)))
-    return blocks
-
-
-def page_parameter_table(fit: Fit) -> Table:
-    """Return the table of a page with the base parameters and their 95 % intervals.
-
-    Args:
-        fit: Identified parameters.
-    """
-    base, trust = fit.base, fit.trust
+def parameter_table(fit: Fit) -> Table:
+    """Return the base parameters with their 95 % intervals."""
+    base, trust, (low, high) = fit.base, fit.trust, fit.intervals().T
     values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
-    ends = [_round_like(d, end) for d, end in zip(deviations, fit.intervals(), strict=True)]
-    low, high = zip(*ends, strict=True)
+    low, high = (with_deviations(ends, fit.standard_deviations)[0] for ends in (low, high))
     return Table(
         "",
         Column("#", list(range(1, base.size + 1))),
@@ -186,11 +153,227 @@ def page_parameter_table(fit: Fit) -> Table:
     )
 
 
-def _round_like(deviation: str, interval: np.ndarray) -> tuple[str, str]:
-    """Return both ends of an interval, to the digits of its standard deviation."""
-    if not np.isfinite(interval).all():
-        return MISSING, MISSING
-    if "e" in deviation:
-        return significant(float(interval[0]), 5), significant(float(interval[1]), 5)
-    decimals = len(deviation.partition(".")[2])
-    return f"{interval[0]:.{decimals}f}", f"{interval[1]:.{decimals}f}"
+def motor_tables(robot: Robot) -> list[Table]:
+    """Return the motors of a robot, if it has gears or couplings: their joints and properties."""
+    drives, A = robot.drives, np.asarray(robot.drives.reduction)
+    if drives.is_direct:
+        return []
+    turns = [
+        " + ".join(f"{row[j]:.6g} {robot.joint_names[j]}" for j in np.flatnonzero(row)) for row in A
+    ]
+    columns = [
+        Column("joint at\nmotor zero", np.asarray(drives.zero), "rad or m"),
+        Column("largest\ntorque", np.asarray(drives.max_torques), "N m"),
+        Column("rotor\ninertia", np.asarray(drives.rotor_inertia), "kg m²"),
+    ]
+    known = (c for c in columns if np.isfinite(c.values).any() and np.any(c.values))
+    numbers = Column("motor", list(range(1, robot.joints + 1)))
+    return [Table("motors", numbers, Column("turns", turns), *known)]
+
+
+def error_table(errors: TorqueErrors, robot: Robot) -> Table:
+    """Return the torque errors of one recording, joint by joint (Eq. 37)."""
+    return Table(
+        f"{errors.name}: relative error {percent(errors.relative)} %",
+        Column("joint", robot.joint_names),
+        Column("unit", [robot.force_unit(j) for j in range(robot.joints)]),
+        Column("mean |e|", errors.mean),
+        Column("RMS", errors.rms),
+        Column("mean", errors.mean_percent, "% of max"),
+        Column("RMS", errors.rms_percent, "% of max"),
+        Column("RMS", 100 * errors.rms_relative, "% of RMS force"),
+    )
+
+
+def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
+    """Return whether the residuals of each joint are white, and where their power lies."""
+    return Table(
+        f"residuals within the filters' band; white: departure below {percent(spectra.limit)} %",
+        Column("joint", robot.joint_names),
+        Column("white", ["yes" if white else "no" for white in spectra.white]),
+        Column("departure", spectra.departure, "%", percent),
+        Column(
+            f"power below {0.1 * spectra.band:.2g} Hz\n(white: 10 %)",
+            spectra.low_frequency,
+            "%",
+            percent,
+        ),
+        status=[Status.GOOD if white else Status.DOUBTFUL for white in spectra.white],
+    )
+
+
+def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
+    """Return mass, centre of mass and margin of each body, and the effect of the bounds."""
+    mass, bounded = np.asarray(consistency.bodies)[:, 0], consistency.masses_from_bounds
+    centre = np.asarray(consistency.bodies)[:, 1:4] / mass[:, None]
+    axes = [
+        Column(f"{axis} of\ncentre", centre[:, k], "m", lambda x: significant(x, 2))
+        for k, axis in enumerate("xyz")
+    ]
+    price = f"{100 * consistency.residual_increase:.2g}"
+    proof = f"within {consistency.error_bound:.1e} of it, {consistency.iterations} iterations"
+    loose = [k in bounded for k in range(len(names))]
+    return Table(
+        "physically consistent bodies",
+        Column("body of joint", names),
+        Column("mass", mass, "kg"),
+        *axes,
+        Column("margin", consistency.margins, "%", percent),
+        Column("mass follows from", ["bounds too" if x else "forces" for x in loose]),
+        status=[Status.DOUBTFUL if x else Status.GOOD for x in loose],
+        facts=[
+            ("price", f"{price} % larger weighted residuals than without bounds"),
+            ("optimum", proof),
+            ("active bounds", "; ".join(consistency.active) or "none"),
+        ],
+    )
+
+
+def alternative_table(
+    errors: Sequence[TorqueErrors], others: Sequence[TorqueErrors], names: tuple[str, str]
+) -> Table:
+    """Return the errors of a fit beside those of another solution of the same equations."""
+    means = [[float(np.mean(e.rms_relative)) for e in group] for group in (errors, others)]
+    return Table(
+        "solved otherwise: RMS error in percent of the RMS force, mean of the joints",
+        Column("recording", [e.name for e in errors]),
+        Column(f"this fit ({names[0]})", means[0], "%", percent),
+        Column(names[1], means[1], "%", percent),
+    )
+
+
+def solution_name(solution: AbstractSpectralSolution) -> str:
+    """Return a solution in words, such as `ridge 0.01`."""
+    strength = getattr(solution, "strength", getattr(solution, "rcond", None))
+    if strength is None:
+        return "plain least squares"
+    return f"{type(solution).__name__.lower()} {strength:.2g}"
+
+
+def verdict(
+    fit: Fit,
+    identification: Sequence[TorqueErrors],
+    verification: Sequence[TorqueErrors],
+    definiteness: Definiteness,
+    doubts: Sequence[str] = (),
+) -> list[Remark]:
+    """Return the verdict on a model: one sentence for everything, then one for each criterion."""
+    eigenvalue = significant(definiteness.smallest)
+    found = [
+        _judge_forces(verification or identification, bool(verification)),
+        *_judge_new_motions(identification, verification),
+        dataclasses.replace(
+            fit.determination[0],
+            detail="A combination counts as undetermined if it leaves more than "
+            f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open.",
+        ),
+        Remark(
+            f"Estimates: {dict(fit.facts)['estimates']}",
+            detail="Standard deviation over estimate. A parameter near zero is never known to a "
+            "few percent, and that is no fault: look at its interval.",
+        ),
+        Remark(
+            str(definiteness),
+            Status.GOOD if definiteness.positive_definite else Status.BAD,
+            f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If it is "
+            "negative, do not simulate or control with this model where joints were not moved.",
+        ),
+        *_judge_residuals(fit),
+        _judge_condition(fit),
+        *_judge_bodies(fit),
+        *(Remark(text[:1].upper() + text[1:], Status.DOUBTFUL) for text in dict.fromkeys(doubts)),
+    ]
+    statuses = [remark.status for remark in found]
+    if Status.BAD in statuses:
+        whole = Remark("Do not rely on this model yet: what is marked ✗ comes first.", Status.BAD)
+    elif Status.DOUBTFUL in statuses:
+        text = "A usable model; look at what is marked ! before you rely on it."
+        whole = Remark(text, Status.DOUBTFUL)
+    else:
+        whole = Remark("A good model: all criteria below are met.", Status.GOOD)
+    return [whole, *found]
+
+
+def _judge_forces(recordings: Sequence[TorqueErrors], unseen: bool) -> Remark:
+    on = "logs that the fit has not seen" if unseen else "the logs of the fit"
+    average = max(float(np.mean(e.mean_percent)) for e in recordings)
+    if np.isfinite(average):
+        worst = max(float(np.max(e.mean_percent)) for e in recordings)
+        return Remark(
+            f"On {on}, forces are predicted to {significant(average, 2)} % of the largest forces, "
+            f"averaged over the joints; the worst joint to {significant(worst, 2)} %.",
+            *_grade(average, MEAN_ERROR, "%", "Mean |e| (Eq. 37); the paper states below 1 %."),
+        )
+    worst = 100 * max(float(np.nanmean(e.rms_relative)) for e in recordings)
+    text = f"the RMS error is {significant(worst, 2)} % of the RMS force, averaged over the joints."
+    return Remark(
+        f"On {on}, {text}",
+        *_grade(worst, RMS_ERROR, "%", "The largest forces of the joints are not known."),
+    )
+
+
+def _grade(value: float, limits: tuple[float, float], unit: str, more: str) -> tuple[Status, str]:
+    """Return whether a value is good, tolerable or bad, and the limits in words."""
+    good, tolerable = limits
+    status = Status.GOOD if value <= good else Status.DOUBTFUL if value <= tolerable else Status.BAD
+    return status, f"Good: up to {good:g} {unit}; tolerable: up to {tolerable:g} {unit}. {more}"
+
+
+def _judge_new_motions(
+    identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors]
+) -> list[Remark]:
+    if not verification:
+        text = "The model was not validated on an unseen log: use `--verify` or `--split`."
+        return [Remark(text, Status.DOUBTFUL)]
+    if not identification:
+        return []
+    # Joint by joint, so that large joints do not hide small ones.
+    fitted, unseen = (
+        np.sqrt(np.mean([np.asarray(e.rms) ** 2 for e in group], axis=0))
+        for group in (identification, verification)
+    )
+    ratio = float(np.fmax.reduce(unseen / np.where(fitted > 0, fitted, np.nan)))
+    ratio = ratio if np.isfinite(ratio) else 1.0
+    text = f"RMS errors on unseen logs are up to {significant(ratio, 3)} times those of the fit."
+    more = "More means that the new motion needs what the fit's logs did not show."
+    return [Remark(text, *_grade(ratio, UNSEEN_RATIO, "times", more))]
+
+
+def _judge_residuals(fit: Fit) -> list[Remark]:
+    spectra = fit.residual_spectra
+    if spectra is None:
+        return []
+    joints, white = len(spectra.white), sum(spectra.white)
+    rule = (
+        f"Bartlett's test: the cumulative spectrum of white residuals departs from a straight "
+        f"line by less than {percent(spectra.limit)} % in 95 % of cases. The intervals account "
+        "for correlated residuals."
+    )
+    if white == joints:
+        return [Remark("The residuals are white noise.", Status.GOOD, rule)]
+    if float(np.max(np.asarray(spectra.departure))) <= 2.0 * spectra.limit:
+        text = f"The residuals are nearly white noise (white: {white} of {joints} joints)."
+        return [Remark(text, Status.NEUTRAL, rule)]
+    text = (
+        f"The residuals are not white noise for {joints - white} of {joints} joints: some effect "
+        "is not in the model, or the noise itself is coloured."
+    )
+    return [Remark(text, Status.DOUBTFUL, rule)]
+
+
+def _judge_condition(fit: Fit) -> Remark:
+    number = fit.condition_numbers.scaled
+    rule = f"Good: below {LARGE_CONDITION:g}."
+    text = f"The condition number with columns of length one is {significant(number, 3)}"
+    if number < LARGE_CONDITION:
+        return Remark(text, Status.GOOD, rule)
+    return Remark(f"{text}: some parameters are hard to tell apart.", Status.DOUBTFUL, rule)
+
+
+def _judge_bodies(fit: Fit) -> list[Remark]:
+    if fit.consistency is None:
+        return []
+    text = "All bodies are physically consistent"
+    if active := fit.consistency.active:
+        return [Remark(f"{text}; {len(active)} bounds are active: {'; '.join(active)}.")]
+    return [Remark(f"{text}, and no bound is active.", Status.GOOD)]

@@ -1,101 +1,105 @@
 """HTML pages: texts, tables and figures in one file that needs nothing else."""
 
 import functools
+import importlib.metadata
+import platform
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
+import jax
+import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from jaxid.report.result_json import versions
 from jaxid.report.style import svg_text
-from jaxid.table import Table
+from jaxid.table import Remark, Table
 
-if TYPE_CHECKING:
-    import jinja2
-
-
-class Section(NamedTuple):
-    """Part of a page with a title, which the table of contents shows.
-
-    Attributes:
-        title: Title of the section.
-        blocks: Blocks in their order, made by `block` and `picture`.
-    """
-
-    title: str
-    blocks: Sequence[str]
-
-    @property
-    def anchor(self) -> str:
-        """Target of links to the section."""
-        return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
-
-
-def block(kind: str, *content: Any, **options: Any) -> str:
-    """Return a block of a page as HTML; all texts are escaped.
-
-    Kinds and their content: `paragraph(text)`, `code(text)`, `table(table, titled=True)`,
-    `remarks(remarks)`, `headline(remark)`, `abreast(*blocks)`, `folded(summary, *blocks)`.
-
-    Args:
-        kind: Name of a macro in `templates/page.html`.
-        *content: Content of the block.
-        **options: Options of the macro.
-    """
-    return getattr(_macros(), kind)(*content, **options)
-
-
-def facts(rows: Iterable[tuple[str, Any]]) -> str:
-    """Return a block of words and what is said about each."""
-    return block("table", Table("", facts=rows))
-
-
-def picture(figure: Figure, caption: str = "") -> str:
-    """Return a block that shows a figure, as the plotting library draws it.
-
-    Args:
-        figure: Figure to show.
-        caption: Text below the figure.
-    """
-    svg = svg_text(figure)
-    # Names of groups are the same in every figure of a page, and nothing refers to them.
-    svg = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
-    title = figure.get_suptitle()
-    return block("picture", svg, title, caption)
-
-
-def provenance(settings: Mapping[str, Any]) -> Section:
-    """Return the last section of a page: how to get the same result again.
-
-    Args:
-        settings: Origin of the result, as far as it is known: `facts` (pairs of a word and a
-            text), `command` and `experiment_text`.
-    """
-    blocks = [facts((*settings.get("facts", ()), *versions().items()))]
-    if settings.get("command"):
-        blocks.append(block("code", str(settings["command"])))
-    if settings.get("experiment_text"):
-        text = block("code", str(settings["experiment_text"]))
-        blocks.append(block("folded", "The experiment file", text))
-    return Section("To repeat this", blocks)
+Section = tuple[str, Sequence[Any]]
+"""Title, which the table of contents shows, and blocks as `render_page` takes them."""
 
 
 def render_page(title: str, sections: Sequence[Section], lead: str = "", footer: str = "") -> str:
     """Return a page: readable without network and script, on a phone, on a desk and on paper.
 
-    Args:
-        title: Title of the page and of the browser's window.
-        sections: Sections in their order.
-        lead: Text below the title.
-        footer: Text below everything.
+    Blocks of a section are texts (paragraphs), tables, figures, a remark (the headline), lists of
+    remarks, tuples of blocks beside each other, and what `picture`, `code` and `folded` return.
+    All texts are escaped.
     """
-    return str(block("page", title, sections, lead, footer))
+    shown = [
+        (name, re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-"), [*map(_render, blocks)])
+        for name, blocks in sections
+    ]
+    return str(_macros().page(title, shown, lead, footer))
+
+
+def _render(block: Any) -> Markup:
+    macros = _macros()
+    match block:
+        case Markup():
+            return block
+        case str():
+            return macros.paragraph(block)
+        case Remark():
+            return macros.headline(block)
+        case Table():
+            return macros.table(block)
+        case Figure():
+            return picture(block)
+        case tuple():
+            return macros.abreast(*map(_render, block))
+        case _:
+            return macros.remarks(block)
+
+
+def picture(figure: Figure, caption: str = "") -> Markup:
+    """Return a block with a figure, as the plotting library draws it, and a text below it."""
+    svg = svg_text(figure)
+    # Names of groups are the same in every figure of a page, and nothing refers to them.
+    svg = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
+    return _macros().picture(svg, figure.get_suptitle(), caption)
+
+
+def code(text: str) -> Markup:
+    """Return a block with a text in a fixed-width font."""
+    return _macros().code(text)
+
+
+def folded(summary: str, *blocks: Any) -> Markup:
+    """Return blocks that are shown when the reader opens them."""
+    return _macros().folded(summary, *map(_render, blocks))
+
+
+def provenance(settings: Mapping[str, Any]) -> Section:
+    """Return the last section of a page: how to get the same result again.
+
+    Of `settings`, `facts` (pairs of a word and a text), `command` and `experiment_text` are shown.
+    """
+    blocks: list[Any] = [Table("", facts=(*settings.get("facts", ()), *versions().items()))]
+    if settings.get("command"):
+        blocks.append(code(str(settings["command"])))
+    if settings.get("experiment_text"):
+        blocks.append(folded("The experiment file", code(str(settings["experiment_text"]))))
+    return "To repeat this", blocks
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software that computed a result."""
+    try:
+        own = importlib.metadata.version("jaxid-robotics")
+    except importlib.metadata.PackageNotFoundError:
+        own = "not installed"
+    return {
+        "jaxid": own,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
 
 
 @functools.cache
-def _macros() -> "jinja2.environment.TemplateModule":
+def _macros() -> Any:
     # Commands that write no page do not wait for it.
     import jinja2
 

@@ -6,19 +6,18 @@ The figures of the paper: `path` (Figs. 3, 8), `joints` (Fig. 4), `filtered` (Fi
 `jaxid` loads this module, and matplotlib, when `jid.plot` is first used.
 """
 
-from jaxid.report.errors import bar_figure as bars
-from jaxid.report.errors import distance_figure as distances
-from jaxid.report.errors import error_figure as errors
+from jaxid.report.fit import autocorrelation_figure as autocorrelation
+from jaxid.report.fit import comparison_figure as comparison
+from jaxid.report.fit import filter_figure as filter_choice
+from jaxid.report.fit import parameter_figure as parameters
+from jaxid.report.fit import residual_figure as residuals
+from jaxid.report.motion import animation as animation
 from jaxid.report.motion import filtered_figure as filtered
 from jaxid.report.motion import joint_figure as joints
+from jaxid.report.motion import path_figure as path
+from jaxid.report.motion import pose_figure as poses
 from jaxid.report.motion import tip_figure as end_effector
-from jaxid.report.parameters import comparison_figure as comparison
-from jaxid.report.parameters import filter_figure as filter_choice
-from jaxid.report.parameters import parameter_figure as parameters
-from jaxid.report.residuals import autocorrelation_figure as autocorrelation
-from jaxid.report.residuals import residual_figure as residuals
-from jaxid.report.robot_figures import animation as animation
-from jaxid.report.robot_figures import path_figure as path
-from jaxid.report.robot_figures import pose_figure as poses
 from jaxid.report.style import save as save
+from jaxid.report.torques import bar_figure as bars
+from jaxid.report.torques import error_figure as errors
 from jaxid.report.torques import torque_figure as torques

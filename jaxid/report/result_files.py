@@ -1,40 +1,62 @@
-"""Reports on disk: pages and figures for people, numbers for programs, written atomically."""
+"""Results on disk: pages and figures for people, numbers for programs, written atomically."""
 
 import csv
 import dataclasses
+import datetime
+import math
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 from jaxid.identification.choices import FilterChoice
-from jaxid.identification.comparison import LEVEL, Comparison
+from jaxid.identification.comparison import LEVEL, Comparison, parameter_kinds
+from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit, load
+from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
-from jaxid.report.errors import error_figure
-from jaxid.report.identification import identification_page
-from jaxid.report.parameters import comparison_figure, filter_figure, parameter_figure
-from jaxid.report.residuals import autocorrelation_figure, residual_figure
-from jaxid.report.result_json import (
-    SCHEMAS,
-    Alternative,
-    comparison_rows,
-    header,
-    identification_record,
-    parameter_rows,
-    plain,
+from jaxid.report.fit import (
+    autocorrelation_figure,
+    comparison_figure,
+    filter_figure,
+    parameter_figure,
+    residual_figure,
 )
+from jaxid.report.identification import identification_page
+from jaxid.report.page import versions
 from jaxid.report.style import save
-from jaxid.report.torques import torque_figure
+from jaxid.report.torques import error_figure, torque_figure
+from jaxid.robot.robot import Robot
 from jaxid.validation import Definiteness, TorqueErrors
 
 MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""
+SCHEMAS = {
+    f"{kind}.json": f"jaxid-{kind}/1"
+    for kind in ("result", "comparison", "payload", "gains", "states", "demo")
+}
+"""Files that hold results, and the schemas in them."""
+
+
+class Alternative(NamedTuple):
+    """Another solution of the same equations, shown beside a fit.
+
+    Attributes:
+        fit: Other fit.
+        errors: Errors of the other fit on the same recordings.
+        names: Names of the fit's own solution and of the other one.
+    """
+
+    fit: Fit
+    errors: Sequence[TorqueErrors]
+    names: tuple[str, str]
 
 
 def write_report(
@@ -50,33 +72,13 @@ def write_report(
     doubts: Sequence[str] = (),
     pdf: bool = False,
 ) -> list[Path]:
-    """Write `report.html`, `result.json`, `parameters.csv`, `model.json` and figures.
+    """Write `report.html`, `result.json`, `parameters.csv`, `model.json` and figures; return them.
 
     A folder that exists keeps its other files; files of an earlier report in it are replaced.
-
-    Args:
-        folder: Folder of the report; made with its parents.
-        fit: Identified parameters.
-        identification: Errors on the recordings of the fit.
-        verification: Errors on recordings that the fit has not seen.
-        definiteness: Definiteness of the mass matrix.
-        settings: Origin of the result, for the record.
-        notes: Notes for the reader, in sentences.
-        alternative: Another solution of the same equations.
-        choice: Choice of the filter, where it was left to the logs.
-        doubts: Doubts about the logs, in sentences.
-        pdf: Whether figures are written as PDF too.
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: If there are no errors to show, or `folder` is a file.
+    `settings` tell the origin of the result, `notes` and `doubts` about the logs are sentences.
     """
-    record = identification_record(
-        fit, identification, verification, definiteness, settings, notes, alternative
-    )
-    figures = _figures(fit, identification, verification, choice)
+    record = _record(fit, identification, verification, definiteness, settings, notes, alternative)
+    figures = _draw(fit, identification, verification, choice)
     page = identification_page(
         fit, identification, verification, definiteness, settings, figures, notes, doubts
     )
@@ -94,42 +96,35 @@ def write_report(
     return [folder / name for name in names]
 
 
-def _figures(
+def _draw(
     fit: Fit,
     identification: Sequence[TorqueErrors],
     verification: Sequence[TorqueErrors],
     choice: FilterChoice | None,
 ) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
-    robot = fit.base.model.robot
+    robot, spectra = fit.base.model.robot, fit.residual_spectra
     figures = {
         "errors": error_figure(identification, verification, robot),
         "parameters": parameter_figure(fit),
     }
     if choice is not None:
         figures["filter"] = filter_figure(choice)
-    if fit.residual_spectra is not None:
-        figures["residuals"] = residual_figure(fit.residual_spectra, robot)
+    if spectra is not None:
+        figures["residuals"] = residual_figure(spectra, robot)
         longest = max(identification, key=lambda errors: len(errors.time))
-        figures["autocorrelation"] = autocorrelation_figure(longest, robot, fit.residual_spectra)
-    roles = (("identification", identification), ("verification", verification))
-    recordings = [(role, errors) for role, group in roles for errors in group]
-    for (role, errors), stem in zip(recordings, _stems(recordings), strict=True):
-        title = errors.name if errors.name == role else f"{errors.name} ({role})"
-        figures[f"torque_{stem}"] = torque_figure(errors, robot, title)
-    return figures
-
-
-def _stems(recordings: Iterable[tuple[str, TorqueErrors]]) -> list[str]:
-    """Return a file name without suffix for every recording, unique also where case is ignored."""
-    stems: list[str] = []
+        figures["autocorrelation"] = autocorrelation_figure(longest, robot, spectra)
     used: set[str] = set()
-    for role, errors in recordings:
-        stem = safe_name(errors.name)
-        choices = (stem, f"{stem}_{role}", *(f"{stem}_{role}_{k}" for k in range(2, 10_000)))
-        stems.append(next(choice for choice in choices if choice.lower() not in used))
-        used.add(stems[-1].lower())
-    return stems
+    for role, group in (("identification", identification), ("verification", verification)):
+        for errors in group:
+            stem = safe_name(errors.name)
+            more = (f"{stem}_{role}_{k}" for k in range(2, 10_000))
+            # Unique also where case is ignored.
+            stem = next(x for x in (stem, f"{stem}_{role}", *more) if x.lower() not in used)
+            used.add(stem.lower())
+            title = errors.name if errors.name == role else f"{errors.name} ({role})"
+            figures[f"torque_{stem}"] = torque_figure(errors, robot, title)
+    return figures
 
 
 def safe_name(name: str) -> str:
@@ -151,15 +146,7 @@ def _earlier_files(folder: Path) -> set[str]:
 
 
 def read_fit(folder: Path, name: str | None = None) -> Fit:
-    """Read the fit of a report.
-
-    Args:
-        folder: Folder that `write_report` has written.
-        name: Name of the fit; the folder's name if None.
-
-    Raises:
-        InputError: If the folder holds no report, or its model file is damaged.
-    """
+    """Read the fit of a report; its name is the folder's by default."""
     folder = folder.parent if folder.is_file() else folder
     if not (folder / MODEL).is_file():
         raise InputError(
@@ -173,31 +160,46 @@ def read_fit(folder: Path, name: str | None = None) -> Fit:
 def write_comparison(
     folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
 ) -> list[Path]:
-    """Write `comparison.json`, `comparison.csv` and `comparison.png`.
-
-    Args:
-        folder: Folder of the files; made with its parents.
-        comparison: Comparison of two fits.
-        sources: Reports that were compared, for the record.
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: If `folder` is a file.
-    """
-    rows = comparison_rows(comparison)
+    """Write `comparison.json`, `comparison.csv` and `comparison.png`; return the files."""
+    first, second, k = comparison.first, comparison.second, list(comparison.indices)
+    rows = _rows(
+        name=comparison.names,
+        expression=[first.base.expressions[i] for i in k],
+        unit=comparison.units,
+        group=comparison.kinds,
+        first=np.asarray(first.parameters)[k],
+        first_standard_deviation=first.standard_deviations[k],
+        second=np.asarray(second.parameters)[k],
+        second_standard_deviation=second.standard_deviations[k],
+        difference=comparison.difference,
+        half_width=comparison.half_widths,
+        p_value=comparison.p_values,
+        adjusted_p_value=comparison.adjusted_p_values,
+        verdict=[v.value for v in comparison.verdicts],
+    )
     content = {
-        "first": comparison.first.name,
-        "second": comparison.second.name,
+        "first": first.name,
+        "second": second.name,
         "sources": [str(source) for source in sources],
         "level": comparison.level,
         "parameters": rows,
         "covariance_of_differences": comparison.uncertainty.covariance,
         "groups": comparison.groups,
     }
-    figures = {"comparison.png": comparison_figure(comparison)}
-    return _write_table(folder, "comparison", content, rows, figures)
+    return _write_table(folder, "comparison", content, rows, comparison_figure(comparison))
+
+
+def estimate_rows(
+    names: Sequence[str], units: Sequence[str], values: AnyArray, uncertainty: Uncertainty
+) -> list[dict[str, Any]]:
+    """Return estimates of a payload, of gains or of states, one row for each."""
+    return _rows(
+        name=names,
+        unit=units,
+        estimate=values,
+        standard_deviation=uncertainty.standard_deviations,
+        half_width=uncertainty.half_widths(),
+    )
 
 
 def write_estimates(
@@ -208,22 +210,7 @@ def write_estimates(
     content: Mapping[str, Any],
     sources: Mapping[str, Sequence[Path]],
 ) -> list[Path]:
-    """Write the estimates of a payload, of gains or of states as JSON and CSV.
-
-    Args:
-        folder: Folder of the files; made with its parents.
-        kind: Name of both files without suffix: `payload`, `gains` or `states`.
-        rows: Rows of the table, as `estimate_rows` makes them.
-        covariance: Covariance of the estimates, or of the first of them.
-        content: Further content of the JSON file.
-        sources: Logs and reports that were used, for the record.
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: If `folder` is a file.
-    """
+    """Write a payload, gains or states as `{kind}.json` and `{kind}.csv`; return the files."""
     everything = {
         "sources": {key: [str(p) for p in paths] for key, paths in sources.items()},
         "level": LEVEL,
@@ -231,7 +218,7 @@ def write_estimates(
         "covariance": covariance,
         **content,
     }
-    return _write_table(folder, kind, everything, rows, {})
+    return _write_table(folder, kind, everything, rows)
 
 
 def _write_table(
@@ -239,14 +226,14 @@ def _write_table(
     stem: str,
     content: Mapping[str, Any],
     rows: list[dict[str, Any]],
-    figures: Mapping[str, Figure],
+    figure: Figure | None = None,
 ) -> list[Path]:
-    names = [f"{stem}.json", f"{stem}.csv", *figures]
+    names = [f"{stem}.json", f"{stem}.csv", *([f"{stem}.png"] if figure else [])]
     with atomic_folder(folder) as staging:
         write_json(staging / names[0], plain({**header(names[0]), **content}))
         write_csv(staging / names[1], rows)
-        for name, figure in figures.items():
-            save(figure, staging / name)
+        if figure is not None:
+            save(figure, staging / names[2])
     return [folder / name for name in names]
 
 
@@ -261,3 +248,193 @@ def write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: arrays become lists, NaN and infinity become null."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return plain(np.asarray(value).tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def header(file: str) -> dict[str, Any]:
+    """Return schema, date and versions, the first entries of a result file."""
+    date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return {"schema": SCHEMAS[file], "made": {"date": date, "versions": versions()}}
+
+
+def _entries(source: Any, names: str, **renamed: str) -> dict[str, Any]:
+    """Return attributes by their names, and those whose keys differ from them."""
+    keys = {**{name: name for name in names.split()}, **renamed}
+    return {key: getattr(source, name) for key, name in keys.items()}
+
+
+def _rows(**columns: Any) -> list[dict[str, Any]]:
+    """Return a dictionary for each row of some columns."""
+    values = (x.tolist() if isinstance(x, np.ndarray | jax.Array) else x for x in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+
+
+def _record(
+    fit: Fit,
+    identification: Sequence[TorqueErrors],
+    verification: Sequence[TorqueErrors],
+    definiteness: Definiteness,
+    settings: Mapping[str, Any],
+    notes: Sequence[str],
+    alternative: Alternative | None,
+) -> dict[str, Any]:
+    """Return the content of `result.json`."""
+    base, model, robot = fit.base, fit.base.model, fit.base.model.robot
+    return plain(
+        {
+            **header("result.json"),
+            "robot": _robot_record(robot),
+            "base_parameters": parameter_rows(fit),
+            "lengths": base.lengths,
+            "model": {
+                "terms": [str(term) for term in model.terms],
+                "standard_names": model.parameter_names,
+                "standard_units": model.parameter_units,
+                "independent": base.indices,
+                "dependent": base.dependent,
+                "kappa": base.kappa,
+            },
+            "fit": _fit_record(fit),
+            "consistency": consistency_record(fit),
+            "errors": {
+                "identification": [_error_record(e, robot) for e in identification],
+                "verification": [_error_record(e, robot) for e in verification],
+            },
+            "mass_matrix": _entries(
+                definiteness,
+                "positive_definite pose poses",
+                smallest_eigenvalue="smallest",
+                indefinite_share="indefinite",
+            ),
+            "beside": alternative
+            and {
+                "way": alternative.names[1],
+                "solution": str(alternative.fit.solution),
+                "errors": [_error_record(e, robot) for e in alternative.errors],
+            },
+            "settings": settings,
+            "notes": tuple(dict.fromkeys((*robot.notes, *fit.notes, *notes))),
+        }
+    )
+
+
+def parameter_rows(fit: Fit) -> list[dict[str, Any]]:
+    """Return the base parameters, one row for each, in their order."""
+    low, high = fit.intervals(0.95).T
+    return _rows(
+        name=fit.base.names,
+        expression=fit.base.expressions,
+        unit=fit.base.units,
+        group=parameter_kinds(fit.base),
+        estimate=fit.parameters,
+        standard_deviation=fit.standard_deviations,
+        relative=fit.relative_standard_deviations,
+        low_95=low,
+        high_95=high,
+        degrees_of_freedom=fit.uncertainty.dof,
+        naive_standard_deviation=fit.naive_standard_deviations,
+        ratio_to_naive=fit.uncertainty.ratios,
+    )
+
+
+def _fit_record(fit: Fit) -> dict[str, Any]:
+    spectra = fit.residual_spectra
+    kept = "estimator solution recordings rows weights residual residual_rms covariance"
+    return {
+        **_entries(fit, kept),
+        "condition_numbers": _entries(fit.condition_numbers, "raw weighted scaled"),
+        "naive_covariance": fit.uncertainty.naive_covariance,
+        "jackknife_standard_deviations": fit.uncertainty.jackknife,
+        "residuals": spectra
+        and _entries(
+            spectra,
+            "white departure limit band frequency density",
+            slow_share="low_frequency",
+            filter_gain="gain",
+        ),
+        "undetermined": [
+            {
+                "sentence": direction.sentence(fit.base),
+                "parameters": [fit.base.names[k] for k in direction.parts],
+                **_entries(direction, "shares singular_value uncertainty"),
+            }
+            for direction in fit.undetermined
+        ],
+        "undetermined_above": LARGEST_UNCERTAINTY,
+    }
+
+
+def consistency_record(fit: Fit) -> dict[str, Any] | None:
+    """Return all standard parameters of a physically consistent estimate; None for others."""
+    found, model = fit.consistency, fit.base.model
+    if found is None or fit.full_parameters is None:
+        return None
+    return {
+        **_entries(
+            found,
+            "error_bound iterations",
+            price="residual_increase",
+            assumed="bounds",
+            active_bounds="active",
+            shares_of_a_body="margins",
+        ),
+        "proved": found.outcome.name == "CERTIFIED",
+        "outcome": found.outcome.value,
+        "masses_from_bounds": [f"m{k + 1}" for k in found.masses_from_bounds],
+        "standard_parameters": _rows(
+            name=model.parameter_names,
+            unit=model.parameter_units,
+            estimate=fit.full_parameters,
+            follows_from_forces_alone=found.determined,
+        ),
+    }
+
+
+def _robot_record(robot: Robot) -> dict[str, Any]:
+    limits, joints = robot.limits, range(robot.joints)
+    names = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
+    return {
+        **_entries(robot, "name source gravity"),
+        "joints": _rows(
+            name=robot.joint_names,
+            kind=["revolute" if revolute else "prismatic" for revolute in robot.revolute],
+            unit=[robot.joint_unit(j) for j in joints],
+            force_unit=[robot.force_unit(j) for j in joints],
+            parent=robot.parent,
+            axis=robot.axis,
+            rotation=robot.rotation,
+            offset=robot.offset,
+            **{name: getattr(limits, name) for name in names},
+        ),
+        "drives": _entries(robot.drives, "reduction zero max_torques rotor_inertia"),
+        "tool": robot.tool and _entries(robot.tool, "body mass centre_of_mass inertia"),
+        "tip": _entries(robot, "", body="tip_body", rotation="tip_rotation", offset="tip_offset"),
+    }
+
+
+def _error_record(errors: TorqueErrors, robot: Robot) -> dict[str, Any]:
+    return {
+        **_entries(errors, "relative", recording="name"),
+        "joints": _rows(
+            name=robot.joint_names,
+            unit=[robot.force_unit(j) for j in range(robot.joints)],
+            rows=np.asarray(errors.counted).sum(axis=0),
+            mean=errors.mean,
+            rms=errors.rms,
+            mean_percent=errors.mean_percent,
+            rms_percent=errors.rms_percent,
+            rms_relative=errors.rms_relative,
+        ),
+    }

@@ -2,16 +2,19 @@
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import matplotlib.style
+import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine, PlaceHolderLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 # The palette of Okabe and Ito, which colour-blind readers can tell apart.
@@ -42,14 +45,10 @@ _SETTINGS = {
     "axes.unicode_minus": True,
     "grid.color": PALE,
     "grid.linewidth": 0.5,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 3,
-    "ytick.major.size": 3,
+    **{f"{axis}tick.labelsize": 8 for axis in "xy"},
+    **{f"{axis}tick.color": GREY for axis in "xy"},
+    **{f"{axis}tick.major.width": 0.6 for axis in "xy"},
+    **{f"{axis}tick.major.size": 3 for axis in "xy"},
     "legend.frameon": False,
     "legend.fontsize": 9,
     "legend.handlelength": 1.6,
@@ -60,35 +59,40 @@ _SETTINGS = {
 }
 
 
-@contextlib.contextmanager
-def house_style(**settings: Any) -> Iterator[None]:
-    """Apply the settings of matplotlib within a block; the user's settings are restored after it.
-
-    Args:
-        **settings: Further settings, with `_` in place of the dots.
-    """
+def house_style(**settings: Any) -> contextlib.AbstractContextManager[None]:
+    """Return a context with the settings of matplotlib, and further ones (`_` for the dots)."""
     further = {key.replace("_", "."): value for key, value in settings.items()}
-    with matplotlib.style.context(["default", {**_SETTINGS, **further}]):
-        yield
+    return matplotlib.style.context(["default", {**_SETTINGS, **further}])
 
 
-def new_figure(width: float, height: float, gap: float = 0.06) -> Figure:
-    """Return an empty figure that belongs to no window and no list of figures.
+@contextlib.contextmanager
+def drawing(
+    title: str, width: float = WIDTH, height: float = 4.2, gap: float = 0.06
+) -> Iterator[Figure]:
+    """Yield an empty figure [inch] with a title, and apply the house style to the block."""
+    with house_style():
+        layout = ConstrainedLayoutEngine(h_pad=gap, w_pad=0.06)
+        # The figure belongs to no window and no list of figures.
+        figure = Figure(figsize=(width, height), layout=layout)
+        FigureCanvasAgg(figure)
+        figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold")
+        yield figure
 
-    Args:
-        width: Width of the figure [inch].
-        height: Height of the figure [inch].
-        gap: Space above and below each panel [inch].
-    """
-    layout = ConstrainedLayoutEngine(h_pad=gap, w_pad=0.06)
-    figure = Figure(figsize=(width, height), layout=layout)
-    FigureCanvasAgg(figure)
-    return figure
+
+def add_legend(figure: Figure, *entries: tuple[str, Mapping[str, Any]] | Artist) -> None:
+    """Add a legend below all panels: labels with the properties of their lines, or artists."""
+    handles = [
+        entry if isinstance(entry, Artist) else Line2D([], [], label=entry[0], **entry[1])
+        for entry in entries
+    ]
+    figure.legend(handles=handles, loc="outside lower left", ncols=len(handles))
 
 
-def heading(figure: Figure, text: str) -> None:
-    """Write the title of a figure at its top left."""
-    figure.suptitle(text, x=0.01, ha="left", fontsize=12, fontweight="bold")
+def label_time(panels: Iterable[Axes], time: np.ndarray) -> None:
+    """Label the axis of time of the lowest panels, and limit it to the samples."""
+    for axes in panels:
+        axes.set_xlabel("time [s]")
+        axes.set_xlim(float(time[0]), float(time[-1]))
 
 
 def caption(axes: Axes, left: str, right: str = "") -> None:
@@ -124,19 +128,19 @@ def save(figure: Figure, path: str | Path) -> None:
 
     Args:
         figure: Figure to write.
-        path: File, whose suffix tells the format.
+        path: Path of the file, whose suffix tells the format.
     """
-    _lay_out(figure)
     unwanted = {".png": "Software", ".pdf": "CreationDate"}.get(Path(path).suffix, "Date")
     with house_style():
+        _lay_out(figure)
         figure.savefig(path, dpi=150, metadata={unwanted: None})
 
 
 def svg_text(figure: Figure) -> str:
     """Return a figure as an SVG element for a page, with text as letters."""
-    _lay_out(figure)
     file = io.StringIO()
     with house_style(svg_fonttype="none", svg_hashsalt=figure.get_suptitle()):
+        _lay_out(figure)
         figure.savefig(file, format="svg", metadata={"Date": None})
     return file.getvalue()
 
@@ -145,6 +149,5 @@ def _lay_out(figure: Figure) -> None:
     """Find the layout of a figure once: it takes longer than to draw."""
     engine = figure.get_layout_engine()
     if engine is not None and not isinstance(engine, PlaceHolderLayoutEngine):
-        with house_style():
-            engine.execute(figure)
+        engine.execute(figure)
         figure.set_layout_engine("none")

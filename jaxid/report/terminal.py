@@ -21,12 +21,7 @@ STYLES = {
 
 
 def show(console: Console, *tables: Table) -> None:
-    """Print tables, each with an empty line before it.
-
-    Args:
-        console: Terminal.
-        *tables: Tables to print.
-    """
+    """Print tables, each with an empty line before it."""
     for table in tables:
         console.print()
         for line in table.lines(console.width):
@@ -35,12 +30,7 @@ def show(console: Console, *tables: Table) -> None:
 
 
 def show_remarks(console: Console, remarks: Iterable[Remark | str]) -> None:
-    """Print remarks, one paragraph each.
-
-    Args:
-        console: Terminal.
-        remarks: Sentences, or remarks with a status.
-    """
+    """Print remarks, one paragraph each."""
     unique = tuple(dict.fromkeys(remarks))
     if unique:
         show(console, Table("", remarks=unique))

@@ -1,30 +1,29 @@
-"""Measured and predicted forces over time, joint by joint (Figs. 6, 7 and 9 of the paper)."""
+"""Measured and predicted forces over time, and their errors (Figs. 6, 7, 9 and 10 of the paper)."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 from jaxid.report.style import (
+    BLUE,
     ERROR,
     GREEN,
     GREY,
+    INK,
     MEASURED,
     ORANGE,
     PREDICTED,
     PURPLE,
     WIDTH,
+    add_legend,
     caption,
-    heading,
-    house_style,
-    new_figure,
+    drawing,
 )
 from jaxid.robot.robot import Robot
 from jaxid.table import percent, shortened, significant
@@ -36,7 +35,6 @@ def torque_figure(
     robot: Robot,
     title: str | None = None,
     joints: Sequence[int] | None = None,
-    beside: Sequence[tuple[str, TorqueErrors]] = (),
 ) -> Figure:
     """Draw measured and predicted forces of every joint, and their difference below.
 
@@ -48,16 +46,11 @@ def torque_figure(
         robot: Robot of the recording.
         title: Title of the figure; the recording's name if None.
         joints: Indices of the joints to show, from 0; all if None.
-        beside: Other predictions of the same recording, with their names.
 
     Raises:
         InputError: If the numbers of joints differ, there is no such joint, or no row counts.
     """
-    colours = dict(zip((GREEN, ORANGE, PURPLE), beside, strict=False))
-    if len(colours) < len(beside):
-        raise InputError(f"`beside` must hold 3 predictions at most, but holds {len(beside)}.")
-    for one in (errors, *(other for _, other in beside)):
-        require_joints(one, robot)
+    require_joints(errors, robot)
     shown = range(robot.joints) if joints is None else tuple(joints)
     if not shown or not set(shown) <= set(range(robot.joints)):
         raise InputError(
@@ -71,8 +64,9 @@ def torque_figure(
     window = slice(counted[0], counted[-1] + 1)
     columns = 1 if len(shown) <= 2 else 2 if len(shown) <= 16 else 3
     rows = math.ceil(len(shown) / columns)
-    with house_style():
-        figure = new_figure(WIDTH if columns < 3 else 15.0, 0.95 + 2.15 * rows, gap=0.045)
+    name = shortened(errors.name if title is None else title, 40)
+    title = f"{name}: relative error {percent(errors.relative)} %"
+    with drawing(title, WIDTH if columns < 3 else 15.0, 0.95 + 2.15 * rows, 0.045) as figure:
         grid = figure.add_gridspec(rows, columns)
         panels = []
         for place, j in enumerate(shown):
@@ -80,45 +74,38 @@ def torque_figure(
             cell = grid[divmod(place, columns)].subgridspec(3, 1, height_ratios=(3, 1, 0.22))
             upper = figure.add_subplot(cell[0])
             lower = figure.add_subplot(cell[1], sharex=upper)
-            panels.append((upper, lower))
-            for colour, (_, other) in colours.items():
-                _draw_line(upper, other, other.predicted, j, window, color=colour, lw=0.8)
-                _draw_line(lower, other, other.errors, j, window, color=colour, lw=0.6)
             _draw_joint(upper, lower, errors, robot, j, window)
-            _scale(lower, [one.errors[window, j] for one in (errors, *(e for _, e in beside))])
+            panels.append((upper, lower))
             if place + columns >= len(shown):
                 lower.set_xlabel("time [s]")
         for column in range(columns):
             figure.align_ylabels([axes for pair in panels[column::columns] for axes in pair])
-        name = shortened(errors.name if title is None else title, 40)
-        heading(figure, f"{name}: relative error {percent(errors.relative)} %")
-        entries = [
-            (MEASURED, "measured"),
-            (PREDICTED, "predicted"),
-            *((colour, name) for colour, (name, _) in colours.items()),
-            (ERROR, "predicted - measured, on a scale of its own"),
-        ]
-        handles = [Line2D([], [], color=colour, lw=1.6, label=name) for colour, name in entries]
-        figure.legend(handles=handles, loc="outside lower left", ncols=len(handles))
+        add_legend(
+            figure,
+            ("measured", {"color": MEASURED, "lw": 1.6}),
+            ("predicted", {"color": PREDICTED, "lw": 1.6}),
+            ("predicted - measured, on a scale of its own", {"color": ERROR, "lw": 1.6}),
+        )
     return figure
-
-
-def _draw_line(
-    axes: Axes, errors: TorqueErrors, values: AnyArray, j: int, window: slice, **style: Any
-) -> None:
-    time, column = np.asarray(errors.time)[window], np.asarray(values)[window, j]
-    axes.plot(*decimate(time, column, bins=700), **style)
 
 
 def _draw_joint(
     upper: Axes, lower: Axes, errors: TorqueErrors, robot: Robot, j: int, window: slice
 ) -> None:
-    unit = robot.force_unit(j)
-    time = np.asarray(errors.time)[window]
-    _draw_line(upper, errors, errors.measured, j, window, color=MEASURED, lw=1.9)
-    _draw_line(upper, errors, errors.predicted, j, window, color=PREDICTED, lw=0.8)
-    _draw_line(lower, errors, errors.errors, j, window, color=ERROR, lw=0.6)
-    caption(upper, shortened(robot.joint_names[j], 26), _mean_error(errors, j, unit))
+    unit, time = robot.force_unit(j), np.asarray(errors.time)[window]
+    difference = errors.errors[window, j]
+    for axes, values, colour, width in (
+        (upper, np.asarray(errors.measured)[window, j], MEASURED, 1.9),
+        (upper, np.asarray(errors.predicted)[window, j], PREDICTED, 0.8),
+        (lower, difference, ERROR, 0.6),
+    ):
+        axes.plot(*decimate(time, values, bins=700), color=colour, lw=width)
+    text = "no row counts"
+    if np.isfinite(difference).any():
+        fraction = errors.mean_percent[j] / 100.0
+        text = f"mean |e| {significant(errors.mean[j], 2)} {unit}"
+        text += f" = {percent(fraction)} % of max" if np.isfinite(fraction) else ""
+    caption(upper, shortened(robot.joint_names[j], 26), text)
     upper.set_ylabel(f"{'torque' if robot.revolute[j] else 'force'} [{unit}]")
     lower.set_ylabel(f"[{unit}]")
     upper.tick_params(labelbottom=False)
@@ -126,29 +113,12 @@ def _draw_joint(
     upper.yaxis.set_major_locator(MaxNLocator(5))
     lower.yaxis.set_major_locator(MaxNLocator(2, symmetric=True, min_n_ticks=3))
     lower.axhline(0.0, color=GREY, lw=0.5)
-
-
-def _scale(axes: Axes, differences: Sequence[np.ndarray]) -> None:
-    """Centre a panel at zero, with room for all differences."""
-    sizes = np.abs(np.concatenate(differences))
-    largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
-    axes.set_ylim(*np.array([-1.1, 1.1]) * (largest if largest > 0 else 1.0))
-
-
-def _mean_error(errors: TorqueErrors, j: int, unit: str) -> str:
-    if not np.asarray(errors.counted)[:, j].any():
-        return "no row counts"
-    mean, fraction = errors.mean[j], errors.mean_percent[j] / 100.0
-    text = f"mean |e| {significant(mean, 2)} {unit}"
-    return f"{text} = {percent(fraction)} % of max" if np.isfinite(fraction) else text
+    largest = float(np.fmax.reduce(np.abs(difference), initial=0.0))
+    lower.set_ylim(*np.array([-1.1, 1.1]) * (largest if largest > 0 else 1.0))
 
 
 def require_joints(errors: TorqueErrors, robot: Robot) -> None:
-    """Reject errors of another robot.
-
-    Raises:
-        InputError: If the numbers of joints differ.
-    """
+    """Reject errors of another robot."""
     if errors.measured.shape[1] != robot.joints:
         raise InputError(
             f"`errors` of `{errors.name}` belong to {errors.measured.shape[1]} joints, but the "
@@ -163,11 +133,6 @@ def decimate(
 
     A peak of one sample stays visible however long the log is. Gaps in time become NaN, at which
     a line breaks; values that are NaN stay out of their bin.
-
-    Args:
-        time: Rising instants of the values [s].
-        values: Values, NaN where there is none.
-        bins: Number of intervals of equal duration, about one for each pixel.
     """
     t, y = np.asarray(time), np.asarray(values)
     if len(t) <= 2 * bins:
@@ -184,3 +149,105 @@ def decimate(
     gaps = np.flatnonzero(np.diff(place[first]) > 1) + 1
     times, points = (np.insert(x, gaps, np.nan, axis=0) for x in (times, points))
     return times.ravel(), points.ravel()
+
+
+def error_figure(
+    identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors], robot: Robot
+) -> Figure:
+    """Draw mean absolute errors as bars and RMS errors as marks (Eq. 37, Fig. 10).
+
+    In percent of the largest forces; of the RMS of the measured forces if a largest one is not
+    known. Several recordings count as one.
+
+    Args:
+        identification: Errors on the recordings of the fit.
+        verification: Errors on recordings that the fit has not seen; may be empty.
+        robot: Robot of the recordings.
+
+    Raises:
+        InputError: If there is no recording at all, or the numbers of joints differ.
+    """
+    if not (*identification, *verification):
+        raise InputError("`identification` or `verification` must hold errors, but both are empty.")
+    groups = (("identification", identification), ("verification", verification))
+    return bar_figure(groups, robot)
+
+
+def bar_figure(groups: Sequence[tuple[str, Sequence[TorqueErrors]]], robot: Robot) -> Figure:
+    """Draw mean absolute errors as bars and RMS errors as marks, for several groups (Eq. 37).
+
+    In percent of the largest forces; of the RMS of the measured forces if a largest one is not
+    known. Recordings of one group count as one.
+
+    Args:
+        groups: Names, and errors on some recordings, like those of one estimator; groups without
+            recordings are left out.
+        robot: Robot of the recordings.
+
+    Raises:
+        InputError: If there is no recording at all, there are too many groups, or the numbers of
+            joints differ.
+    """
+    colours = (BLUE, ORANGE, GREEN, PURPLE)
+    filled = [(name, recordings) for name, recordings in groups if recordings]
+    if not 0 < len(filled) <= len(colours):
+        raise InputError(
+            f"`groups` must hold 1 to {len(colours)} groups with errors, but holds {len(filled)}."
+        )
+    everything = [errors for _, recordings in filled for errors in recordings]
+    for errors in everything:
+        require_joints(errors, robot)
+    largest, n = np.asarray(everything[0].max_forces), robot.joints
+    known = bool(np.isfinite(largest).all())
+    width = min(0.36, 0.72 / len(filled))
+    figure_width = max(7.6, min(2.0 + 1.1 * n, 1.4 * WIDTH))
+    with drawing(f"{robot.name}: torque errors", figure_width, 4.4) as figure:
+        axes = figure.add_subplot()
+        for k, (colour, (label, recordings)) in enumerate(zip(colours, filled, strict=False)):
+            mean, rms, force_rms = _pool(recordings)
+            scale = 100.0 / (largest if known else np.maximum(force_rms, 1e-300))
+            place = np.arange(n) + (k - 0.5 * (len(filled) - 1)) * (width + 0.02)
+            average = percent(float(np.mean(mean * scale)) / 100.0)
+            label = f"{label}, mean |e|: {average} % on average"
+            bars = axes.bar(place, mean * scale, width, color=colour, label=label)
+            if n * len(filled) <= 20:
+                texts = [percent(x / 100.0) for x in mean * scale]
+                ink = "white" if colour == BLUE else INK
+                axes.bar_label(bars, texts, label_type="center", fontsize=7.5, color=ink)
+            axes.plot(
+                place,
+                rms * scale,
+                linestyle="none",
+                marker="D",
+                markersize=4.5 if n <= 10 else 3.0,
+                markerfacecolor="white",
+                markeredgecolor=INK,
+                markeredgewidth=0.9,
+                label="RMS" if k == len(filled) - 1 else "_",
+            )
+        names = [shortened(name, 20) for name in robot.joint_names]
+        tilted = n > 10 or max(map(len, names)) > 12
+        axes.set_xticks(
+            np.arange(n), names, rotation=35 if tilted else 0, ha="right" if tilted else "center"
+        )
+        axes.tick_params(axis="x", length=0)
+        axes.grid(visible=False, axis="x")
+        margin = 0.6 + 0.5 * max(0, 4 - n)
+        axes.set_xlim(-margin, n - 1 + margin)
+        axes.set_ylabel(f"error [% of {'the largest force' if known else 'RMS force'}]")
+        handles, _ = axes.get_legend_handles_labels()
+        bars_first = sorted(handles, key=lambda handle: handle.get_label() == "RMS")
+        figure.legend(handles=bars_first, loc="outside lower left", ncols=3)
+    return figure
+
+
+def _pool(recordings: Sequence[TorqueErrors]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean and RMS of the errors, and RMS of the forces, as if all were one recording."""
+    e = np.concatenate([r.errors for r in recordings])
+    counted = np.concatenate([np.asarray(r.counted) for r in recordings])
+    forces = np.concatenate([np.asarray(r.measured) for r in recordings])
+    rows = np.maximum(counted.sum(axis=0), 1)
+    e, forces = np.where(counted, e, 0.0), np.where(counted, forces, 0.0)
+    mean = np.abs(e).sum(axis=0) / rows
+    rms, force_rms = (np.sqrt((x**2).sum(axis=0) / rows) for x in (e, forces))
+    return mean, rms, force_rms

@@ -1,4 +1,4 @@
-"""A small robot with a rail and a pendulum, fitted to a noisy virtual log."""
+"""A small robot with a rail and a pendulum, fitted to a noisy virtual log; errors of any arm."""
 
 import dataclasses
 
@@ -6,43 +6,48 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.dynamics.base import base_parameters
-from jaxid.dynamics.terms import RigidBodies
-from jaxid.identification.estimators import LeastSquares
-from jaxid.identification.identify import identify
-from jaxid.measurement.filters import ZeroPhaseButterworth
-from jaxid.measurement.observations import observe
-from jaxid.robot.joints import Limits
-from jaxid.robot.robot import Robot
+from jaxid.report.result_files import write_report
 from jaxid.simulation.friction import SmoothFriction
-from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
-from jaxid.trajectory.fourier import random_fourier_series
-from jaxid.validation import Validation, validate
+from jaxid.simulation.virtual import Sensors, random_bodies
+from jaxid.validation import TorqueErrors
 
 
-def cart() -> Robot:
-    return Robot(
+@pytest.fixture(scope="session")
+def errors_of():
+    """Return a function that makes torque errors of an arm."""
+
+    def errors_of(joints, rows=200, *, name="log", seed=0):
+        random = np.random.default_rng(seed)
+        measured = 10.0 * random.standard_normal((rows, joints))
+        return TorqueErrors(
+            name=name,
+            time=np.arange(rows) * 0.01,
+            measured=measured,
+            predicted=measured + random.standard_normal((rows, joints)),
+            counted=np.ones((rows, joints), bool),
+            max_forces=np.full(joints, 50.0),
+        )
+
+    return errors_of
+
+
+@pytest.fixture(scope="session")
+def validated():
+    """A fit of the cart with its validation on two recordings."""
+    robot = jid.Robot(
         "cart",
         revolute=(False, True),
         axis=[(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)],
         rotation=np.tile(np.eye(3), (2, 1, 1)),
         offset=np.zeros((2, 3)),
         joint_names=("rail", "swing_$1_$"),
-        limits=Limits(2, velocity=[1.0, 3.0], force=[200.0, 30.0]),
+        limits=jid.Limits(2, velocity=[1.0, 3.0], force=[200.0, 30.0]),
         tip_offset=(0.0, 0.0, 0.4),
     )
-
-
-@pytest.fixture(scope="session")
-def validated():
-    """A fit of the cart with its validation on two recordings."""
-    robot = cart()
-    random = np.random.default_rng(0)
-    bodies = random_bodies(robot, np.array([8.0, 2.0]), random)
-    virtual = VirtualRobot(
+    virtual = jid.VirtualRobot(
         robot=robot,
-        terms=(RigidBodies(),),
-        values=bodies.ravel(),
+        terms=(jid.RigidBodies(),),
+        values=random_bodies(robot, np.array([8.0, 2.0]), np.random.default_rng(0)).ravel(),
         friction=SmoothFriction(np.array([3.0, 0.2]), np.array([5.0, 0.4])),
         sensors=Sensors(
             encoder_step=1e-6,
@@ -51,40 +56,32 @@ def validated():
             memory=0.1,
         ),
     )
-    observations = [
-        observe(
-            virtual.measure(
-                random_fourier_series(robot, omega=1.5, seed=s),
-                duration=4.0,
-                sample_time=0.005,
-                seed=s,
-                name=name,
-            ),
-            robot,
-            ZeroPhaseButterworth(10.0),
-        )
-        for s, name in ((1, "first/run"), (2, "second"))
-    ]
-    fit = identify(base_parameters(virtual.model), observations[0], LeastSquares())
-    return fit, validate(fit, observations)
+    observations = []
+    for seed, name in ((1, "first/run"), (2, "second")):
+        motion = jid.random_fourier_series(robot, omega=1.5, seed=seed)
+        log = virtual.measure(motion, duration=4.0, sample_time=0.005, seed=seed, name=name)
+        observations.append(jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0)))
+    base = jid.base_parameters(virtual.model)
+    fit = jid.identify(base, observations[0], jid.estimators.LeastSquares())
+    return fit, jid.validate(fit, observations)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def fit(validated):
     return validated[0]
 
 
-@pytest.fixture
-def validation(validated) -> Validation:
+@pytest.fixture(scope="session")
+def validation(validated):
     return validated[1]
 
 
-@pytest.fixture
-def warm(fit):
-    """Return the same robot with a third of the rail's friction."""
+@pytest.fixture(scope="session")
+def changed(fit):
+    """The comparison with the same robot, warm: a third of the rail's friction."""
     p = np.array(fit.parameters)
     p[fit.base.names.index("fv1")] /= 3.0
-    return dataclasses.replace(fit, parameters=p, recordings=("warm",))
+    return jid.compare(fit, dataclasses.replace(fit, parameters=p, recordings=("warm",)))
 
 
 @pytest.fixture(scope="session")
@@ -103,3 +100,22 @@ def consistent():
     o = jid.observe(log, robot, jid.ZeroPhaseButterworth(10.0))
     estimator = jid.PhysicallyConsistent(jid.estimators.ResidualVariances(0))
     return jid.identify(jid.base_parameters(model), o, estimator)
+
+
+@pytest.fixture(scope="session")
+def written(validated, tmp_path_factory):
+    """Return a folder with a report."""
+    fit, validation = validated
+    folder = tmp_path_factory.mktemp("new") / "report"
+    write_report(
+        folder,
+        fit,
+        validation.errors[:1],
+        validation.errors[1:],
+        validation.definiteness,
+        {"experiment": "cart.toml", "experiment_text": "[robot]\nurdf = 'a<b'\n"},
+        ("a note <script>alert('&\"')</script>",),
+        doubts=("the log looks odd",),
+        pdf=True,
+    )
+    return folder

@@ -6,12 +6,17 @@ import json
 
 import numpy as np
 import pytest
-from report_samples import errors_of
 
 from jaxid.identification.comparison import Verdict, compare
 from jaxid.report import result_files
-from jaxid.report.result_files import read_fit, safe_name, write_comparison, write_report
-from jaxid.report.result_json import consistency_record, plain
+from jaxid.report.result_files import (
+    consistency_record,
+    plain,
+    read_fit,
+    safe_name,
+    write_comparison,
+    write_report,
+)
 
 
 @pytest.fixture
@@ -43,20 +48,15 @@ def names(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-def test_writes_all_files_with_their_parents(tmp_path, fit, validation):
-    folder = tmp_path / "a" / "b" / "report"
-    files = report(folder, fit, validation, pdf=True)
-    assert sorted(p.name for p in files) == names(folder)
+def test_writes_all_files_with_their_parents(written):
     figures = ("autocorrelation", "errors", "parameters", "residuals")
     figures += ("torque_first-run", "torque_second")
-    assert set(names(folder)) == {
-        *(f"{name}{suffix}" for name in figures for suffix in (".png", ".pdf")),
-        *("model.json", "parameters.csv", "report.html", "result.json"),
-    }
-    for path in files:
-        if path.suffix in (".png", ".pdf"):
-            assert path.read_bytes()[:4] in (b"\x89PNG", b"%PDF")
-    assert names(tmp_path) == ["a"]
+    expected = ["model.json", "parameters.csv", "report.html", "result.json"]
+    expected += [f"{name}{suffix}" for name in figures for suffix in (".png", ".pdf")]
+    assert names(written) == sorted(load(written)["files"]) == sorted(expected)
+    for path in written.glob("*.p[nd][gf]"):
+        assert path.read_bytes()[:4] in (b"\x89PNG", b"%PDF")
+    assert names(written.parent) == ["report"]
 
 
 def test_numbers_come_back_exactly(tmp_path, fit, validation, quick):
@@ -130,9 +130,9 @@ def test_the_model_can_be_used_again(tmp_path, fit, validation, quick):
     p = np.random.default_rng(0).standard_normal(fit.base.model.size)
     again = p[model["independent"]] + np.array(model["kappa"]) @ p[model["dependent"]]
     np.testing.assert_allclose(again, fit.base.from_standard(p), rtol=1e-14)
-    read = read_fit(tmp_path)
-    assert read.name == tmp_path.name
-    np.testing.assert_array_equal(read.parameters, fit.parameters)
+    again = read_fit(tmp_path)
+    assert again.name == tmp_path.name
+    np.testing.assert_array_equal(again.parameters, fit.parameters)
 
 
 @pytest.mark.parametrize("present", [False, True])
@@ -170,7 +170,9 @@ def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, 
         assert (tmp_path / name).read_text() == "mine"
 
 
-def test_recordings_of_one_name_keep_their_figures_apart(tmp_path, fit, validation, quick):
+def test_recordings_of_one_name_keep_their_figures_apart(
+    tmp_path, fit, validation, quick, errors_of
+):
     same = tuple(dataclasses.replace(errors_of(2), name=name) for name in ("Run", "run", "run"))
     report(tmp_path, fit, validation, identification=same[:1], verification=same[1:])
     figures = [n for n in names(tmp_path) if n.startswith("torque")]
@@ -178,17 +180,16 @@ def test_recordings_of_one_name_keep_their_figures_apart(tmp_path, fit, validati
     assert "torque_run_verification.png" in figures
 
 
-def test_comparisons_hold_the_numbers_exactly(tmp_path, fit, warm):
-    found = compare(fit, warm)
-    files = write_comparison(tmp_path / "out", found)
+def test_comparisons_hold_the_numbers_exactly(tmp_path, changed):
+    files = write_comparison(tmp_path / "out", changed)
     assert [p.name for p in files] == ["comparison.json", "comparison.csv", "comparison.png"]
     content = json.loads(files[0].read_text(encoding="utf-8"))
     assert content["schema"] == "jaxid-comparison/1"
-    assert [r["difference"] for r in content["parameters"]] == found.difference.tolist()
+    assert [r["difference"] for r in content["parameters"]] == changed.difference.tolist()
     assert content["groups"][1]["changed"] is True
     with files[1].open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [float(r["half_width"]) for r in rows] == found.half_widths.tolist()
+    assert [float(r["half_width"]) for r in rows] == changed.half_widths.tolist()
     assert files[2].read_bytes().startswith(b"\x89PNG")
 
 

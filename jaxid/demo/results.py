@@ -1,0 +1,359 @@
+"""Results of the demo beside the paper's numbers: tables, a page, and a record for programs."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxid as jid
+from jaxid.demo import study as settings
+from jaxid.demo.study import Model, Study
+from jaxid.io import atomic_folder
+from jaxid.report.excitation import side_by_side_table
+from jaxid.report.identification import parameter_table
+from jaxid.report.page import Section, folded, picture, render_page, versions
+from jaxid.report.result_files import SCHEMAS, plain, write_json
+from jaxid.table import MISSING, Column, Remark, Status, Table, significant, with_deviation
+
+PUBLISHED = {
+    1: (273.40, 273.62, "kg"),
+    2: (1.68, 1.65, "kg m"),
+    27: (248.41, 90.19, "N s/m"),
+    28: (41.26, 25.65, "N m s"),
+    34: (312.50, 233.00, "N"),
+    35: (18.24, 15.07, "N m"),
+}
+"""Base parameters of the paper (Sec. 6): number from 1; value cold and warm, and their unit."""
+SHOWN = (0, 2, 4, 6)
+"""Axes 1, 5 and 7 of the paper's Figs. 6, 7 and 9, and the shoulder, which holds the arm."""
+POINTS = 800
+"""Samples of a line in a figure."""
+
+
+def write_study(folder: Path, study: Study) -> list[Path]:
+    """Write `report.html` and `demo.json`, both or none; return the files."""
+    page = demo_page(study)
+    with atomic_folder(folder) as staging:
+        (staging / "report.html").write_text(page, encoding="utf-8")
+        write_json(staging / "demo.json", plain(_record(study)))
+    return [folder / "report.html", folder / "demo.json"]
+
+
+def tables(study: Study) -> list[Table]:
+    """Return all tables of the demo."""
+    return [
+        paper_table(study),
+        *([side_by_side_table(study.plans)] if study.plans else []),
+        error_table(study, 0),
+        error_table(study, 1),
+        study.temperature.group_summary(),
+        following_table(study),
+    ]
+
+
+def remarks(study: Study) -> list[Remark]:
+    """Return the findings of the paper, as far as they come out here."""
+    worst, true = ([max(m.mean_errors(k)) for k in (0, 1)] for m in (study.weighted, study.true))
+    plain, weighted = (m.mean_errors(0)[-1] for m in (study.unweighted, study.weighted))
+    none, cad, identified = (1e3 * run.rms for run in study.followed)
+    found = [
+        Remark(
+            f"The identified model predicts the torques of every axis to {worst[0]:.2g} % of the "
+            f"largest torque, and to {worst[1]:.2g} % on an unseen path.",
+            Status.GOOD if max(worst) < 1.0 else Status.DOUBTFUL,
+            f"Mean error of the worst axis; the paper states below 1 %. {true[0]:.2g} % and "
+            f"{true[1]:.2g} % by the true parameters: stiction, Stribeck friction, ripple and "
+            "noise are not in the model.",
+        ),
+        Remark(
+            f"Without weights the last axis errs by {plain:.2g} %, with weights by {weighted:.2g} "
+            "% of its largest torque.",
+            Status.GOOD if weighted < plain else Status.BAD,
+        ),
+        Remark(
+            "With the identified model fed forward the end-effector keeps its path to "
+            f"{identified:.2g} mm (RMS), with CAD values to {cad:.2g} mm, without a model to "
+            f"{none:.2g} mm.",
+            Status.GOOD if identified < cad < none else Status.DOUBTFUL,
+        ),
+    ]
+    for filter, inside, total in study.coverage:
+        text = f"{inside} of {total} estimates ({100 * inside / total:.1f} %)"
+        found.append(
+            Remark(
+                f"With noise and encoders as the only disturbance, {text} lie within their 95 % "
+                f"intervals with {filter}."
+            )
+        )
+    return [*found, *([Remark(study.timing)] if isinstance(study.timing, str) else [])]
+
+
+def paper_table(study: Study) -> Table:
+    """Return the statements of the paper beside the results of the demo."""
+    base, timed = study.base, study.timing
+    speed, acceleration = study.tip_maxima
+    worst = [significant(max(study.weighted.mean_errors(k)), 2) for k in (0, 1)]
+    moving = significant(max(study.moving_errors(study.weighted, 1)), 2)
+    true = significant(max(study.true.mean_errors(1)), 2)
+    lengths = ", ".join(f"{name} = {base.lengths[name]:g}" for name in ("l2x", "l3z"))
+    rows = [
+        ("parameters, all of them", "70", str(base.model.size)),
+        ("base parameters", "44", str(base.size)),
+        ("p_B(1) (Eq. 24)", "m1 + m2 + m3 - m4 rc4z / l3z + I1", base.expressions[0]),
+        ("p_B(2) (Eq. 24)", "m2 rc2x + l2x m3 - l2x m4 rc4z / l3z", base.expressions[1]),
+        ("lengths in it [m]", "l2x, l3z", lengths),
+        ("speed of the end-effector, up to [m/s]", "2.7", significant(speed)),
+        ("acceleration of the end-effector, up to [m/s²]", "11.3", significant(acceleration)),
+        ("mean error, worst axis, identification [%]", "below 1", worst[0]),
+        ("mean error, worst axis, verification [%]", "below 1", worst[1]),
+        ("the same while the axis moves [%]", MISSING, moving),
+        ("verification, by the true parameters [%]", MISSING, true),
+        ("mass matrix without weights", "not positive definite", _definite(study.unweighted)),
+        ("mass matrix with weights", "positive definite", _definite(study.weighted)),
+        ("mass matrix, consistent bodies", "not done", _definite(study.consistent)),
+    ]
+    for number, (cold, warm, unit) in PUBLISHED.items():
+        for state, value, fit in (("cold", cold, study.weighted.fit), ("warm", warm, study.warm)):
+            k = number - 1
+            pair = with_deviation(float(fit.parameters[k]), float(fit.standard_deviations[k]))
+            rows.append((f"p_B({number}), {state} [{unit}]", f"{value:.2f}", " ± ".join(pair)))
+    if not isinstance(timed, str):
+        literal, factored, full = (1e6 * timed[key] for key in ("literal", "factored", "full"))
+        rows += [
+            ("feed-forward, Eq. 39 as printed [µs]", "11.928", significant(literal)),
+            ("feed-forward, Eq. 38 [µs]", "15.243", significant(full)),
+            ("Eq. 39 as printed over Eq. 38", "0.78", significant(literal / full, 2)),
+            ("feed-forward, Eq. 39 factored [µs]", MISSING, significant(factored)),
+            ("computed by", "PC, 2.16 GHz", timed["where"]),
+        ]
+    title = f"the paper, and the results on the virtual {base.model.robot.name}"
+    names = ("quantity", "paper", "here")
+    return Table(title, *map(Column, names, zip(*rows, strict=True)))
+
+
+def _definite(model: Model) -> str:
+    found = model.validation.definiteness
+    if found.positive_definite:
+        return "positive definite"
+    return f"not positive definite in {100 * found.indefinite:.0f} % of the poses"
+
+
+def error_table(study: Study, recording: int) -> Table:
+    """Return the mean errors of all axes on identification (0) or verification (1) (Fig. 10)."""
+
+    def column(name: str, errors: list[float]) -> Column:
+        return Column(name, [*errors, max(errors)], "%", lambda x: significant(x, 2))
+
+    names = study.base.model.robot.joint_names
+    role = ("identification", "verification")[recording]
+    return Table(
+        f"mean error on {role}, relative to the largest torque (Fig. 10)",
+        Column("axis", [*names, "worst"]),
+        *(column(m.name.replace(" ", "\n"), m.mean_errors(recording)) for m in study.models),
+        column("weighted,\nmoving", study.moving_errors(study.weighted, recording)),
+        rules=[len(names)],
+    )
+
+
+def following_table(study: Study) -> Table:
+    """Return how well the path of ISO 9283 is followed with each model."""
+    runs = study.followed
+    joints = [np.sqrt(np.mean(run.joint_rms[1:] ** 2)) for run in runs]
+    return Table(
+        "following the path of ISO 9283 by computed torque",
+        Column("fed forward", [run.name for run in runs]),
+        Column("end-effector\nRMS", [1e3 * run.rms for run in runs], "mm"),
+        Column("end-effector\nmax", [1e3 * float(run.distance.max()) for run in runs], "mm"),
+        Column("rail\nRMS", [1e3 * float(run.joint_rms[0]) for run in runs], "mm"),
+        Column("joints\nRMS", [1e3 * float(x) for x in joints], "mrad"),
+    )
+
+
+def demo_page(study: Study) -> str:
+    """Return the page of the demo as HTML."""
+    headline, *findings = remarks(study)
+    notes = (
+        "six base parameters, cold and warm, are the paper's",
+        *study.base.model.robot.notes,
+        "assumed: the other parameters of bodies, rotors and friction, and all disturbances",
+    )
+    used = ", ".join(f"{name} {number}" for name, number in versions().items())
+    return render_page(
+        "The paper, end to end",
+        [
+            ("Results", [headline, findings, paper_table(study)]),
+            _excitation(study),
+            _identification(study),
+            _verification(study),
+            _temperature(study),
+            ("The robot, and assumptions", [[Remark(n[0].upper() + n[1:]) for n in notes]]),
+        ],
+        "A persistent method for parameter identification of a seven-axes manipulator, repeated "
+        "on a virtual Stäubli TX90L on its rail, with the paper's numbers beside the results.",
+        f"`jaxid demo --seed {study.seed}`; {used}",
+    )
+
+
+def _excitation(study: Study) -> Section:
+    base, series = study.base, study.played.inner
+    robot, (speed, acceleration) = base.model.robot, study.tip_maxima
+    times = np.linspace(0.0, float(series.duration), POINTS)
+    motion = series.motion(times)
+    return "Base parameters, and the motion that excites them", [
+        "Seven bodies with seven parameters each, viscous and Coulomb friction and rotors make "
+        f"{base.model.size} columns. The QR decomposition without pivoting leaves {base.size} of "
+        "them; the first two are those that the paper prints in Eq. 24.",
+        folded(
+            f"All {base.size} base parameters, as estimated with weights, cold",
+            parameter_table(study.weighted.fit),
+        ),
+        f"The motion is a Fourier series of {settings.HARMONICS} harmonics at {settings.OMEGA:g} "
+        "rad/s within all limits and clear of collisions. The paper minimises the condition number "
+        "of the unweighted information matrix; that motion is run here. The D-optimal one beside "
+        "it makes the parameters most certain.",
+        *([side_by_side_table(study.plans)] if study.plans else []),
+        picture(
+            jid.plot.path(robot, motion, times),
+            "Fig. 3: path of the end-effector along the designed motion. The paper states up to "
+            f"2.7 m/s and 11.3 m/s²; here {speed:.3g} m/s and {acceleration:.3g} m/s².",
+        ),
+        picture(
+            jid.plot.joints(robot, robot.limits, times, motion),
+            "Fig. 4: one period of the designed motion.",
+        ),
+    ]
+
+
+def _identification(study: Study) -> Section:
+    robot, observations = study.base.model.robot, study.observations[0]
+    begin, end = (float(t) for t in study.played.window)
+    time = np.asarray(observations.time)
+    shown = np.flatnonzero((time >= begin) & (time <= end))[:: max(1, len(time) // (2 * POINTS))]
+    desired, filtered = study.played.motion(time[shown]), observations.motion[shown]
+    plain, weighted = (m.validation.errors[0] for m in (study.unweighted, study.weighted))
+    return "Identification with and without weights", [
+        "The virtual robot follows the motion by its servo at 1000 Hz: cold, and once more when "
+        "it is warm. Logs hold the angles of 17-bit motor encoders and motor torques with 1 % of "
+        "noise, disturbed by ripple, stiction and Stribeck friction that the model does not have. "
+        f"Filter (Eq. 25): {observations.filter}; {observations.rows} rows of each joint.",
+        picture(
+            jid.plot.filtered(robot, time[shown], desired, filtered, 2),
+            "Fig. 5: desired velocity and acceleration, and those that the filter makes of the "
+            "measured angles.",
+        ),
+        picture(
+            jid.plot.torques(plain, robot, "identified without weights", SHOWN),
+            "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction by a model that was "
+            "identified without weights.",
+        ),
+        picture(
+            jid.plot.torques(weighted, robot, "identified with weights", SHOWN),
+            "Fig. 7: the same with weights (Eq. 30).",
+        ),
+    ]
+
+
+def _verification(study: Study) -> Section:
+    robot, path = study.base.model.robot, study.joint_path
+    times = np.linspace(0.0, float(path.duration), 5 * POINTS)
+    motion, capsules = path.motion(times), jid.robots.tx90l_on_rail_collision()
+    first, second = study.weighted.validation.errors
+    return "Verification and application on another path", [
+        "The path after ISO 9283: straight lines, a rectangle and two circles on the plane through "
+        f"two opposite edges of a cube of {settings.EDGE:g} m. Where pieces meet the end-effector "
+        f"is at rest; speed up to {settings.SPEED:g} m/s, acceleration up to "
+        f"{settings.ACCELERATION:g} m/s². The seven joints are redundant: of all solutions the "
+        "nearest to a posture are taken.",
+        picture(jid.plot.path(robot, motion, times), "Fig. 8: path of the end-effector."),
+        picture(
+            jid.plot.poses(robot, motion.q[::5], capsules),
+            "The robot with its capsules along the path.",
+        ),
+        picture(
+            jid.plot.torques(second, robot, "verification", SHOWN),
+            "Fig. 9: torques of the axes 1, 3, 5 and 7 on the verification path.",
+        ),
+        picture(
+            jid.plot.errors([first], [second], robot),
+            "Fig. 10: mean errors on identification and verification.",
+        ),
+        (error_table(study, 0), error_table(study, 1)),
+        f"“Moving”: rows of each axis above {settings.AT_REST:g} rad/s or m/s. The torque of an "
+        "axis at rest may be anything up to stiction, which no model of speeds predicts, and this "
+        "path rests at every corner.",
+        "The same path once more, with the same servo, and three torques fed forward: none, those "
+        "of a CAD model whose bodies are 10 to 18 % off and that has no friction, and those of the "
+        "identified model.",
+        following_table(study),
+    ]
+
+
+def _temperature(study: Study) -> Section:
+    figure = jid.plot.comparison(study.temperature)
+    return "Cold and warm", [
+        "Two identifications of the same motion. Inertial parameters stay, friction falls as the "
+        "lubricant warms; a parameter has changed if its difference is more than chance.",
+        study.temperature.group_summary(),
+        folded("All base parameters, cold and warm", figure),
+    ]
+
+
+def _record(study: Study) -> dict[str, Any]:
+    """Return the results of the demo for `demo.json`, in rad, m, s, N and N m."""
+    base, fits = study.base, (study.weighted.fit, study.warm)
+    speed, acceleration = study.tip_maxima
+    return {
+        "schema": SCHEMAS["demo.json"],
+        "versions": versions(),
+        "seed": study.seed,
+        "base_parameters": {
+            "standard": base.model.size,
+            "count": base.size,
+            "names": base.names,
+            "truth": study.truth,
+        },
+        "excitation": {
+            "designs": [
+                {
+                    "criterion": plan.criterion.name,
+                    "criteria": {c.name: c.after for c in plan.criteria},
+                    "random": {c.name: c.before for c in plan.criteria},
+                    "gain": plan.mean_gain,
+                }
+                for plan in study.plans
+            ],
+            "tip_speed": speed,
+            "tip_acceleration": acceleration,
+        },
+        "estimates": {
+            model.name: {
+                "parameters": model.fit.parameters,
+                "standard_deviations": model.fit.standard_deviations,
+                "mean_percent_identification": model.mean_errors(0),
+                "mean_percent_verification": model.mean_errors(1),
+                "mean_percent_moving": [study.moving_errors(model, k) for k in (0, 1)],
+                "indefinite_share": model.validation.definiteness.indefinite,
+            }
+            for model in study.models
+        },
+        "temperature": [
+            {
+                "number": k,
+                "unit": unit,
+                "paper": [cold, warm],
+                "estimates": [float(fit.parameters[k - 1]) for fit in fits],
+                "verdict": study.temperature.verdicts[k - 1].value,
+            }
+            for k, (cold, warm, unit) in PUBLISHED.items()
+        ],
+        "coverage": [dict(zip(("filter", "inside", "of"), c, strict=True)) for c in study.coverage],
+        "following": [
+            {
+                "fed_forward": run.name,
+                "tip_rms": run.rms,
+                "tip_largest": run.distance.max(),
+            }
+            for run in study.followed
+        ],
+        "feed_forward": study.timing,
+    }
