@@ -92,7 +92,7 @@ def test_tables_and_files_say_the_same(found, tmp_path):
     assert "With the identified model fed forward" in said
 
 
-def test_refuses_a_file_in_place_of_its_folder(run, tmp_path):
+def test_refuses_a_file_in_place_of_its_folder(run, tmp_path):  # noqa: F811
     (tmp_path / "taken").write_text("a file")
     assert refused(run("demo", "-o", tmp_path / "taken"), "is a file", "needs a folder")
     (tmp_path / "foreign").mkdir()
