@@ -2,30 +2,28 @@
 
 Processes, on one host or many, read recordings of their own and exchange only factors: some tens of
 kilobytes for each block of time. Factors are joined in a fixed order, so that every process gets
-the same answer. The devices of one process need no function of their own: `identify` uses all CPU
-devices for long logs.
+the same answer. The devices of one process need no function: `identify` uses all CPU devices.
 """
 
+import io
 import itertools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxid.arrays import Float, require_float64
+from jaxid.arrays import require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.compiled import shard_map
 from jaxid.identification.factors import Blocks, Factors, JointFactor
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations, Progress
 
 MOST = 64
-"""Largest number of blocks of time that a process passes on."""
+"""Largest number of blocks of time of all processes, unless there are more processes."""
 _calls = itertools.count()
 
 
@@ -64,10 +62,9 @@ def factorise_across_processes(
 ) -> RegressionProblem:
     """Return the regression problem of the recordings of all processes: their joined factors.
 
-    Call it in every process after `jax.distributed.initialize`. Processes pass their blocks on in
-    pairs, so that none ever holds more than 64; further blocks are joined with their neighbours in
-    time. Every process gets the same blocks, in the order of the processes: `fit_problem` gives the
-    same fit everywhere.
+    Call it in every process after `jax.distributed.initialize`. Every process gets the same blocks,
+    in the order of the processes: `identify` gives the same fit everywhere. Of more than 64 blocks,
+    those of a process are joined with their neighbours in time.
 
     Args:
         base: The base parameters, the same in all processes.
@@ -82,62 +79,34 @@ def factorise_across_processes(
         InputError: If the processes' base parameters differ.
     """
     require_float64("factors across processes")
-    own = Blocks(())
+    own, processes = Blocks(()), jax.process_count()
     if recordings:
         own = RegressionProblem(base, recordings, progress, divisions=divisions).blocks
-    if jax.process_count() == 1:
+    if processes == 1:
         return RegressionProblem(base, blocks=own, names=[o.name for o in recordings])
+    # What must be the same in all processes for their factors to fit together.
+    names = base.model.robot.joint_names, base.model.parameter_names
+    content = repr((names, base.indices, np.round(base.kappa, 9).tolist())).encode()
     try:
         _wait(patience)
-        heads = multihost_utils.process_allgather(np.array([zlib.crc32(_content(base))]))
-        if (heads != heads[0]).any():
+        packed = _pack(own.condense(max(1, MOST // processes)))
+        head = np.array([zlib.crc32(content), len(packed)])
+        heads = multihost_utils.process_allgather(head)
+        if (heads[:, 0] != heads[0, 0]).any():
             raise InputError(
                 "`base` differs between the processes: make it from the same robot, terms and "
                 "version."
             )
-        return RegressionProblem(base, blocks=_join_in_a_tree(own, base))
+        filled = np.pad(packed, (0, heads[:, 1].max() - len(packed)))
+        gathered = np.asarray(multihost_utils.process_allgather(filled))
+        found = zip(gathered, heads[:, 1], strict=True)
+        parts = [part for x, length in found for part in _unpack(x[:length], base)]
+        return RegressionProblem(base, blocks=Blocks(tuple(parts)))
     except jax.errors.JaxRuntimeError as error:
         raise RuntimeError(
             f"process {jax.process_index()} lost another one: look for the first error in the "
             f"others' logs, and start all again. ({str(error).splitlines()[0]})"
         ) from error
-
-
-def _content(base: BaseParameters) -> bytes:
-    """Return what must be the same in all processes for their factors to fit together."""
-    names = base.model.robot.joint_names, base.model.parameter_names
-    return repr((names, base.indices, np.round(base.kappa, 9).tolist())).encode()
-
-
-def _join_in_a_tree(blocks: Blocks, base: BaseParameters) -> Blocks:
-    """Return the blocks of all processes, gathered in pairs by the first one, and sent to all."""
-    count, number = jax.process_count(), jax.process_index()
-    firsts = {d.process_index: d for d in reversed(jax.devices())}
-    mesh = Mesh(np.array([firsts[k] for k in range(count)]), ("processes",))
-    blocks = blocks.condense(MOST)
-    step = 1
-    while step < count:
-        routes = tuple((k, k - step) for k in range(step, count, 2 * step))
-        received = _unpack(_exchange(_pack(blocks, base), mesh, routes), base)
-        blocks = Blocks((*blocks.parts, *received.parts)).condense(MOST)
-        step *= 2
-    packed = _pack(blocks if number == 0 else Blocks(()), base)
-    return _unpack(np.asarray(multihost_utils.broadcast_one_to_all(packed)), base)
-
-
-def _exchange(x: np.ndarray, mesh: Mesh, routes: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """Return the array that another process has sent here; zeros if none has."""
-    own = jax.device_put(x[None], mesh.devices[jax.process_index()])
-    sharding = NamedSharding(mesh, PartitionSpec("processes"))
-    shape = (mesh.devices.size, *x.shape)
-    everyone = jax.make_array_from_single_device_arrays(shape, sharding, [own])
-    return np.asarray(_permutation(mesh, routes)(everyone).addressable_data(0))[0]
-
-
-def _permutation(mesh: Mesh, routes: tuple[tuple[int, int], ...]) -> Callable:
-    spec = PartitionSpec("processes")
-    send = shard_map(lambda x: jax.lax.ppermute(x, "processes", routes), mesh, (spec,), spec)
-    return jax.jit(send)
 
 
 def _wait(patience: float) -> None:
@@ -161,30 +130,19 @@ def _wait(patience: float) -> None:
         ) from error
 
 
-def _pack(blocks: Blocks, base: BaseParameters) -> Float[np.ndarray, "most numbers"]:
-    """Return one row of numbers for each block, behind a one; rows of zeros fill up."""
-    size = sum((len(own) + 1) ** 2 + 1 for own in base.acting_columns)
-    packed = np.zeros((MOST, 1 + size))
-    for row, part in zip(packed, blocks.parts, strict=False):
-        numbers = [[1.0]]
-        for joint in part.joints:
-            width = len(joint.columns) + 1
-            R = np.zeros((width, width))
-            R[: len(joint.R)] = joint.R
-            numbers += [[joint.rows], R.ravel()]
-        row[:] = np.concatenate(numbers)
-    return packed
+def _pack(blocks: Blocks) -> np.ndarray:
+    """Return the factors as bytes."""
+    buffer, triangles = io.BytesIO(), [joint.R for part in blocks.parts for joint in part.joints]
+    np.savez(buffer, *triangles, rows=[part.rows for part in blocks.parts])
+    return np.frombuffer(buffer.getvalue(), np.uint8)
 
 
-def _unpack(packed: Float[np.ndarray, "most numbers"], base: BaseParameters) -> Blocks:
+def _unpack(packed: np.ndarray, base: BaseParameters) -> list[Factors]:
+    """Return the factors of some bytes."""
+    found = np.load(io.BytesIO(packed.tobytes()))
+    triangles = (found[f"arr_{k}"] for k in itertools.count())
     parts = []
-    for row in packed[packed[:, 0] > 0]:
-        joints, start = [], 1
-        for own in base.acting_columns:
-            width = len(own) + 1
-            stop = start + 1 + width**2
-            R = row[start + 1 : stop].reshape(width, width)
-            joints.append(JointFactor(own, R, int(row[start])))
-            start = stop
-        parts.append(Factors(tuple(joints), base.size))
-    return Blocks(tuple(parts))
+    for rows in found["rows"].tolist():
+        joints = zip(base.acting_columns, triangles, rows, strict=False)
+        parts.append(Factors(tuple(JointFactor(*joint) for joint in joints), base.size))
+    return parts

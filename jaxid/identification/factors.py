@@ -8,6 +8,7 @@ factors. The observation matrix is never held in memory.
 
 import functools
 import itertools
+import operator
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -16,8 +17,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.motion import Motion
-from jaxid.measurement.observations import Chunk
+from jaxid.measurement.observations import Observations
 
 Columns = Sequence[tuple[int, ...]]
 """Indices of the base parameters that can act on each joint."""
@@ -54,37 +54,45 @@ class RowChunk(NamedTuple):
             mask=self.mask[selection],
         )
 
+    def divide(self, edges: Sequence[int]) -> "Iterator[RowChunk]":
+        """Yield the parts that lie in each block of time, by the first rows of the blocks."""
+        start = self.rows.start
+        for block, own in divide_rows(edges, self.rows):
+            part = self.part(slice(own.start - start, own.stop - start))
+            yield part._replace(block=self.block + block)
+
     def equations(self) -> list[np.ndarray]:
         """Return the masked rows `[columns, force]` of each joint."""
         joints = zip(self.columns, self.forces.T, self.mask.T, strict=True)
         return [np.column_stack([theta, force])[kept] for theta, force, kept in joints]
 
 
-def reduce_chunk(
-    base: BaseParameters, motion: Motion, forces: Float[AnyArray, "samples joints"], chunk: Chunk
-) -> tuple[list[Float[np.ndarray, "rows columns"]], Float[np.ndarray, "rows joints"]]:
-    """Return the columns of each joint and the forces of a chunk, filtered and decimated (Eq. 26).
+def row_chunks(
+    base: BaseParameters,
+    observations: Observations,
+    samples: int,
+    wanted: Sequence[tuple[int, int]] | None = None,
+) -> Iterator[RowChunk]:
+    """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
 
-    Args:
-        base: The base parameters.
-        motion: Motion at the samples of the chunk.
-        forces: Measured forces at the samples of the chunk [N m or N].
-        chunk: Filter and decimation, which make rows of samples.
+    Chunks without any of the `wanted` ranges of rows are left out.
     """
-    forces = np.asarray(forces)
-    if base.model.robot.tool is not None:
-        forces = forces - base.tool_forces(motion)
-    columns = [chunk.reduce(theta) for theta in base.regressor_rows(motion)]
-    return columns, chunk.reduce(forces)
+    mask, indices = np.asarray(observations.mask), base.acting_columns
+    for chunk in observations.chunks(samples):
+        first, last = chunk.rows
+        if wanted is not None and not any(a < last and first < b for a, b in wanted):
+            continue
+        motion, forces = observations.read(slice(*chunk.samples))
+        forces = np.asarray(forces)
+        if base.model.robot.tool is not None:
+            forces = forces - base.tool_forces(motion)
+        columns = [chunk.reduce(theta) for theta in base.regressor_rows(motion)]
+        rows = slice(first, last)
+        yield RowChunk(0, 0, rows, indices, columns, chunk.reduce(forces), mask[rows])
 
 
 def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]]:
-    """Yield each block of time that some rows reach into, with its part of the rows.
-
-    Args:
-        edges: First row of each block, and the end of the last one.
-        rows: Consecutive rows.
-    """
+    """Yield each block of time that some rows reach into, with its part of the rows."""
     for block, (low, high) in enumerate(itertools.pairwise(edges)):
         a, b = max(low, rows.start), min(high, rows.stop)
         if a < b:
@@ -173,12 +181,7 @@ class Factors(eqx.Module):
 
 
 def empty_factors(columns: Columns, size: int) -> Factors:
-    """Return the factors of no rows.
-
-    Args:
-        columns: Parameters that can act on each joint.
-        size: Number of all parameters.
-    """
+    """Return the factors of no rows, with the columns of each joint and the number of all."""
     joints = (JointFactor(tuple(own), np.zeros((0, len(own) + 1)), 0) for own in columns)
     return Factors(tuple(joints), size)
 
@@ -195,12 +198,11 @@ class Blocks(eqx.Module):
     @property
     def total(self) -> Factors:
         """The factors of all rows."""
-        return functools.reduce(lambda x, y: x + y, self.parts)
+        return functools.reduce(operator.add, self.parts)
 
     def without(self, block: int) -> Factors:
         """Return the factors of all rows but those of one block."""
-        others = (*self.parts[:block], *self.parts[block + 1 :])
-        return functools.reduce(lambda x, y: x + y, others)
+        return Blocks((*self.parts[:block], *self.parts[block + 1 :])).total
 
     def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Blocks":
         """Return the factors of rows that are multiplied by one factor for each joint."""
@@ -208,8 +210,8 @@ class Blocks(eqx.Module):
 
     def condense(self, most: int) -> "Blocks":
         """Return the same rows in at most so many blocks; neighbours are joined in pairs."""
-        parts = list(self.parts)
+        parts = self.parts
         while len(parts) > most:
             pairs = (parts[k : k + 2] for k in range(0, len(parts), 2))
-            parts = [functools.reduce(lambda x, y: x + y, pair) for pair in pairs]
-        return Blocks(tuple(parts))
+            parts = tuple(Blocks(pair).total for pair in pairs)
+        return Blocks(parts)

@@ -63,12 +63,8 @@ class BatchFit(eqx.Module):
 class DataSets(NamedTuple):
     """Data sets of a batch; their samples may be divided by a second axis, of chunks.
 
-    Attributes:
-        motion: Motion [datasets, samples, joints].
-        forces: Forces of some draws [datasets, draws, samples, joints], in [N m] or [N].
-        weights: Weights of the joints' rows [datasets, joints].
-        mask: One for rows that count, else zero [datasets, samples, joints]; None if all count.
-        numbers: Numbers of the geometry [datasets, numbers], if robots differ.
+    Forces have an axis of draws before the samples. The mask is one for rows that count, and None
+    if all count; `numbers` are those of the geometry [datasets, numbers], if robots differ.
     """
 
     motion: Motion
@@ -81,10 +77,7 @@ class DataSets(NamedTuple):
 def solve(rows: JointRegressor, batch: DataSets, row_time: float | None = None) -> BatchFit:
     """Solve all data sets, a group at a time; compiled once for each of the latest shapes.
 
-    Args:
-        rows: Columns of the joints.
-        batch: Data sets.
-        row_time: Time between two rows [s], for the spectral sandwich; without it all is naive.
+    With the time between two rows [s], standard deviations come from the spectral sandwich.
     """
     arrays, rest = eqx.partition((rows, batch, row_time), lambda x: isinstance(x, AnyArray))
     constants, tree = jax.tree.flatten(rest)
@@ -172,13 +165,9 @@ def _columns(rows: JointRegressor, batch: DataSets) -> list[Array]:
 def _solve_one(
     rows: JointRegressor, one: DataSets, total: Callable, row_time: float | None
 ) -> BatchFit:
-    """Solve one data set by the products of its rows.
+    """Solve one data set by the products of its rows; `one` is the set, or its first chunk.
 
-    Args:
-        rows: Columns of the joints.
-        one: Data set, or its first chunk.
-        total: Sums a function of data and columns over the data set's chunks.
-        row_time: Time between two rows [s], or None.
+    The sum of a function of data and columns over the data set's chunks is `total(function)`.
     """
     weights, places = one.weights, [np.array(own, int) for own in rows.columns]
     length, size = len(one.motion.q), rows.size

@@ -5,18 +5,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.factors import (
     Blocks,
     Columns,
     Factors,
     RowChunk,
-    divide_rows,
     empty_factors,
-    reduce_chunk,
+    row_chunks,
 )
 from jaxid.identification.streaming import stream_blocks, suits
 from jaxid.measurement.observations import Observations, Progress
@@ -24,6 +22,8 @@ from jaxid.robot.robot import Robot
 
 Span = tuple[int, int, int]
 """Index of a recording, and the half-open range of some of its rows."""
+Equations = Callable[[RowChunk], Sequence[np.ndarray]]
+"""Function from a chunk to the rows `[columns, force]` of each joint."""
 
 
 class RegressionProblem:
@@ -75,17 +75,20 @@ class RegressionProblem:
         if self._given is not None:
             return self._given
         self.require_samples("a pass over the rows")
-        parts = self._empty(self.base.acting_columns, self.base.size)
-        done, samples = 0, [o.samples for o in self.recordings]
+        parts = []
         for number, recording in enumerate(self.recordings):
+            edges, first = self._edges[number], self._first_block(number)
             if suits(recording):
-                edges, first = self._edges[number], self._first_block(number)
-                report = self._part_of_progress(done / sum(samples), samples[number] / sum(samples))
-                own = stream_blocks(self.base, recording, edges, report)
-                parts[first : first + len(own)] = own
+                report = functools.partial(self._report, number)
+                parts += stream_blocks(self.base, recording, edges, report)
             else:
-                _append(parts, self._chunks(number), RowChunk.equations)
-            done += samples[number]
+                folded = self._fold(
+                    self._chunks(number),
+                    RowChunk.equations,
+                    self.base.acting_columns,
+                    self.base.size,
+                )
+                parts += folded[first : first + len(edges) - 1]
         return Blocks(tuple(parts))
 
     @functools.cached_property
@@ -99,10 +102,7 @@ class RegressionProblem:
         return bool(self.recordings)
 
     def require_samples(self, task: str) -> None:
-        """Check that the rows themselves are known.
-
-        Args:
-            task: Task that needs rows, as it reads at the beginning of a sentence.
+        """Check that the rows themselves are known, for a task at the beginning of a sentence.
 
         Raises:
             InputError: If only factors are known.
@@ -126,7 +126,7 @@ class RegressionProblem:
 
     def fold(
         self,
-        equations: Callable[[RowChunk], Sequence[np.ndarray]],
+        equations: Equations,
         columns: Columns | None = None,
         size: int | None = None,
     ) -> Blocks:
@@ -141,12 +141,16 @@ class RegressionProblem:
             InputError: If only factors are known.
         """
         columns = self.base.acting_columns if columns is None else columns
-        parts = self._empty(columns, self.base.size if size is None else size)
-        _append(parts, self.chunks(), equations)
-        return Blocks(tuple(parts))
+        size = self.base.size if size is None else size
+        return Blocks(tuple(self._fold(self.chunks(), equations, columns, size)))
 
-    def _empty(self, columns: Columns, size: int) -> list[Factors]:
-        return [empty_factors(columns, size)] * self._first_block(len(self.recordings))
+    def _fold(
+        self, chunks: Iterable[RowChunk], equations: Equations, columns: Columns, size: int
+    ) -> list[Factors]:
+        parts = [empty_factors(columns, size)] * self._first_block(len(self.recordings))
+        for chunk in chunks:
+            parts[chunk.block] = parts[chunk.block].append(equations(chunk))
+        return parts
 
     def chunks(self, spans: Sequence[Span] | None = None) -> Iterator[RowChunk]:
         """Yield the rows, recording by recording, in their order.
@@ -169,40 +173,25 @@ class RegressionProblem:
         if number in self._cache:
             yield from self._cache[number]
             return
-        kept: list[RowChunk] | None = [] if wanted is None else None
-        available = self.cached_numbers - sum(map(_numbers, self._cache.values()))
-        for chunk in self._evaluate(number, wanted):
-            if kept is not None:
-                kept.append(chunk)
-                kept = kept if _numbers(kept) <= available else None
-            yield chunk
-        if kept is not None:
-            self._cache[number] = kept
-
-    def _evaluate(
-        self, number: int, wanted: Sequence[tuple[int, int]] | None
-    ) -> Iterator[RowChunk]:
-        observations = self.recordings[number]
-        mask, indices = np.asarray(observations.mask), self.base.acting_columns
-        reduced = reduced_rows(self.base, observations, self.samples_per_chunk, wanted=wanted)
-        for rows, columns, forces in reduced:
-            whole = RowChunk(number, 0, rows, indices, columns, forces, mask[rows])
-            for block, own in divide_rows(self._edges[number], rows):
-                part = whole.part(slice(own.start - rows.start, own.stop - rows.start))
-                yield part._replace(block=self._first_block(number) + block)
-            if self.progress is not None:
-                done = sum(o.rows for o in self.recordings[:number]) + rows.stop
-                self.progress(done / sum(o.rows for o in self.recordings))
+        room = self.cached_numbers if wanted is None else -1
+        kept, first = [], self._first_block(number)
+        for whole in row_chunks(self.base, self.recordings[number], self.samples_per_chunk, wanted):
+            for chunk in whole._replace(recording=number, block=first).divide(self._edges[number]):
+                room -= sum(x.size for x in chunk.columns)
+                kept = [*kept, chunk] if room >= 0 else []
+                yield chunk
+            self._report(number, whole.rows.stop / self.recordings[number].rows)
+        if room >= 0:
+            self._cache[number], self.cached_numbers = kept, room
 
     def _first_block(self, number: int) -> int:
         return sum(len(edges) - 1 for edges in self._edges[:number])
 
-    def _part_of_progress(self, start: float, fraction: float) -> Progress | None:
-        """Return the progress of one recording among several."""
-        progress = self.progress
-        if progress is None:
-            return None
-        return lambda done: progress(min(1.0, start + fraction * done))
+    def _report(self, number: int, done: float) -> None:
+        """Report the completed fraction of a pass, from that of one recording."""
+        if self.progress is not None:
+            sizes = [o.samples for o in self.recordings]
+            self.progress(min(1.0, (sum(sizes[:number]) + done * sizes[number]) / sum(sizes)))
 
     def residuals(
         self, p: np.ndarray, spans: Sequence[Span] | None = None
@@ -236,20 +225,6 @@ def chunk_residuals(chunk: RowChunk, p: np.ndarray) -> Float[np.ndarray, "rows j
     return chunk.forces - np.stack(predicted, axis=1)
 
 
-def _append(
-    parts: list[Factors],
-    chunks: Iterable[RowChunk],
-    equations: Callable[[RowChunk], Sequence[np.ndarray]],
-) -> None:
-    """Append the equations of some chunks to the factors of their blocks."""
-    for chunk in chunks:
-        parts[chunk.block] = parts[chunk.block].append(equations(chunk))
-
-
-def _numbers(chunks: Sequence[RowChunk]) -> int:
-    return sum(x.size for chunk in chunks for x in chunk.columns)
-
-
 def block_edges(observations: Observations, blocks: int) -> list[int]:
     """Return the first row of each block of time, and the end of the last one.
 
@@ -260,40 +235,8 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
     return [0, *edges[1:], observations.rows]
 
 
-def reduced_rows(
-    base: BaseParameters,
-    observations: Observations,
-    samples: int = RegressionProblem.samples_per_chunk,
-    read: Callable[[slice], tuple[Motion, AnyArray]] | None = None,
-    wanted: Sequence[tuple[int, int]] | None = None,
-) -> Iterator[tuple[slice, list[np.ndarray], np.ndarray]]:
-    """Yield the rows of observations by chunks; forces of a known tool are subtracted.
-
-    Args:
-        base: The base parameters.
-        observations: Observations of a recording.
-        samples: Samples of a chunk.
-        read: Function that returns motion and forces of some samples; by default those of the log.
-        wanted: Ranges of rows; chunks without any of them are left out. By default all.
-
-    Yields:
-        Range of the rows; columns of each joint [rows, columns of the joint]; forces
-        [rows, joints] in [N m] or [N].
-    """
-    reader = observations.read if read is None else read
-    for chunk in observations.chunks(samples):
-        first, last = chunk.rows
-        if wanted is not None and not any(a < last and first < b for a, b in wanted):
-            continue
-        yield slice(*chunk.rows), *reduce_chunk(base, *reader(slice(*chunk.samples)), chunk)
-
-
 def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blocks, Blocks]]:
     """Yield the blocks of time without one contiguous part, and that part, for each part in turn.
-
-    Args:
-        blocks: At least two blocks of time.
-        count: Number of parts.
 
     Raises:
         InputError: If there are fewer than two blocks.

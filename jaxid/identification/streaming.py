@@ -1,60 +1,136 @@
-"""Factors of long logs: Gram matrices of preconditioned columns, by a compiled loop.
+"""Factors of long logs: one compiled loop over the samples, on all devices of the processor.
 
-A Gram matrix of the columns themselves would lose twice the digits of their condition number. So a
-few parts of the log give a first triangle for each joint, and the pass adds up the products of
-columns times the inverse of this triangle: these are almost orthonormal, so that no digits are
-lost. The triangle of all rows follows from both.
+The loop evaluates the columns of a chunk, filters and decimates them to rows by matrix products
+with the impulse responses, and adds up the Gram matrix of each joint's rows; columns live only
+within an iteration, in float64. A Gram matrix of the columns themselves would lose twice the digits
+of their condition number. So a few parts of the log give a first triangle for each joint, and the
+pass adds up the products of columns times the inverse of this triangle: these are almost
+orthonormal, so that no digits are lost. The triangle of all rows follows from both.
 """
 
+import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from scipy import signal
 
+from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.identification.compiled import CompiledLoop, Grams, Stage, filter_stages, reach_of
-from jaxid.identification.factors import (
-    Factors,
-    JointFactor,
-    RowChunk,
-    divide_rows,
-    reduce_chunk,
-)
+from jaxid.dynamics.dispatch import program_of
+from jaxid.identification.factors import Factors, JointFactor, divide_rows, row_chunks
+from jaxid.measurement.filters import LowPass
 from jaxid.measurement.observations import Observations, Progress
+from jaxid.program import Program, default_fence, lower
 
 LONG = 100_000
 """Samples from which compiling pays."""
+CHUNK = 2048
+"""Samples of an iteration of the loop."""
+PIECE = 32768
+"""Samples that are passed to the loop at once."""
+TILE = 16
+"""Rows of a banded matrix product: more multiply more zeros, fewer use the processor less."""
 
-
-class Piece(NamedTuple):
-    """Consecutive rows of one block that the compiled loop adds up in one call.
-
-    Attributes:
-        block: Index of the block of time.
-        rows: Half-open range of rows.
-        samples: Samples that are needed.
-    """
-
-    block: int
-    rows: tuple[int, int]
-    samples: slice
+Grams = list[np.ndarray]
+"""For each joint the products of its columns and forces with each other."""
+Stage = tuple[np.ndarray, int]
+"""Zero-phase filter, as its response of odd length to an impulse, and a decimation factor."""
 
 
 def suits(observations: Observations) -> bool:
     """Return whether a log is long enough to compile for, and its filters are short enough."""
     if observations.samples < LONG:
         return False
-    stages = _stages(observations)
+    sizes = [(len(response), factor) for response, factor in _stages(observations)]
     # A filter is a matrix product of so many products for each row and column.
-    cost = sum(len(stage.response) / stage.factor for stage in stages)
-    return cost <= 256 and max((len(s.response) for s in stages), default=1) <= 16384
+    cost = sum(lags / factor for lags, factor in sizes)
+    return cost <= 256 and max((lags for lags, _ in sizes), default=1) <= 16384
 
 
 def _stages(observations: Observations) -> tuple[Stage, ...]:
-    return filter_stages(observations.filter, observations.decimation, observations.sample_time)
+    """Return the stages of decimation that change something, the first one with the filter."""
+    filter, decimation = observations.filter, observations.decimation
+    before, stages = impulse_response(filter.low_pass(observations.sample_time)), []
+    for k, factor in enumerate(decimation.stages):
+        response = np.convolve(before, impulse_response(decimation.low_pass(k)))
+        if factor > 1 or len(response) > 1:
+            stages.append((response, factor))
+        before = np.ones(1)
+    return tuple(stages)
+
+
+def impulse_response(low_pass: LowPass) -> Float[np.ndarray, " lags"]:
+    """Return the response to an impulse in the middle, until it has decayed on both sides."""
+    if not low_pass.sections:
+        return np.ones(1)
+    half = low_pass.memory()
+    sos = np.array(low_pass.sections)
+    impulse = np.zeros(2 * half + 1)
+    impulse[0] = 1.0
+    backward = signal.sosfilt(sos, impulse)[::-1]
+    two_way = signal.sosfilt(sos, np.concatenate([backward, np.zeros(half)]))
+    # The tail that the first pass cut off has decayed: the middle of the response is symmetric.
+    right = two_way[2 * half :]
+    return np.concatenate([right[:0:-1], right])
+
+
+class LoopShape(NamedTuple):
+    """Samples of an iteration, largest number of iterations of a call, and sizes of the stages.
+
+    These are the decimation factors, the lengths of the responses, and the rows by which results
+    come late.
+    """
+
+    samples: int
+    iterations: int
+    factors: tuple[int, ...]
+    lags: tuple[int, ...]
+    delays: tuple[int, ...]
+
+    @classmethod
+    def of(cls, stages: Sequence[Stage], chunk: int) -> "LoopShape":
+        """Return the sizes for some stages and about so many samples of an iteration."""
+        factors = tuple(factor for _, factor in stages)
+        lags = tuple(len(response) for response, _ in stages)
+        samples = max(1, round(chunk / math.prod(factors))) * math.prod(factors)
+        delays = []
+        for k, (n, f) in enumerate(zip(lags, factors, strict=True)):
+            # Later stages must get complete rows.
+            later = math.prod(factors[k + 1 :])
+            delays.append(later * -(-max(0, n - f) // (f * later)))
+        return cls(samples, max(1, PIECE // samples), factors, lags, tuple(delays))
+
+    @property
+    def rows(self) -> int:
+        """Rows of an iteration."""
+        return self.samples // math.prod(self.factors)
+
+    @property
+    def delay(self) -> int:
+        """Rows at the start of a call that stand for nothing yet."""
+        rates = [math.prod(self.factors[k + 1 :]) for k in range(len(self.factors))]
+        return sum(d // rate for d, rate in zip(self.delays, rates, strict=True))
+
+    @property
+    def reach(self) -> int:
+        """Number of samples before, and after, a row's instant on which it depends."""
+        rates = [math.prod(self.factors[:k]) for k in range(len(self.factors))]
+        return sum(rate * (n // 2) for rate, n in zip(rates, self.lags, strict=True))
+
+
+class Piece(NamedTuple):
+    """Consecutive rows of one block that the loop adds up in one call, and their samples."""
+
+    block: int
+    rows: tuple[int, int]
+    samples: slice
 
 
 def stream_blocks(
@@ -62,26 +138,19 @@ def stream_blocks(
     observations: Observations,
     edges: Sequence[int],
     progress: Progress | None = None,
-    chunk: int = 2048,
 ) -> list[Factors]:
     """Return the factors of blocks of time by the compiled loop, for logs of any length.
 
     All CPU devices of this process share the log. Products are added up in the order of the pieces:
-    the number of devices changes no digit but those that a compiler may change.
-
-    Args:
-        base: The base parameters.
-        observations: Observations of a recording.
-        edges: First row of each block, and the end of the last one.
-        progress: Callback, called with the completed fraction (0 to 1).
-        chunk: Samples of an iteration of the loop.
+    the number of devices changes no digit but those that a compiler may change. `edges` are the
+    first row of each block, and the end of the last one.
     """
     mask, indices = np.asarray(observations.mask), base.acting_columns
-    stream = _Stream(base, observations, edges, progress, chunk)
+    stream = _Stream(base, observations, edges, progress)
     blocks = []
     for R, (first, last) in zip(stream.triangles(), itertools.pairwise(edges), strict=True):
-        joints = zip(indices, R, mask[first:last].sum(axis=0), strict=True)
-        blocks.append(Factors(tuple(JointFactor(c, r, int(n)) for c, r, n in joints), base.size))
+        joints = zip(indices, R, mask[first:last].sum(axis=0).tolist(), strict=True)
+        blocks.append(Factors(tuple(JointFactor(*joint) for joint in joints), base.size))
     return blocks
 
 
@@ -94,74 +163,60 @@ class _Stream:
         observations: Observations,
         edges: Sequence[int],
         progress: Progress | None,
-        chunk: int,
     ):
-        self._progress = progress
-        stages = _stages(observations)
-        self._stride = 1
-        if all(len(stage.response) == 1 for stage in stages):
+        stages, self._stride = _stages(observations), 1
+        if all(len(response) == 1 for response, _ in stages):
             # Without filters the samples between the rows are not needed.
-            self._stride, stages = math.prod(stage.factor for stage in stages), ()
-        self._observations, self._edges = observations, list(edges)
+            self._stride, stages = math.prod(factor for _, factor in stages), ()
+        self._observations, self._edges, self._progress = observations, list(edges), progress
         self._widths = [len(columns) + 1 for columns in base.acting_columns]
-        self._loop = CompiledLoop(base, stages, chunk)
         self._mask = np.asarray(observations.mask)
-        reach = reach_of(stages)
+        self._shape = LoopShape.of(stages, CHUNK)
+        self._matrices = [_matrix(response, factor) for response, factor in stages]
+        self._devices = jax.local_devices(backend="cpu")
+        n = (base.model.robot.joints,)
+        columns, tool = program_of(base, base.columns, n, n, n), None
+        if base.model.robot.tool is not None:
+            tool = program_of(base.model, base.model.known_forces, n, n, n)
+        self._loop = _compiled(columns, tool, tuple(base.acting_columns), self._shape)
         segments = range(len(observations.segments))
-        self._pieces = [p for k in segments for p in self._divide(k, reach)]
-        self._ends = list(self._reduce_ends(base, reach)) if reach else []
+        self._pieces = [piece for k in segments for piece in self._divide(k)]
+        self._ends = list(self._reduce_ends(base)) if self._shape.reach else []
 
-    def _divide(self, segment: int, reach: int) -> Iterator[Piece]:
+    def _divide(self, segment: int) -> Iterator[Piece]:
         """Yield the pieces of the rows of a segment that do not depend on its ends."""
-        o, shape = self._observations, self._loop.shape
-        (a, b), r0 = o.segments[segment], o.row_segments[segment][0]
-        first = a + o.filter.edge(o.sample_time)
+        o, shape, reach = self._observations, self._shape, self._shape.reach
+        (a, b), (r0, r1) = o.segments[segment], o.row_segments[segment]
+        factor, edge = o.decimation.factor, o.filter.edge(o.sample_time)
+        low, high = r0, r1
+        if reach:
+            away = max(reach - edge, o.decimation.memory(), 0)
+            low = r0 + -(-away // factor)
+            high = min(r0 + (b - a - 2 * edge - 1 - away) // factor + 1, r1)
         most = shape.iterations * shape.rows - shape.delay
-        for block, rows in divide_rows(self._edges, slice(*self._inner(segment, reach))):
+        for block, rows in divide_rows(self._edges, slice(low, high)):
             for r in range(rows.start, rows.stop, most):
                 end = min(r + most, rows.stop)
-                begin = first + (r - r0) * o.decimation.factor - reach
-                length = self._samples_of(end - r)
-                samples = slice(begin, min(begin + length, b), self._stride)
+                begin = a + edge + (r - r0) * factor - reach
+                samples = slice(begin, min(begin + self._samples_of(end - r), b), self._stride)
                 yield Piece(block, (r, end), samples)
 
-    def _inner(self, segment: int, reach: int) -> tuple[int, int]:
-        """Return the range of rows of a segment that do not depend on its ends."""
-        o = self._observations
-        (a, b), (r0, r1) = o.segments[segment], o.row_segments[segment]
-        if not reach:
-            return r0, r1
-        factor, edge = o.decimation.factor, o.filter.edge(o.sample_time)
-        away = max(reach - edge, o.decimation.memory(), 0)
-        low = r0 + -(-away // factor)
-        high = r0 + (b - a - 2 * edge - 1 - away) // factor + 1
-        return (low, min(high, r1)) if low < high else (r1, r1)
-
     def _samples_of(self, rows: int) -> int:
-        shape = self._loop.shape
+        shape = self._shape
         return -(-(rows + shape.delay) // shape.rows) * shape.samples * self._stride
 
-    def _reduce_ends(self, base: BaseParameters, reach: int) -> Iterator[RowChunk]:
-        """Yield the rows that no piece covers, reduced in NumPy."""
-        covered = np.zeros(len(self._mask), bool)
+    def _reduce_ends(self, base: BaseParameters) -> Iterator[tuple[int, list[np.ndarray]]]:
+        """Yield block and equations of the rows that no piece covers, reduced in NumPy."""
+        outer = np.ones(len(self._mask), bool)
         for piece in self._pieces:
-            covered[slice(*piece.rows)] = True
-        indices = base.acting_columns
-        for chunk in self._observations.chunks(max(4096, 2 * reach)):
-            start, stop = chunk.rows
-            outer = np.flatnonzero(~covered[start:stop])
-            if not len(outer):
-                continue
-            columns, forces = reduce_chunk(
-                base, *self._observations.read(slice(*chunk.samples)), chunk
-            )
-            for run in np.split(outer, np.flatnonzero(np.diff(outer) > 1) + 1):
-                a, b = int(run[0]), int(run[-1]) + 1
-                for block, rows in divide_rows(self._edges, slice(start + a, start + b)):
-                    own = slice(rows.start - start, rows.stop - start)
-                    copies = [theta[own].copy() for theta in columns]
-                    mask = self._mask[rows]
-                    yield RowChunk(0, block, rows, indices, copies, forces[own].copy(), mask)
+            outer[slice(*piece.rows)] = False
+        changes = np.flatnonzero(np.diff(np.r_[False, outer, False])).tolist()
+        runs = list(zip(changes[::2], changes[1::2], strict=True))
+        samples = max(4096, 2 * self._shape.reach)
+        for chunk in row_chunks(base, self._observations, samples, runs):
+            mask = chunk.mask & outer[chunk.rows, None]
+            for part in chunk._replace(mask=mask).divide(self._edges):
+                yield part.block, part.equations()
 
     def triangles(self) -> list[list[np.ndarray]]:
         """Return an R factor of columns and forces for each block and joint."""
@@ -175,67 +230,103 @@ class _Stream:
 
     def _first_grams(self, parts: int = 8) -> Grams:
         """Return the Gram matrices of a few parts of the log."""
-        plain = [np.eye(width) for width in self._widths]
-        step = max(1, len(self._pieces) // parts)
-        pieces = [self._first_rows(piece) for piece in self._pieces[step // 2 :: step]]
+        step, pieces = max(1, len(self._pieces) // parts), []
+        for block, (a, b), samples in self._pieces[step // 2 :: step]:
+            # As many rows of a piece as an iteration has.
+            b = min(b, a + self._shape.rows)
+            stop = min(samples.stop, samples.start + self._samples_of(b - a))
+            pieces.append(Piece(block, (a, b), slice(samples.start, stop, samples.step)))
         total = [np.zeros((width, width)) for width in self._widths]
-        for _, grams in self._run(pieces, plain):
-            _add(total, grams)
-        self._add_ends([total] * (len(self._edges) - 1), plain)
+        self._add([total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths])
         return total
-
-    def _first_rows(self, piece: Piece) -> Piece:
-        """Return the first rows of a piece, as many as an iteration has."""
-        (a, b), samples = piece.rows, piece.samples
-        b = min(b, a + self._loop.shape.rows)
-        stop = min(samples.stop, samples.start + self._samples_of(b - a))
-        return Piece(piece.block, (a, b), slice(samples.start, stop, samples.step))
 
     def _pass(self, first: Grams) -> tuple[Grams, list[Grams], bool]:
         """Return the first triangles, Gram matrices of every block, and whether they agree."""
         R = [_triangle(G) for G in first]
         mixing = [np.linalg.inv(r) for r in R]
         blocks = [[np.zeros((w, w)) for w in self._widths] for _ in self._edges[1:]]
-        for done, (piece, grams) in enumerate(self._run(self._pieces, mixing), 1):
-            _add(blocks[piece.block], grams)
-            if self._progress is not None:
-                self._progress(done / len(self._pieces))
-        self._add_ends(blocks, mixing)
+        self._add(blocks, self._pieces, mixing, self._progress)
         total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
         return R, blocks, all(_similar(*x) for x in zip(total, first, mixing, strict=True))
 
+    def _add(
+        self,
+        blocks: list[Grams],
+        pieces: Sequence[Piece],
+        mixing: Grams,
+        progress: Progress | None = None,
+    ) -> None:
+        """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
+        for done, (piece, grams) in enumerate(self._run(pieces, mixing), 1):
+            for total, G in zip(blocks[piece.block], grams, strict=True):
+                total += G
+            if progress is not None:
+                progress(done / len(pieces))
+        for block, equations in self._ends:
+            for total, rows, mix in zip(blocks[block], equations, mixing, strict=True):
+                mixed = rows @ mix
+                total += mixed.T @ mixed
+
     def _run(self, pieces: Sequence[Piece], mixing: Grams) -> Iterator[tuple[Piece, Grams]]:
-        """Call the loop for some pieces, and read the next ones meanwhile."""
-        size = len(self._loop.devices)
+        """Call the loop for some pieces, one on each device, and read the next ones meanwhile."""
+        size = len(self._devices)
         groups = [pieces[k : k + size] for k in range(0, len(pieces), size)]
+
+        def read(group: Sequence[Piece]) -> list:
+            return [self._observations.read(piece.samples) for piece in group]
+
+        # The thread only reads: memory that a thread allocates comes back late.
         with ThreadPoolExecutor(1) as reader:
-            coming = [reader.submit(self._prepare, group) for group in groups[:1]]
+            coming = [reader.submit(read, group) for group in groups[:1]]
             for group, following in itertools.zip_longest(groups, groups[1:]):
-                prepared = coming.pop().result()
+                found = coming.pop().result()
                 if following is not None:
-                    coming.append(reader.submit(self._prepare, following))
-                yield from zip(group, self._loop(prepared, mixing), strict=True)
+                    coming.append(reader.submit(read, following))
+                arrays = [self._fill(*x) for x in zip(group, found, strict=True)]
+                yield from zip(group, self._call(arrays, mixing), strict=True)
 
-    def _prepare(self, pieces: Sequence[Piece]) -> list[list[np.ndarray]]:
-        prepared, delay = [], self._loop.shape.delay
-        for piece in pieces:
-            motion, forces = self._observations.read(piece.samples)
-            mask = np.concatenate(
-                [np.zeros((delay, self._mask.shape[1]), bool), self._mask[slice(*piece.rows)]]
-            )
-            prepared.append(self._loop.prepare((motion.q, motion.qd, motion.qdd, forces), mask))
-        return prepared
+    def _fill(self, piece: Piece, read: tuple) -> list[np.ndarray]:
+        """Return the arrays of one piece, filled up to the shape of the loop."""
+        (motion, forces), shape = read, self._shape
+        # The first rows come late, and do not count.
+        mask = np.pad(self._mask[slice(*piece.rows)], ((shape.delay, 0), (0, 0)))
+        length = shape.iterations * shape.samples
+        arrays = [
+            _filled_up(np.asarray(x, np.float64), length)
+            for x in (motion.q, motion.qd, motion.qdd, forces)
+        ]
+        arrays.append(_filled_up(mask, shape.iterations * shape.rows))
+        return [*arrays, np.asarray(-(-len(mask) // shape.rows), np.int32)]
 
-    def _add_ends(self, blocks: list[Grams], mixing: Grams) -> None:
-        for end in self._ends:
-            for j, equations in enumerate(end.equations()):
-                rows = equations @ mixing[j]
-                blocks[end.block][j] += rows.T @ rows
+    def _call(self, pieces: list[list[np.ndarray]], mixing: Grams) -> list[Grams]:
+        """Return the Gram matrices of some pieces, at most one for each device."""
+        count, devices = len(pieces), self._devices
+        with double_precision(), jax.default_device(devices[0]):
+            if len(devices) == 1:
+                grams = [self._loop(*x, mixing, self._matrices) for x in pieces]
+                return [[np.asarray(G) for G in joints] for joints in grams]
+            pieces = pieces + [[np.zeros_like(x) for x in pieces[0]]] * (len(devices) - count)
+            run = _on_devices(self._loop, Mesh(np.array(devices), ("pieces",)))
+            stacked = (np.stack(x) for x in zip(*pieces, strict=True))
+            grams = [np.asarray(G) for G in run(*stacked, mixing, self._matrices)]
+        return [[G[k] for G in grams] for k in range(count)]
 
 
-def _add(total: Grams, grams: Grams) -> None:
-    for into, G in zip(total, grams, strict=True):
-        into += G
+def _matrix(response: np.ndarray, factor: int) -> Float[np.ndarray, "rows samples"]:
+    """Return the matrix that makes the rows of a tile of consecutive samples."""
+    lags = len(response)
+    H = np.zeros((TILE, (TILE - 1) * factor + lags))
+    for i in range(TILE):
+        H[i, i * factor : i * factor + lags] = response
+    return H
+
+
+def _filled_up(x: np.ndarray, length: int) -> np.ndarray:
+    if len(x) >= length:
+        return np.ascontiguousarray(x[:length])
+    out = np.zeros((length, *x.shape[1:]), x.dtype)
+    out[: len(x)] = x
+    return out
 
 
 def _triangle(G: np.ndarray) -> np.ndarray:
@@ -270,3 +361,111 @@ def _root(G: np.ndarray) -> np.ndarray:
         rows = np.sqrt(np.maximum(values, 0.0))[:, None] * directions.T
         root[own] = np.linalg.qr(rows, mode="r")
     return root
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(
+    program: Program, tool: Program | None, acting: tuple[tuple[int, ...], ...], shape: LoopShape
+) -> Callable:
+    """Return the loop, which is compiled when it is first called."""
+    joints = len(acting)
+    size = len(program.outputs) // joints
+    fence = default_fence("cpu", jax.__version_info__)
+    base_columns = lower(program, fence)
+    tool_forces = None if tool is None else lower(tool, fence)
+    # Joints share columns: every distinct one is filtered once.
+    distinct: dict[tuple[bool, int | float], int] = {}
+    first, places = [], []
+    for j, own in enumerate(acting):
+        for k in own:
+            x = program.outputs[j * size + k]
+            if distinct.setdefault((isinstance(x, int), x), len(distinct)) == len(first):
+                first.append(j * size + k)
+        outputs = [program.outputs[j * size + k] for k in own]
+        places.append([distinct[isinstance(x, int), x] for x in outputs])
+    places = [np.array([*own, len(first) + j]) for j, own in enumerate(places)]
+    height = len(first) + joints
+
+    def evaluate(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
+        packed = base_columns(q, qd, qdd)
+        rows = [jnp.broadcast_to(jnp.asarray(packed[i], float), q.shape[1:]) for i in first]
+        known = [0.0] * joints if tool_forces is None else tool_forces(q, qd, qdd)
+        rows += [f - k for f, k in zip(forces, known, strict=True)]
+        return rows
+
+    def nothing(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
+        return [jnp.zeros(q.shape[1:])] * height
+
+    def run(
+        q: AnyArray,
+        qd: AnyArray,
+        qdd: AnyArray,
+        forces: AnyArray,
+        mask: AnyArray,
+        count: AnyArray,
+        mixing: list,
+        matrices: list,
+    ) -> list[Array]:
+        def iteration(k: Array, state: tuple) -> tuple:
+            carried, grams = state
+            parts = [_part(x, k, shape.samples) for x in (q, qd, qdd, forces)]
+            # Results of a branch are stored: no consumer computes them again.
+            columns = jax.lax.cond(count > 0, evaluate, nothing, *parts)
+            new = jnp.stack(columns)
+            left = []
+            stages = zip(carried, matrices, shape.factors, shape.lags, strict=True)
+            for before, H, factor, lags in stages:
+                joined = jnp.concatenate([before, new], axis=1)
+                left.append(joined[:, new.shape[1] :])
+                new = _decimate(joined, H, new.shape[1] // factor, factor, lags)
+            counted = _part(mask, k, shape.rows).astype(new.dtype)
+            sums = []
+            for j, own in enumerate(places):
+                own_rows = new[own] if carried else jnp.stack([columns[i] for i in own])
+                rows = mixing[j].T @ (own_rows * counted[j][None])
+                sums.append(grams[j] + rows @ rows.T)
+            return left, sums
+
+        carried = [
+            jnp.zeros((height, d * f)) for d, f in zip(shape.delays, shape.factors, strict=True)
+        ]
+        grams = [jnp.zeros((len(own), len(own))) for own in places]
+        return jax.lax.fori_loop(0, count, iteration, (carried, grams))[1]
+
+    return jax.jit(run)
+
+
+def _part(x: AnyArray, k: Array, length: int) -> Array:
+    """Return the samples of one iteration, on the last axis."""
+    start = (k * length, jnp.zeros_like(k))
+    return jax.lax.dynamic_slice(x, start, (length, x.shape[1])).T
+
+
+def _decimate(x: Array, H: Array, rows: int, factor: int, lags: int) -> Array:
+    """Return the banded matrix product, tile by tile."""
+    tiles = []
+    for start in range(0, rows, TILE):
+        height = min(TILE, rows - start)
+        window = (height - 1) * factor + lags
+        low = start * factor
+        tiles.append(x[:, low : low + window] @ H[:height, :window].T)
+    return jnp.concatenate(tiles, axis=1)
+
+
+@functools.lru_cache(maxsize=16)
+def _on_devices(run: Callable, mesh: Mesh) -> Callable:
+    """Return the loop for one piece on each device, compiled once for all."""
+    own, same = PartitionSpec(*mesh.axis_names), PartitionSpec()
+
+    def device(*arrays) -> list[Array]:
+        *piece, mixing, matrices = arrays
+        return [x[None] for x in run(*(x[0] for x in piece), mixing, matrices)]
+
+    specs = (*(own,) * 6, same, same)
+    if hasattr(jax, "shard_map"):
+        mapped = jax.shard_map(device, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)
+    else:
+        from jax.experimental.shard_map import shard_map
+
+        mapped = shard_map(device, mesh=mesh, in_specs=specs, out_specs=own, check_rep=False)
+    return jax.jit(mapped)

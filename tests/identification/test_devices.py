@@ -15,7 +15,6 @@ from virtual import observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.devices import factorise_across_processes
-from jaxid.identification.factors import Blocks
 
 HERE = Path(__file__).resolve().parent
 COMMON = """
@@ -49,8 +48,8 @@ def write(problem):
 """
 LONG = """
 assert len(jax.devices()) == int(sys.argv[2])
-from jaxid.identification import compiled, streaming
-streaming.LONG, compiled.PIECE = 1000, 2048
+from jaxid.identification import streaming
+streaming.LONG, streaming.PIECE = 1000, 2048
 o = observations(base.model, standard_parameters(base.model), samples=20011, noise=0.3,
                  filter=jid.ZeroPhaseButterworth(30.0), every=15)
 shares = []
@@ -72,18 +71,13 @@ from jaxid.identification import devices
 if number == 1:
     def killed(*_):
         os.kill(os.getpid(), signal.SIGKILL)
-    devices._exchange = killed
+    devices._pack = killed
 start = time.monotonic()
 try:
     factorise_across_processes(base, [recording(number)], patience=30.0)
 except (RuntimeError, TimeoutError) as error:
     say("ended:", type(error).__name__, error)
     os._exit(7)
-"""
-PROCESSES = """
-# The second process has two recordings, the first one: factors are filled up to the same number.
-own = [recording(0)] if number == 0 else [recording(1), recording(2)]
-write(factorise_across_processes(base, own, patience=60.0))
 """
 LEFT_ALONE = """
 if number == 1:
@@ -92,17 +86,6 @@ try:
     factorise_across_processes(base, [recording(0)], patience=float(sys.argv[4]))
 except (RuntimeError, TimeoutError) as error:
     say(type(error).__name__, error)
-    os._exit(7)
-"""
-
-LEFT_BY_THE_FIRST = """
-import signal
-if number == 0:
-    os.kill(os.getpid(), signal.SIGKILL)
-try:
-    factorise_across_processes(base, [recording(1)], patience=40.0)
-except (RuntimeError, TimeoutError) as error:
-    say("ended:", type(error).__name__, error)
     os._exit(7)
 """
 
@@ -172,23 +155,8 @@ def test_a_long_log_on_three_devices_without_asking(tmp_path):
     np.testing.assert_array_equal(one["rows"], three["rows"])
 
 
-def test_two_processes(base, tmp_path):
-    port = free_port()
-    paths = [tmp_path / f"{k}.npz" for k in range(2)]
-    processes = [start(PROCESSES, path, port, f"{k}/2") for k, path in enumerate(paths)]
-    outputs = finish(*processes)
-    assert [p.returncode for p in processes] == [0, 0], "\n\n".join(outputs)
-    recordings = [recording(base, k) for k in range(3)]
-    fit = jid.identification.identify.fit_problem(
-        jid.RegressionProblem(base, recordings), jid.estimators.LeastSquares()
-    )
-    for path in paths:
-        assert_same(path, fit)
-    a, b = (np.load(path)["p"] for path in paths)
-    np.testing.assert_array_equal(a, b)
-
-
 def test_three_processes_read_their_own_shards(base, tmp_path):
+    """One of them has more recordings than the others."""
     count = 3
     folder = tmp_path / "logs"
     folder.mkdir()
@@ -211,16 +179,6 @@ def test_three_processes_read_their_own_shards(base, tmp_path):
     for path in paths:
         assert_same(path, fit)
         np.testing.assert_array_equal(np.load(path)["p"], np.load(paths[0])["p"])
-
-
-def test_many_blocks_are_joined_in_pairs(base):
-    parts = jid.RegressionProblem(base, [recording(base, 0)], divisions=11).blocks.parts
-    few = Blocks(parts).condense(4).parts
-    assert len(few) == 3
-    total, expected = Blocks(tuple(few)).total, Blocks(parts).total
-    np.testing.assert_array_equal(total.rows, expected.rows)
-    for a, b in zip(total.joints, expected.joints, strict=True):
-        np.testing.assert_allclose(a.R.T @ a.R, b.R.T @ b.R, rtol=1e-12, atol=1e-9)
 
 
 def test_a_process_that_is_killed_in_the_exchange_ends_the_others(tmp_path):
@@ -252,17 +210,6 @@ def test_a_process_that_dies_ends_the_others(tmp_path, heartbeat, patience, said
     assert processes[1].returncode == 3
     assert processes[0].returncode == 7, outputs[0]
     assert said in outputs[0], outputs[0]
-
-
-def test_a_first_process_that_is_killed_ends_the_others(tmp_path):
-    """It watches over the others: where it is gone, JAX itself ends them at once."""
-    arguments = tmp_path / "no.npz", free_port()
-    processes = [start(LEFT_BY_THE_FIRST, *arguments, f"{k}/2") for k in range(2)]
-    outputs = finish(*processes)
-    assert processes[0].returncode == -signal.SIGKILL
-    assert processes[1].returncode not in (0, None), outputs[1]
-    assert "lost another one" in outputs[1] or "another task died" in outputs[1], outputs[1]
-    assert not (tmp_path / "no.npz").exists()
 
 
 def test_a_program_of_one_process_needs_no_coordinator(base):

@@ -1,7 +1,5 @@
 """Logs on disk give what the same logs in memory give."""
 
-import math
-
 import numpy as np
 import polars as pl
 import pytest
@@ -11,7 +9,7 @@ import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification import streaming
 from jaxid.measurement import chunked_files, units
-from jaxid.measurement.log_on_disk import filter_memory, scan_log
+from jaxid.measurement.log_on_disk import scan_log
 from jaxid.measurement.timestamps import NeedsMemory
 
 COLUMNS = jid.Columns(angles="q{}", forces="tau{}", time="t")
@@ -74,16 +72,15 @@ def agree(base, log, o):
         assert np.abs((A.T @ A - B.T @ B) / norms / norms[:, None]).max() < 1e-9
 
 
-@pytest.mark.parametrize("decimation", [jid.Subsample(1), EVERY])
-def test_parquet_in_numpy(base, parquet, decimation, monkeypatch):
+def test_parquet_in_numpy(base, parquet, monkeypatch):
     monkeypatch.setattr(jid.RegressionProblem, "samples_per_chunk", 3000)
-    log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, decimation)
-    agree(base, log, in_memory(base, parquet, decimation))
+    log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, EVERY)
+    agree(base, log, in_memory(base, parquet, EVERY))
 
 
 def test_parquet_compiled(base, parquet, monkeypatch):
     monkeypatch.setattr(streaming, "LONG", 1000)
-    monkeypatch.setattr("jaxid.identification.compiled.PIECE", 4096)
+    monkeypatch.setattr("jaxid.identification.streaming.PIECE", 4096)
     log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, EVERY)
     agree(base, log, in_memory(base, parquet, EVERY))
     fractions = []
@@ -122,14 +119,6 @@ def test_a_part_is_filtered_like_the_whole(base, parquet):
     np.testing.assert_allclose(log.motion.qd, whole.qd, atol=1e-10)
 
 
-def test_how_long_filters_remember():
-    slow, fast = (filter_memory(jid.ZeroPhaseButterworth(f), DT, False) for f in (5.0, 50.0))
-    assert slow > 5 * fast
-    assert filter_memory(jid.ZeroPhaseButterworth(math.inf), DT, True) < 10
-    with pytest.raises(NeedsMemory, match="PeriodicFourier"):
-        filter_memory(jid.filters.PeriodicFourier(2.0, 3), DT, False)
-
-
 @pytest.mark.usefixtures("short_parts")
 def test_text_is_converted_in_parts(base, parquet, text):
     log, other = (
@@ -148,9 +137,7 @@ def test_text_is_converted_in_parts(base, parquet, text):
 @pytest.mark.parametrize(
     ("separator", "header", "end", "comma"),
     [
-        (",", True, "\n", False),
         (";", True, "\r\n", True),
-        ("  ", False, "", False),
         (" , ", False, "\n\n\n", False),
         ("\t", True, "", False),
     ],
@@ -239,6 +226,8 @@ def test_refusals(base, numbers, parquet, tmp_path):
     ):
         with pytest.raises(ValueError, match=complaint):
             scan_log(tmp_path / name, COLUMNS, robot, SMOOTH)
+    with pytest.raises(NeedsMemory, match="PeriodicFourier"):
+        scan_log(parquet, COLUMNS, robot, jid.filters.PeriodicFourier(2.0, 3))
     with pytest.raises(ValueError, match="have 2 columns"):
         scan_log(parquet, COLUMNS, jid.robots.planar_arm(3, 0.4), SMOOTH)
     late = np.where(np.arange(SAMPLES) == 9000, time + 4e-4, time)

@@ -67,7 +67,26 @@ class BodyBounds(eqx.Module):
         self.ellipsoid_centre = each("ellipsoid_centre", ellipsoid_centre, 3)
         self.ellipsoid_axes = each("ellipsoid_axes", ellipsoid_axes, 3)
         self.total_mass = None if total_mass is None else float(total_mass)
-        self._check()
+        low, high, radius = self.mass_min, self.mass_max, self.radius
+        rules = (
+            ("mass_max", "positive and finite", (high > 0) & np.isfinite(high)),
+            ("radius", "positive and finite", (radius > 0) & np.isfinite(radius)),
+            ("ellipsoid_axes", "positive", self.ellipsoid_axes > 0),
+            ("mass_min", "at least 0 and below `mass_max`", (low >= 0) & (low < high)),
+            ("centre_min", "below `centre_max`", self.centre_min < self.centre_max),
+        )
+        for name, rule, good in rules:
+            if not good.all():
+                k = int(np.argwhere(~good)[0, 0])
+                value = np.asarray(getattr(self, name))[k]
+                raise InputError(f"`{name}` must be {rule}, but body {k + 1} has {value}.")
+        total = self.total_mass
+        if total is not None and not low.sum() < total < high.sum():
+            raise InputError(
+                f"`total_mass` must lie between the sums of the bodies' bounds, {low.sum():g} and "
+                f"{high.sum():g} kg, but is {total:g} kg."
+            )
+        _ = self.inner_centres
 
     @classmethod
     def from_geometry(cls, robot: Robot) -> "BodyBounds":
@@ -158,29 +177,6 @@ class BodyBounds(eqx.Module):
                 f"its sphere of {float(self.radius[k]):.3g} m: widen one of them."
             )
         return point
-
-    def _check(self) -> None:
-        low, high = np.asarray(self.mass_min), np.asarray(self.mass_max)
-        radius, axes = np.asarray(self.radius), np.asarray(self.ellipsoid_axes)
-        rules = (
-            ("mass_max", "positive and finite", (high > 0) & np.isfinite(high)),
-            ("radius", "positive and finite", (radius > 0) & np.isfinite(radius)),
-            ("ellipsoid_axes", "positive", axes > 0),
-            ("mass_min", "at least 0 and below `mass_max`", (low >= 0) & (low < high)),
-            ("centre_min", "below `centre_max`", self.centre_min < self.centre_max),
-        )
-        for name, rule, good in rules:
-            if not good.all():
-                k = int(np.argwhere(~good)[0, 0])
-                value = np.asarray(getattr(self, name))[k]
-                raise InputError(f"`{name}` must be {rule}, but body {k + 1} has {value}.")
-        total = self.total_mass
-        if total is not None and not low.sum() < total < high.sum():
-            raise InputError(
-                f"`total_mass` must lie between the sums of the bodies' bounds, {low.sum():g} and "
-                f"{high.sum():g} kg, but is {total:g} kg."
-            )
-        _ = self.inner_centres
 
 
 class EntropicPull(eqx.Module):

@@ -32,10 +32,8 @@ Number = Float[AnyArray, "*batch"] | np.floating
 class Coupling(NamedTuple):
     """Parameters of coupled drives that form one positive semidefinite matrix.
 
-    Attributes:
-        columns: Standard parameters of the matrix.
-        basis: Matrices of unit parameters [members, axes, axes].
-        diagonal: For each axis the parameter on the matrix's diagonal.
+    `basis` holds the matrices of unit parameters [columns, axes, axes], and `diagonal` for each
+    axis the parameter on the matrix's diagonal.
     """
 
     columns: tuple[int, ...]
@@ -46,10 +44,7 @@ class Coupling(NamedTuple):
 class ScaledRows(NamedTuple):
     r"""Rows $|A p - b|^2$ of all standard parameters, in units of the noise.
 
-    Attributes:
-        A: Matrix [height, standard].
-        b: Right-hand side.
-        scale: Half the number of rows: about half the squared residuals at the optimum.
+    `scale` is half the number of rows: about half the squared residuals at the optimum.
     """
 
     A: Values
@@ -157,12 +152,7 @@ class FeasibleSet(NamedTuple):
 
 
 def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> FeasibleSet:
-    """Return the feasible standard parameters of a model.
-
-    Args:
-        model: Model with bodies.
-        bounds: Bounds of its bodies.
-        margin: Fraction (0 to 1) of a nominal ball that every body contains.
+    """Return the feasible parameters of a model; bodies contain a fraction of nominal balls.
 
     Raises:
         InputError: If the model has no bodies, the bounds are those of another robot, or coupled
@@ -237,15 +227,7 @@ def _connected_axes(joined: np.ndarray) -> list[list[int]]:
 def scaled_rows(
     xp: ModuleType, base: BaseParameters, R: Values, z: Values, rows: Values | int
 ) -> ScaledRows:
-    """Divide a weighted triangular factor by the standard deviation of its residuals.
-
-    Args:
-        xp: NumPy or `jax.numpy`.
-        base: Base parameters of the factor's columns.
-        R: Upper triangle of the weighted rows [height, base].
-        z: Weighted forces, of the same decomposition [height].
-        rows: Number of rows behind the factor.
-    """
+    """Divide the weighted triangle of so many rows by the standard deviation of its residuals."""
     rest = z[base.size :]
     dof = xp.maximum(xp.asarray(rows - base.size, float), 1.0)
     # Noise below a thousandth of the forces is not credible.
@@ -369,15 +351,7 @@ def cone_program(
     strength: float = 0.0,
     prior: Float[np.ndarray, "bodies 4 4"] | None = None,
 ) -> ConeProgram:
-    """Return the convex program of least squares over a feasible set.
-
-    Args:
-        xp: NumPy or `jax.numpy`.
-        feasible: Feasible set.
-        data: Rows in units of the noise.
-        strength: Strength of a pull towards a prior's bodies.
-        prior: Pseudo-inertias of these bodies.
-    """
+    """Return the convex program of least squares, with a pull towards the bodies of a prior."""
     bounds, units = feasible.bounds, feasible.scales(xp, data)
     K, w, n = len(feasible.bodies), feasible.width, len(feasible.drives)
     _, rows, offsets = feasible.linear_bounds()
@@ -416,10 +390,7 @@ def _coupled(
 ) -> tuple[Values, np.ndarray, np.ndarray]:
     """Return the matrices of ellipsoids and couplings in scaled variables, filled up to size four.
 
-    Args:
-        xp: NumPy or `jax.numpy`.
-        feasible: Feasible set.
-        largest: Units of the drives' variables.
+    The units of the drives' variables are `largest`.
     """
     w, bounds = feasible.width, feasible.bounds
     matrices, members, fillings = [], [], []

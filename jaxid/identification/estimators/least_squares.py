@@ -29,8 +29,8 @@ from jaxid.identification.estimators.solutions import (
     ResidualVariances,
 )
 from jaxid.identification.factors import Blocks, Factors, RowChunk
-from jaxid.identification.problem import RegressionProblem, Span, reduced_rows
-from jaxid.measurement.observations import Observations
+from jaxid.identification.problem import RegressionProblem, Span
+from jaxid.measurement.observations import Observations, SamplesInMemory
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 
@@ -381,14 +381,11 @@ def _columns(
     base: BaseParameters, observations: Observations, reference: AbstractTrajectory, start: float
 ) -> tuple[np.ndarray, ...]:
     """Return the columns of a reference for each joint, filtered like those of the recording."""
-    time, n = np.asarray(observations.time), observations.joints
-
-    def read(samples: slice) -> tuple[Motion, np.ndarray]:
-        m = reference.motion(time[samples] - start)
-        motion = Motion(*(np.asarray(x, np.float64) for x in (m.q, m.qd, m.qdd)))
-        return motion, np.zeros((len(motion.q), n))
-
-    parts = [columns for _, columns, _ in reduced_rows(base, observations, read=read)]
+    m = reference.motion(np.asarray(observations.time) - start)
+    motion = Motion(*(np.asarray(x, np.float64) for x in (m.q, m.qd, m.qdd)))
+    source = SamplesInMemory(motion, np.zeros(motion.q.shape))
+    problem = RegressionProblem(base, [observations.replace(source=source)])
+    parts = [chunk.columns for chunk in problem.chunks()]
     return tuple(np.concatenate(joint) for joint in zip(*parts, strict=True))
 
 

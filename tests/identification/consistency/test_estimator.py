@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.identification.consistency import consistency_margin, solver
+from jaxid.identification.consistency import solver
 from jaxid.identification.consistency.program import nominal_bodies
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 
@@ -94,16 +94,6 @@ def test_coupled_drives_are_definite():
     assert jid.validate(fit, o).definiteness.positive_definite
 
 
-def test_seven_parameters_are_bodies_with_principal_axes():
-    terms = (jid.RigidBodies(principal_axes=True), *FRICTION)
-    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(3, 0.5), terms))
-    o = observations(base.model, np.full(base.model.size, 0.4), noise=2.0)
-    fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS))
-    assert (consistency_margin(fit.consistency.bodies) > 0).all()
-    assert not fit.consistency.bodies[:, 7:].any()
-    assert jid.validate(fit, o).definiteness.positive_definite
-
-
 def test_bounds_hold_and_are_named(panda):
     base, _, o = panda
     bounds = jid.consistency.BodyBounds.from_geometry(base.model.robot).replace(
@@ -121,7 +111,7 @@ def test_bounds_hold_and_are_named(panda):
     assert "of the centre of mass of body" in " ".join(fit.consistency.active)
 
 
-def test_a_strong_pull_leads_to_its_bodies(panda):
+def test_a_strong_pull_leads_to_its_bodies(panda, consistent):
     base, p, o = panda
     bodies = p[:70].reshape(7, 10)
     gaps = []
@@ -129,17 +119,11 @@ def test_a_strong_pull_leads_to_its_bodies(panda):
         pull = jid.consistency.EntropicPull(bodies, strength)
         fit = jid.identify(base, o, jid.PhysicallyConsistent(WEIGHTS, pull=pull))
         gaps.append(np.abs(fit.consistency.bodies - bodies).max())
+        if strength == 1.0:
+            smallest = [jid.validate(x, o).definiteness.smallest for x in (consistent, fit)]
+            assert smallest[1] > smallest[0] > 0
     assert gaps[0] > gaps[1] > gaps[2]
     assert gaps[2] < 0.05 * gaps[0]
-
-
-def test_a_pull_gives_the_mass_matrix_a_margin(panda, consistent):
-    base, _, o = panda
-    pulled = jid.identify(
-        base, o, jid.PhysicallyConsistent(WEIGHTS, pull=jid.consistency.EntropicPull())
-    )
-    smallest = [jid.validate(fit, o).definiteness.smallest for fit in (consistent, pulled)]
-    assert smallest[1] > smallest[0] > 0
 
 
 def test_a_parameter_prior_counts(panda):
