@@ -214,15 +214,17 @@ def _estimate_each(
     row_time: float | None,
 ) -> BatchFit:
     """Return the estimates of `identify` for each data set and draw, on all cores."""
-    arrays = [np.asarray(x) for x in jax.tree.leaves(motion)]
+    q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
     Q = np.asarray(forces).reshape(len(forces), -1, *forces.shape[-2:])
-    counted = np.ones(arrays[0].shape, bool) if mask is None else np.asarray(mask) > 0
+    counted = np.ones(q.shape, bool) if mask is None else np.asarray(mask) > 0
     uncertainty = IndependentRows() if row_time is None else None
 
     def one(case: tuple[int, int]) -> Fit:
         k, draw = case
         o = Observations.of(
-            *(x[k] for x in arrays),
+            q[k],
+            qd[k],
+            qdd[k],
             np.where(counted[k], Q[k, draw], 0.0),
             sample_time=1.0 if row_time is None else row_time,
             mask=counted[k],

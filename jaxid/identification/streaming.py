@@ -172,7 +172,11 @@ class _Stream:
         self._widths = [len(columns) + 1 for columns in base.acting_columns]
         self._mask = np.asarray(observations.mask)
         self._shape = LoopShape.of(stages, CHUNK)
-        self._matrices = [_matrix(response, factor) for response, factor in stages]
+        # Each makes the rows of a tile of consecutive samples.
+        self._matrices = [
+            np.stack([np.pad(h, (k * f, (TILE - 1 - k) * f)) for k in range(TILE)])
+            for h, f in stages
+        ]
         self._devices = jax.local_devices(backend="cpu")
         n = (base.model.robot.joints,)
         columns, tool = program_of(base, base.columns, n, n, n), None
@@ -310,15 +314,6 @@ class _Stream:
             stacked = (np.stack(x) for x in zip(*pieces, strict=True))
             grams = [np.asarray(G) for G in run(*stacked, mixing, self._matrices)]
         return [[G[k] for G in grams] for k in range(count)]
-
-
-def _matrix(response: np.ndarray, factor: int) -> Float[np.ndarray, "rows samples"]:
-    """Return the matrix that makes the rows of a tile of consecutive samples."""
-    lags = len(response)
-    H = np.zeros((TILE, (TILE - 1) * factor + lags))
-    for i in range(TILE):
-        H[i, i * factor : i * factor + lags] = response
-    return H
 
 
 def _filled_up(x: np.ndarray, length: int) -> np.ndarray:

@@ -269,7 +269,7 @@ def _barriers(
     if p.members.shape[-2]:
         flat = xp.reshape(p.couplings, (*p.members.shape, 16))
         more = flat @ _products(xp, inverse_S[K:], Z[K:]) @ xp.swapaxes(flat, -1, -2)
-        ones = indicators(p.members, H.shape[0])
+        ones = indicators(p.members, p.A.shape[-1])
         H = H + xp.einsum("kia,kij,kjb->ab", ones, symmetric_part(xp, more), ones)
     return H
 
