@@ -11,7 +11,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
-from jaxid.identification.estimators.solutions import NUMERICAL
+from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
@@ -280,51 +280,45 @@ def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination],
     factors, weights = problem.factors, np.asarray(fit.weights)
     squares = weights**2
     total = float(squares @ factors.force_squares)
+    parts = [(rest.total, part.total) for rest, part in cross_validation_folds(problem.blocks, 10)]
+    folds = [(*rest.weighted(weights), part) for rest, part in parts]
     R, z = factors.weighted(weights)
-    parts = [
-        (rest.total.weighted(weights), part.total)
-        for rest, part in cross_validation_folds(problem.blocks, 10)
-    ]
     kept = list(range(fit.base.size))
-    naive = _estimates(factors, R, z, weights, kept)[1]
+    naive = _naive_deviations(factors, weights, *_solve(R, z, kept))
     deviations = np.asarray(fit.standard_deviations)
     known = np.isfinite(deviations) & (naive > 0)
     ratio = np.where(known, deviations / np.where(naive > 0, naive, 1.0), np.inf)
     path, sets, name, deviation = [], [], "", 0.0
     while kept:
-        p, naive = _estimates(factors, R, z, weights, kept)
+        p, B = _solve(R, z, kept)
         error = float(squares @ factors.residual_squares(p))
-        held_out = sum(squares @ part.residual_squares(_solve(*r, kept)) for r, part in parts)
+        held_out = sum(squares @ part.residual_squares(_solve(*r, kept)[0]) for *r, part in folds)
         errors = float(np.sqrt(error / total)), float(np.sqrt(held_out / total))
         sets.append(list(kept))
         path.append(Elimination(name, deviation, len(kept), *errors))
         size = np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
-        relative = ratio[kept] * naive / size
+        relative = ratio[kept] * _naive_deviations(factors, weights, p, B) / size
         worst = int(np.argmax(relative))
         name, deviation = fit.base.names[kept[worst]], float(relative[worst])
         del kept[worst]
     return path, sets
 
 
-def _solve(R: np.ndarray, z: np.ndarray, kept: list[int]) -> np.ndarray:
-    """Return the least-squares solution in some parameters; the others are zero."""
-    p = np.zeros(R.shape[1])
-    scale = np.linalg.norm(R[:, kept], axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    p[kept] = np.linalg.lstsq(R[:, kept] / scale, z, rcond=NUMERICAL)[0] / scale
-    return p
+def _solve(R: np.ndarray, z: np.ndarray, kept: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return least squares in some parameters, the others zero, and the inverse information."""
+    p, B = np.zeros(R.shape[1]), np.zeros((R.shape[1], len(kept)))
+    decomposition = Decomposition.of(R[:, kept], z)
+    p[kept], B[kept] = decomposition.solve(), decomposition.inverse_information()
+    return p, B
 
 
-def _estimates(
-    factors: Factors, R: np.ndarray, z: np.ndarray, weights: np.ndarray, kept: list[int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return estimates, and standard deviations for independent rows and joints' variances."""
-    p = _solve(R, z, kept)
+def _naive_deviations(
+    factors: Factors, weights: np.ndarray, p: np.ndarray, B: np.ndarray
+) -> np.ndarray:
+    """Return standard deviations for independent rows, and a variance of each joint."""
     variances = factors.residual_squares(p) / np.maximum(factors.rows, 1)
-    half = np.linalg.pinv(R[:, kept], rcond=NUMERICAL)
-    B, inner = np.zeros((R.shape[1], len(kept))), np.zeros(len(kept))
-    B[kept] = half @ half.T
+    total = np.zeros(B.shape[1])
     for joint, w, variance in zip(factors.joints, weights, variances, strict=True):
         influence = w**2 * np.asarray(joint.R)[:, :-1] @ B[list(joint.columns)]
-        inner += variance * np.sum(influence**2, axis=0)
-    return p, np.sqrt(inner)
+        total += variance * np.sum(influence**2, axis=0)
+    return np.sqrt(total)

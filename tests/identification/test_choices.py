@@ -39,20 +39,20 @@ def test_parameters_without_effect_are_eliminated():
     assert ratio.max() < 1.2
     assert ratio.min() < 0.9
     assert f"{found.last.remaining} of {BASE.size} base parameters are essential" in str(found)
-
-
-def test_the_path_leads_from_all_parameters_to_one_with_growing_error():
-    o = virtual.observations(MODEL, without_offsets(), noise=0.3, samples=400)
-    fit = jid.identify(BASE, o, WLS)
-    found = jid.essential_parameters(fit, o)
+    # The path leads from all parameters to one, with growing error.
     assert [s.remaining for s in found.path] == list(range(BASE.size, 0, -1))
     assert found.path[0].name == ""
     assert len({s.name for s in found.path}) == BASE.size
     assert (np.diff([s.error for s in found.path]) >= -1e-12).all()
     assert found.path[0].error == pytest.approx(fit.residual, rel=1e-9)
-    smallest = min(s.held_out for s in found.path)
-    assert found.last.held_out <= 1.02 * smallest
-    assert found.path[found.path.index(found.last) + 1].held_out > 1.02 * smallest
+    most = 1.001 * min(s.held_out for s in found.path)
+    assert found.last.held_out <= most
+    assert found.path[found.path.index(found.last) + 1].held_out > most
+    # A model of fewer parameters is the model in which the others are zero.
+    p, motion = np.zeros(BASE.size), virtual.motion(3, 20)
+    p[kept] = found.fit.parameters
+    torques = BASE.inverse_dynamics(p, motion)
+    np.testing.assert_allclose(found.fit.predict(motion), torques, atol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def noisy_log():
     return jid.Recording.of(bits * np.round(q / bits), forces + noise, time=t.ravel())
 
 
-CUTOFFS = (0.5, 2.0, 8.0, 16.0, 60.0, 100.0)
+CUTOFFS = (0.5, 8.0, 16.0, 100.0)
 
 
 def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from virtual import dense, observations, standard_parameters
+from virtual import observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.estimators import Complete
 from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Factors
 
@@ -22,20 +21,8 @@ LINEAR = (
     jid.WeightedLeastSquares(solution=jid.estimators.Ridge(0.1)),
 )
 """Estimates that are linear in the forces."""
-FOLLOWING = (
-    *LINEAR,
-    jid.WeightedLeastSquares(jid.estimators.ResidualVariances()),
-    jid.estimators.IterativelyReweighted(loss=jid.estimators.Huber()),
-    jid.estimators.IterativelyReweighted(loss=jid.estimators.Tukey()),
-    jid.estimators.GeneralisedLeastSquares(),
-)
-"""Estimates that are in other units where the forces are."""
-few = settings(max_examples=4)
+few = settings(max_examples=3)
 seeds = st.integers(0, 1000)
-
-
-def name(estimator):
-    return type(estimator).__name__
 
 
 def observed(seed, samples=150, **options):
@@ -45,34 +32,18 @@ def observed(seed, samples=150, **options):
     )
 
 
-def with_forces(o, forces):
-    return o.replace(forces=forces)
-
-
 def close(found, expected, rtol=1e-9):
     size = np.abs(expected).max()
     np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol * size)
 
 
-@pytest.mark.parametrize("estimator", FOLLOWING, ids=name)
-@few
-@given(seed=seeds, power=st.integers(-30, 30))
-def test_forces_in_other_units_give_parameters_in_other_units(estimator, seed, power):
-    """Grams for kilograms, say; by powers of two nothing is rounded on the way in."""
-    o, c = observed(seed), 2.0**power
-    one, other = (jid.identify(BASE, x, estimator) for x in (o, with_forces(o, c * o.forces)))
-    close(other.parameters, c * one.parameters)
-    close(other.standard_deviations, c * one.standard_deviations, 1e-8)
-    assert other.undetermined == one.undetermined
-
-
-@pytest.mark.parametrize("estimator", LINEAR, ids=name)
+@pytest.mark.parametrize("estimator", LINEAR)
 @few
 @given(first=seeds, second=seeds, c=st.floats(-3.0, 3.0))
 def test_forces_that_add_up_give_parameters_that_do(estimator, first, second, c):
     a, b = observed(first), observed(second)
-    b = with_forces(a, np.asarray(b.forces))
-    both = with_forces(a, np.asarray(a.forces) + c * np.asarray(b.forces))
+    b = a.replace(forces=np.asarray(b.forces))
+    both = a.replace(forces=np.asarray(a.forces) + c * np.asarray(b.forces))
     p, q, sum_ = (jid.identify(BASE, x, estimator).parameters for x in (a, b, both))
     np.testing.assert_allclose(sum_, p + c * q, rtol=1e-8, atol=1e-8 * np.abs(p).max())
 
@@ -80,15 +51,11 @@ def test_forces_that_add_up_give_parameters_that_do(estimator, first, second, c)
 @few
 @given(seed=seeds, weights=st.tuples(*[st.floats(1e-3, 1e3)] * 2), power=st.integers(-40, 40))
 def test_only_the_ratio_of_weights_counts(seed, weights, power):
-    o = observed(seed)
-    fits = [
-        jid.identify(
-            BASE, o, jid.WeightedLeastSquares(jid.estimators.GivenWeights(c * np.array(weights)))
-        )
-        for c in (1.0, 2.0**power)
-    ]
-    close(fits[1].parameters, fits[0].parameters)
-    close(fits[1].standard_deviations, fits[0].standard_deviations)
+    o, w = observed(seed), np.array(weights)
+    given = (jid.estimators.GivenWeights(x) for x in (w, 2.0**power * w))
+    one, other = (jid.identify(BASE, o, jid.WeightedLeastSquares(x)) for x in given)
+    close(other.parameters, one.parameters)
+    close(other.standard_deviations, one.standard_deviations)
 
 
 @few
@@ -104,10 +71,6 @@ def test_the_order_of_rows_is_rounding(seed, order):
     close(b.parameters, a.parameters, 1e-10)
     assert b.rows == a.rows
     close(b.residual_rms, a.residual_rms, 1e-10)
-    theta, forces, joint = dense(BASE, o)
-    w = 1.0 / np.array([40.0, 5.0])[joint]
-    expected = np.linalg.lstsq(w[:, None] * theta, w * forces, rcond=None)[0]
-    close(b.parameters, expected, 1e-10)
 
 
 @few
@@ -125,8 +88,7 @@ def test_rows_of_zeros_and_the_number_of_blocks_change_nothing(seed, added, bloc
 
 
 def solved(factors):
-    decomposition = Decomposition.of(*factors.weighted(np.array([0.025, 0.2])))
-    return decomposition.solve(Complete().inverse(decomposition.values))
+    return Decomposition.of(*factors.weighted(np.array([0.025, 0.2]))).solve()
 
 
 @few
@@ -148,7 +110,7 @@ def test_rows_that_do_not_count_may_hold_anything(seed):
     rng = np.random.default_rng(seed)
     mask = rng.uniform(size=(150, 2)) > 0.2
     o = observed(seed, mask=mask)
-    spoilt = with_forces(o, np.where(mask, o.forces, 1e6 * rng.standard_normal((150, 2))))
+    spoilt = o.replace(forces=np.where(mask, o.forces, 1e6 * rng.standard_normal((150, 2))))
     a, b = (jid.identify(BASE, x, jid.WeightedLeastSquares()) for x in (o, spoilt))
     close(b.parameters, a.parameters, 1e-12)
     assert b.rows == a.rows == tuple(mask.sum(axis=0))

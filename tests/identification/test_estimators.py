@@ -74,18 +74,19 @@ def member(request, base, noisy):
 
 def test_every_estimator_finds_the_truth_without_noise(base, member):
     p = standard_parameters(base.model)
-    o = observations(base.model, p)
+    o = observations(base.model, p, samples=100)
     fit = jid.identify(base, o, members(o)[member[0]])
     np.testing.assert_allclose(fit.parameters, base.from_standard(p), rtol=1e-7, atol=1e-7)
 
 
 def test_every_estimator_follows_its_forces_and_judges_itself(base, noisy, member):
-    """Twice the forces, twice the parameters and their deviations."""
-    k, fit = member
-    double = with_forces(noisy, lambda f: np.multiply(f, 2.0, out=f))
-    other = jid.identify(base, double, members(noisy, 2.0)[k])
-    np.testing.assert_allclose(other.parameters, 2 * np.asarray(fit.parameters), rtol=1e-4)
-    np.testing.assert_allclose(other.standard_deviations, 2 * fit.standard_deviations, rtol=1e-3)
+    """Forces in other units, parameters and deviations in other units; the same undetermined."""
+    (k, fit), c = member, 2.0**-13
+    other = jid.identify(base, noisy.replace(forces=c * noisy.forces), members(noisy, c)[k])
+    size = c * np.abs(fit.parameters).max()
+    np.testing.assert_allclose(other.parameters, c * np.asarray(fit.parameters), 1e-9, 1e-9 * size)
+    np.testing.assert_allclose(other.standard_deviations, c * fit.standard_deviations, rtol=1e-8)
+    assert other.undetermined == fit.undetermined
     truth = np.asarray(base.from_standard(standard_parameters(base.model)))
     z = (np.asarray(fit.parameters) - truth) / fit.standard_deviations
     assert np.sqrt(np.mean(z**2)) < 2.0

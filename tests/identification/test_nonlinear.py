@@ -102,13 +102,11 @@ def test_deviations_of_shapes_agree_with_their_scatter():
     """White noise on every row: the linearised problem predicts the scatter over 20 draws."""
     found = []
     for seed in range(20):
-        o = observations(samples=600, noise=0.3, noise_seed=seed)
-        rows = separable(START, o)
+        rows = separable(START, observations(samples=600, noise=0.3, noise_seed=seed))
         start = rows.shapes.values
         found.append(search_shapes(rows, np.ones(3), start, start)[0])
-    fit = jid.identify_nonlinear(
-        START, observations(samples=600, noise=0.3), NonlinearFriction(WLS)
-    )
+    o = observations(samples=600, noise=0.3)
+    fit = jid.identify_nonlinear(START, o, NonlinearFriction(WLS))
     assert fit.names == ("eps1", "eps2", "eps3", "vs1", "vs2", "vs3")
     assert set(fit.units) == {"rad/s"}
     scatter = np.std(found, axis=0, ddof=1)
@@ -116,11 +114,15 @@ def test_deviations_of_shapes_agree_with_their_scatter():
     assert (scatter / fit.shape_deviations < 1.6).all()
     assert (scatter / fit.shape_deviations > 1 / 1.6).all()
     assert (np.abs(fit.shapes - [*TRUE_EPSILON, *TRUE_SPEED]) < 4 * fit.shape_deviations).all()
-    # Unknown shapes make the levels of friction less certain.
-    known = jid.identify(fit.fit.base, observations(samples=600, noise=0.3), WLS)
+    # Unknown shapes make the levels of friction less certain, a second recording more certain.
+    known = jid.identify(fit.fit.base, o, WLS)
     ratio = fit.fit.standard_deviations / known.standard_deviations
     assert (ratio > 1 - 1e-9).all()
     assert ratio[list(START.names).index("fs1")] > 1.1
+    second = observations(samples=600, noise=0.3, seed=1, noise_seed=1)
+    both = jid.identify_nonlinear(START, (o, second), NonlinearFriction(WLS))
+    assert both.fit.rows == (1200,) * 3
+    assert both.shape_deviations.mean() < fit.shape_deviations.mean()
 
 
 def test_it_pays_where_friction_is_nonlinear_and_only_there():
@@ -145,33 +147,22 @@ def test_it_pays_where_friction_is_nonlinear_and_only_there():
     assert "nonlinear friction does not pay" in str(whole.held_out)
 
 
-def test_two_recordings_are_fitted_together():
-    both = [observations(samples=500, seed=s, noise=0.1, noise_seed=s) for s in (0, 1)]
-    fit = jid.identify_nonlinear(START, both, NonlinearFriction(WLS))
-    alone = jid.identify_nonlinear(START, both[0], NonlinearFriction(WLS))
-    assert fit.fit.rows == (1000,) * 3
-    assert fit.shape_deviations.mean() < alone.shape_deviations.mean()
+TWO = jid.terms.StribeckFriction(), jid.terms.LoadFriction(np.ones((3, 10)))
+REFUSALS = [
+    ((jid.CoulombFriction(jid.terms.HardSign()),), None, "`model`"),
+    (TWO, lambda t: (t[1].transition.dead_zone,), "`free`"),
+    (TWO, lambda t: (t[1].transition.epsilon, t[2].transition.epsilon), "`eps`"),
+]
 
 
-def test_what_cannot_be_searched_is_refused():
-    terms = (jid.RigidBodies(), jid.CoulombFriction(jid.terms.HardSign()))
-    hard = jid.base_parameters(jid.Model(ROBOT, terms))
-    with pytest.raises(ValueError, match="`model`"):
-        select_shapes(hard)
-    with pytest.raises(ValueError, match="`free`"):
-        select_shapes(START, lambda terms: (terms[2].transition.dead_zone,))
-    friction = jid.terms.StribeckFriction(), jid.terms.LoadFriction(np.ones((3, 10)))
-    double = jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), *friction)))
-    with pytest.raises(ValueError, match="`eps`"):
-        select_shapes(double, lambda t: (t[1].transition.epsilon, t[2].transition.epsilon))
+@pytest.mark.parametrize(("friction", "free", "named"), REFUSALS)
+def test_what_cannot_be_searched_is_rejected(friction, free, named):
+    base = jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), *friction)))
+    with pytest.raises(ValueError, match=named):
+        select_shapes(base, free)
     zero = dataclasses.replace(START, model=model(0.04, np.array([0.1, 0.0, 0.1])))
     with pytest.raises(ValueError, match="`vs2`"):
         _ = select_shapes(zero).values
-    blocks = jid.RegressionProblem(START, [observations(samples=300)]).blocks
-    with pytest.raises(ValueError, match="needs the rows themselves"):
-        jid.identification.identify.fit_problem(
-            jid.RegressionProblem(START, blocks=blocks), NonlinearFriction(WLS)
-        )
 
 
 def test_friction_falls_with_temperature_as_fits_at_several_tell():

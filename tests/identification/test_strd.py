@@ -15,12 +15,6 @@ def powers(x, degree):
     return np.column_stack([x**k for k in range(degree + 1)])
 
 
-PONTIUS_Y = numbers(
-    ".11019 .21956 .32949 .43899 .54803 .65694 .76562 .87487 .98292 1.09146 1.20001 1.30822 "
-    "1.41599 1.52399 1.63194 1.73947 1.84646 1.95392 2.06128 2.16844 .11052 .22018 .32939 .43886 "
-    ".54798 .65739 .76596 .87474 .98300 1.09150 1.20004 1.30818 1.41613 1.52408 1.63159 1.73965 "
-    "1.84696 1.95445 2.06177 2.16829"
-)
 FILIP = numbers(
     "-6.860120914 -4.324130045 -4.358625055 -4.358426747 -6.955852379 -6.661145254 -6.355462942 "
     "-6.118102026 -7.115148017 -6.815308569 -6.519993057 -6.204119983 -5.853871964 -6.109523091 "
@@ -76,18 +70,6 @@ def wampler(coefficients, errors):
 
 
 PROBLEMS = {
-    "Pontius": (
-        powers(np.tile(150_000.0 * np.arange(1, 21), 2), 2),
-        PONTIUS_Y,
-        numbers("0.673565789473684e-03 0.732059160401003e-06 -0.316081871345029e-14"),
-        numbers("0.107938612033077e-03 0.157817399981659e-09 0.486652849992036e-16"),
-    ),
-    "NoInt1": (
-        np.arange(60.0, 71.0)[:, None],
-        np.arange(130.0, 141.0),
-        numbers("2.07438016528926"),
-        numbers("0.165289256198347e-01"),
-    ),
     "Filip": (
         powers(FILIP, 10),
         FILIP_Y,
@@ -121,8 +103,6 @@ PROBLEMS = {
     "Wampler5": wampler([1.0] * 6, 10_000),
 }
 DIGITS = {
-    "Pontius": 11,
-    "NoInt1": 14,
     "Filip": 6,
     "Longley": 10,
     "Wampler1": 8,
@@ -158,7 +138,7 @@ def test_certified_digits_are_reached_in_any_order_of_the_rows(name):
         assert digits(p, certified) >= DIGITS[name]
 
 
-@pytest.mark.parametrize("name", ["Pontius", "NoInt1", "Filip", "Longley", "Wampler3"])
+@pytest.mark.parametrize("name", ["Filip", "Longley", "Wampler3"])
 def test_certified_standard_deviations_are_reached(name):
     X, y, _, certified = PROBLEMS[name]
     _, found = solved(X, y)
@@ -168,7 +148,7 @@ def test_certified_standard_deviations_are_reached(name):
     assert digits(deviations, certified) >= 5
 
 
-@pytest.mark.parametrize("name", ["Longley", "Pontius", "Wampler3"])
+@pytest.mark.parametrize("name", ["Longley", "Wampler3"])
 def test_units_of_columns_change_nothing_but_the_units_of_estimates(name):
     X, y, _, _ = PROBLEMS[name]
     factors = 2.0 ** np.random.default_rng(0).integers(-9, 10, X.shape[1])

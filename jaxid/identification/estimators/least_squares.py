@@ -92,8 +92,7 @@ class GeneralisedLeastSquares(AbstractEstimator):
             def equations(chunk, influence=influence, weights=weights):
                 """Return the combinations of joints, as if they were the joints' own rows."""
                 mixed = zip(influence(chunk, chunk.forces), weights, chunk.mask.T, strict=True)
-                both = ((np.column_stack([x.equations, x.disturbance]), w, m) for x, w, m in mixed)
-                return [rows[mask] / w for rows, w, mask in both]
+                return [np.column_stack(x[2:4])[mask] / w for x, w, mask in mixed]
 
             blocks = problem.fold(equations, [tuple(range(size))] * n)
             estimate = Estimate.solve(problem, weights, self.solution, blocks, influence)

@@ -78,17 +78,11 @@ class Lines(NamedTuple):
 
     Attributes:
         length: Rows of a stretch; shorter ones are padded with rows that do not count.
-        row_time: Time between two rows [s].
-        frequency: Frequencies of the lines [Hz].
-        multiplicity: 2, or 1 for lines without a mirror image.
-        gain: Gain (0 to 1) of the filters.
-        bins: Bin of each line.
         energy: $|\sum_t (B z_t)_i e^{-i \omega t}|^2 m / N$ [base, channels, lines].
         leverage: Fraction (0 to 1) of each line explained by the fit [channels, lines].
         power: Periodogram of the disturbances [channels, lines].
         residual: Periodogram of the residuals [joints, lines], in [N² m²] or [N²].
         exposure: Number of stretches, weighted by the fraction of rows of each channel that count.
-        stretches: Number of stretches.
     """
 
     length: int
@@ -289,9 +283,6 @@ class SpectralTable:
 
     Computed once for a design and applied to many draws; in NumPy, or in JAX where `xp` is
     `jax.numpy`. The other arguments are those of `Lines`, of all lengths of stretches together.
-
-    Attributes:
-        map: $C$ [base, channels x lines].
     """
 
     def __init__(
@@ -312,7 +303,7 @@ class SpectralTable:
         least = 0.02 * self._sums(half * exposure)
         self._rest = xp.maximum(rest, xp.maximum(least, 1e-300))
         C = half[None] * transposed_sums(energy / self._rest[None])
-        self.map = C.reshape((len(C), -1))
+        self._map = C.reshape((len(C), -1))
         # From a line's power to the scatter of its mean over the stretches.
         scatter = xp.sqrt(2.0 / (half * (1.0 + xp.maximum(exposure, 1.0))))
         self._scatter = scatter.reshape((1, -1))
@@ -339,14 +330,10 @@ class SpectralTable:
         return np.asarray(self._sums(self._half * power) / self._rest)
 
     def __call__(self, power: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """Return variances and their degrees of freedom: sums of one chi-square for each line.
-
-        Args:
-            power: Periodograms of the residuals [draws, channels, lines].
-        """
+        """Return variances and degrees of freedom for periodograms [draws, channels, lines]."""
         xp, flat = self._xp, power.reshape((len(power), -1))
-        variance = flat @ self.map.T
-        squares = (flat * self._scatter) ** 2 @ (self.map**2).T
+        variance = flat @ self._map.T
+        squares = (flat * self._scatter) ** 2 @ (self._map**2).T
         positive = squares > 0
         dof = xp.where(positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf)
         return variance, dof
