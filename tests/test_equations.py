@@ -75,18 +75,3 @@ def test_a_row_names_what_exists_and_cites_it(number):
     for name in names:
         inside = [d for x, (_, d) in _definitions().items() if _within(x, name)]
         assert any(number in set.union(*_cited(d)) for d in inside), name
-
-
-@pytest.mark.parametrize(
-    ("text", "single", "ranges"),
-    [
-        ("… of one body (Eq. 10).", {10}, set()),
-        ("(Eqs. 16, 18)", {16, 18}, set()),
-        ("(Eqs. 20-22, 24; Sec. 5)", {24}, {20, 21, 22}),
-        ("(Eq. 37, Fig. 10)", {37}, set()),
-        ("(Eqs. 1\n    and 2)", {1, 2}, set()),
-        ("Equal to 5, sequence 7.", set(), set()),
-    ],
-)
-def test_citations_are_read_as_they_are_written(text, single, ranges):
-    assert _cited(text) == (single, ranges)

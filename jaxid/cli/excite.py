@@ -14,7 +14,7 @@ from jaxid.experiment.excitation import compare_criteria, design_motion, write_d
 from jaxid.experiment.experiment import load_experiment
 from jaxid.experiment.progress import designing
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
-from jaxid.report.terminal import show, show_files, show_remarks
+from jaxid.report.page import show, show_files, show_remarks
 from jaxid.table import Remark, Status
 
 STOPPED = 130

@@ -15,8 +15,8 @@ from jaxid.export.mjcf import export_mjcf
 from jaxid.export.urdf import export_urdf
 from jaxid.identification.fit import Fit, load
 from jaxid.io import require_writable
+from jaxid.report.page import show_files
 from jaxid.report.result_files import MODEL
-from jaxid.report.terminal import show_files
 
 
 class Target(enum.StrEnum):

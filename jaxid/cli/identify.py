@@ -36,8 +36,8 @@ from jaxid.report.identification import (
     motor_tables,
     residual_table,
 )
+from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import write_report
-from jaxid.report.terminal import show, show_files, show_remarks
 from jaxid.table import Remark, Status, Table, significant
 
 

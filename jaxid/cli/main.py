@@ -82,7 +82,7 @@ def demo(
     """
     from jaxid.demo.results import remarks, tables, write_study
     from jaxid.demo.study import run_study
-    from jaxid.report.terminal import show, show_remarks
+    from jaxid.report.page import show, show_remarks
 
     console = open_console()
     refuse_foreign_folder(output, force)

@@ -29,13 +29,13 @@ from jaxid.identification.payload import (
     identify_payload,
 )
 from jaxid.identification.states import identify_states
+from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import (
     estimate_rows,
     read_fit,
     write_comparison,
     write_estimates,
 )
-from jaxid.report.terminal import show, show_files, show_remarks
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.table import Remark, Status, significant
 

@@ -158,14 +158,11 @@ def error_table(study: Study, recording: int) -> Table:
 def following_table(study: Study) -> Table:
     """Return how well the path of ISO 9283 is followed with each model."""
     runs = study.followed
-    joints = [np.sqrt(np.mean(run.joint_rms[1:] ** 2)) for run in runs]
     return Table(
         "following the path of ISO 9283 by computed torque",
         Column("fed forward", [run.name for run in runs]),
         Column("end-effector\nRMS", [1e3 * run.rms for run in runs], "mm"),
         Column("end-effector\nmax", [1e3 * float(run.distance.max()) for run in runs], "mm"),
-        Column("rail\nRMS", [1e3 * float(run.joint_rms[0]) for run in runs], "mm"),
-        Column("joints\nRMS", [1e3 * float(x) for x in joints], "mrad"),
     )
 
 
@@ -177,6 +174,11 @@ def demo_page(study: Study) -> str:
         *study.base.model.robot.notes,
         "assumed: the other parameters of bodies, rotors and friction, and all disturbances",
     )
+    warming = (
+        "Two identifications of the same motion. Inertial parameters stay, friction falls as the "
+        "lubricant warms; a parameter has changed if its difference is more than chance."
+    )
+    every, changes = "All base parameters, cold and warm", jid.plot.comparison(study.temperature)
     used = ", ".join(f"{name} {number}" for name, number in versions().items())
     return render_page(
         "The paper, end to end",
@@ -185,7 +187,7 @@ def demo_page(study: Study) -> str:
             _excitation(study),
             _identification(study),
             _verification(study),
-            _temperature(study),
+            ("Cold and warm", [warming, study.temperature.group_summary(), folded(every, changes)]),
             ("The robot, and assumptions", [[Remark(n[0].upper() + n[1:]) for n in notes]]),
         ],
         "A persistent method for parameter identification of a seven-axes manipulator, repeated "
@@ -285,16 +287,6 @@ def _verification(study: Study) -> Section:
         "of a CAD model whose bodies are 10 to 18 % off and that has no friction, and those of the "
         "identified model.",
         following_table(study),
-    ]
-
-
-def _temperature(study: Study) -> Section:
-    figure = jid.plot.comparison(study.temperature)
-    return "Cold and warm", [
-        "Two identifications of the same motion. Inertial parameters stay, friction falls as the "
-        "lubricant warms; a parameter has changed if its difference is more than chance.",
-        study.temperature.group_summary(),
-        folded("All base parameters, cold and warm", figure),
     ]
 
 

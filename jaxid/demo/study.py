@@ -70,11 +70,6 @@ class PathRun(NamedTuple):
         """RMS distance of the end-effector [m]."""
         return float(np.sqrt(np.mean(self.distance**2)))
 
-    @property
-    def joint_rms(self) -> Float[np.ndarray, " joints"]:
-        """RMS of the joints' tracking errors [rad or m]."""
-        return np.sqrt(np.mean(np.asarray(self.run.tracking_error) ** 2, axis=0))
-
 
 class Study(NamedTuple):
     """Results of the demo.
@@ -171,7 +166,10 @@ def run_study(
     progress("adding the leads", 0.0)
     played = jid.trajectories.with_leads(motion, robot, periods=periods)
     progress("inverse kinematics of the verification path", 0.0)
-    path = _verification_path()
+    forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    path = jid.trajectories.iso9283_path(  # the tool points along the rail (Fig. 8)
+        CUBE, EDGE, forward, leans_along=1, speed=SPEED, acceleration=ACCELERATION
+    )
     joints = jid.trajectories.joint_path(robot, path, posture=(0.0, 1.57, -0.3, 1.8, 0.0, 0.0, 0.0))
     observations = []
     for virtual, trajectory, name in (
@@ -216,14 +214,6 @@ def run_study(
         coverage=coverage,
         followed=followed,
         timing=time_feed_forward(fits["consistent"], joints),
-    )
-
-
-def _verification_path() -> jid.trajectories.TipPath:
-    """Return the path of ISO 9283; the tool points along the rail (Fig. 8)."""
-    forward = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    return jid.trajectories.iso9283_path(
-        CUBE, EDGE, forward, leans_along=1, speed=SPEED, acceleration=ACCELERATION
     )
 
 

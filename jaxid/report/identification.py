@@ -25,12 +25,6 @@ from jaxid.table import (
 )
 from jaxid.validation import Definiteness, TorqueErrors
 
-TRUST = {
-    Status.GOOD: "trusted",
-    Status.DOUBTFUL: "doubtful",
-    Status.BAD: "small, or not excited",
-}
-"""Words for the trust in an estimate."""
 MEAN_ERROR = (1.0, 3.0)
 """Mean errors up to which forces are predicted well, and tolerably [% of the largest forces]."""
 RMS_ERROR = (5.0, 15.0)
@@ -134,7 +128,7 @@ def _torque_blocks(figures: Mapping[str, Figure], joints: int) -> list[Figure | 
 
 def parameter_table(fit: Fit) -> Table:
     """Return the base parameters with their 95 % intervals."""
-    base, trust, (low, high) = fit.base, fit.trust, fit.intervals().T
+    base, (low, high) = fit.base, fit.intervals().T
     values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
     low, high = (with_deviations(ends, fit.standard_deviations)[0] for ends in (low, high))
     return Table(
@@ -147,9 +141,8 @@ def parameter_table(fit: Fit) -> Table:
         Column("95 %\nfrom", low, kind="number"),
         Column("95 %\nto", high, kind="number"),
         Column("±", fit.relative_standard_deviations, "%", percent),
-        Column("trust", [TRUST[level] for level in trust]),
         Column("combination", base.expressions, kind="code"),
-        status=trust,
+        status=fit.trust,
     )
 
 
@@ -258,7 +251,11 @@ def verdict(
     doubts: Sequence[str] = (),
 ) -> list[Remark]:
     """Return the verdict on a model: one sentence for everything, then one for each criterion."""
-    eigenvalue = significant(definiteness.smallest)
+    condition, eigenvalue = fit.condition_numbers.scaled, significant(definiteness.smallest)
+    bodies = []
+    if fit.consistency is not None:
+        active = "; ".join(fit.consistency.active) or "none"
+        bodies = [Remark(f"All bodies are physically consistent; active bounds: {active}")]
     found = [
         _judge_forces(verification or identification, bool(verification)),
         *_judge_new_motions(identification, verification),
@@ -279,8 +276,12 @@ def verdict(
             "negative, do not simulate or control with this model where joints were not moved.",
         ),
         *_judge_residuals(fit),
-        _judge_condition(fit),
-        *_judge_bodies(fit),
+        Remark(
+            f"The condition number with columns of length one is {significant(condition, 3)}.",
+            Status.GOOD if condition < LARGE_CONDITION else Status.DOUBTFUL,
+            f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to tell apart.",
+        ),
+        *bodies,
         *(Remark(text[:1].upper() + text[1:], Status.DOUBTFUL) for text in dict.fromkeys(doubts)),
     ]
     statuses = [remark.status for remark in found]
@@ -359,21 +360,3 @@ def _judge_residuals(fit: Fit) -> list[Remark]:
         "is not in the model, or the noise itself is coloured."
     )
     return [Remark(text, Status.DOUBTFUL, rule)]
-
-
-def _judge_condition(fit: Fit) -> Remark:
-    number = fit.condition_numbers.scaled
-    rule = f"Good: below {LARGE_CONDITION:g}."
-    text = f"The condition number with columns of length one is {significant(number, 3)}"
-    if number < LARGE_CONDITION:
-        return Remark(text, Status.GOOD, rule)
-    return Remark(f"{text}: some parameters are hard to tell apart.", Status.DOUBTFUL, rule)
-
-
-def _judge_bodies(fit: Fit) -> list[Remark]:
-    if fit.consistency is None:
-        return []
-    text = "All bodies are physically consistent"
-    if active := fit.consistency.active:
-        return [Remark(f"{text}; {len(active)} bounds are active: {'; '.join(active)}.")]
-    return [Remark(f"{text}, and no bound is active.", Status.GOOD)]

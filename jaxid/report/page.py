@@ -1,10 +1,10 @@
-"""HTML pages: texts, tables and figures in one file that needs nothing else."""
+"""Results for people: HTML pages that need nothing else, and tables in the terminal."""
 
 import functools
 import importlib.metadata
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,21 @@ import jax
 import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from rich.console import Console
+from rich.text import Text
 
 from jaxid.report.style import svg_text
-from jaxid.table import Remark, Table
+from jaxid.table import Remark, Status, Table
 
+STYLES = {
+    Status.GOOD: "green",
+    Status.DOUBTFUL: "yellow",
+    Status.BAD: "red",
+    Status.NEUTRAL: "dim",
+    **{style: style for style in ("dim", "")},
+    **dict.fromkeys(("title", "header"), "bold"),
+}
+"""Styles of the parts of a table's lines in the terminal."""
 Section = tuple[str, Sequence[Any]]
 """Title, which the table of contents shows, and blocks as `render_page` takes them."""
 
@@ -121,3 +132,25 @@ def _align(number: str) -> str:
     if not blanks or "." in bare:
         return bare + "\N{FIGURE SPACE}" * blanks
     return bare + "\N{PUNCTUATION SPACE}" + "\N{FIGURE SPACE}" * (blanks - 1)
+
+
+def show(console: Console, *tables: Table) -> None:
+    """Print tables, each with an empty line before it."""
+    for table in tables:
+        console.print()
+        for line in table.lines(console.width):
+            text = Text.assemble(*((part, STYLES[style]) for part, style in line))
+            console.print(text, soft_wrap=True)
+
+
+def show_remarks(console: Console, remarks: Iterable[Remark | str]) -> None:
+    """Print remarks, one paragraph each."""
+    unique = tuple(dict.fromkeys(remarks))
+    if unique:
+        show(console, Table("", remarks=unique))
+
+
+def show_files(console: Console, folder: Path, names: Iterable[str]) -> None:
+    """Print the names of files that were written, and their folder."""
+    console.print()
+    console.print(Text(f"wrote {folder}: {', '.join(names)}"))

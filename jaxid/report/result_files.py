@@ -135,12 +135,12 @@ def safe_name(name: str) -> str:
 
 
 def _earlier_files(folder: Path) -> set[str]:
-    """Return the figures and factors that an earlier report in this folder has written."""
+    """Return the figures that an earlier report in this folder has written."""
     try:
         content = read_json(folder / "result.json")
         if content["schema"] != SCHEMAS["result.json"]:
             return set()
-        return {f for f in content["files"] if re.fullmatch(r"[\w.-]+\.(png|pdf)|run\.npz", f)}
+        return {f for f in content["files"] if re.fullmatch(r"[\w.-]+\.(png|pdf)", f)}
     except (OSError, ValueError, KeyError, TypeError):
         return set()
 
@@ -403,24 +403,18 @@ def consistency_record(fit: Fit) -> dict[str, Any] | None:
 
 
 def _robot_record(robot: Robot) -> dict[str, Any]:
-    limits, joints = robot.limits, range(robot.joints)
+    """Return names, units and limits; geometry, drives and tool are in the model file."""
+    joints = range(robot.joints)
     names = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
     return {
-        **_entries(robot, "name source gravity"),
+        **_entries(robot, "name source"),
         "joints": _rows(
             name=robot.joint_names,
             kind=["revolute" if revolute else "prismatic" for revolute in robot.revolute],
             unit=[robot.joint_unit(j) for j in joints],
             force_unit=[robot.force_unit(j) for j in joints],
-            parent=robot.parent,
-            axis=robot.axis,
-            rotation=robot.rotation,
-            offset=robot.offset,
-            **{name: getattr(limits, name) for name in names},
+            **{name: getattr(robot.limits, name) for name in names},
         ),
-        "drives": _entries(robot.drives, "reduction zero max_torques rotor_inertia"),
-        "tool": robot.tool and _entries(robot.tool, "body mass centre_of_mass inertia"),
-        "tip": _entries(robot, "", body="tip_body", rotation="tip_rotation", offset="tip_offset"),
     }
 
 

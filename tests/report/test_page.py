@@ -6,7 +6,7 @@ import re
 from html.parser import HTMLParser
 
 import jaxid as jid
-from jaxid.report.identification import TRUST, identification_page, verdict
+from jaxid.report.identification import identification_page, verdict
 from jaxid.report.page import _align, code, folded, picture, render_page
 from jaxid.table import Column, Remark, Status, Table
 
@@ -98,8 +98,6 @@ def test_every_parameter_stands_there_with_the_numbers_of_the_result(written, fi
             shown_digits = cells[title].strip()
             step = 10.0 ** -len(shown_digits.partition(".")[2])
             assert abs(float(shown_digits) - row[key]) <= 0.51 * step, (row["name"], title)
-    trusts = [dict(zip(table[0], shown, strict=True))["trust"] for shown in table[1:]]
-    assert trusts == [TRUST[level] for level in fit.trust]
 
 
 def test_names_that_are_markup_stay_text(fit, validation):

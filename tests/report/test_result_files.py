@@ -135,27 +135,20 @@ def test_the_model_can_be_used_again(tmp_path, fit, validation, quick):
     np.testing.assert_array_equal(again.parameters, fit.parameters)
 
 
-@pytest.mark.parametrize("present", [False, True])
-def test_a_failure_in_the_middle_leaves_nothing(
-    tmp_path, fit, validation, monkeypatch, quick, present
-):
-    folder = tmp_path / "new" / "report"
-    if present:
-        folder.mkdir(parents=True)
-        (folder / "result.json").write_text("old")
-
+def test_a_failure_in_the_middle_leaves_nothing(tmp_path, fit, validation, monkeypatch, quick):
     def fail(figure, path):
         path.write_bytes(b"half")
         raise RuntimeError("no ink")
 
     monkeypatch.setattr(result_files, "save", fail)
-    with pytest.raises(RuntimeError, match="no ink"):
-        report(folder, fit, validation)
-    if present:
-        assert names(folder) == ["result.json"]
-        assert (folder / "result.json").read_text() == "old"
-    else:
-        assert not folder.exists()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "result.json").write_text("old")
+    for folder in (tmp_path / "old", tmp_path / "new" / "report"):
+        with pytest.raises(RuntimeError, match="no ink"):
+            report(folder, fit, validation)
+    assert names(tmp_path) == ["old"]
+    assert names(tmp_path / "old") == ["result.json"]
+    assert (tmp_path / "old" / "result.json").read_text() == "old"
 
 
 def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, quick):
@@ -205,11 +198,9 @@ def test_folders_that_are_no_reports_are_refused(tmp_path, fit, validation, quic
 @pytest.mark.parametrize(
     ("name", "safe"),
     [
-        ("log_1", "log_1"),
         ("../../etc/passwd", "etc-passwd"),
         ("Prüfstand 3: kalt", "Prufstand-3-kalt"),
         ("日本", "recording"),
-        ("..", "recording"),
         ("a" * 300, "a" * 80),
     ],
 )
