@@ -12,6 +12,8 @@ from jaxid.demo.results import error_table, paper_table, remarks, tables, write_
 from jaxid.demo.study import run_study, time_feed_forward
 from jaxid.identification.comparison import Verdict
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 
 @pytest.fixture(scope="module")
 def found():

@@ -47,13 +47,12 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     """Return what must be known of a design, what it assumes, and what it leaves vague."""
     published = ", ".join(plan.limits.limits.assumed)
-    assumed = ", ".join(_assumed_limits(plan))
+    assumed, vague = ", ".join(_assumed_limits(plan)), ", ".join(plan.vague)
     doubts = (
         published and f"Limits that nobody published, assumed: {published}",
         assumed and f"Assumed, because not given: {assumed}",
-        plan.vague
-        and f"Deviations above {100 * VAGUE:g} % of the nominal value: {', '.join(plan.vague)}",
-        plan.interrupted and "The design was stopped: `--resume` goes on where it was",
+        vague and f"Deviations above {100 * VAGUE:g} % of the nominal value: {vague}",
+        "The design was stopped: `--resume` goes on where it was" if plan.interrupted else "",
     )
     found = [Remark(text, Status.DOUBTFUL) for text in doubts if text]
     robot = plan.base.model.robot

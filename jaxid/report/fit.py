@@ -128,15 +128,8 @@ def _draw_deviations(
     axes.hlines(places, low, deviations, color=colours, lw=1.6)
     beyond = ~(relative[shown] <= ceiling)
     for marker, where in (("o", ~beyond), (">", beyond)):
-        axes.scatter(
-            deviations[where],
-            places[where],
-            s=20,
-            c=colours[where],
-            marker=marker,
-            zorder=3,
-            clip_on=False,
-        )
+        dots = {"s": 20, "c": colours[where], "marker": marker, "zorder": 3, "clip_on": False}
+        axes.scatter(deviations[where], places[where], **dots)
     axes.set_xscale("log")
     axes.set_xlim(low, ceiling)
     for limit in (TRUSTED, DOUBTFUL):

@@ -214,22 +214,13 @@ def bar_figure(groups: Sequence[tuple[str, Sequence[TorqueErrors]]], robot: Robo
                 texts = [percent(x / 100.0) for x in mean * scale]
                 ink = "white" if colour == BLUE else INK
                 axes.bar_label(bars, texts, label_type="center", fontsize=7.5, color=ink)
-            axes.plot(
-                place,
-                rms * scale,
-                linestyle="none",
-                marker="D",
-                markersize=4.5 if n <= 10 else 3.0,
-                markerfacecolor="white",
-                markeredgecolor=INK,
-                markeredgewidth=0.9,
-                label="RMS" if k == len(filled) - 1 else "_",
-            )
+            marks = {"marker": "D", "ms": 4.5 if n <= 10 else 3.0, "mew": 0.9, "mec": INK}
+            last = "RMS" if k == len(filled) - 1 else "_"
+            axes.plot(place, rms * scale, ls="none", mfc="white", label=last, **marks)
         names = [shortened(name, 20) for name in robot.joint_names]
         tilted = n > 10 or max(map(len, names)) > 12
-        axes.set_xticks(
-            np.arange(n), names, rotation=35 if tilted else 0, ha="right" if tilted else "center"
-        )
+        turn = {"rotation": 35, "ha": "right"} if tilted else {}
+        axes.set_xticks(np.arange(n), names, **turn)
         axes.tick_params(axis="x", length=0)
         axes.grid(visible=False, axis="x")
         margin = 0.6 + 0.5 * max(0, 4 - n)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import subprocess
 import sys
 from pathlib import Path
 
@@ -95,7 +94,7 @@ def test_torques_of_some_joints_and_rows(errors_of):
     jid.plot.torques(errors_of(2, rows=1), arm_of(2)).canvas.draw()
 
 
-@pytest.mark.parametrize("joints", [1, 3, 6])
+@pytest.mark.parametrize("joints", [1, 5])
 def test_any_number_of_joints_fits_on_the_page(joints, errors_of):
     names = tuple(f"a_long_name_of_the_joint_number_{i}" for i in range(joints))
     robot = arm_of(joints).replace(joint_names=names)
@@ -319,17 +318,6 @@ def test_autocorrelation_is_that_of_the_plain_formula(errors_of):
     figure = jid.plot.autocorrelation(errors, arm_of(2))
     drawn = figure.axes[0].get_lines()[1].get_ydata()
     np.testing.assert_allclose(drawn[:6], found[:, 0], atol=1e-12)
-
-
-def test_matplotlib_is_loaded_only_when_figures_are_used():
-    script = (
-        "import sys, jaxid as jid\n"
-        "assert 'matplotlib' not in sys.modules\n"
-        "jid.plot.torques\n"
-        "assert 'matplotlib' in sys.modules and 'matplotlib.pyplot' not in sys.modules\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
 
 
 def test_files_are_the_same_each_time_and_leave_figure_and_settings_alone(errors_of, tmp_path):

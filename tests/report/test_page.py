@@ -10,7 +10,6 @@ from jaxid.report.identification import identification_page, verdict
 from jaxid.report.page import _align, code, folded, picture, render_page
 from jaxid.table import Column, Remark, Status, Table
 
-VOID = {"meta", "br", "hr", "img", "link", "input"}
 EVIL = "<script>alert('&\"')</script>"  # as in conftest.py
 
 
@@ -20,15 +19,14 @@ class Reader(HTMLParser):
     def __init__(self, text: str):
         super().__init__()
         self.open, self.ids, self.links, self.tables = [], [], [], []
-        self.scripts = 0
-        self.text = ""
+        self.scripts, self.text = 0, ""
         self.feed(text)
         self.close()
         assert not self.open, f"never closed: {self.open}"
 
     def handle_starttag(self, tag, attrs):
-        self._note(tag, dict(attrs))
-        if tag not in VOID:
+        self.handle_startendtag(tag, attrs)
+        if tag not in {"meta", "br", "hr", "img", "link", "input"}:
             self.open.append(tag)
         if tag == "table":
             self.tables.append([])
@@ -38,7 +36,11 @@ class Reader(HTMLParser):
             self.tables[-1][-1].append("")
 
     def handle_startendtag(self, tag, attrs):
-        self._note(tag, dict(attrs))
+        self.scripts += tag == "script"
+        for key, value in attrs:
+            self.ids += [value] if key == "id" else []
+            self.links += [value] if key.endswith("href") or key == "src" else []
+            self.links += re.findall(r"url\(([^)]*)\)", value or "")
 
     def handle_endtag(self, tag):
         assert self.open, f"</{tag}> without a beginning"
@@ -48,12 +50,6 @@ class Reader(HTMLParser):
         self.text += data
         if self.open and self.open[-1] in ("td", "th"):
             self.tables[-1][-1][-1] += data
-
-    def _note(self, tag, attrs):
-        self.scripts += tag == "script"
-        self.ids += [attrs["id"]] if "id" in attrs else []
-        self.links += [v for k, v in attrs.items() if k.endswith("href") or k == "src"]
-        self.links += re.findall(r"url\(([^)]*)\)", " ".join(v or "" for v in attrs.values()))
 
 
 def read(page_text: str) -> Reader:

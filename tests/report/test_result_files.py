@@ -59,9 +59,8 @@ def test_writes_all_files_with_their_parents(written):
     assert names(written.parent) == ["report"]
 
 
-def test_numbers_come_back_exactly(tmp_path, fit, validation, quick):
-    report(tmp_path, fit, validation)
-    found = load(tmp_path)
+def test_numbers_come_back_exactly(written, fit, validation):
+    found = load(written)
     assert found["schema"] == "jaxid-result/1"
     rows = found["base_parameters"]
     for key, values in {
@@ -85,9 +84,9 @@ def test_numbers_come_back_exactly(tmp_path, fit, validation, quick):
     joints = found["errors"]["verification"][0]["joints"]
     assert [j["mean"] for j in joints] == validation.errors[1].mean.tolist()
     assert [j["unit"] for j in joints] == ["N", "N m"]
-    assert found["notes"][-1] == "a note"
+    assert found["notes"][-1].startswith("a note")
     assert set(found["made"]["versions"]) == {"jaxid", "jax", "numpy", "python"}
-    with (tmp_path / "parameters.csv").open(encoding="utf-8", newline="") as file:
+    with (written / "parameters.csv").open(encoding="utf-8", newline="") as file:
         table = list(csv.DictReader(file))
     assert [float(r["estimate"]) for r in table] == np.asarray(fit.parameters).tolist()
 
@@ -124,14 +123,13 @@ def test_values_that_are_not_finite_are_null(tmp_path, fit, validation, quick):
     assert set(same.verdicts) == {Verdict.UNKNOWN, Verdict.UNCHANGED}
 
 
-def test_the_model_can_be_used_again(tmp_path, fit, validation, quick):
-    report(tmp_path, fit, validation)
-    model = load(tmp_path)["model"]
+def test_the_model_can_be_used_again(written, fit):
+    model = load(written)["model"]
     p = np.random.default_rng(0).standard_normal(fit.base.model.size)
     again = p[model["independent"]] + np.array(model["kappa"]) @ p[model["dependent"]]
     np.testing.assert_allclose(again, fit.base.from_standard(p), rtol=1e-14)
-    again = read_fit(tmp_path)
-    assert again.name == tmp_path.name
+    again = read_fit(written)
+    assert again.name == "report"
     np.testing.assert_array_equal(again.parameters, fit.parameters)
 
 
