@@ -22,7 +22,7 @@ TARGET = Path(__file__).resolve().parent.parent / "build" / "api"
 def main() -> None:
     """Build all pages."""
     warnings.simplefilter("error")
-    public = [name for name in vars(jaxid) if not name.startswith("_")] + ["plot"]
+    public = dir(jaxid)
     names = [x.__name__ for name in public if inspect.ismodule(x := getattr(jaxid, name))]
     namespaces = "|".join(re.escape(x) for x in names)
     jaxid.__all__ = [x for x in public if not inspect.ismodule(getattr(jaxid, x))]

@@ -1,5 +1,5 @@
 """Runs the command line as `python -m jaxid`."""
 
-from jaxid.cli.main import main
+from jaxid.cli import main
 
 main()

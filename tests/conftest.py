@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from jax.experimental.compilation_cache import compilation_cache
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -49,3 +50,13 @@ def blank_figures() -> Iterator[None]:
         patch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
         patch.setattr(Figure, "draw", lambda figure, renderer: None)
         yield
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A cache of compiled code that commands share, for tests of many commands on one robot."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAXID_CACHE_DIR", str(tmp_path_factory.mktemp("compiled")))
+        yield
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()

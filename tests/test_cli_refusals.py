@@ -2,21 +2,26 @@
 
 import io
 import sys
-from pathlib import Path
 
 import pytest
-from test_cli import EXPERIMENT, folder, refused, run  # noqa: F401
+from test_cli import EXPERIMENT, first, folder, material, refused, run  # noqa: F401
 
-from jaxid.cli.main import main
+from jaxid.cli import main
 from jaxid.trajectory.files import load_trajectory
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
+pytestmark = pytest.mark.usefixtures("blank_figures", "compiled")
 
+COLUMNS = 'angles = "q{}"\nforces = "tau{}"'
 KEYS = [
-    ('time = "t"', 'time = "t"\ntime_unit = "ns"', "has 2e+11 samples in a second: check"),
-    ('time = "t"', 'time = "t"\nforce_delay = inf', "the delay must be a finite time [s]"),
-    ('time = "t"', 'time = "t"\nforce_delay = 100', "but the longest segment of `a` lasts 6 s"),
+    ('"t"', '"t"\ntime_unit = "ns"', "has 2e+11 samples in a second: check"),
+    ('"t"', '"t"\nforce_delay = inf', "the delay must be a finite time [s]"),
+    ('"t"', '"t"\nforce_delay = 100', "but the longest segment of `a` lasts 6 s"),
     ("cutoff = 10", "cutoff = 99", "take one of 1 samples at most"),
+    ("cutoff = 10", "cutoff = -3", "e.toml: `filter`: `cutoff`"),
+    ('"q{}"', '["q1"]', "`recording.angles` names 1"),
+    (COLUMNS, 'angles = ["q1", "q2"]\nforces = ["tau1", "q2"]', "`q2` of `a.csv` is used for"),
+    (COLUMNS, 'angles = ["q1", "q2"]\nforces = ["tau1", "tau1"]', "`tau1` of `a.csv` is used twi"),
+    ('builtin = "planar_arm"', 'urdf = "lost.urdf"', "`lost.urdf` is no file: paths in an experim"),
 ]
 
 
@@ -30,61 +35,80 @@ def test_keys(folder, run, key, wrong, sentence):  # noqa: F811
 def test_logs(folder, run):  # noqa: F811
     text = (folder / "a.csv").read_text()
     lines = text.splitlines()
-
-    def log(content, *sentences, name="x.csv"):
+    rows = [line.split(",", 1) for line in lines[1:]]
+    slow = [lines[0], *(f"{1e3 * float(t):g},{rest}" for t, rest in rows)]
+    huge = "column `q1` of `x.csv`, line 8, is 1e+31 in size, which nothing measures"
+    logs = {
+        lines[0] + "\n": "`x.csv` has a header, but no rows",
+        "\n".join([*lines[:9], "1,2,3,4,5,6"]): "with 5 columns in every line: repair",
+        text.encode("utf-16"): "`x.csv` is text in UTF-16: save it again in UTF-8",
+        "t,q1,q2,tau1,tau2\n0,0,0,0,0\n0.1,0,x,0,0\n": "line 3",
+        "\n".join([*lines[:7], "0.03,1e31,0,0,0", *lines[8:]]): huge,
+        "\n".join(slow): "or log faster than 20 Hz. Few robots log so slowly: check `time_unit`",
+    }
+    for content, sentence in logs.items():
         encoded = content.encode() if isinstance(content, str) else content
-        (folder / name).write_bytes(encoded)
-        return refused(run("inspect", "experiment.toml", name), *sentences)
-
-    assert log(lines[0] + "\n", "`x.csv` has a header, but no rows")
-    assert log("\n".join([*lines[:9], "1,2,3,4,5,6"]), "with 5 columns in every line: repair")
-    assert log(text.encode("utf-16"), "`x.csv` is text in UTF-16: save it again in UTF-8")
-    assert log(b"PK\3\4abc", "`x.npz` is no NPZ file", name="x.npz")
+        (folder / "x.csv").write_bytes(encoded)
+        assert refused(run("inspect", "experiment.toml", "x.csv"), sentence)
+    (folder / "x.npz").write_bytes(b"PK\3\4abc")
+    assert refused(run("inspect", "experiment.toml", "x.npz"), "`x.npz` is no NPZ file")
 
 
-def test_logs_that_are_named_twice(folder, run):  # noqa: F811
-    said = "`a.csv` is given twice"
-    assert refused(run("identify", "experiment.toml", "a.csv", "./a.csv"), said)
+COMMANDS = [
+    ("inspect none.toml", "`none.toml` is no file"),
+    ("identify experiment.toml none.csv", "`none.csv` is no file"),
+    ("identify experiment.toml a.csv --split 1.5", "between 0 and 1, like 0.6, but is 1.5"),
+    ("identify experiment.toml a.csv ./a.csv", "`a.csv` is given twice"),
+    ("identify experiment.toml a.csv --verify ./a.csv", "`a.csv` is given both to identify and"),
+    ("init none.urdf", "none.urdf"),
+    ("excite experiment.toml -o a.csv", "`a.csv` is there already, and no motion of `jaxid exc"),
+    ("excite experiment.toml -o motion", "`motion` must end in .csv"),
+    ("excite experiment.toml -o truth.csv", "`truth.json` is there al"),
+    ("excite experiment.toml -o mine.csv", "`mine.ros.yaml` is there al"),
+    ("excite experiment.toml -o pictures.csv", "joints.png` is there already"),
+]
 
 
-def test_a_motion_is_not_written_over_other_files(folder, run):  # noqa: F811
-    said = "`a.csv` is there already, and no motion of `jaxid excite`"
-    assert refused(run("excite", "experiment.toml", "-o", "a.csv"), said)
-    assert refused(run("excite", "experiment.toml", "-o", "motion"), "`motion` must end in .csv")
+@pytest.mark.parametrize(("words", "sentence"), COMMANDS, ids=range(len(COMMANDS)))
+def test_commands(folder, run, words, sentence):  # noqa: F811
     (folder / "truth.json").write_text("{}")
-    assert refused(run("excite", "experiment.toml", "-o", "truth.csv"), "`truth.json` is there al")
     (folder / "mine.ros.yaml").write_text("mine")
-    assert refused(
-        run("excite", "experiment.toml", "-o", "mine.csv"), "`mine.ros.yaml` is there al"
-    )
     (folder / "pictures").mkdir()
     (folder / "pictures" / "joints.png").write_text("mine")
-    said = f"`{Path('pictures') / 'joints.png'}` is there already"
-    assert refused(run("excite", "experiment.toml", "-o", "pictures.csv"), said)
+    before = sorted(folder.rglob("*"))
+    assert refused(run(*words.split()), sentence)
+    assert sorted(folder.rglob("*")) == before
 
 
-def test_damaged_results(folder, run):  # noqa: F811
-    for name in "ab":
-        assert run("identify", "experiment.toml", f"{name}.csv", "-o", name)[0] == 0
-    path = folder / "b" / "model.json"
+@pytest.mark.parametrize("words", ["identify experiment.toml", "idntify", "identify a b --splt"])
+def test_words_that_no_command_knows(folder, run, words):  # noqa: F811
+    code, _, err = run(*words.split())
+    assert code == 2
+    assert "Traceback" not in err
+
+
+def test_damaged_results(folder, first, run):  # noqa: F811
+    path = first / "model.json"
     whole = path.read_text(encoding="utf-8")
-    for damaged in (whole[:-20], whole.replace('"rows": [', '"rows": [1, ', 1), "{}", "[]"):
+    (folder / "deep").mkdir()
+    (folder / "deep" / "model.json").write_text(100_000 * "[")
+    one_row_more = whole.replace('"rows": [', '"rows": [1, ', 1)
+    for damaged in (whole[:-20], one_row_more, "{}", "[]", "", "PK"):
         path.write_text(damaged, encoding="utf-8")
-        assert refused(run("compare", "a", "b"), "model.json")
+        assert refused(run("compare", "first", "deep"), "model.json")
+        arguments = ("experiment.toml", "first", "b.csv", "-o", "s")
+        assert refused(run("identify", *arguments), "model.json")
+    assert not (folder / "s").exists()
     path.unlink()
-    assert refused(run("compare", "a", "b"), "holds no `model.json`")
-
-
-def test_files_of_nothing_but_brackets(folder, run):  # noqa: F811
-    for name in ("deep", "deeper"):
-        (folder / name).mkdir()
-    for path in (folder / "deep" / "model.json", folder / "deep.json"):
-        path.write_text(100_000 * "[")
-    said = "brackets are nested too deeply"
-    assert refused(run("compare", "deep", "deeper"), "model.json")
+    assert refused(run("compare", "first", "deep"), "holds no `model.json`")
+    assert refused(run("compare", "deep", "first"), "model.json")
     assert refused(run("identify", "experiment.toml", "a.csv", "-o", "deep"), "but no report")
+
+
+def test_trajectories_of_nothing_but_brackets(folder, run):  # noqa: F811
+    (folder / "deep.json").write_text(100_000 * "[")
     assert refused(run("excite", "experiment.toml", "-o", "deep.csv"), "`deep.json` is there al")
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match="brackets are nested too deeply"):
         load_trajectory(folder / "deep.json")
     nested = '{"kind": "PaddedToCycle", "inner": '
     head = '{"format": "jaxid trajectory", "version": 2, "trajectory": '
@@ -102,63 +126,3 @@ def test_a_terminal_of_few_characters_shows_the_rest_as_marks(folder, monkeypatc
     assert ended.value.code == 0
     terminal.flush()
     assert b"kg m?" in terminal.buffer.getvalue()
-
-
-def test_one_column_is_one_channel(folder, run):  # noqa: F811
-    swapped = 'angles = ["q1", "q2"]\nforces = ["tau1", "q2"]'
-    text = EXPERIMENT.replace('angles = "q{}"\nforces = "tau{}"', swapped)
-    (folder / "e.toml").write_text(text)
-    said = "the column `q2` of `a.csv` is used for `angles` and `forces`"
-    assert refused(run("inspect", "e.toml", "a.csv"), said)
-    (folder / "e.toml").write_text(text.replace('["tau1", "q2"]', '["tau1", "tau1"]'))
-    assert refused(run("inspect", "e.toml", "a.csv"), "the column `tau1` of `a.csv` is used twice")
-
-
-def test_numbers_that_nothing_measures(folder, run):  # noqa: F811
-    lines = (folder / "a.csv").read_text().splitlines()
-    lines[7] = "0.03,1e31,0,0,0"
-    (folder / "x.csv").write_text("\n".join(lines))
-    said = "column `q1` of `x.csv`, line 8, is 1e+31 in size, which nothing measures"
-    assert refused(run("inspect", "experiment.toml", "x.csv"), said)
-
-
-def test_rates_that_cannot_be(folder, run):  # noqa: F811
-    (folder / "e.toml").write_text(EXPERIMENT.replace('"t"', '"t"\ntime_unit = "s"'))
-    lines = (folder / "a.csv").read_text().splitlines()
-    rows = [line.split(",", 1) for line in lines[1:]]
-    slow = [lines[0], *(f"{1e3 * float(t):g},{rest}" for t, rest in rows)]
-    (folder / "x.csv").write_text("\n".join(slow))
-    said = "sampling rate of 0.2 Hz: take a lower one, or log faster than 20 Hz. Few robots log so"
-    assert refused(run("inspect", "e.toml", "x.csv"), said, "check `time_unit`")
-
-
-def test_a_urdf_that_is_not_there(folder, run):  # noqa: F811
-    text = EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "lost.urdf"')
-    (folder / "e.toml").write_text(text)
-    said = "`lost.urdf` is no file: paths in an experiment file are relative to its folder; mend"
-    assert refused(run("inspect", "e.toml"), "`urdf`", said)
-
-
-def test_results_that_cannot_run_code(folder, run):  # noqa: F811
-    assert run("identify", "experiment.toml", "a.csv", "-o", "r")[0] == 0
-    path = folder / "r" / "model.json"
-    for content in (b"", b"PK", path.read_bytes()[:900]):
-        path.write_bytes(content)
-        result = run("identify", "experiment.toml", "r", "b.csv", "-o", "s")
-        assert refused(result, "is no model file")
-    assert not (folder / "s").exists()
-
-
-def test_a_disk_without_room(folder, run, monkeypatch):  # noqa: F811
-    import errno
-    import os
-
-    from jaxid.report import result_files
-
-    def full(path, content):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(result_files, "write_json", full)
-    result = run("identify", "experiment.toml", "a.csv")
-    assert refused(result, "No space left on device: nothing was written; make room")
-    assert not (folder / "report").exists()

@@ -6,13 +6,23 @@ import re
 
 import numpy as np
 import pytest
-from test_cli import EXPERIMENT, folder, refused, result, run, write_log  # noqa: F401
+from test_cli import (  # noqa: F401
+    EXPERIMENT,
+    first,
+    folder,
+    material,
+    refused,
+    result,
+    run,
+    words,
+    write_log,
+)
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.experiment import load_experiment
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
+pytestmark = pytest.mark.usefixtures("blank_figures", "compiled")
 
 SPATIAL = """\
 [robot]
@@ -90,10 +100,10 @@ def shop(workshop, tmp_path, monkeypatch):
     return tmp_path
 
 
-def pasted(out, first):
+def pasted(out, title):
     """The lines for the experiment file that a command has printed, from one on."""
     lines = out.splitlines()
-    start = lines.index(first)
+    start = lines.index(title)
     return "\n".join(lines[start : lines.index("", start)]) + "\n"
 
 
@@ -127,15 +137,10 @@ def test_reports_stand_for_their_logs(shop, run):  # noqa: F811
         json.loads((shop / place / "payload.json").read_text(encoding="utf-8")) for place in "pq"
     )
     np.testing.assert_allclose(one["estimate"], other["estimate"], rtol=1e-9, atol=1e-12)
-    assert refused(
-        run("payload", "experiment.toml", "empty", "--loaded", "empty/"),
-        "`empty` is given both without and with the load",
-    )
 
 
 def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     logs = ("empty_nominal.csv", "--loaded", "loaded_nominal.csv")
-    assert refused(run("gains", "experiment.toml", *logs), "the table `[load]` is missing")
     code, out, err = run("gains", "load.toml", *logs)
     assert (code, err) == (0, "")
     found = json.loads((shop / "gains" / "gains.json").read_text(encoding="utf-8"))
@@ -168,8 +173,7 @@ def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
     assert "force_delay" not in out
 
 
-def test_a_report_takes_later_logs(folder, run):  # noqa: F811
-    assert run("identify", "experiment.toml", "a.csv", "-o", "first")[0] == 0
+def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
     assert run("identify", "experiment.toml", "a.csv", "b.csv", "-o", "all")[0] == 0
     code, _, err = run("identify", "experiment.toml", "first/", "b.csv", "-o", "both")
     assert (code, err) == (0, "")
@@ -190,77 +194,61 @@ def test_a_report_takes_later_logs(folder, run):  # noqa: F811
     assert result(folder, "three")["fit"]["recordings"] == ["a", "b", "c"]
 
 
-def test_folders_that_hold_no_run_are_refused(folder, run):  # noqa: F811
-    assert run("identify", "experiment.toml", "a.csv", "-o", "first")[0] == 0
+FOREIGN = [
+    ("", "identify e.toml other b.csv", "holds no `model.json`"),
+    ("", "identify e.toml first", "at least one log"),
+    ("[estimator]\nridge = 0.1", "identify e.toml first b.csv", "to plain least squares only"),
+    ("[model]\nsprings = true", "identify e.toml first b.csv", "different base parameters"),
+    ("", "payload e.toml a.csv --loaded b.csv --body elbow", "`--body` must be the name of the jo"),
+    ("", "payload e.toml first --loaded first/", "`first` is given both without and with the load"),
+    (
+        "[estimator]\nnonlinear_friction = true",
+        "payload e.toml a.csv --loaded b.csv",
+        "`estimator.nonlinear_friction` would find other shapes of friction in each run",
+    ),
+    ("", "states e.toml a.csv", "one log or report for each of two or more states"),
+    ("", "states e.toml a.csv a.csv", "with different names"),
+    ("", "gains e.toml a.csv --loaded b.csv", "the table `[load]` is missing"),
+]
+
+
+@pytest.mark.parametrize(("table", "command", "said"), FOREIGN, ids=range(len(FOREIGN)))
+def test_what_does_not_go_together(folder, first, run, table, command, said):  # noqa: F811
     (folder / "other").mkdir()
-    assert refused(
-        run("identify", "experiment.toml", "other", "b.csv"), "`other`", "holds no `model.json`"
-    )
-    assert refused(run("identify", "experiment.toml", "first"), "at least one log")
-    (folder / "ridge.toml").write_text(EXPERIMENT + "[estimator]\nridge = 0.1\n")
-    assert refused(run("identify", "ridge.toml", "first", "b.csv"), "to plain least squares only")
-    (folder / "spring.toml").write_text(EXPERIMENT + "[model]\nsprings = true\n")
-    assert refused(run("identify", "spring.toml", "first", "b.csv"), "different base parameters")
-    write_log(folder / "d.csv", 7)
-    assert refused(
-        run("payload", "experiment.toml", "a.csv", "--loaded", "d.csv", "--body", "elbow"),
-        "`--body` must be one of joint1, joint2",
-    )
+    (folder / "e.toml").write_text(f"{EXPERIMENT}{table}\n")
+    assert refused(run(*command.split()), said)
 
 
-def test_searches_that_two_runs_cannot_share_are_refused(folder, run):  # noqa: F811
-    logs = "a.csv", "--loaded", "b.csv"
-    (folder / "shapes.toml").write_text(EXPERIMENT + "[estimator]\nnonlinear_friction = true\n")
-    said = "`estimator.nonlinear_friction` would find other shapes of friction in each run"
-    assert refused(run("payload", "shapes.toml", *logs), said)
+def test_what_is_not_seen_or_not_used_is_said(folder, words):  # noqa: F811
     (folder / "huber.toml").write_text(EXPERIMENT + '[estimator]\nkind = "huber"\n')
-    code, out, err = run("payload", "huber.toml", *logs)
-    assert (code, err) == (0, "")
-    assert "all runs are weighted least squares here" in out
+    said = words("payload", "huber.toml", "a.csv", "--loaded", "b.csv")
+    assert "all runs are weighted least squares here" in said
+    assert "do not determine all ten parameters" in said
 
 
-def test_states_share_inertia(folder, run):  # noqa: F811
+def test_states_share_inertia(folder, words):  # noqa: F811
     write_log(folder / "warm.csv", 7)
-    code, out, err = run("states", "experiment.toml", "a.csv", "warm.csv")
-    assert (code, err) == (0, "")
+    assert "fv1 (warm)" in words("states", "experiment.toml", "a.csv", "warm.csv")
     found = json.loads((folder / "states" / "states.json").read_text(encoding="utf-8"))
     assert found["states"] == ["a", "warm"]
     described = load_experiment(folder / "experiment.toml")
-    base, read = described.base, lambda log: described.observe(described.read(folder / log))
-    runs = [
-        jid.identify(
-            base,
-            read(log),
-            estimator=jid.WeightedLeastSquares(described.estimation.plain.weights),
-            name=name,
-        )
-        for log, name in (("a.csv", "a"), ("warm.csv", "warm"))
-    ]
+    base, estimator = described.base, described.estimation.plain
+    runs = []
+    for name in ("a", "warm"):
+        log = described.observe(described.read(folder / f"{name}.csv"))
+        runs.append(jid.identify(base, log, estimator=estimator, name=name))
     expected = jid.identify_states(runs)
     estimates = {row["name"]: row["estimate"] for row in found["parameters"]}
     assert tuple(estimates) == expected.names
     np.testing.assert_allclose(list(estimates.values()), expected.parameters, rtol=1e-9, atol=1e-12)
     assert set(found["shared"]) == {base.names[k] for k in expected.shared}
-    assert "fv1 (warm)" in out
-    said = "one log or report for each of two or more states, with different names"
-    assert refused(run("states", "experiment.toml", "a.csv"), said)
-    assert refused(run("states", "experiment.toml", "a.csv", "a.csv"), said)
 
 
-def test_essential_parameters_on_the_command_line(folder, run):  # noqa: F811
+def test_essential_parameters_on_the_command_line(folder, first, run, words):  # noqa: F811
     (folder / "essential.toml").write_text(EXPERIMENT + "[estimator]\nessential = 0.3\n")
-    assert run("identify", "experiment.toml", "a.csv", "-o", "all")[0] == 0
-    code, out, err = run("identify", "essential.toml", "a.csv", "-o", "few")
-    assert (code, err) == (0, "")
-    few, every = (len(result(folder, k)["fit"]["covariance"]) for k in ("few", "all"))
+    said = words("identify", "essential.toml", "a.csv", "-o", "few")
+    few, every = (len(result(folder, k)["fit"]["covariance"]) for k in ("few", "first"))
     assert 0 < few < every
-    said = " ".join(out.split())
     assert f"{few} of {every} base parameters are essential" in said
     assert "eliminated, and taken as zero: " in said
-    assert refused(run("identify", "essential.toml", "all", "b.csv"), "for essential parameters")
-
-
-def test_a_payload_of_which_only_a_part_is_seen(folder, run):  # noqa: F811
-    code, out, err = run("payload", "experiment.toml", "a.csv", "--loaded", "b.csv")
-    assert (code, err) == (0, "")
-    assert "do not determine all ten parameters" in " ".join(out.split())
+    assert refused(run("identify", "essential.toml", "first", "b.csv"), "for essential parameters")

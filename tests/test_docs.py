@@ -21,14 +21,10 @@ import jaxid as jid
 from jaxid.diagnosis.mislabelled import BAD, SURE
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.decoder import check_tables, decode
-from jaxid.experiment.estimator_table import KINDS, choose_uncertainty
-from jaxid.experiment.excitation_tables import Collision, Excitation
 from jaxid.experiment.experiment import TABLES
-from jaxid.experiment.method_tables import FILTERS, SIDES, Effects, Logs, build_rows
-from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
+from jaxid.experiment.method_tables import FILTERS, SIDES
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
-from jaxid.measurement.columns import Columns
 from jaxid.report.identification import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation import POSES
@@ -177,38 +173,19 @@ def test_python_in_a_page_runs(page, given, monkeypatch):
         exec(compile(block, f"{page.name}, block {k + 1}", "exec"), names)
 
 
-FUNCTIONS = {
-    "robot": [RobotSource],
-    "limits": [replace_limits],
-    "drives": [replace_drives],
-    "collision": [Collision],
-    "model": [Effects],
-    "recording": [Columns, Logs],
-    "load": [Load],
-    "rows": [build_rows],
-    "excitation": [Excitation],
-}
-
-
-def _functions(name, table):
-    if name == "filter":
-        return [FILTERS[table.pop("kind", "butterworth")]]
-    if name == "estimator":
-        return [choose_uncertainty, *KINDS[table.pop("kind", "weighted")][1]]
-    return FUNCTIONS[name]
-
-
 @pytest.mark.parametrize("page", _with("toml"))
 def test_keys_in_a_page_exist(page):
     for block in _blocks(page, "toml"):
         content = tomllib.loads(block)
         check_tables(content, list(TABLES))
         for name, table in content.items():
-            if name == "filter" and isinstance(table.get("cutoff"), list):
-                table["cutoff"] = table["cutoff"][0]
+            functions = TABLES[name]
+            if name == "filter":
+                functions = [FILTERS[table.pop("kind", "butterworth")]]
+                table["cutoff"] = np.max(table["cutoff"]).item()
             if name == "robot":
                 table = {"builtin": "panda", **table} if "tool" in table else table
-            decode(_functions(name, table), table, name, complete=False, skip=SIDES)
+            decode(functions, table, name, complete=False, skip=SIDES)
 
 
 def test_other_packages_bodies_become_ours(given):

@@ -9,14 +9,10 @@ import pytest
 import jaxid as jid
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import keys_of
-from jaxid.experiment.estimator_table import KINDS
-from jaxid.experiment.excitation_tables import Collision, Excitation
-from jaxid.experiment.experiment import load_experiment
-from jaxid.experiment.method_tables import FILTERS, SIDES, Logs, build_rows
-from jaxid.experiment.robot_tables import RobotSource, replace_drives, replace_limits
-from jaxid.experiment.template import render, write_template
+from jaxid.experiment.experiment import TABLES, load_experiment
+from jaxid.experiment.method_tables import SIDES
+from jaxid.experiment.template import write_template
 from jaxid.measurement import units
-from jaxid.measurement.columns import Columns
 from jaxid.robot import library
 
 ARM = """\
@@ -469,7 +465,7 @@ REFUSALS = [
     ("[robot]", "`urdf`, `builtin` and `dh`"),
     ("[[robot]]", "`[[…]]`"),
     (ARM + 'urdf = "a"', "`urdf` and `builtin`"),
-    ('[robot]\nbuiltin = "tx9"', "`builtin`"),
+    ('[robot]\nbuiltin = "tx9"', "`robot.builtin`"),
     ('[robot]\nbuiltin = "panda"\ntip = "x"', "`tip` belongs to `urdf`"),
     (ARM + "snap_tolerance = 0.01", "`snap_tolerance`"),
     ('[robot]\nurdf = "no.urdf"', "`urdf`: `.*no.urdf`"),
@@ -479,7 +475,7 @@ REFUSALS = [
     ("[robot]\ndh = [{alpha = 0, a = 0, d = 0, teta = 0}]", "`robot.dh[0].teta`.*`theta`"),
     (ARM + "gravity = [0, -9.81]", "`robot.gravity`"),
     (ARM + "gravity = [0, 0, 'g']", "`robot.gravity[2]`"),
-    (ARM + "gravity = [0, 0, nan]", "`gravity`"),
+    (ARM + "gravity = [0, 0, nan]", "`robot.gravity[2]`"),
     (ARM + "gravty = 1", "`robot.gravty`.*`gravity`"),
     (ARM + "xyzzy = 1", "`robot.xyzzy`.*`[robot]` has urdf"),
     (ARM + 'name = "a\\u001b[31m"', "`robot.name`.*U+001B"),
@@ -487,7 +483,7 @@ REFUSALS = [
     (TOOL.replace("mass = 1", "mass = 1e300"), "`mass`"),
     (TOOL + "body = 'hand'", "`body`.*joint1, joint2"),
     (TOOL + "inertia = {xx = 1, yy = 1, zz = 9}", "`inertia`"),
-    (ARM + "[limits]\nvelocity = [1, 2, 3]", "`limits`: `velocity`.*joint1, joint2"),
+    (ARM + "[limits]\nvelocity = [1, 2, 3]", "`limits`: `velocity`"),
     (ARM + "[limits]\nvelocity = 1", "`limits.velocity`"),
     (ARM + "[limits]\nvelocity = [1, -2]", "`limits`: `velocity`"),
     (ARM + "[limits]\nangle_unit = 'grad'", "`limits.angle_unit`"),
@@ -500,11 +496,11 @@ REFUSALS = [
         "`gear_ratios` or `matrix`",
     ),
     (ARM + "[drives]\ngear_ratios = [1]", "`gear_ratios`"),
-    (ARM + "[drives]\ngear_ratios = [nan, 1]", "`gear_ratios`"),
+    (ARM + "[drives]\ngear_ratios = [nan, 1]", "`drives.gear_ratios[0]`"),
     (ARM + "[drives]\ngear_ratios = [1, 0]", "`drives`"),
     (ARM + "[drives]\nmatrix = [[1, 0], [0]]", "`matrix`"),
     (ARM + "[drives]\nzero = [1]", "`zero`"),
-    (ARM + "[drives]\nzero = [inf, 1]", "`zero`"),
+    (ARM + "[drives]\nzero = [inf, 1]", "`drives.zero[0]`"),
     (ARM + "[drives]\nmax_torques = [0, 1]", "`drives.max_torques[0]`"),
     (ARM + "[model]\nviscous = 1", "`model.viscous`"),
     (ARM + "[model]\ncoulomb = 'hard'", "`model.coulomb`"),
@@ -524,7 +520,6 @@ REFUSALS = [
     (COLUMNS + "angle_signs = [1, 2]", "`angle_signs`"),
     (COLUMNS + "angle_offsets = [1]", "`angle_offsets`"),
     (COLUMNS + "largest_gap = 0.5", "`recording.largest_gap`"),
-    (COLUMNS.replace('"q{}"', '["q1"]'), "`angles`"),
     (COLUMNS + "angels = 1", "`recording.angels`.*`angles`"),
     (ARM + "[filter]\ncutoff = 1", "`filter.kind`"),
     (ARM + "[filter]\nkind = 'buterworth'", "`filter.kind`"),
@@ -549,7 +544,7 @@ REFUSALS = [
         "`estimator.weights`: belongs to `kind",
     ),
     (ARM + "[estimator]\nlimit = 2.0", '`estimator.limit`: belongs to `kind = "huber" or "tuk'),
-    (ARM + "[estimator]\nkind = 'instrumental'", "`estimator.reference`"),
+    (ARM + "[estimator]\nkind = 'instrumental'", "`estimator`: `reference`"),
     (ARM + "[estimator]\nridge = 0.1\nprior = 'urdf'", "`prior"),
     (ARM + "[estimator]\nnonlinear_friction = true\nessential = 0.1", "`nonlinear_friction`"),
     (ARM + BODIES + "mass_min = -1", "`mass_min`"),
@@ -569,7 +564,7 @@ REFUSALS = [
     (ARM + "[estimator]\nessential = 0.1\nridge = 0.1", "`essential`.*`ridge`"),
     (ARM + "[estimator]\ntruncate = 1", "`estimator.truncate`"),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge`"),
-    (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`truncate` or `ridge`"),
+    (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`truncate`.*`ridge`"),
     (ARM + "[excitation.spline]\npionts = 3", "`excitation.spline.pionts`.*`points`"),
     (ARM + "[excitation.spline]\npoints = 3", "`excitation.spline.points`"),
     (ARM + "[excitation]\nspline = 3", "`excitation.spline`"),
@@ -582,7 +577,7 @@ REFUSALS = [
     (ARM + ARM, "TOML"),
     (ARM + "x = " + 3000 * "[", "TOML"),
     (ARM + "x = " + 9999 * "9", "TOML"),
-    (SHAPES.replace('body = "bend"', 'body = "wrist"'), "`body` of capsule `hand`.*turn, lift"),
+    (SHAPES.replace('body = "bend"', 'body = "wrist"'), "`collision`: `body`.*turn, lift"),
     (SHAPES.replace("radius = 0.08", "radius = -1"), "`collision.capsules[1].radius`"),
     (SHAPES.replace("ground = -0.1", 'pairs = [["hand", "chair"]]'), "`chair`"),
     (SHAPES.replace("ground = -0.1", "fit = true"), "`fit`.*`robot.urdf`"),
@@ -608,7 +603,7 @@ def test_files_that_cannot_be_read(tmp_path):
             load_experiment(path)
     path = tmp_path / "latin.toml"
     path.write_bytes("# Stäubli\n".encode("latin-1"))
-    with pytest.raises(InputError, match=r"latin.toml: .* \(byte 4\)"):
+    with pytest.raises(InputError, match=r"latin.toml: .* position 4"):
         load_experiment(path)
 
 
@@ -674,11 +669,10 @@ def _refusal(path):
     return ""
 
 
-def test_the_template_documents_every_key():
-    text = render(jid.robots.tx90l_on_rail(), "arm.urdf")
-    tables = (RobotSource, replace_limits, replace_drives, Columns, Logs, build_rows)
-    kinds = [f for _, functions in KINDS.values() for f in functions]
-    for function in (*tables, *FILTERS.values(), *kinds, Excitation, Collision):
+def test_the_template_documents_every_key(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    text = write_template(tmp_path / "arm.urdf")
+    for function in (function for functions in TABLES.values() for function in functions):
         for key in set(keys_of(function)) - {*SIDES, "tool"}:
             assert re.search(rf"^(# )?{key} = .", text, flags=re.M), key
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 import typer.main
@@ -30,7 +30,7 @@ import jax
 def settings():
     return {name: jax.config._read(name) for name in jax.config.values}
 before = settings()
-import jaxid
+import jaxid.api
 after = settings()
 assert after == before, {k: v for k, v in after.items() if before.get(k, v) != v}
 loaded = sorted({"matplotlib", "typer", "rich"} & set(sys.modules))
@@ -52,10 +52,8 @@ def _tree(path: Path) -> ast.Module:
 @cache
 def _public() -> dict[str, Any]:
     """Return the flat public names and what they stand for, without the namespaces."""
-    names = {name: getattr(jaxid, name) for name in vars(jaxid) if not name.startswith("_")}
-    return {
-        k: v for k, v in names.items() if not inspect.ismodule(v) and v not in (Any, TYPE_CHECKING)
-    }
+    names = {name: getattr(jaxid, name) for name in dir(jaxid)}
+    return {name: thing for name, thing in names.items() if not inspect.ismodule(thing)}
 
 
 def _commands() -> list[str]:

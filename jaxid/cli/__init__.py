@@ -1,4 +1,401 @@
-"""Command line of jaxid."""
+"""The command line `jaxid`: names, options and help of the commands.
 
-from jaxid.cli.main import app as app
-from jaxid.cli.main import main as main
+Their work is imported when they run, so that `jaxid --help` answers at once.
+"""
+
+import importlib.metadata
+import io
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.text import Text
+
+from jaxid.cli.options import (
+    ExperimentFile,
+    Force,
+    Loaded,
+    OutputFolder,
+    Unloaded,
+    describe_error,
+    open_console,
+    output_folder,
+    refuse_foreign_folder,
+    refuse_foreign_table,
+    require_one_log_per_option,
+    start,
+)
+from jaxid.errors import InputError
+
+app = typer.Typer(
+    name="jaxid",
+    help="Identifies the dynamic parameters of robots: from a log to a model.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+FILES = {
+    "c": "arm.c",
+    "urdf": "arm.urdf",
+    "mjcf": "arm.xml",
+    "json": "arm.json",
+    "pinocchio": "arm_pinocchio.json",
+    "jax": "arm.jax",
+}
+"""Formats of an exported model, and the files where no name is given."""
+
+
+def main() -> None:
+    """Run a command; an error of a user is one sentence on stderr, with exit code 2."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals know few characters
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        require_one_log_per_option()
+        app()
+    except (InputError, OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
+            raise  # of JAX, not a failed search
+        open_console(stderr=True).print(Text(f"jaxid: {describe_error(error)}"), soft_wrap=True)
+        raise SystemExit(2) from None
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        try:
+            shown = importlib.metadata.version("jaxid-robotics")
+        except importlib.metadata.PackageNotFoundError:
+            shown = "(not installed)"
+        typer.echo(f"jaxid {shown}")
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    output: OutputFolder = Path("demo"),
+    seed: Annotated[
+        int, typer.Option("--seed", metavar="N", min=0, help="Seed of motions and noise.")
+    ] = 0,
+    force: Force = False,
+) -> None:
+    """Do the whole paper on a virtual TX90L on its rail.
+
+    Base parameters, optimal excitation, measurement cold and warm, identification, verification on
+    the path of ISO 9283, and how well the path is followed with and without the model.
+    """
+    from jaxid.demo.results import remarks, tables, write_study
+    from jaxid.demo.study import run_study
+    from jaxid.experiment.session import stages
+    from jaxid.report.page import show, show_remarks
+
+    console = start()
+    refuse_foreign_folder(output, force)
+    with stages(open_console(stderr=True), 15) as stage:
+        part = stage.through()
+
+        def progress(name: str, fraction: float) -> None:
+            nonlocal part
+            if fraction == 0.0:
+                stage(name)
+                part = stage.through()
+            else:
+                part(fraction)
+
+        study = run_study(seed, progress)
+        stage("writing the report")
+        files = write_study(output, study)
+    show(console, *tables(study))
+    show_remarks(console, remarks(study))
+    console.print()
+    console.print(Text(f"the report: {files[0]}"), soft_wrap=True)
+
+
+@app.command()
+def example(
+    folder: Annotated[Path, typer.Argument(help="Folder of the files.", metavar="DIR")],
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Seed of parameters, motion and noise.")
+    ] = 0,
+) -> None:
+    """Write an experiment to try things on.
+
+    An experiment file and two logs of a virtual robot whose parameters are known.
+    """
+    from jaxid.simulation.example import write_example
+
+    console = start()
+    for file in write_example(folder, seed=seed):
+        console.print(Text(f"wrote {file}"), soft_wrap=True)
+    words = f"now: jaxid identify {folder}/experiment.toml {folder}/identification.csv "
+    words += f"--verify {folder}/verification.csv -o {folder}/report"
+    console.print(Text(words), soft_wrap=True)
+
+
+@app.command()
+def init(
+    urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.", metavar="ARM.URDF")],
+    tip: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LINK", help="The end-effector: take only the chain that leads to it."
+        ),
+    ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option(metavar="LINK", help="The link on the ground; by default the root."),
+    ] = None,
+) -> None:
+    """Print a commented experiment file for a robot.
+
+    Like this: jaxid init arm.urdf > experiment.toml
+    """
+    from jaxid.experiment.template import write_template
+
+    start()
+    text = write_template(urdf, tip=tip, base=base, folder=output_folder())
+    typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
+
+
+@app.command()
+def excite(
+    experiment: ExperimentFile,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
+    ] = Path("trajectory.csv"),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where a design was stopped.")
+    ] = False,
+    all_criteria: Annotated[
+        bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
+    ] = False,
+) -> None:
+    """Design the motion to record, within the limits of the joints.
+
+    Beside the table lie the trajectory itself (.json), the same for ROS (.ros.yaml), pictures of
+    joints and end-effector in a folder, and the state of the design until it is done. Ctrl-C keeps
+    the best motion so far.
+    """
+    from jaxid.cli import commands
+
+    console = start()
+    refuse_foreign_table(output)
+    commands.excite(console, experiment, output, resume, all_criteria)
+
+
+@app.command()
+def inspect(
+    experiment: ExperimentFile,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(help="Logs to examine.", metavar="LOG")
+    ] = None,
+) -> None:
+    """Show what can be identified, and if logs are sane.
+
+    Joints, motors and limits; base parameters and what becomes of each standard parameter; ranges,
+    speeds and forces of each log beside the limits, and what the log does not determine.
+    """
+    from jaxid.cli import commands
+
+    commands.inspect(start(), experiment, logs or [])
+
+
+@app.command()
+def identify(
+    experiment: ExperimentFile,
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Logs to identify with, fitted together; the folder of an earlier report stands "
+            "for the logs it was made of.",
+            metavar="LOG",
+        ),
+    ],
+    verify: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--verify",
+            metavar="LOG",
+            help="A log to verify with, which the fit does not see; may be repeated.",
+        ),
+    ] = None,
+    split: Annotated[
+        float | None,
+        typer.Option(
+            "--split",
+            metavar="F",
+            help="Use the first fraction F (0-1) of each log for identification, the rest for "
+            "validation.",
+        ),
+    ] = None,
+    output: OutputFolder = Path("report"),
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write the figures as PDF too, for papers.")
+    ] = False,
+    force: Force = False,
+) -> None:
+    """Estimate the parameters and write a report.
+
+    A page for the browser, with figures and a verdict; the same numbers for programs.
+    """
+    from jaxid.cli import commands
+
+    console, unseen = start(), verify or []
+    commands.check_logs(logs, unseen, split)
+    refuse_foreign_folder(output, force)
+    commands.identify(console, experiment, logs, unseen, split, output, pdf)
+
+
+@app.command()
+def export(
+    report: Annotated[
+        Path,
+        typer.Argument(
+            help="Report of `jaxid identify`, or a model file (.json).", metavar="REPORT"
+        ),
+    ],
+    to: Annotated[
+        Literal["c", "urdf", "mjcf", "json", "pinocchio", "jax"],
+        typer.Option("--to", help="What to write."),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE", help="The file; `arm` with the usual ending if left."
+        ),
+    ] = None,
+    urdf: Annotated[
+        Path | None,
+        typer.Option("--urdf", metavar="ARM.URDF", help="The robot's own file, for `--to urdf`."),
+    ] = None,
+    tip: Annotated[
+        str | None, typer.Option(metavar="LINK", help="As in the experiment file, for `--to urdf`.")
+    ] = None,
+    base: Annotated[
+        str | None, typer.Option(metavar="LINK", help="As in the experiment file, for `--to urdf`.")
+    ] = None,
+    single: Annotated[
+        bool, typer.Option("--float", help="C that computes in single precision.")
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a file that is there already.")
+    ] = False,
+) -> None:
+    """Write an identified model as C, URDF, MJCF, JSON, vectors, or a JAX function.
+
+    C is a feed-forward for controllers: one file and its header, named like the output.
+    """
+    from jaxid.cli import commands
+
+    console = start()
+    path = Path(FILES[to]) if output is None else output
+    made = [path, path.with_suffix(".h")] if to == "c" else [path]
+    if to == "c" and path.suffix != ".c":
+        raise InputError(f"`--output` must be a C file like arm.c, but is `{path}`.")
+    for one in made:
+        if one.is_dir():
+            raise InputError(f"`{one}` is a folder: choose another `--output`.")
+        if one.exists() and not force:
+            raise InputError(f"`{one}` is there already: choose another `--output`, or `--force`.")
+    chain = {"tip": tip, "base": base}
+    commands.export(report, to, path, urdf, chain, double=not single)
+    console.print()
+    console.print(Text(f"wrote {path.parent}: {', '.join(x.name for x in made)}"))
+
+
+@app.command()
+def compare(
+    first: Annotated[
+        Path, typer.Argument(help="Report of one run, like that of the cold robot.", metavar="COLD")
+    ],
+    second: Annotated[
+        Path, typer.Argument(help="Report of another run of the same robot.", metavar="WARM")
+    ],
+    level: Annotated[
+        float, typer.Option("--level", metavar="L", help="Confidence of the decisions (0-1).")
+    ] = 0.95,
+    output: OutputFolder = Path("comparison"),
+    force: Force = False,
+) -> None:
+    """Decide which parameters have changed between two runs.
+
+    Each argument is a folder that `jaxid identify` has written.
+    """
+    from jaxid.cli import commands
+
+    console = start()
+    if first.resolve() == second.resolve():
+        raise InputError(f"`{first}` is given twice: compare two different runs.")
+    refuse_foreign_folder(output, force)
+    commands.compare(console, (first, second), level, output)
+
+
+@app.command()
+def payload(
+    experiment: ExperimentFile,
+    logs: Unloaded,
+    loaded: Loaded,
+    body: Annotated[
+        str | None,
+        typer.Option(
+            "--body", metavar="JOINT", help="The joint that moves the body with the payload."
+        ),
+    ] = None,
+    output: OutputFolder = Path("payload"),
+    force: Force = False,
+) -> None:
+    """Find a payload's mass, centre of mass and moments of inertia.
+
+    From logs without it and logs with it. Friction may differ between them.
+    """
+    from jaxid.cli import commands
+
+    console = start()
+    refuse_foreign_folder(output, force)
+    commands.payload(console, experiment, logs, loaded, body, output)
+
+
+@app.command()
+def gains(
+    experiment: ExperimentFile,
+    logs: Unloaded,
+    loaded: Loaded,
+    output: OutputFolder = Path("gains"),
+    force: Force = False,
+) -> None:
+    """Find the drives' true forces, like torque constants, with a load that is known.
+
+    From logs without it and logs with it; the table `[load]` of the experiment file describes it.
+    """
+    from jaxid.cli import commands
+
+    console = start()
+    refuse_foreign_folder(output, force)
+    commands.gains(console, experiment, logs, loaded, output)
+
+
+@app.command()
+def states(
+    experiment: ExperimentFile,
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Logs, or folders of reports: one for each state, like cold and warm.",
+            metavar="LOG",
+        ),
+    ],
+    output: OutputFolder = Path("states"),
+    force: Force = False,
+) -> None:
+    """Fit several states of a robot at once: one inertia, friction for each.
+
+    Like cold and warm. Friction and offsets are each state's own, all else is shared.
+    """
+    from jaxid.cli import commands
+
+    console = start()
+    refuse_foreign_folder(output, force)
+    commands.states(console, experiment, logs, output)

@@ -1,11 +1,10 @@
-"""Options of the commands, the terminal, errors as sentences, and folders of results."""
+"""Options that commands share, the terminal, errors as sentences, and folders of results."""
 
 import errno
 import os
 import shlex
 import stat
 import sys
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated
 
@@ -13,10 +12,6 @@ import typer
 from rich.console import Console
 
 from jaxid.errors import InputError
-from jaxid.experiment.progress import Stages, stages
-from jaxid.io import read_json, require_writable
-from jaxid.report.result_files import SCHEMAS
-from jaxid.trajectory.files import load_trajectory
 
 WIDTH = 100
 """Width of the output where there is no terminal."""
@@ -24,19 +19,32 @@ WIDTH = 100
 ExperimentFile = Annotated[
     Path, typer.Argument(help="The experiment file.", metavar="EXPERIMENT.TOML")
 ]
-
+OutputFolder = Annotated[
+    Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the result.")
+]
 Force = Annotated[
     bool, typer.Option("--force", help="Write into a folder that holds other files too.")
+]
+Unloaded = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Logs without the load, or folders of reports on such logs.", metavar="LOG"
+    ),
+]
+Loaded = Annotated[
+    list[Path],
+    typer.Option(
+        "--loaded",
+        metavar="LOG",
+        help="A log with the load, or the folder of a report; may be repeated.",
+    ),
 ]
 
 
 def require_one_log_per_option() -> None:
-    """Reject several logs behind one `--verify` or `--loaded`, as earlier versions took them.
+    """Reject several logs behind one `--verify` or `--loaded`.
 
     Otherwise the second log would silently be used for something else.
-
-    Raises:
-        InputError: If two words that are no options follow such an option.
     """
     words = [word for arg in sys.argv[1:] for word in arg.split("=", 1)]
     for option, _, second in zip(words, words[1:], words[2:], strict=False):
@@ -47,12 +55,27 @@ def require_one_log_per_option() -> None:
             )
 
 
-def describe_error(error: Exception) -> str:
-    """Return what an error says, with the file that it is about.
+def start() -> Console:
+    """Turn on double precision and the cache of compiled code; return the terminal."""
+    import jax
 
-    Args:
-        error: Error of a user, or of the operating system.
-    """
+    from jaxid.program.cache import keep_compiled
+
+    jax.config.update("jax_enable_x64", True)
+    keep_compiled()
+    return open_console()
+
+
+def open_console(stderr: bool = False) -> Console:
+    """Return the terminal, or a console of fixed width where there is none."""
+    console = Console(stderr=stderr, highlight=False)
+    if not console.is_terminal and "COLUMNS" not in console._environ:
+        console.width = WIDTH
+    return console
+
+
+def describe_error(error: Exception) -> str:
+    """Return what an error of a user or of the operating system says, with its file."""
     if not isinstance(error, OSError) or not error.strerror:
         return str(error)
     where = f"`{error.filename}`: " if error.filename else ""
@@ -64,72 +87,41 @@ def describe_error(error: Exception) -> str:
     return f"{where}{error.strerror}."
 
 
-def open_console(stderr: bool = False) -> Console:
-    """Return the terminal, or a console of fixed width where there is none.
-
-    Args:
-        stderr: Whether to write to stderr, as errors and bars do.
-    """
-    console = Console(stderr=stderr, highlight=False)
-    if not console.is_terminal and "COLUMNS" not in console._environ:
-        console.width = WIDTH
-    return console
-
-
-def open_stages(total: int) -> AbstractContextManager[Stages]:
-    """Return a progress bar for the stages of a command.
-
-    Args:
-        total: Number of stages.
-    """
-    return stages(open_console(stderr=True), total)
-
-
-def command_line(
-    experiment: Path,
-    logs: list[Path],
-    verify: list[Path],
-    split: float | None,
-    output: Path,
-    pdf: bool,
-) -> str:
-    """Return the command line that makes a report of `jaxid identify` again.
-
-    Args:
-        experiment: Path of the experiment file.
-        logs: Logs to identify with.
-        verify: Logs to verify with.
-        split: Fraction of each log to identify with.
-        output: Folder of the report.
-        pdf: Whether figures are written as PDF too.
-    """
-    words = ["jaxid", "identify", str(experiment), *map(str, logs)]
-    words += [word for log in verify for word in ("--verify", str(log))]
-    words += ["--split", f"{split:g}"] if split is not None else []
-    words += ["-o", str(output), *(["--pdf"] if pdf else [])]
-    return shlex.join(words)
+def command_line() -> str:
+    """Return the command line that gives the same result again."""
+    words = (word for word in sys.argv[1:] if word not in ("--force", "--resume"))
+    return shlex.join(["jaxid", *words])
 
 
 def refuse_foreign_folder(target: Path, force: bool) -> None:
     """Reject a folder that holds other things than an earlier report.
 
-    Args:
-        target: Folder of the report.
-        force: Whether the report may stand beside other files.
-
     Raises:
         OSError: If nothing can be written there.
         InputError: If there is something else in its place.
     """
+    from jaxid.io import require_writable
+    from jaxid.report.result_files import SCHEMAS
+
     if target.exists() and not target.is_dir():
         raise InputError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
-    if force or not target.is_dir() or not any(target.iterdir()) or _holds_report(target):
-        require_writable(target)
-        return
-    raise InputError(
-        f"`{target}` holds files but no report: choose another folder with -o, or add --force to "
-        "put the report beside them."
-    )
+    kinds = {file: schema.split("/")[0] for file, schema in SCHEMAS.items()}
+    empty = not target.is_dir() or not any(target.iterdir())
+    if not (force or empty or any(_has_schema(target / f, kind) for f, kind in kinds.items())):
+        raise InputError(
+            f"`{target}` holds files but no report: choose another folder with -o, or add --force "
+            "to put the report beside them."
+        )
+    require_writable(target)
+
+
+def _has_schema(path: Path, kind: str) -> bool:
+    from jaxid.io import read_json
+
+    try:
+        return str(read_json(path)["schema"]).startswith(kind)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def refuse_foreign_table(target: Path) -> None:
@@ -143,39 +135,23 @@ def refuse_foreign_table(target: Path) -> None:
         OSError: If nothing can be written there.
         InputError: If the name is not that of a table, or something else is in its place.
     """
+    from jaxid.io import require_writable
+    from jaxid.trajectory.files import load_trajectory
+
     if target.suffix.lower() != ".csv":
         raise InputError(f"`{target}` must end in .csv: choose another -o.")
     beside, pictures = target.with_suffix(".json"), target.with_suffix("")
-    if _is_trajectory(beside):
-        return
-    ros = (target.with_suffix(f".ros.{kind}") for kind in ("yaml", "json"))
-    drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
-    foreign = next((path for path in (target, beside, *ros, *drawn) if path.exists()), None)
-    if foreign is not None:
-        raise InputError(
-            f"`{foreign}` is there already, and no motion of `jaxid excite`: choose another -o."
-        )
-    require_writable(target.parent)
-
-
-def _is_trajectory(path: Path) -> bool:
     try:
-        load_trajectory(path)
+        load_trajectory(beside)
     except (OSError, ValueError):
-        return False
-    return True
-
-
-def _holds_report(folder: Path) -> bool:
-    return any(_has_schema(folder / file, schema) for file, schema in SCHEMAS.items())
-
-
-def _has_schema(path: Path, schema: str) -> bool:
-    try:
-        content = read_json(path)
-        return str(content["schema"]).startswith(schema.split("/")[0])
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+        ros = (target.with_suffix(f".ros.{kind}") for kind in ("yaml", "json"))
+        drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
+        foreign = next((path for path in (target, beside, *ros, *drawn) if path.exists()), None)
+        if foreign is not None:
+            raise InputError(
+                f"`{foreign}` is there already, and no motion of `jaxid excite`: choose another -o."
+            ) from None
+        require_writable(target.parent)
 
 
 def output_folder() -> Path | None:

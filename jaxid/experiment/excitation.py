@@ -1,9 +1,9 @@
 """Design of the motion that an experiment file asks for, and the files that a robot can play."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -13,17 +13,14 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import (
     AbstractConstraint,
     Clearance,
-    Finding,
     ForceLimits,
     TipLimits,
 )
-from jaxid.excitation.criteria import CRITERIA as ALL_CRITERIA
-from jaxid.excitation.criteria import information
+from jaxid.excitation.criteria import CRITERIA, information
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.problem import assumed_noise
 from jaxid.experiment.decoder import within
-from jaxid.experiment.excitation_tables import CRITERIA
 from jaxid.experiment.experiment import Experiment
 from jaxid.identification.comparison import parameter_kinds
 from jaxid.io import atomic_folder
@@ -64,18 +61,6 @@ class Nominal(NamedTuple):
         return np.where(np.isin(self.names, self.undetermined), np.nan, self.parameters)
 
 
-class Aside(NamedTuple):
-    """Remarks on a design beside those of its plan, and its origin.
-
-    Attributes:
-        remarks: Remarks.
-        settings: Origin of the design: `facts`, `command` and `experiment_text`.
-    """
-
-    remarks: tuple[Remark, ...]
-    settings: dict[str, Any]
-
-
 class Design(NamedTuple):
     """Designed motion as a robot can play it.
 
@@ -83,19 +68,17 @@ class Design(NamedTuple):
         plan: Result of the optimisation.
         played: Motion from standstill to standstill where that is possible.
         window: Times of it between which lies the designed motion [s].
-        aside: Remarks, and how the motion came about.
+        remarks: Remarks beside those of the plan.
         sampled: Motion as it is written in samples: until a sample meets its end.
         sample_time: Time between those samples [s].
-        ros: Language of the file for ROS: yaml or json.
     """
 
     plan: ExcitationPlan
     played: AbstractTrajectory
     window: tuple[float, float]
-    aside: Aside
+    remarks: tuple[Remark, ...]
     sampled: AbstractTrajectory
     sample_time: float
-    ros: str
 
 
 def design_motion(
@@ -120,7 +103,7 @@ def design_motion(
         nominal = find_nominal(experiment)
         plan = design_excitation(
             experiment.base,
-            criterion=CRITERIA[table.criterion](),
+            criterion=table.objective,
             starts=table.starts,
             generations=table.generations,
             polish=min(table.polish, table.starts),
@@ -135,23 +118,17 @@ def design_motion(
 def compare_criteria(
     experiment: Experiment, progress: Callable[[DesignProgress], None]
 ) -> list[ExcitationPlan]:
-    """Design by every criterion, from few starts and without polishing, until Ctrl-C.
-
-    Args:
-        experiment: Experiment with its table `[excitation]`, or the defaults.
-        progress: Callback for the progress of the designs.
-    """
+    """Design by every criterion, from few starts and without polishing, until Ctrl-C."""
     plans, table = [], experiment.excitation
-    for number, criterion in enumerate(ALL_CRITERIA):
+    for number, criterion in enumerate(CRITERIA):
 
         def tell(now: DesignProgress, number: int = number) -> None:
-            share = (number + now.fraction) / len(ALL_CRITERIA)
-            doing = f"criterion {number + 1} of {len(ALL_CRITERIA)}, {now.task}"
+            share = (number + now.fraction) / len(CRITERIA)
+            doing = f"criterion {number + 1} of {len(CRITERIA)}, {now.task}"
             progress(now._replace(fraction=share, task=doing))
 
         try:
             with within("excitation", experiment.path.name):
-                nominal = find_nominal(experiment)
                 plan = design_excitation(
                     experiment.base,
                     criterion=criterion,
@@ -160,7 +137,7 @@ def compare_criteria(
                     polish=0,
                     progress=tell,
                     throw=False,
-                    **_settings(experiment, nominal, bool(criterion.weighted)),
+                    **_settings(experiment, find_nominal(experiment), bool(criterion.weighted)),
                 )
         except KeyboardInterrupt:
             break
@@ -170,25 +147,30 @@ def compare_criteria(
     return plans
 
 
-def write_design(design: Design, output: Path, command: str = "") -> list[Path]:
+def write_design(
+    experiment: Experiment, design: Design, output: Path, command: str = ""
+) -> list[Path]:
     """Write table, trajectory, ROS message and pictures; return the files.
 
     Args:
+        experiment: Experiment of the motion.
         design: The motion.
         output: Path of the table; the others lie beside it.
         command: Command line that makes it again, for the page.
     """
-    plan, step = design.plan, design.sample_time
-    aside = design.aside._replace(settings={**design.aside.settings, "command": command})
+    plan, step, table = design.plan, design.sample_time, experiment.excitation
     robot = plan.base.model.robot
-    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{design.ros}"]
-    write_ros = write_ros_json if design.ros == "json" else write_ros_yaml
+    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{table.ros}"]
+    write_ros = write_ros_json if table.ros == "json" else write_ros_yaml
+    settings = {"facts": (("seed", str(table.seed)),), "experiment_text": experiment.text}
+    settings["command"] = command
     with double_precision(), atomic_folder(output.parent) as folder:
         write_csv(design.sampled, robot, folder / names[0], sample_time=step)
         save_trajectory(jax.tree.map(np.asarray, design.played), folder / names[1])
         write_ros(design.sampled, robot, folder / names[2], sample_time=step)
         # Before the others take their places: where there is no room for pictures, nothing changes.
-        pictures = write_excitation(output.with_suffix(""), plan, design.played, *aside)
+        place = output.with_suffix("")
+        pictures = write_excitation(place, plan, design.played, design.remarks, settings)
     return [output.parent / n for n in names] + pictures
 
 
@@ -212,10 +194,6 @@ def find_constraints(
     experiment: Experiment, nominal: Nominal | None
 ) -> tuple[AbstractConstraint, ...]:
     """Return the constraints of the motion beside the limits of the joints.
-
-    Args:
-        experiment: Experiment with its tables `[collision]` and `[excitation]`.
-        nominal: Nominal parameters; None if nothing is known.
 
     Raises:
         InputError: If forces are limited, but no parameters or no largest forces are known.
@@ -255,7 +233,7 @@ def _earlier_information(
     table, folder = experiment.excitation, experiment.path.parent
     if not table.earlier:
         return None
-    if not CRITERIA[table.criterion]().weighted:
+    if not table.objective.weighted:
         raise InputError(
             f'`earlier` and `criterion = "{table.criterion}"` do not go together: what motions '
             "tell adds up in units of the noise, which this criterion does not know; leave out "
@@ -278,9 +256,6 @@ def _earlier_information(
 
 def find_nominal(experiment: Experiment) -> Nominal | None:
     """Return nominal parameters of an earlier result, or those that the URDF file claims.
-
-    Args:
-        experiment: Experiment with its table `[excitation]`.
 
     Raises:
         InputError: If the earlier result is of other parameters.
@@ -320,108 +295,84 @@ def _earlier_result(experiment: Experiment, report: str) -> Nominal:
 def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None) -> Design:
     """Return the motion from standstill to standstill, in samples of the controller."""
     motion, table = plan.trajectory, experiment.excitation
-    leads = table.chosen_leads
-    begin, last, end = _sample_times(plan)[[0, 1, -1]].tolist()
-    step, refusal = last - begin, ""
+    leads, times = table.chosen_leads, np.asarray(plan.limits.basis.times(plan.samples))
+    begin, end = float(times[0]), float(times[-1] + times[1] - times[0])
+    step = float(times[1] - times[0])
+    remarks = []
     # Where there are constraints, leads were designed together with the motion.
     if leads is not None and leads.time is None and not plan.findings:
         robot = experiment.robot.replace(limits=plan.limits.limits)
         try:
             motion = with_leads(motion, robot, periods=leads.periods)
-        except InputError as error:
-            refusal = str(error)
-        else:
             begin, end = (float(t) for t in motion.window)
+        except InputError as error:
+            text = f"the motion is without leads, and starts and ends at full speed: {error} "
+            text += "`rest = true` designs one that is at rest there."
+            remarks.append(Remark(text, Status.BAD))
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
-    remarks = (
-        *_remarks(experiment, plan, float(motion.duration), (begin, end), refusal),
-        *force_remarks(experiment, nominal, motion),
-    )
-    settings = {"facts": (("seed", str(table.seed)),), "experiment_text": experiment.text}
-    step = step if table.sample_time is None else table.sample_time
-    rests = leads is not None or table.rest or table.spline is not None
-    whole_cycles = table.sample_time is not None and rests and not refusal
-    sampled = PaddedToCycle(motion, step) if whole_cycles else motion
-    return Design(plan, motion, (begin, end), Aside(remarks, settings), sampled, step, table.ros)
-
-
-def _sample_times(plan: ExcitationPlan) -> Float[np.ndarray, " times"]:
-    """Return the times of the samples of one run, and its end [s]."""
-    times = plan.limits.basis.times(plan.samples)
-    return np.append(times, times[-1] + times[1] - times[0])
-
-
-def _remarks(
-    experiment: Experiment,
-    plan: ExcitationPlan,
-    duration: float,
-    window: tuple[float, float],
-    refusal: str,
-) -> Iterator[Remark]:
-    table, leads, (begin, end) = experiment.excitation, experiment.excitation.chosen_leads, window
-    notes = []
+    rests = not remarks and (leads is not None or table.rest or table.spline is not None)
     if begin > 0:
-        notes.append(
-            f"the robot starts at rest and is in the designed motion from {begin:.3f} to "
-            f"{end:.3f} s of {duration:.3f} s"
+        remarks.append(
+            Remark(
+                f"the robot starts at rest and is in the designed motion from {begin:.3f} to "
+                f"{end:.3f} s of {float(motion.duration):.3f} s"
+            )
         )
+    remarks += _remarks(experiment, plan)
+    remarks += force_remarks(experiment, nominal, motion)
+    sampled = motion
+    if table.sample_time is not None:
+        step = table.sample_time
+        sampled = PaddedToCycle(motion, step) if rests else motion
+    return Design(plan, motion, (begin, end), tuple(remarks), sampled, step)
+
+
+def _remarks(experiment: Experiment, plan: ExcitationPlan) -> list[Remark]:
+    table, notes = experiment.excitation, []
     if table.noise is None:
         notes.append(
             "the noise is assumed as 1 % of the largest forces: give `noise` if it is known"
         )
     if table.earlier:
         notes.append(f"deviations are those together with {', '.join(table.earlier)}")
-    if leads is not None and leads.periods > 1:
-        notes.append(f"the motion runs through {leads.periods} periods; the deviations are of one")
-    notes += table.unused
+    if table.chosen_leads is not None and table.chosen_leads.periods > 1:
+        count = table.chosen_leads.periods
+        notes.append(f"the motion runs through {count} periods; the deviations are of one")
     if plan.nominal is None:
         notes.append(
             "for relative deviations, say in `excitation.nominal` where an earlier result is"
         )
-    for text in notes:
-        yield Remark(text)
-    if refusal:
-        yield Remark(
-            f"the motion is without leads, and starts and ends at full speed: {refusal} "
-            "`rest = true` designs one that is at rest there.",
-            Status.BAD,
-        )
+    return [Remark(text) for text in notes]
 
 
 def force_remarks(
     experiment: Experiment, nominal: Nominal | None, played: AbstractTrajectory
-) -> Iterator[Remark]:
-    """Yield remarks about the forces of a motion, where any are limited.
-
-    Args:
-        experiment: Experiment with its table `[excitation]`.
-        nominal: Nominal parameters; None if nothing is known.
-        played: Motion with its leads.
-    """
+) -> list[Remark]:
+    """Return remarks about the forces of a motion, where any are limited."""
     if not np.isfinite(experiment.robot.known_max_forces).any():
-        return
+        return []
     if nominal is None:
-        yield Remark(
+        text = (
             "forces were not checked, although they have limits, for no parameters are known: "
             "say in `excitation.nominal` where an earlier result is, and give `force_margin` to "
-            "keep the limits",
-            Status.DOUBTFUL,
+            "keep the limits"
         )
-        return
+        return [Remark(text, Status.DOUBTFUL)]
+    remarks = []
     if experiment.excitation.force_margin is None:
-        yield _force_use(experiment, nominal, played)
-    unknown = _unknown_parameters(experiment, nominal)
-    if unknown:
+        remarks.append(_force_use(experiment, nominal, played))
+    if unknown := _unknown_parameters(experiment, nominal):
         text = f"not known, and counted as zero in the forces: {unknown}"
-        yield Remark(text, Status.DOUBTFUL)
+        remarks.append(Remark(text, Status.DOUBTFUL))
     if nominal.undetermined:
-        yield Remark(
+        text = (
             f"`{experiment.excitation.nominal}` does not determine "
             f"{', '.join(nominal.undetermined)}: the forces are computed with its estimates of "
-            "them, whose uncertainty counts as zero",
-            Status.DOUBTFUL,
+            "them, whose uncertainty counts as zero"
         )
+        remarks.append(Remark(text, Status.DOUBTFUL))
+    return remarks
 
 
 def _force_use(experiment: Experiment, nominal: Nominal, played: AbstractTrajectory) -> Remark:
@@ -430,23 +381,22 @@ def _force_use(experiment: Experiment, nominal: Nominal, played: AbstractTraject
         motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
         limits = _force_limits(experiment, nominal, 0.0)
         findings = limits.describe(robot, np.asarray(limits(robot, motion)))
-    exceeded = [_describe_use(one) for one in findings if one.value > 0]
+    shown = {
+        f"{x.name} with {100 * x.used:.1f} % of {x.limit:.4g} {x.unit}": x.value for x in findings
+    }
+    exceeded = [text for text, value in shown.items() if value > 0]
     if exceeded:
         return Remark(
             "by the nominal parameters this motion needs more than robot and motors can give: "
             f"{'; '.join(exceeded)}; give `force_margin`, and the design keeps these limits",
             Status.BAD,
         )
-    nearest = max(findings, key=lambda one: one.value)
+    nearest = max(shown, key=lambda text: shown[text])
     return Remark(
         "forces were not part of the design; by the nominal parameters they stay within their "
-        f"limits, the nearest being {_describe_use(nearest)} (`force_margin` keeps them with room)",
+        f"limits, the nearest being {nearest} (`force_margin` keeps them with room)",
         Status.NEUTRAL,
     )
-
-
-def _describe_use(finding: Finding) -> str:
-    return f"{finding.name} with {100 * finding.used:.1f} % of {finding.limit:.4g} {finding.unit}"
 
 
 def _unknown_parameters(experiment: Experiment, nominal: Nominal) -> str:

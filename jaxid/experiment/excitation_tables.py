@@ -1,24 +1,16 @@
 """The tables `[collision]` and `[excitation]` of an experiment file."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.excitation.criteria import (
-    AbstractCriterion,
-    AOptimal,
-    ConditionNumber,
-    DOptimal,
-    EOptimal,
-    WeightedConditionNumber,
-)
+from jaxid.excitation import criteria
+from jaxid.excitation.criteria import AbstractCriterion
 from jaxid.experiment.decoder import Bounds, Count, Positive, Vector
-from jaxid.experiment.robot_tables import RobotSource, joint_list
-from jaxid.robot import library
+from jaxid.experiment.robot_tables import RobotSource, joint_number
 from jaxid.robot.collision import (
     GROUND,
     AbstractObstacle,
@@ -26,7 +18,9 @@ from jaxid.robot.collision import (
     Capsule,
     CollisionModel,
     HalfSpace,
+    fit_capsules,
 )
+from jaxid.robot.library import tx90l_on_rail_collision
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
@@ -34,14 +28,7 @@ from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
 
-CRITERIA: dict[str, Callable[[], AbstractCriterion]] = {
-    "d_optimal": DOptimal,
-    "a_optimal": AOptimal,
-    "e_optimal": EOptimal,
-    "condition_number": ConditionNumber,
-    "weighted_condition_number": WeightedConditionNumber,
-    "scaled_condition_number": lambda: WeightedConditionNumber(scaled=True),
-}
+Corner = tuple[float, float, float]
 
 
 def capsule(
@@ -93,32 +80,20 @@ class Collision:
     fit: bool = False
     packages: str | None = None
     ground: float | None = None
-    capsules: list[Annotated[tuple[str, Capsule], capsule]] = dataclasses.field(
-        default_factory=list
-    )
-    boxes: list[Annotated[Box, box]] = dataclasses.field(default_factory=list)
+    capsules: tuple[Annotated[tuple[str, Capsule], capsule], ...] = ()
+    boxes: tuple[Annotated[Box, box], ...] = ()
     pairs: list[tuple[str, str]] | None = None
 
     def build(self, robot: Robot, source: RobotSource, folder: Path) -> CollisionModel:
-        """Return the collision model.
-
-        Args:
-            robot: Robot with its joints.
-            source: Source of the robot, which may know shapes.
-            folder: Folder of the experiment file.
+        """Return the collision model; the robot's source may know shapes.
 
         Raises:
             InputError: If shapes cannot be made, or a name is unknown.
         """
         capsules, obstacles, pairs = self._fitted(source, folder) if self.fit else ([], [], None)
-        numbers = {"ground": GROUND, **{name: j for j, name in enumerate(robot.joint_names)}}
         for body, shape in self.capsules:
-            if body not in numbers:
-                raise InputError(
-                    f"`body` of capsule `{shape.name}` must be `ground` or the name of the joint "
-                    f'that moves it ({joint_list(robot)}), but is "{body}".'
-                )
-            capsules.append(dataclasses.replace(shape, body=numbers[body]))
+            number = GROUND if body == "ground" else joint_number(robot, body)
+            capsules.append(dataclasses.replace(shape, body=number))
         obstacles += self.boxes
         if self.ground is not None:
             obstacles.append(HalfSpace("ground", height=self.ground))
@@ -129,24 +104,21 @@ class Collision:
     ) -> tuple[list[Capsule], list[AbstractObstacle], list[tuple[str, str]] | None]:
         """Return shapes that the robot's source knows, and their pairs if it knows those too."""
         if source.urdf is not None:
-            return list(source.capsules(folder, self.packages)), [], None
-        make = getattr(library, f"{source.builtin}_collision", None)
-        if make is None:
+            packages = None if self.packages is None else folder / self.packages
+            place = {**source.chain, **source.placement}
+            return list(fit_capsules(folder / source.urdf, packages=packages, **place)), [], None
+        moved = source.base_rotation is not None or source.base_position is not None
+        if source.builtin != "tx90l_on_rail" or moved:
             raise InputError(
-                "`fit` needs `robot.urdf`, or the built-in robot tx90l_on_rail, whose shapes are "
-                "known: give `capsules` instead."
+                "`fit` needs `robot.urdf`, or the built-in robot tx90l_on_rail without "
+                "`robot.base_rotation` and `robot.base_position`: give `capsules` instead."
             )
-        if source.base_rotation is not None or source.base_position is not None:
-            raise InputError(
-                "`fit` knows the built-in robot only where it stands by itself: leave out "
-                "`robot.base_rotation` and `robot.base_position`, or give `capsules`."
-            )
-        model = make()
-        names = [s.name for s in (*model.capsules, *model.obstacles)]
-        pairs = [(names[i], names[k]) for i, k in model.pairs]
+        model = tx90l_on_rail_collision()
         # New shapes are to be watched too: then all pairs are found anew.
         alone = not self.capsules and not self.boxes and self.ground is None
         obstacles = [o for o in model.obstacles if self.ground is None or o.name != "ground"]
+        names = [s.name for s in (*model.capsules, *model.obstacles)]
+        pairs = [(names[i], names[k]) for i, k in model.pairs]
         return list(model.capsules), obstacles, pairs if alone else None
 
 
@@ -185,8 +157,8 @@ class Excitation:
         criterion: Objective: "d_optimal" for the smallest standard deviations on the whole,
             a_optimal, e_optimal, condition_number (the paper's, Eq. 36), weighted_condition_number
             or scaled_condition_number.
-        harmonics: Number of harmonics of the Fourier series, like `5`, the default.
-        omega: Ground frequency of the series [rad/s], like `0.8`, the default.
+        harmonics: Number of harmonics of the Fourier series.
+        omega: Ground frequency of the series [rad/s].
         rest: Whether the motion starts and stops at rest.
         spline: Spline from rest to rest in place of a series, like
             `{ points = 12, duration = 8.0 }`.
@@ -222,8 +194,8 @@ class Excitation:
         "weighted_condition_number",
         "scaled_condition_number",
     ] = "d_optimal"
-    harmonics: Annotated[int, Bounds(least=1, most=50)] | None = None
-    omega: Annotated[float, Bounds(above=0.0, most=1000.0)] | None = None
+    harmonics: Annotated[int, Bounds(least=1, most=50)] = 5
+    omega: Annotated[float, Bounds(above=0.0, most=1000.0)] = 0.8
     rest: bool = False
     spline: Annotated[RestToRestSplineBasis, spline_basis] | None = None
     leads: bool | Leads = True
@@ -240,13 +212,14 @@ class Excitation:
     force_margin: Annotated[float, Bounds(least=0.0, below=1.0)] | None = None
     tip_speed: Positive | None = None
     tip_acceleration: Positive | None = None
-    workspace: tuple[Vector, Vector] | None = None
+    workspace: tuple[Corner, Corner] | None = None
 
     @property
-    def series(self) -> tuple[int, float]:
-        """Number of harmonics, and ground frequency [rad/s]."""
-        harmonics = 5 if self.harmonics is None else self.harmonics
-        return harmonics, 0.8 if self.omega is None else self.omega
+    def objective(self) -> AbstractCriterion:
+        """Criterion of that name: `d_optimal` stands for the class `DOptimal`."""
+        if self.criterion == "scaled_condition_number":
+            return criteria.WeightedConditionNumber(scaled=True)
+        return getattr(criteria, self.criterion.title().replace("_", ""))()
 
     @property
     def chosen_leads(self) -> Leads | None:
@@ -254,19 +227,6 @@ class Excitation:
         if not self.leads or self.rest or self.spline is not None:
             return None
         return self.leads if isinstance(self.leads, Leads) else Leads()
-
-    @property
-    def unused(self) -> list[str]:
-        """Sentences about keys that others leave without effect."""
-        notes = []
-        if self.spline is not None:
-            given = [f"`{k}`" for k in ("harmonics", "omega") if getattr(self, k) is not None]
-            if given:
-                verb = "do" if len(given) > 1 else "does"
-                notes.append(f"{' and '.join(given)} {verb} nothing for a `spline`")
-        if isinstance(self.leads, Leads) and self.chosen_leads is None:
-            notes.append("`leads` do nothing for a motion that rests at its ends")
-        return notes
 
     def basis(self, constrained: bool) -> AbstractBasis:
         """Return the basis of the trajectories.
@@ -284,15 +244,14 @@ class Excitation:
                     "`rest` is for Fourier series, and a `spline` rests at its ends: leave one out."
                 )
             return self.spline
+        leads, series = self.chosen_leads, (self.harmonics, self.omega)
         if self.rest:
-            return RestToRestBasis(*self.series)
-        series, leads = FourierBasis(*self.series), self.chosen_leads
+            return RestToRestBasis(*series)
         if leads is None:
-            self._check_sample_time(float(series.duration))
-            return series
-        if not constrained and leads.time is None:
-            return series
-        return LeadsBasis(*self.series, lead=leads.time or 0.5, periods=leads.periods)
+            self._check_sample_time(2 * np.pi / self.omega)
+        if leads is None or (not constrained and leads.time is None):
+            return FourierBasis(*series)
+        return LeadsBasis(*series, lead=leads.time or 0.5, periods=leads.periods)
 
     def _check_sample_time(self, period: float) -> None:
         """Reject samples of a motion at full speed that end before it or go on after it."""

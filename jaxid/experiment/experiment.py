@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,19 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import call, check_tables, within
-from jaxid.experiment.estimator_table import Estimation, build_estimation
+from jaxid.experiment.estimator_table import Estimation, build_estimation, decode_estimator
 from jaxid.experiment.excitation_tables import Collision, Excitation
 from jaxid.experiment.method_tables import (
+    FILTERS,
     Effects,
     Logs,
     build_columns,
     build_filters,
     build_rows,
-    filter_candidates,
 )
-from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
+from jaxid.experiment.robot_tables import RobotSource, known_load, replace_drives, replace_limits
 from jaxid.identification.choices import FilterCandidate, essential_parameters
+from jaxid.identification.consistency import BodyBounds
 from jaxid.identification.estimators import (
     Complete,
     CrossValidated,
@@ -48,11 +50,20 @@ from jaxid.measurement.timestamps import NeedsMemory
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot, Tool
 
-TABLES = (
-    *("robot", "limits", "drives", "collision", "model", "recording", "load"),
-    *("filter", "rows", "estimator", "excitation"),
-)
-"""Tables of an experiment file."""
+TABLES: dict[str, tuple[Callable, ...]] = {
+    "robot": (RobotSource,),
+    "load": (known_load,),
+    "limits": (replace_limits,),
+    "drives": (replace_drives,),
+    "model": (Effects,),
+    "recording": (Columns, Logs),
+    "filter": tuple(FILTERS.values()),
+    "rows": (build_rows,),
+    "estimator": (build_estimation, BodyBounds),
+    "excitation": (Excitation,),
+    "collision": (Collision,),
+}
+"""Tables of an experiment file, and functions whose arguments are their keys."""
 LONG = 500_000
 """Samples from which a log is read part by part."""
 
@@ -117,12 +128,7 @@ class Experiment:
         return dataclasses.replace(self.estimation.plain, solution=other)
 
     def fit(self, rows: RegressionProblem, progress: Progress | None = None) -> Fit:
-        """Estimate parameters as the table `[estimator]` says.
-
-        Args:
-            rows: Rows to identify with.
-            progress: Callback, called with the completed fraction of a search (0 to 1).
-        """
+        """Estimate parameters as the table `[estimator]` says."""
         uncertainty = self.estimation.uncertainty
         if self.linear is not None:
             linear = base_parameters(Model(self.robot, self.linear))
@@ -141,23 +147,20 @@ class Experiment:
     def read(self, log: str | Path) -> Recording:
         """Read a log as the table `[recording]` says.
 
-        Args:
-            log: Path of the log; the files of forces and velocities lie beside it.
-
         Raises:
             InputError: If the file has no table `[recording]`, or the log is not as it says.
         """
-        log = Path(log)
-        columns, logs = self._columns_of(log), self.logs
+        log, logs = Path(log), self.logs
+        columns = self._columns_of(log)
         recording = read_recording(log, columns, largest_gap=logs.largest_gap, **logs.files(log))
         if recording.joints != self.robot.joints:
             raise InputError(
                 f"{self.path.name}: `recording.angles` names {recording.joints} of the "
                 f"columns of `{log.name}`, but the robot `{self.robot.name}` has "
-                f"{self.robot.joints} joints: "
-                "name one column for each joint, or choose another robot (`robot.tip`)."
+                f"{self.robot.joints} joints: name one column for each joint, or choose another "
+                "robot (`robot.tip`)."
             )
-        with self._within("recording"):
+        with within("recording", self.path.name):
             if recording.sample_time < 1e-6:
                 raise InputError(
                     f"`{log.name}` has {1 / recording.sample_time:.3g} samples in a second: check "
@@ -170,43 +173,27 @@ class Experiment:
         return recording
 
     def observe(self, recording: Recording) -> Observations:
-        """Filter a recording and make rows of it, as the tables `[filter]` and `[rows]` say.
-
-        Args:
-            recording: Recording of a log.
-
-        Raises:
-            InputError: If filter and recording do not go together.
-        """
-        with self._within("filter` and `rows"):
+        """Filter a recording and make rows of it, as the tables `[filter]` and `[rows]` say."""
+        with within("filter` and `rows", self.path.name):
             return observe(recording, self.robot, self.filter, self.decimation, self.min_speed)
 
     def is_long(self, log: str | Path) -> bool:
-        """Return whether a log is better read part by part than as a whole.
-
-        Args:
-            log: Path of the log.
-        """
+        """Return whether a log is better read part by part than as a whole."""
         return estimated_rows(Path(log)) >= LONG
 
-    def open(self, log: str | Path, progress: Progress | None = None) -> Observations:
+    def open(self, log: Path) -> Observations:
         """Open a log that need not fit into memory: like `read` and `observe`, part by part.
-
-        Args:
-            log: Path of the log.
-            progress: Callback, called with the completed fraction (0 to 1) for `rows.min_speed`.
 
         Raises:
             NeedsMemory: If it can be read only as a whole.
             InputError: If the log is not as the file says.
         """
-        log = Path(log)
-        columns, logs = self._columns_of(log), self.logs
+        logs = self.logs
         if logs.force_delay:
             raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
         return scan_log(
             log,
-            columns,
+            self._columns_of(log),
             self.robot,
             self.filter,
             self.decimation,
@@ -214,7 +201,6 @@ class Experiment:
             largest_gap=logs.largest_gap,
             start=logs.start,
             stop=logs.stop,
-            progress=progress,
             **logs.files(log),
         )
 
@@ -226,15 +212,9 @@ class Experiment:
             )
         return self.columns
 
-    def _within(self, table: str) -> Any:
-        return within(table, self.path.name)
-
 
 def load_experiment(path: str | Path) -> Experiment:
-    """Load an experiment file.
-
-    Args:
-        path: Path of a TOML file; paths in it are relative to its folder.
+    """Load an experiment file; paths in it are relative to its folder.
 
     Raises:
         OSError: If the file cannot be read.
@@ -242,27 +222,20 @@ def load_experiment(path: str | Path) -> Experiment:
             names of file and key.
     """
     path = Path(path)
-    try:
-        text, content = _read(path)
-        return Experiment(path=path, text=text, **_build(content, path.parent))
-    except InputError as error:
-        raise InputError(f"{path.name}: {error}") from error
-
-
-def _read(path: Path) -> tuple[str, dict[str, Any]]:
     if not path.is_file():
         raise InputError(
             f"`{path}` is no file: check its path, or write one with `jaxid init arm.urdf`."
         )
     try:
         text = path.read_bytes().decode("utf-8-sig")
-        return text, tomllib.loads(text)
-    except UnicodeDecodeError as error:
-        raise InputError(f"is no text in UTF-8 (byte {error.start}).") from error
-    except RecursionError as error:
-        raise InputError("is no TOML: brackets are nested too deeply.") from error
-    except ValueError as error:  # also a number of thousands of digits
-        raise InputError(f"is no TOML: {str(error).rstrip('.')}.") from error
+        content = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        said = str(error).rstrip(".")
+        raise InputError(f"{path.name}: is no TOML in UTF-8: {said}.") from error
+    try:
+        return Experiment(path=path, text=text, **_build(content, path.parent))
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from error
 
 
 def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -279,20 +252,32 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     effects = call(Effects, content.get("model", {}), "model")
     with within("model"):
         model = Model(robot, effects.terms(robot))
-    fields: dict[str, Any] = {"source": source, "robot": robot, "model": model}
-    fields |= _collision(content, robot, source, folder)
-    fields |= _load(content, robot)
+    filters, filter_notes = build_filters(content.get("filter"))
+    decimation, min_speed = call(build_rows, content.get("rows", {}), "rows", robot)
     columns, logs = None, Logs()
     if "recording" in content:
         columns, logs = build_columns(content["recording"], robot)
-    filters, filter_notes = build_filters(content.get("filter"))
-    decimation, min_speed = call(build_rows, content.get("rows", {}), "rows", robot)
-    estimation = build_estimation(content.get("estimator", {}), robot, model, source, folder)
-    return fields | {
+    given, bounds = decode_estimator(content.get("estimator", {}))
+    with within("estimator"):
+        estimation = build_estimation(model, source, folder, bounds, **given)
+    shapes = call(Collision, content["collision"], "collision") if "collision" in content else None
+    with within("collision"):
+        collision = None if shapes is None else shapes.build(robot, source, folder)
+    load = call(known_load, content["load"], "load") if "load" in content else None
+    with within("load"):
+        tool = None if load is None else load(robot)
+    several = len(filters) > 1
+    return {
+        "source": source,
+        "robot": robot,
+        "model": model,
+        "collision": collision,
+        "clearance": 0.0 if shapes is None else shapes.distance,
         "columns": columns,
         "logs": logs,
+        "load": tool,
         "filter": filters[0],
-        "candidates": filter_candidates(filters, decimation),
+        "candidates": tuple((f, decimation) for f in filters if several),
         "decimation": decimation,
         "min_speed": min_speed,
         "estimation": estimation,
@@ -300,27 +285,6 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         "excitation": call(Excitation, content.get("excitation", {}), "excitation"),
         "notes": (*_two_forces(robot), *filter_notes, *estimation.notes),
     }
-
-
-def _collision(
-    content: dict[str, Any], robot: Robot, source: RobotSource, folder: Path
-) -> dict[str, Any]:
-    if "collision" not in content:
-        return {"collision": None, "clearance": 0.0}
-    shapes = call(Collision, content["collision"], "collision")
-    with within("collision"):
-        return {
-            "collision": shapes.build(robot, source, folder),
-            "clearance": shapes.distance,
-        }
-
-
-def _load(content: dict[str, Any], robot: Robot) -> dict[str, Any]:
-    if "load" not in content:
-        return {"load": None}
-    load = call(Load, content["load"], "load")
-    with within("load"):
-        return {"load": load.on(robot)}
 
 
 def _two_forces(robot: Robot) -> list[str]:

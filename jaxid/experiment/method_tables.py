@@ -23,9 +23,16 @@ from jaxid.dynamics.terms import (
     ViscousFriction,
 )
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import Bounds, Count, Magnitude, Positive, decode, quoted, within
-from jaxid.experiment.robot_tables import one_per_joint
-from jaxid.identification.choices import FilterCandidate
+from jaxid.experiment.decoder import (
+    Bounds,
+    Count,
+    Magnitude,
+    Positive,
+    call,
+    decode,
+    decode_value,
+    within,
+)
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
 from jaxid.measurement.filters import (
@@ -35,6 +42,7 @@ from jaxid.measurement.filters import (
     ZeroPhaseButterworth,
 )
 from jaxid.measurement.units import Unit
+from jaxid.robot.joints import per_joint
 from jaxid.robot.robot import Robot
 
 FILTERS: dict[str, type[AbstractFilter]] = {
@@ -46,7 +54,6 @@ CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
 
 Side = Literal["joint", "motor"]
-Speed = float | Float[np.ndarray, " joints"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,22 +76,14 @@ class DryFriction:
     stribeck: Positive | list[Positive] | None = None
 
     def transition(self, robot: Robot) -> AbstractTransition:
-        """Return the transition between the directions.
-
-        Args:
-            robot: Robot with the joints.
-        """
+        """Return the transition between the directions."""
         dead_zone = _speed(robot, "coulomb.dead_zone", self.dead_zone)
         if self.hard:
             return HardSign(dead_zone)
         return Tanh(_speed(robot, "coulomb.epsilon", self.epsilon), dead_zone)
 
     def term(self, robot: Robot) -> AbstractTerm:
-        """Return the term of the model.
-
-        Args:
-            robot: Robot with the joints.
-        """
+        """Return the term of the model."""
         transition = self.transition(robot)
         if self.stribeck is None:
             kind = AsymmetricCoulombFriction if self.asymmetric else CoulombFriction
@@ -98,11 +97,10 @@ class DryFriction:
         return StribeckFriction(speed=speed, transition=transition)
 
 
-def _speed(robot: Robot, name: str, value: float | list[float]) -> Speed:
-    if not isinstance(value, list):
-        return float(value)
-    one_per_joint(robot, name, value)
-    return np.array(value, np.float64)
+def _speed(
+    robot: Robot, name: str, value: float | list[float]
+) -> float | Float[np.ndarray, " joints"]:
+    return per_joint(name, value, robot.joints, 0.0) if isinstance(value, list) else float(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,14 +128,7 @@ class Effects:
     coulomb: bool | DryFriction = True
 
     def terms(self, robot: Robot) -> tuple[AbstractTerm, ...]:
-        """Return the terms of the model, in the paper's order.
-
-        Args:
-            robot: Robot with the joints.
-
-        Raises:
-            InputError: If a list does not hold one number for each joint.
-        """
+        """Return the terms of the model, in the paper's order."""
         dry = DryFriction() if isinstance(self.coulomb, bool) else self.coulomb
         # An offset is half of what two levels of dry friction can express already.
         offset = not dry.asymmetric if self.offset is None else self.offset
@@ -160,11 +151,7 @@ class Effects:
         return tuple(terms)
 
     def linear_terms(self, robot: Robot) -> tuple[AbstractTerm, ...]:
-        """Return the terms with Coulomb's law in place of Stribeck's.
-
-        Args:
-            robot: Robot with the joints.
-        """
+        """Return the terms with Coulomb's law in place of Stribeck's."""
         if not isinstance(self.coulomb, DryFriction):
             return self.terms(robot)
         coulomb = dataclasses.replace(self.coulomb, stribeck=None)
@@ -197,11 +184,7 @@ class Logs:
     stop: float = np.inf
 
     def files(self, log: Path) -> dict[str, Any]:
-        """Return the paths of the files beside a log, as the readers take them.
-
-        Args:
-            log: Path of the log.
-        """
+        """Return the paths of the files beside a log, as the readers take them."""
         names = {"forces_path": self.forces_file, "velocities_path": self.velocities_file}
         return {
             key: None if name is None else log.parent / name.replace("{}", log.stem)
@@ -213,36 +196,28 @@ SIDES = ("angles_on_motor_side", "forces_on_motor_side")
 """Arguments of `Columns` for which the file has `side` and `forces_side`."""
 
 
-def build_columns(table: Any, robot: Robot) -> tuple[Columns, Logs]:
-    """Return the columns of the logs, and how logs are read.
-
-    Args:
-        table: The table `[recording]`.
-        robot: Robot that was recorded.
-
-    Raises:
-        InputError: If a key or value does not fit.
-    """
+def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, Logs]:
+    """Return the columns of the logs, and how logs are read."""
     given, reading = decode([Columns, Logs], table, "recording", skip=SIDES)
     with within("recording"):
-        for name, value in given.items():
-            if isinstance(value, list | tuple):
-                one_per_joint(robot, name, value)
         logs = Logs(**reading)
         on_motor_side = (logs.side == "motor", (logs.forces_side or logs.side) == "motor")
         columns = Columns(**given, **dict(zip(SIDES, on_motor_side, strict=True)))
-        if logs.side == "joint":
-            _refuse_mixed(robot, "angle_unit", given.get("angle_unit"))
-            _refuse_mixed(robot, "velocity_unit", given.get("velocity_unit"))
-        if not on_motor_side[1]:
-            _refuse_mixed(robot, "force_unit", given.get("force_unit"))
+        for scale in (columns.angle_scale, columns.angle_shift, columns.velocity_scale):
+            scale(robot.joints)  # refuses lists that do not fit the robot
+        columns.force_scale(robot.joints)
+        for name, motors in (
+            ("angle_unit", on_motor_side[0]),
+            ("velocity_unit", on_motor_side[0]),
+            ("force_unit", on_motor_side[1]),
+        ):
+            if name in given and not motors:
+                _refuse_mixed(robot, name, given[name])
     return columns, logs
 
 
-def _refuse_mixed(robot: Robot, name: str, value: Unit | tuple[Unit, ...] | None) -> None:
+def _refuse_mixed(robot: Robot, name: str, value: Unit | tuple[Unit, ...]) -> None:
     """Reject degrees or N m for a joint that slides, and millimetres or N for one that turns."""
-    if value is None:
-        return
     units = (value,) * robot.joints if isinstance(value, Unit) else value
     for label, turns, one in zip(robot.joint_names, robot.revolute, units, strict=True):
         foreign = ("mm", "mm/s", "N") if turns else ("deg", "rev", "deg/s", "rpm", "N m")
@@ -253,59 +228,23 @@ def _refuse_mixed(robot: Robot, name: str, value: Unit | tuple[Unit, ...] | None
             )
 
 
-def build_filters(table: Any) -> tuple[list[AbstractFilter], list[str]]:
-    """Return the filter, or several to choose from, and what is assumed.
-
-    Args:
-        table: The table `[filter]`; None if the file has none.
-
-    Raises:
-        InputError: If a key or value does not fit.
-    """
+def build_filters(table: dict[str, Any] | None) -> tuple[list[AbstractFilter], list[str]]:
+    """Return the filter, or several to choose from, and what is assumed without a table."""
     if table is None:
         note = (
             f"no table `[filter]`: a Butterworth low-pass at {CUTOFF:g} Hz is assumed; choose "
             "about five times the highest frequency of the motion."
         )
         return [ZeroPhaseButterworth(CUTOFF)], [note]
-    kind, rest = pop_kind(table, "filter", list(FILTERS))
-    cutoffs = rest.get("cutoff")
-    if kind == "butterworth" and isinstance(cutoffs, list):
-        if not cutoffs:
-            raise InputError("`filter.cutoff` must be a number, or a list to choose from.")
-        tables = [{**rest, "cutoff": cutoff} for cutoff in cutoffs]
-    else:
-        tables = [rest]
-    filters = []
-    for one in tables:
-        (arguments,) = decode([FILTERS[kind]], one, "filter")
-        with within("filter"):
-            filters.append(FILTERS[kind](**arguments))
-    return filters, []
-
-
-def pop_kind(
-    table: Any, place: str, kinds: list[str], default: str | None = None
-) -> tuple[str, dict[str, Any]]:
-    """Return the `kind` of a table, and its other keys.
-
-    Args:
-        table: The table.
-        place: Path of the table in the file.
-        kinds: Kinds that there are.
-        default: Kind of a table that names none; None if it must.
-
-    Raises:
-        InputError: If there is no such kind.
-    """
-    if not isinstance(table, dict):
-        raise InputError(f"`{place}` must be a table, but is {table}.")
-    kind = table.get("kind", default)
-    if kind is None:
-        raise InputError(f"`{place}.kind` is missing: `[{place}]` needs it ({quoted(kinds)}).")
-    if kind not in kinds:
-        raise InputError(f'`{place}.kind` must be {quoted(kinds)}, but is "{kind}".')
-    return kind, {k: v for k, v in table.items() if k != "kind"}
+    kind = decode_value(table.get("kind", ""), Literal[tuple(FILTERS)], "filter.kind")
+    keys = {name: value for name, value in table.items() if name != "kind"}
+    cutoffs = keys.get("cutoff")
+    tables = [keys]
+    if isinstance(cutoffs, list):
+        tables = [{**keys, "cutoff": cutoff} for cutoff in cutoffs]
+    if not tables:
+        raise InputError("`filter.cutoff` must be a number, or a list to choose from.")
+    return [call(FILTERS[kind], one, "filter") for one in tables], []
 
 
 def build_rows(
@@ -336,17 +275,3 @@ def build_rows(
     if min_speed is not None:
         speed = np.broadcast_to(_speed(robot, "min_speed", min_speed), (robot.joints,)) + 0.0
     return Subsample(step or 1) if factors is None else Decimation(tuple(factors)), speed
-
-
-def filter_candidates(
-    filters: list[AbstractFilter], decimation: AbstractDecimation
-) -> tuple[FilterCandidate, ...]:
-    """Return the filters to choose from; none where there is one only.
-
-    Args:
-        filters: Filters of the file.
-        decimation: Decimation after each of them.
-    """
-    if len(filters) == 1:
-        return ()
-    return tuple((one, decimation) for one in filters)

@@ -1,7 +1,7 @@
 """The tables `[robot]`, `[limits]`, `[drives]` and `[load]` of an experiment file."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -9,23 +9,13 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import Magnitude, PerJoint, Positive, Vector, quoted
+from jaxid.experiment.decoder import Finite, Magnitude, PerJoint, Positive, Vector
 from jaxid.robot import library
-from jaxid.robot.collision import Capsule, fit_capsules
-from jaxid.robot.joints import Limits, far_notes, fast_notes, range_fault
+from jaxid.robot.joints import Limits, far_notes, fast_notes, per_joint, range_fault
 from jaxid.robot.library import from_dh
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters
-
-BUILTIN = {
-    name: getattr(library, name)
-    for name in (
-        *("tx90l_on_rail", "tx40", "ur10", "ur10e"),
-        *("panda", "iiwa14", "kr300", "planar_arm"),
-    )
-}
-"""Functions that make the robots of the library."""
 
 AngleUnit = Literal["rad", "deg"]
 DhRow = tuple[str | None, bool, tuple[float, float, float, float]]
@@ -75,11 +65,16 @@ def inertia_tensor(
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-@dataclasses.dataclass(frozen=True)
-class Load:
+def known_load(
+    *,
+    mass: Positive,
+    centre_of_mass: Vector,
+    inertia: Annotated[np.ndarray, inertia_tensor] | None = None,
+    body: str | None = None,
+) -> Callable[[Robot], Tool]:
     """Known load, whose forces are subtracted and not identified.
 
-    Attributes:
+    Args:
         mass: Mass [kg], like `1.5`.
         centre_of_mass: Centre of mass in the frame of the end-effector, or of `body` [m], like
             `[0.0, 0.0, 0.05]`.
@@ -88,72 +83,28 @@ class Load:
             default.
         body: Name of the joint that moves the body with the load, like `"joint1"`; the end-effector
             by default.
+
+    Returns:
+        Function from a robot to the load as a tool of it.
     """
 
-    mass: Positive
-    centre_of_mass: Vector
-    inertia: Annotated[np.ndarray, inertia_tensor] | None = None
-    body: str | None = None
+    def on(robot: Robot) -> Tool:
+        content = {"mass": mass, "centre_of_mass": centre_of_mass, "inertia": inertia}
+        if body is None:
+            return cast(Tool, robot.with_tool(**content).tool)
+        return Tool(joint_number(robot, body), **content)
 
-    def on(self, robot: Robot) -> Tool:
-        """Return the load as a tool of a robot.
-
-        Args:
-            robot: Robot that carries it.
-
-        Raises:
-            InputError: If no joint has the name of `body`, or no such load could exist.
-        """
-        if self.body is None:
-            loaded = robot.with_tool(
-                mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia
-            )
-            return cast(Tool, loaded.tool)
-        body = joint_number(robot, self.body)
-        return Tool(body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia)
+    return on
 
 
 def joint_number(robot: Robot, name: str, key: str = "body") -> int:
-    """Return the index of a joint.
-
-    Args:
-        robot: Robot with the joint.
-        name: Name of the joint.
-        key: Key or option that gives the name, for the message.
-
-    Raises:
-        InputError: If the robot has no such joint.
-    """
+    """Return the index of the joint that a key or an option names."""
     if name not in robot.joint_names:
         raise InputError(
-            f"`{key}` must be the name of the joint that moves it ({joint_list(robot)}), but is "
-            f'"{name}".'
+            f"`{key}` must be the name of the joint that moves it "
+            f'({", ".join(robot.joint_names)}), but is "{name}".'
         )
     return robot.joint_names.index(name)
-
-
-def one_per_joint(robot: Robot, name: str, values: list | tuple) -> None:
-    """Check that a list holds one value for each joint.
-
-    Args:
-        robot: Robot with the joints.
-        name: Key of the list.
-        values: The list.
-
-    Raises:
-        InputError: If it holds more or fewer.
-    """
-    if len(values) != robot.joints:
-        raise InputError(
-            f"`{name}` must hold one value for each of the {robot.joints} joints "
-            f"({joint_list(robot)}), but holds {len(values)}."
-        )
-
-
-def joint_list(robot: Robot) -> str:
-    """Return the names of the joints for a message; of many, the first and the last ones."""
-    names = robot.joint_names
-    return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:6])}, … {names[-1]}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +135,10 @@ class RobotSource:
     urdf: str | None = None
     tip: str | None = None
     base: str | None = None
-    builtin: str | None = None
+    builtin: (
+        Literal["tx90l_on_rail", "tx40", "ur10", "ur10e", "panda", "iiwa14", "kr300", "planar_arm"]
+        | None
+    ) = None
     dh: list[Annotated[DhRow, dh_row]] | None = None
     convention: Literal["modified", "standard"] | None = None
     name: str | None = None
@@ -192,20 +146,17 @@ class RobotSource:
     base_rotation: Vector | None = None
     base_position: Vector | None = None
     snap_tolerance: Magnitude | None = None
-    tool: Load | None = None
+    tool: Annotated[Callable[[Robot], Tool], known_load] | None = None
 
     def __post_init__(self) -> None:
-        given = [f"`{k}`" for k in ("urdf", "builtin", "dh") if getattr(self, k) is not None]
+        given = [k for k in ("urdf", "builtin", "dh") if getattr(self, k) is not None]
         if len(given) != 1:
-            came = " and ".join(given) or "none of them"
+            came = " and ".join(f"`{k}`" for k in given) or "none of them"
             raise InputError(f"one of `urdf`, `builtin` and `dh` is needed, but there is {came}.")
-        for key, owner in (("tip", "urdf"), ("base", "urdf"), ("convention", "dh")):
-            if getattr(self, key) is not None and getattr(self, owner) is None:
-                raise InputError(f"`{key}` belongs to `{owner}`, not to {given[0]}: leave it out.")
-        for key in ("gravity", "base_rotation", "base_position"):
-            vector = getattr(self, key)
-            if vector is not None and not np.isfinite(vector).all():
-                raise InputError(f"`{key}` must hold three finite numbers, but is {vector}.")
+        owners = {"tip": "urdf", "base": "urdf", "convention": "dh", "snap_tolerance": "urdf or dh"}
+        for key, owner in owners.items():
+            if getattr(self, key) is not None and given[0] not in owner.split():
+                raise InputError(f"`{key}` belongs to `{owner}`, not to `{given[0]}`: remove it.")
 
     @property
     def placement(self) -> dict[str, Any]:
@@ -213,19 +164,18 @@ class RobotSource:
         R = None if self.base_rotation is None else rpy_rotation(np.deg2rad(self.base_rotation))
         return {"base_rotation": R, "base_position": self.base_position or (0.0, 0.0, 0.0)}
 
+    @property
+    def chain(self) -> dict[str, Any]:
+        """Chain in the URDF file, and tolerance of quarter turns."""
+        tolerance = SNAP_TOLERANCE if self.snap_tolerance is None else self.snap_tolerance
+        return {"tip": self.tip, "base": self.base, "snap_tolerance": tolerance}
+
     def build(self, folder: Path) -> Robot:
-        """Return the robot.
-
-        Args:
-            folder: Folder of the experiment file, to which paths are relative.
-
-        Raises:
-            InputError: If the robot cannot be made.
-        """
+        """Return the robot; paths are relative to the folder of the experiment file."""
         robot = self._build(folder)
         if self.name is not None:
             robot = robot.replace(name=self.name)
-        return robot if self.tool is None else robot.replace(tool=self.tool.on(robot))
+        return robot if self.tool is None else robot.replace(tool=self.tool(robot))
 
     def _build(self, folder: Path) -> Robot:
         gravity = self.gravity or GRAVITY
@@ -236,22 +186,13 @@ class RobotSource:
                     f"`urdf`: `{path}` is no file: paths in an experiment file are relative to its "
                     "folder; mend the path, or put the file there."
                 )
-            return load_urdf(path, gravity=gravity, **self._chain, **self.placement)
+            return load_urdf(path, gravity=gravity, **self.chain, **self.placement)
         if self.dh is not None:
             return self._from_dh(self.dh, gravity)
-        if self.builtin not in BUILTIN:
-            raise InputError(f'`builtin` must be {quoted(BUILTIN)}, but is "{self.builtin}".')
-        if self.snap_tolerance is not None:
-            raise InputError("`snap_tolerance`: the robot's angles are exact: leave it out.")
-        robot = BUILTIN[self.builtin]()
+        robot = getattr(library, cast(str, self.builtin))()
         if self.gravity is not None:
             robot = robot.replace(gravity=np.array(self.gravity))
         return robot.mounted(*self.placement.values())
-
-    @property
-    def _chain(self) -> dict[str, Any]:
-        tolerance = SNAP_TOLERANCE if self.snap_tolerance is None else self.snap_tolerance
-        return {"tip": self.tip, "base": self.base, "snap_tolerance": tolerance}
 
     def _from_dh(self, rows: list[DhRow], gravity: Vector) -> Robot:
         if self.convention is None:
@@ -266,7 +207,7 @@ class RobotSource:
             revolute=tuple(not slides for _, slides, _ in rows),
             joint_names=tuple(name or f"joint{i + 1}" for i, (name, _, _) in enumerate(rows)),
             gravity=gravity,
-            snap_tolerance=self._chain["snap_tolerance"],
+            snap_tolerance=self.chain["snap_tolerance"],
             source="Denavit-Hartenberg table of the experiment file",
             **self.placement,
         )
@@ -274,26 +215,12 @@ class RobotSource:
     def parameters(self, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
         """Return the bodies' parameters that the URDF file claims; None if there is no such file.
 
-        Args:
-            folder: Folder of the experiment file.
-
         Raises:
             InputError: If the file describes a body that cannot exist.
         """
         if self.urdf is None:
             return None
-        return np.asarray(urdf_parameters(folder / self.urdf, **self._chain)).reshape(-1, 10)
-
-    def capsules(self, folder: Path, packages: str | None) -> tuple[Capsule, ...]:
-        """Return capsules around the geometry of the URDF file's links.
-
-        Args:
-            folder: Folder of the experiment file.
-            packages: Folder of what the URDF file calls `package://`, as seen from there.
-        """
-        where = None if packages is None else folder / packages
-        path = folder / cast(str, self.urdf)
-        return tuple(fit_capsules(path, packages=where, **self._chain, **self.placement))
+        return np.asarray(urdf_parameters(folder / self.urdf, **self.chain)).reshape(-1, 10)
 
 
 def replace_limits(
@@ -322,41 +249,32 @@ def replace_limits(
     Raises:
         InputError: If a list has another length, or a limit is not plausible.
     """
-    given = {
-        "position_min": position_min,
-        "position_max": position_max,
-        "velocity": velocity,
-        "acceleration": acceleration,
-        "jerk": jerk,
-        "force": force,
-    }
-    degrees = np.where(np.array(robot.revolute) & (angle_unit == "deg"), np.pi / 180, 1.0)
+    given = {"position_min": position_min, "position_max": position_max, "velocity": velocity}
+    given |= {"acceleration": acceleration, "jerk": jerk, "force": force}
     fields, told = {}, []
     for name, values in given.items():
-        known = fields[name] = np.asarray(getattr(robot.limits, name))
-        if values is None:
-            continue
-        one_per_joint(robot, name, values)
-        new = np.array(values) * (1.0 if name == "force" else degrees)
-        told += [f"{name} of {j}" for j, x in zip(robot.joint_names, new, strict=True) if x == x]
-        fields[name] = np.where(np.isnan(new), known, new)
-        if not np.isnan(new).any():
-            told.append(name)
-    _check_forces(fields["force"])
-    _check_ranges(robot, fields)
+        new = per_joint(name, values, robot.joints, np.nan)
+        new = new if name == "force" else new * _angle_scale(robot, angle_unit)
+        known = np.isnan(new)
+        fields[name] = np.where(known, getattr(robot.limits, name), new)
+        told += [f"{name} of {j}" for j, k in zip(robot.joint_names, known, strict=True) if not k]
+        told += [] if known.any() else [name]
+    _check_limits(robot, fields)
     assumed = tuple(name for name in robot.limits.assumed if name not in told)
     limits = Limits(robot.joints, **fields, assumed=assumed)
     notes = _doubts(robot, limits, position_min or position_max, velocity and angle_unit == "rad")
     return robot.replace(limits=limits, notes=(*robot.notes, *notes))
 
 
-def _check_forces(forces: np.ndarray) -> None:
-    """Reject forces that no joint of a robot has, so that weights stay finite."""
-    if ((forces > 0) & (forces < 1e-9)).any() or (np.isfinite(forces) & (forces >= 1e9)).any():
-        raise InputError(f"`force` must lie between 1e-9 and 1e9 N m or N, but is {forces}.")
+def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
+    return np.where(np.array(robot.revolute) & (unit == "deg"), np.pi / 180, 1.0)
 
 
-def _check_ranges(robot: Robot, fields: dict[str, np.ndarray]) -> None:
+def _check_limits(robot: Robot, fields: dict[str, np.ndarray]) -> None:
+    """Reject forces that no joint has, so that weights stay finite, and ranges in other units."""
+    force = fields["force"]
+    if ((force > 0) & (force < 1e-9)).any() or (np.isfinite(force) & (force >= 1e9)).any():
+        raise InputError(f"`force` must lie between 1e-9 and 1e9 N m or N, but is {force}.")
     for j, name in enumerate(robot.joint_names):
         low, high = fields["position_min"][j], fields["position_max"][j]
         if why := range_fault(low, high, robot.revolute[j]):
@@ -379,9 +297,9 @@ def _doubts(robot: Robot, limits: Limits, ranges: Any, speeds: Any) -> Iterator[
 def replace_drives(
     robot: Robot,
     *,
-    gear_ratios: PerJoint | None = None,
+    gear_ratios: list[Finite] | None = None,
     matrix: list[PerJoint] | None = None,
-    zero: PerJoint | None = None,
+    zero: list[Finite] | None = None,
     angle_unit: AngleUnit = "rad",
     max_torques: list[Positive] | None = None,
     rotor_inertia: list[Magnitude] | None = None,
@@ -404,27 +322,13 @@ def replace_drives(
     """
     if gear_ratios is not None and matrix is not None:
         raise InputError("give `gear_ratios` or `matrix`, but not both.")
-    lists = {
-        "gear_ratios": gear_ratios,
-        "matrix": matrix,
-        "zero": zero,
-        "max_torques": max_torques,
-        "rotor_inertia": rotor_inertia,
-    }
-    for name, values in lists.items():
-        if values is None:
-            continue
-        one_per_joint(robot, name, values)
-        if name in ("gear_ratios", "zero") and not np.isfinite(values).all():
-            raise InputError(f"`{name}` must hold finite numbers, but is {values}.")
-    if matrix is not None and {len(row) for row in matrix} != {robot.joints}:
-        raise InputError(f"`matrix` must hold {robot.joints} numbers in each row.")
-    turns = np.array(robot.revolute) & (angle_unit == "deg")
-    new = {
-        "reduction": gear_ratios or matrix,
-        "zero": None if zero is None else np.array(zero) * np.where(turns, np.pi / 180, 1.0),
-        "max_torques": max_torques,
-        "rotor_inertia": rotor_inertia,
-    }
+    n = robot.joints
+    if matrix is not None and {len(matrix), *map(len, matrix)} != {n}:
+        raise InputError(f"`matrix` must hold {n} rows of {n} numbers.")
+    new = {"max_torques": max_torques, "rotor_inertia": rotor_inertia, "reduction": matrix}
+    if gear_ratios is not None:
+        new["reduction"] = per_joint("gear_ratios", gear_ratios, n, 1.0)
+    if zero is not None:
+        new["zero"] = per_joint("zero", zero, n, 0.0) * _angle_scale(robot, angle_unit)
     given = {name: value for name, value in new.items() if value is not None}
     return robot.replace(drives=dataclasses.replace(robot.drives, **given))

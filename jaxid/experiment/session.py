@@ -2,45 +2,86 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from jaxid.diagnosis import Diagnosis, diagnose
 from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.diagnosis.mislabelled import BAD
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
+from jaxid.excitation.design import DesignProgress
 from jaxid.experiment.decoder import within
 from jaxid.experiment.experiment import Experiment
-from jaxid.experiment.progress import Stages
 from jaxid.identification.choices import FilterChoice, choose_filter
 from jaxid.identification.combination import require_same_base, share_rows, update
 from jaxid.identification.fit import Fit, load
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
+from jaxid.measurement.observations import Progress as Callback
 from jaxid.measurement.recording import Recording
 from jaxid.measurement.timestamps import NeedsMemory
 from jaxid.report.identification import solution_name
 from jaxid.report.result_files import MODEL, Alternative
 from jaxid.validation import Validation, comparison_step, torque_errors, validate
 
+LoadedLog = tuple[Recording | Observations, Observations, Diagnosis]
+"""Log as it was read (of a log on disk its observations), filtered log, and diagnosis."""
 
-@dataclasses.dataclass(frozen=True)
-class LoadedLog:
-    """Log of an experiment, and its diagnosis.
 
-    Attributes:
-        recording: Log as it was read; the observations of a log on disk.
-        observations: Filtered log.
-        diagnosis: Statistics beside the limits of the robot, and findings.
-        notes: Remarks on how it was read, as sentences.
-    """
+class Stages:
+    """Progress bar of a command, called with the name of each stage as it begins."""
 
-    recording: Recording | Observations
-    observations: Observations
-    diagnosis: Diagnosis
-    notes: tuple[str, ...] = ()
+    def __init__(self, bar: Progress, total: int):
+        self._bar = bar
+        self._task = bar.add_task("starting", total=total + 1, detail="")
+        self._part = bar.add_task("", total=1.0, detail="", visible=False)
+
+    def __call__(self, name: str) -> None:
+        """Begin a stage."""
+        self._bar.update(self._task, description=name, advance=1)
+        self._bar.update(self._part, visible=False)
+
+    def through(self, rows: int = 0) -> Callback:
+        """Return a callback for the completed fraction of a stage, which shows its speed."""
+        self._bar.reset(self._part, visible=False)
+        start = monotonic()
+
+        def progress(fraction: float) -> None:
+            seconds = monotonic() - start
+            detail = f"{100 * fraction:3.0f} %"
+            if rows and seconds > 0:
+                speed = fraction * rows / seconds
+                detail += f", {speed / 1e6:.1f} million" if speed >= 1e6 else f", {speed:,.0f}"
+                detail += " rows/s"
+            if fraction > 0:
+                left = int(seconds / fraction - seconds)
+                detail += f", {left // 60}:{left % 60:02d} left"
+            self._bar.update(self._part, completed=fraction, visible=True, detail=detail)
+
+        return progress
+
+    def design(self, now: DesignProgress) -> None:
+        """Show the progress of a design, and the best value so far."""
+        kept = "" if now.feasible else ", limits not yet kept"
+        text = f"{now.task}, best so far {now.best:.5g}{kept}"
+        self._bar.update(self._task, description=text, completed=now.fraction)
+
+
+@contextmanager
+def stages(console: Console, total: int = 0) -> Iterator[Stages]:
+    """Show a progress bar of so many stages in a terminal, and nothing elsewhere."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    detail = TextColumn("{task.fields[detail]}")
+    quiet = not console.is_terminal
+    with Progress(*columns, detail, console=console, transient=True, disable=quiet) as progress:
+        yield Stages(progress, total)
 
 
 def load_log(
@@ -53,9 +94,6 @@ def load_log(
         path: Path of the log.
         stage: Progress bar.
         name: Name of the log; the file's if None.
-
-    Raises:
-        InputError: If the log is not as the experiment's file says.
     """
     notes = ()
     if experiment.is_long(path):
@@ -70,7 +108,7 @@ def load_log(
     stage(f"filtering {path.name}")
     observations = experiment.observe(recording)
     diagnosis = diagnose(recording, experiment.robot, observations=observations)
-    return LoadedLog(recording, observations, diagnosis, notes)
+    return recording, observations.replace(notes=(*observations.notes, *notes)), diagnosis
 
 
 def _scan_log(experiment: Experiment, path: Path, stage: Stages, name: str | None) -> LoadedLog:
@@ -78,47 +116,28 @@ def _scan_log(experiment: Experiment, path: Path, stage: Stages, name: str | Non
     log = experiment.open(path)
     log = log if name is None else log.replace(name=name)
     stage(f"looking through {path.name}")
-    diagnosis = diagnose(
-        log,
-        experiment.robot,
-        min_speed=experiment.min_speed,
-        progress=stage.through(log.samples),
-    )
-    log = log.replace(notes=(*log.notes, *diagnosis.notes))
-    step = comparison_step(log)
-    if step == 1:
-        return LoadedLog(log, log, diagnosis)
-    note = f"{log.name}: torque errors and figures take one of every {step} of its {log.rows} rows"
-    return LoadedLog(log, log, diagnosis, (note,))
+    through = stage.through(log.samples)
+    robot, min_speed = experiment.robot, experiment.min_speed
+    diagnosis = diagnose(log, robot, min_speed=min_speed, progress=through)
+    notes, step = [*log.notes, *diagnosis.notes], comparison_step(log)
+    if step > 1:
+        what = f"one of every {step} of its {log.rows} rows"
+        notes.append(f"{log.name}: torque errors and figures take {what}")
+    log = log.replace(notes=tuple(notes))
+    return log, log, diagnosis
 
 
 def load_logs(experiment: Experiment, paths: Sequence[Path], stage: Stages) -> list[LoadedLog]:
-    """Read and diagnose logs; equal names are preceded by their folders.
-
-    Args:
-        experiment: Experiment of the logs.
-        paths: Paths of the logs.
-        stage: Progress bar.
-
-    Raises:
-        InputError: If a log is not as the experiment's file says.
-    """
+    """Read and diagnose logs; equal names are preceded by their folders."""
     stems = [p.stem for p in paths]
-    logs = []
-    for path in paths:
-        twice = stems.count(path.stem) > 1
-        name = f"{path.resolve().parent.name}/{path.stem}" if twice else None
-        logs.append(load_log(experiment, path, stage, name))
-    return logs
+    names = (
+        f"{p.resolve().parent.name}/{p.stem}" if stems.count(p.stem) > 1 else None for p in paths
+    )
+    return [load_log(experiment, p, stage, n) for p, n in zip(paths, names, strict=True)]
 
 
-def findings_of(logs: Sequence[LoadedLog]) -> list[str]:
-    """Return the findings on logs, with their names.
-
-    Args:
-        logs: Loaded logs.
-    """
-    return [f"{log.recording.name}: {text}" for log in logs for text in log.diagnosis.findings]
+def _findings(logs: Sequence[LoadedLog]) -> list[str]:
+    return [f"{diagnosis.name}: {text}" for *_, diagnosis in logs for text in diagnosis.findings]
 
 
 def select_filter(
@@ -163,21 +182,8 @@ def select_filter(
     return dataclasses.replace(experiment, filter=choice.filter, candidates=(), notes=notes), choice
 
 
-def is_report(path: Path) -> bool:
-    """Return whether a path stands for the logs that a report was made of.
-
-    Args:
-        path: Path of a log or of a report.
-    """
-    return path.is_dir()
-
-
 def earlier_run(experiment: Experiment, folder: Path) -> Fit:
-    """Return the fit of an earlier report.
-
-    Args:
-        experiment: Experiment with the same robot and model.
-        folder: Folder that `jaxid identify` has written.
+    """Return the fit of the report in a folder.
 
     Raises:
         InputError: If it keeps nothing, or of another robot or model.
@@ -196,14 +202,20 @@ def earlier_run(experiment: Experiment, folder: Path) -> Fit:
     return fit
 
 
-def require_plain(experiment: Experiment) -> tuple[str, ...]:
-    """Reject estimators that two runs cannot share; return a note on what others disregard.
+def read_runs(
+    experiment: Experiment, groups: Sequence[Sequence[Path]], names: Sequence[str], stage: Stages
+) -> tuple[list[Fit], list[str]]:
+    """Return a run of the logs and reports of each group, and doubts about the logs.
 
     Args:
         experiment: Experiment of the runs.
+        groups: Paths of logs, and of folders of reports, which stand for their logs.
+        names: Names of the runs.
+        stage: Progress bar.
 
     Raises:
-        InputError: If the shape of friction is sought.
+        InputError: If the shape of friction is sought, a log is not as the file says, or a folder
+            holds no report.
     """
     if experiment.linear is not None:
         raise InputError(
@@ -211,39 +223,28 @@ def require_plain(experiment: Experiment) -> tuple[str, ...]:
             "friction in each run: leave it out, and give both runs the shapes that `jaxid "
             "identify` finds, as `epsilon` and `stribeck` of `model.coulomb`."
         )
-    estimation = experiment.estimation
+    estimation, doubts = experiment.estimation, []
     plain = estimation.estimator is estimation.plain and not estimation.regularised
-    if plain and estimation.essential is None:
-        return ()
-    return ("all runs are weighted least squares here: the rest of `[estimator]` does not count",)
-
-
-def read_run(
-    experiment: Experiment, paths: Sequence[Path], stage: Stages, name: str
-) -> tuple[Fit, list[str]]:
-    """Return logs, and reports that stand for theirs, as one run; and findings on the logs.
-
-    Args:
-        experiment: Experiment of the logs.
-        paths: Paths of logs and of folders of reports.
-        stage: Progress bar.
-        name: Name of the run.
-
-    Raises:
-        InputError: If a log is not as the experiment's file says, or a folder holds no report.
-    """
-    runs = [earlier_run(experiment, path) for path in paths if is_report(path)]
-    logs = [load_log(experiment, path, stage) for path in paths if not is_report(path)]
-    findings = findings_of(logs)
-    if logs:
-        observations = [log.observations for log in logs]
-        stage(f"factorising the rows, {name}")
-        through = stage.through(sum(o.samples for o in observations))
-        rows = RegressionProblem(experiment.base, observations, through)
-        fit = fit_problem(rows, experiment.estimation.plain)
-        findings += mistakes_in_logs([log.diagnosis for log in logs], fit)
-        runs.append(fit)
-    return functools.reduce(update, runs), findings
+    if not plain or estimation.essential is not None:
+        rest = "the rest of `[estimator]` does not count"
+        doubts.append(f"all runs are weighted least squares here: {rest}")
+    stage("finding base parameters")
+    files = [path for paths in groups for path in paths if not path.is_dir()]
+    experiment, _ = select_filter(experiment, files, stage)
+    runs = []
+    for paths, name in zip(groups, names, strict=True):
+        fits = [earlier_run(experiment, path) for path in paths if path.is_dir()]
+        logs = [load_log(experiment, path, stage) for path in paths if not path.is_dir()]
+        doubts += _findings(logs)
+        if logs:
+            observations = [log for _, log, _ in logs]
+            stage(f"factorising the rows, {name}")
+            through = stage.through(sum(o.samples for o in observations))
+            rows = RegressionProblem(experiment.base, observations, through)
+            fits.append(fit_problem(rows, estimation.plain))
+            doubts += mistakes_in_logs([diagnosis for *_, diagnosis in logs], fits[-1])
+        runs.append(dataclasses.replace(functools.reduce(update, fits), name=name))
+    return runs, doubts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -293,59 +294,46 @@ def identify_logs(
         InputError: If a log is not as the file says, or a log would verify a model that has seen
             it.
     """
-    logs = [p for p in paths if not is_report(p)]
-    reports = [p for p in paths if is_report(p)]
+    logs = [p for p in paths if not p.is_dir()]
+    reports = [p for p in paths if p.is_dir()]
     experiment, choice = select_filter(experiment, logs, stage, split)
     loaded = load_logs(experiment, [*logs, *verify], stage)
-    observations = [log.observations for log in loaded]
+    observations = [log for _, log, _ in loaded]
     fitted, unseen = observations[: len(logs)], observations[len(logs) :]
     if split is not None:
-        fitted, rests = _split(fitted, split)
-        unseen = [*rests, *unseen]
+        parts = [log.split(split) for log in fitted]
+        fitted = [a.replace(name=f"{a.name}, first {100 * split:g} %") for a, _ in parts]
+        unseen = [*(b.replace(name=f"{b.name}, rest") for _, b in parts), *unseen]
     stage("finding base parameters")
     base = experiment.base
     stage("factorising the rows")
     samples = sum(o.samples for o in fitted)
     rows = RegressionProblem(base, fitted, stage.through(samples))
     fit = experiment.fit(rows, stage.through(samples))
-    notes = [note for o in (*fitted, *unseen) for note in o.notes]
-    notes += [note for log in loaded for note in log.notes]
     if reports:
         fit = _add_reports(experiment, reports, fit)
         _refuse_seen(fit, base, unseen)
     stage("predicting torques")
-    through = stage.through(max(o.samples for o in [*fitted, *unseen]))
-    validation = validate(fit, [*fitted, *unseen], progress=through)
+    every = [*fitted, *unseen]
+    through = stage.through(max(o.samples for o in every))
+    validation = validate(fit, every, progress=through)
     alternative = None
     if (experiment.estimation.regularised or fit.undetermined) and not reports:
         same = rows if fit.base is base else RegressionProblem(fit.base, fitted)
-        alternative = _alternative(experiment, fit, same, [*fitted, *unseen])
-    mistakes = mistakes_in_logs([log.diagnosis for log in loaded[: len(logs)]], fit)
+        other = fit_problem(same, experiment.other_estimator)
+        names = (solution_name(fit.solution), solution_name(other.solution))
+        alternative = Alternative(other, [torque_errors(other, log) for log in every], names)
+    notes = [note for o in every for note in o.notes]
+    mistakes = mistakes_in_logs([diagnosis for *_, diagnosis in loaded[: len(logs)]], fit)
     if fit.residual > BAD and not mistakes:
         notes.append(
             "whether the forces stand later in the logs than the angles takes longer to tell: "
             "`jaxid inspect` says so for each log."
         )
+    notes, findings = list(dict.fromkeys(notes)), _findings(loaded)
     return Identification(
-        experiment,
-        choice,
-        fit,
-        validation,
-        len(fitted),
-        alternative,
-        list(dict.fromkeys(notes)),
-        findings_of(loaded),
-        mistakes,
+        experiment, choice, fit, validation, len(fitted), alternative, notes, findings, mistakes
     )
-
-
-def _split(
-    logs: Sequence[Observations], fraction: float
-) -> tuple[list[Observations], list[Observations]]:
-    """Return the first parts of logs and their rests, with names that say so."""
-    parts = [log.split(fraction) for log in logs]
-    first = [a.replace(name=f"{a.name}, first {100 * fraction:g} %") for a, _ in parts]
-    return first, [b.replace(name=f"{b.name}, rest") for _, b in parts]
 
 
 def _add_reports(experiment: Experiment, reports: Sequence[Path], fit: Fit) -> Fit:
@@ -367,11 +355,3 @@ def _refuse_seen(fit: Fit, base: BaseParameters, unseen: Sequence[Observations])
                 f"a report that was given has seen the data of `{log.name}`: a model that has seen "
                 "a log is not verified by it; verify with another."
             )
-
-
-def _alternative(
-    experiment: Experiment, fit: Fit, rows: RegressionProblem, logs: Sequence[Observations]
-) -> Alternative:
-    other = fit_problem(rows, experiment.other_estimator)
-    names = (solution_name(fit.solution), solution_name(other.solution))
-    return Alternative(other, [torque_errors(other, log) for log in logs], names)

@@ -11,27 +11,18 @@ import os
 import re
 import textwrap
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from jaxid.experiment.decoder import Key, choices, keys_of
-from jaxid.experiment.estimator_table import KINDS, choose_uncertainty
-from jaxid.experiment.excitation_tables import Collision, Excitation
-from jaxid.experiment.method_tables import (
-    CUTOFF,
-    FILTERS,
-    SIDES,
-    DryFriction,
-    Effects,
-    Logs,
-    build_rows,
-)
-from jaxid.experiment.robot_tables import Load, RobotSource, replace_drives, replace_limits
+from jaxid.experiment.decoder import Key, keys_of, table_of
+from jaxid.experiment.estimator_table import KINDS
+from jaxid.experiment.experiment import TABLES
+from jaxid.experiment.method_tables import CUTOFF, FILTERS, SIDES, DryFriction
+from jaxid.experiment.robot_tables import known_load
 from jaxid.io import union_members
-from jaxid.measurement.columns import Columns
 from jaxid.measurement.units import Unit
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
@@ -49,28 +40,13 @@ HEAD = """\
 #   jaxid excite   experiment.toml -o trajectory.csv    the motion to record
 #   jaxid identify experiment.toml log.csv -o report/   parameters and torque errors
 """
-EXAMPLES = {
-    "angle_signs": "1",
-    "force_signs": "1",
-    "angle_offsets": "0.0",
-    "velocities": '"dq{}"',
-    "sample_time": "0.001",
-    "velocity_unit": '"rad/s"',
-    "force_cutoff": "inf",
-    "margin": "0.1",
-    "period": "10.0",
-    "harmonics": "5",
-    "force_harmonics": "50",
-    "mass_min": "0.5",
-    "mass_max": "50.0",
-    "radius": "0.6",
-    "centre_min": "[-0.2, -0.2, 0.0]",
-    "centre_max": "[0.2, 0.2, 0.5]",
-    "ellipsoid_centre": "[0.0, 0.0, 0.2]",
-    "ellipsoid_axes": "[0.2, 0.2, 0.4]",
-    "total_mass": "120.0",
+SUMMARIES = {
+    "load": "Known load that is on the robot in some logs only: `jaxid gains` finds the true "
+    "forces.",
+    "recording": "Columns of the logs: CSV (any separator), Parquet, NPZ or MAT files. A pattern "
+    '("{}" stands for the joint\'s number), a list of names, or positions from 0.',
 }
-"""Values of keys whose descriptions hold no example."""
+"""Descriptions of tables where the docstring of their function says something else."""
 
 
 def write_template(
@@ -97,104 +73,91 @@ def write_template(
     path = Path(urdf).resolve()
     if folder is not None:
         path = Path(os.path.relpath(path, Path(folder).resolve()))
-    return render(robot, path.as_posix(), tip, base)
-
-
-def render(robot: Robot, urdf: str, tip: str | None = None, base: str | None = None) -> str:
-    """Return the file for a robot that a URDF file describes.
-
-    Args:
-        robot: Robot of the URDF file.
-        urdf: Path of the URDF file, as it is written into the file.
-        tip: Link of the end-effector, if it was chosen.
-        base: Link that stands on the ground, if it was chosen.
-    """
-    source = {"urdf": urdf, "tip": tip, "base": base}
-    n = robot.joints
-    sections = [
-        HEAD.format(name=robot.name),
-        _table("robot", [RobotSource], n, {k: v for k, v in source.items() if v}, ("tool",)),
-        _table("robot.tool", [Load], n, active=False),
-        _table("load", [Load], n, active=False, summary=_LOAD),
-        _joints(robot) + _table("limits", [replace_limits], n, _limits(robot)),
-        _table("drives", [replace_drives], n, {"gear_ratios": [1.0] * n}),
-        _table("model", [Effects], n, {"offset": True}),
-        _table("model.coulomb", [DryFriction], n),
-        _table("recording", [Columns, Logs], n, _recording(robot), SIDES, _RECORDING),
-        _table("filter", [FILTERS["butterworth"]], n, {"kind": "butterworth", "cutoff": CUTOFF})
-        + _other_kinds("butterworth", {k: (_summary(f), (f,)) for k, f in FILTERS.items()}, n),
-        _table("rows", [build_rows], n),
-        _table(
-            "estimator",
-            [*KINDS["weighted"][1], choose_uncertainty],
-            n,
-            {"kind": "weighted"},
-            (),
-            _ESTIMATOR,
+    source = {"urdf": path.as_posix(), "tip": tip, "base": base}
+    limits = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
+    values = {
+        "robot": {key: value for key, value in source.items() if value},
+        "limits": {name: np.asarray(getattr(robot.limits, name)).tolist() for name in limits},
+        "drives": {"gear_ratios": [1.0] * robot.joints},
+        "model": {"offset": True},
+        "recording": _recording(robot),
+        "filter": {"kind": "butterworth", "cutoff": CUTOFF},
+        "estimator": {"kind": "weighted"},
+    }
+    commented = {name for keys in KINDS.values() for name in keys} - {*KINDS["weighted"]}
+    sections = [HEAD.format(name=robot.name)]
+    for name, functions in TABLES.items():
+        functions = functions[:1] if name == "filter" else functions
+        table = _table(
+            name,
+            functions,
+            robot.joints,
+            values.get(name, {}),
+            commented if name == "estimator" else (),
+            active=name not in ("load", "collision"),
         )
-        + _other_kinds("weighted", KINDS, n),
-        _table("excitation", [Excitation], n),
-        _table("collision", [Collision], n, active=False),
-    ]
+        if name == "robot":
+            table += "\n" + _table("robot.tool", (known_load,), robot.joints, active=False)
+        if name == "limits":
+            table = _joints(robot) + table
+        if name == "model":
+            table += "\n" + _table("model.coulomb", (DryFriction,), robot.joints)
+        sections.append(table + (_other_filters(robot.joints) if name == "filter" else ""))
     return "\n".join(sections)
-
-
-_LOAD = "Known load that is on the robot in some logs only: `jaxid gains` finds the true forces."
-_ESTIMATOR = "Estimator of the parameters from the rows, and of their standard deviations."
-_RECORDING = (
-    'Columns of the logs: CSV (any separator), Parquet, NPZ or MAT files. A pattern ("{}" stands '
-    "for the joint's number), a list of names, or positions from 0."
-)
 
 
 def _table(
     name: str,
-    functions: Iterable[Callable],
+    functions: tuple[Callable, ...],
     joints: int,
     values: Mapping[str, Any] | None = None,
-    skip: Iterable[str] = (),
-    summary: str = "",
+    commented: Collection[str] = (),
     *,
     active: bool = True,
 ) -> str:
-    """Return a table with all keys of some functions."""
-    functions, values = list(functions), values or {}
-    mark = "" if active else "# "
-    lines = [*_comment(summary or _summary(functions[0])), f"{mark}[{name}]"]
-    if "kind" in values:
-        lines += _entry("kind", json.dumps(values["kind"]), "", active)
-    for function in functions:
-        for key in keys_of(function).values():
-            if key.name not in skip:
-                lines += _key(key, joints, values.get(key.name), active)
+    """Return a table with all keys of some functions; some or all of them are commented out."""
+    values = values or {}
+    lines = _comment(SUMMARIES.get(name) or _summary(functions[0]))
+    lines.append(f"{'' if active else '# '}[{name}]")
+    if name == "filter":
+        lines += _entry("kind", json.dumps(values["kind"]), "", True)
+    for key in (key for function in functions for key in keys_of(function).values()):
+        if key.name not in (*SIDES, "tool"):
+            shown = active and key.name not in commented
+            lines += _key(key, joints, values.get(key.name), shown)
     return "\n".join(lines) + "\n"
 
 
-def _other_kinds(
-    default: str, kinds: Mapping[str, tuple[str, tuple[Callable, ...]]], joints: int
-) -> str:
-    """Return the keys of other kinds of a table, as comments."""
-    lines, known = [], {name for f in kinds[default][1] for name in keys_of(f)}
-    for kind, (text, functions) in kinds.items():
-        if kind == default:
-            continue
-        lines += ["#", *_entry("kind", json.dumps(kind), text, False)]
-        for key in (key for f in functions for key in keys_of(f).values()):
+def _other_filters(joints: int) -> str:
+    """Return the keys of the other kinds of filters, as comments."""
+    lines, known = [], {*keys_of(FILTERS["butterworth"])}
+    for kind, function in list(FILTERS.items())[1:]:
+        lines += ["#", *_entry("kind", json.dumps(kind), _summary(function), False)]
+        for key in keys_of(function).values():
             if key.name not in known:
-                known.add(key.name)
                 lines += _key(key, joints, None, False)
+        known |= {*keys_of(function)}
     return "\n".join(lines) + "\n"
 
 
 def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
     text, example = _split_example(key.text)
-    example = example or EXAMPLES.get(key.name, "")
-    if value is None and not (key.needed or key.tables or (example and not active)):
+    needed = key.default is inspect.Parameter.empty
+    if value is None and not (needed or _holds_table(key.hint) or (example and not active)):
         value = key.default
     shown = _toml(value)
     if shown is None:
         active, shown = False, _example(key, joints, example)
     yield from _entry(key.name, shown, text, active)
+
+
+def _holds_table(hint: Any) -> bool:
+    """Whether a value may hold tables."""
+    options = union_members(hint)
+    inner = [
+        x for o in options if typing.get_origin(o) in (list, tuple) for x in typing.get_args(o)
+    ]
+    return any(table_of(o) for o in options) or any(x is not ... and _holds_table(x) for x in inner)
 
 
 def _split_example(text: str) -> tuple[str, str]:
@@ -214,37 +177,27 @@ def _example(key: Key, joints: int, example: str) -> str:
     if typing.get_origin(option) in (list, tuple):
         one = example or "1.0"
         return one if one.startswith("[") else f"[{', '.join([one] * joints)}]"
-    return (
-        example
-        or {int: "1", float: "1.0"}.get(option)
-        or str(_toml((choices(key.hint) or [True])[0]))
-    )
+    if typing.get_origin(option) is Literal:
+        example = example or json.dumps(typing.get_args(option)[0])
+    return example or {int: "1", float: "1.0"}.get(option, "true")
 
 
 def _toml(value: Any) -> str | None:
     """Return a value as TOML; None for what a file need not say."""
     if isinstance(value, list | tuple):
-        shown = [_toml(x) if not isinstance(x, float) else _number(x) for x in value]
+        shown = [repr(x) if isinstance(x, float) else _toml(x) for x in value]
         return f"[{', '.join(map(str, shown))}]" if value else None
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, Unit):
         return json.dumps(value.symbol)
     if isinstance(value, str):
-        return _quoted(value)
+        # Nothing in a text may look like a comment behind a key.
+        quoted = json.dumps(value, ensure_ascii=False).replace("  #", "  \\u0023")
+        return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in quoted)
     if isinstance(value, int | float) and math.isfinite(value):
-        return _number(value)
+        return repr(value)
     return None
-
-
-def _number(value: float | int) -> str:
-    return repr(value)
-
-
-def _quoted(text: str) -> str:
-    """Return a text of TOML that holds nothing that looks like a comment behind a key."""
-    quoted = json.dumps(text, ensure_ascii=False).replace("  #", "  \\u0023")
-    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in quoted)
 
 
 def _entry(name: str, value: str, text: str, active: bool) -> Iterator[str]:
@@ -285,11 +238,6 @@ def _summary(function: Callable) -> str:
     """Return the first sentence of a docstring, without formulas."""
     text = (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ")
     return re.sub(r" \$[^$]*\$", "", text)
-
-
-def _limits(robot: Robot) -> dict[str, list[float]]:
-    names = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
-    return {name: np.asarray(getattr(robot.limits, name)).tolist() for name in names}
 
 
 def _recording(robot: Robot) -> dict[str, Any]:

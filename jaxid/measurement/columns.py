@@ -52,17 +52,19 @@ class Columns(eqx.Module):
     Attributes:
         angles: Joint or motor angles.
         forces: Joint forces, motor torques or motor currents.
-        velocities: Measured velocities, on the same side as the angles; None if there are none.
+        velocities: Measured velocities, on the same side as the angles, like `"dq{}"`; None if
+            there are none.
         time: Time stamps; None if `sample_time` is given.
-        sample_time: Time between two rows [s], instead of time stamps.
+        sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
         angle_unit: Unit of the angles.
-        velocity_unit: Unit of the velocities; the angles' unit per second if None.
+        velocity_unit: Unit of the velocities, like `"rad/s"`; the angles' unit per second if
+            None.
         force_unit: Unit of the forces; currents need `torque_constants`.
         torque_constants: Torque of each motor for its current [N m/A].
         angle_signs: +1 or -1 for each joint, for the angles and velocities.
         force_signs: +1 or -1 for each joint.
-        angle_offsets: Offsets that are added to the angles [rad or m].
+        angle_offsets: Offsets that are added to the angles [rad or m], like `0.0`.
         force_gains: Ratio of the true forces to those of the log, as a known load tells.
         angles_on_motor_side: Whether angles and velocities are the motors', before the gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.

@@ -263,9 +263,10 @@ class ZeroPhaseButterworth(AbstractFilter):
     Attributes:
         cutoff: Cut-off of angles and velocities, of one direction as in scipy [Hz].
         order: Order of one direction.
-        force_cutoff: Cut-off of forces and columns [Hz]; `cutoff` if None; infinite if decimation
-            alone shall limit their band.
-        margin: Time to drop at both ends of a segment [s]; until the filter has settled if None.
+        force_cutoff: Cut-off of forces and columns [Hz], like `20.0`; `cutoff` if None; infinite if
+            decimation alone shall limit their band.
+        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter has settled
+            if None.
     """
 
     cutoff: float = eqx.field(static=True, converter=float)
@@ -314,7 +315,8 @@ class PaperFilter(AbstractFilter):
     Attributes:
         velocity: Cut-off of the velocities [rad/s].
         acceleration: Cut-off of accelerations, forces and columns [rad/s].
-        margin: Time to drop at both ends of a segment [s]; until the filter has settled if None.
+        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter has settled
+            if None.
     """
 
     velocity: float = eqx.field(static=True, converter=float, default=1200.0)
@@ -369,12 +371,13 @@ class PeriodicFourier(AbstractFilter):
     zero-phase Butterworth low-pass. Measured velocities are not used.
 
     Attributes:
-        period: Period of the motion [s].
-        harmonics: Number of harmonics; that of the planned trajectory or a few more.
-        force_harmonics: Cut-off of forces and columns, in harmonics; ten times `harmonics` if None,
-            infinite if decimation alone shall limit their band.
+        period: Period of the motion [s], like `10.0`.
+        harmonics: Number of harmonics, like `5`; that of the planned trajectory or a few more.
+        force_harmonics: Cut-off of forces and columns, in harmonics, like `50`; ten times
+            `harmonics` if None, infinite if decimation alone shall limit their band.
         order: Order of the low-pass, of one direction.
-        margin: Time to drop at both ends of a segment [s]; until the filter has settled if None.
+        margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter has settled
+            if None.
     """
 
     period: float = eqx.field(static=True, converter=float)

@@ -13,14 +13,18 @@ class BodyBounds(eqx.Module):
     """Bounds of masses, sizes and centres of mass; without them the best masses are infinite.
 
     Attributes:
-        mass_max: Largest mass of each body [kg].
-        radius: Radius of the sphere about the origin of each body's frame that holds it [m].
-        mass_min: Smallest mass of each body [kg].
-        centre_min: Lower corners of boxes for the centres of mass [m]; -inf for none.
-        centre_max: Upper corners [m]; inf for none.
-        ellipsoid_centre: Centres of ellipsoids that hold the centres of mass [m].
-        ellipsoid_axes: Their half axes, along the axes of the body's frame [m]; inf for none.
-        total_mass: Mass of all bodies together [kg], or None.
+        mass_max: Largest mass of each body [kg], like `50.0`.
+        radius: Radius of the sphere about the origin of each body's frame that holds it [m], like
+            `0.6`.
+        mass_min: Smallest mass of each body [kg], like `0.5`.
+        centre_min: Lower corners of boxes for the centres of mass [m], like `[-0.2, -0.2, 0.0]`;
+            -inf for none.
+        centre_max: Upper corners [m], like `[0.2, 0.2, 0.5]`; inf for none.
+        ellipsoid_centre: Centres of ellipsoids that hold the centres of mass [m], like
+            `[0.0, 0.0, 0.2]`.
+        ellipsoid_axes: Their half axes, along the axes of the body's frame [m], like
+            `[0.2, 0.2, 0.4]`; inf for none.
+        total_mass: Mass of all bodies together [kg], like `120.0`; None if unknown.
     """
 
     mass_max: Float[AnyArray, " bodies"]

@@ -1,0 +1,411 @@
+"""Work of the commands for an experiment and its logs, and what they print."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from jaxid.cli.options import command_line, open_console
+from jaxid.errors import InputError
+from jaxid.excitation.criteria import CRITERIA
+from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
+from jaxid.experiment.experiment import Experiment, load_experiment
+from jaxid.experiment.robot_tables import joint_number
+from jaxid.experiment.session import (
+    Identification,
+    identify_logs,
+    load_log,
+    read_runs,
+    select_filter,
+    stages,
+)
+from jaxid.export.c_code import export_c
+from jaxid.export.feed_forward import export_jax
+from jaxid.export.inertials import export_pinocchio
+from jaxid.export.mjcf import export_mjcf
+from jaxid.export.urdf import export_urdf
+from jaxid.identification.comparison import compare as compare_fits
+from jaxid.identification.drive_gains import identify_drive_gains
+from jaxid.identification.fit import Fit, load
+from jaxid.identification.identify import identify as estimate
+from jaxid.identification.payload import (
+    CENTRAL_NAMES,
+    CENTRAL_UNITS,
+    Payload,
+    identify_payload,
+)
+from jaxid.identification.states import identify_states
+from jaxid.io import require_writable
+from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
+from jaxid.report.identification import (
+    alternative_table,
+    body_table,
+    motor_tables,
+    residual_table,
+)
+from jaxid.report.result_files import (
+    MODEL,
+    estimate_rows,
+    read_fit,
+    write_comparison,
+    write_estimates,
+    write_report,
+)
+from jaxid.report.page import show, show_files, show_remarks
+from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.table import Remark, Status, Table, significant
+
+STOPPED = 130
+"""Exit code of a command that Ctrl-C has ended, as shells expect it."""
+UNLIKELY = 0.01
+"""Probability that the states agree on shared parameters, below which a remark is made."""
+
+
+def inspect(console: Console, path: Path, logs: list[Path]) -> None:
+    """Show what can be identified, and if logs are sane."""
+    experiment, examined = load_experiment(path), []
+    choices = len(logs) + 1 if experiment.candidates else 0
+    with stages(open_console(stderr=True), 1 + choices + 4 * len(logs)) as stage:
+        stage("finding base parameters")
+        _ = experiment.base.expressions
+        experiment, _ = select_filter(experiment, logs, stage)
+        for log in logs:
+            recording, observations, diagnosis = load_log(experiment, log, stage)
+            stage(f"factorising {log.name}")
+            through = stage.through(recording.samples)
+            fit = estimate(experiment.base, observations, experiment.estimation.plain, through)
+            stage(f"looking for mistakes in {log.name}")
+            findings = dict.fromkeys((*diagnosis.findings, *diagnosis.fit_findings(fit)))
+            diagnosis = dataclasses.replace(diagnosis, findings=tuple(findings))
+            examined.append((recording, diagnosis, fit))
+    robot = experiment.robot
+    show(console, robot.summary(), *motor_tables(robot), experiment.base.summary())
+    show_remarks(console, experiment.notes)
+    for log, diagnosis, fit in examined:
+        facts = [
+            ("samples", f"{log.samples} at {significant(1 / log.sample_time, 4)} Hz"),
+            ("duration", f"{significant(log.duration, 4)} s"),
+            ("gaps", str(len(log.segments) - 1 or "none")),
+        ]
+        remarks = [*map(Remark, log.notes), *fit.determination]
+        show(console, diagnosis.summary(), Table("", facts=[*facts, *fit.facts], remarks=remarks))
+
+
+def check_logs(logs: list[Path], verify: list[Path], split: float | None) -> None:
+    """Reject logs that would count twice, or verify a model that has seen them."""
+    if split is not None and not 0 < split < 1:
+        raise InputError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
+    places = [p.resolve() for p in logs]
+    repeated = next((p for k, p in enumerate(logs) if places[k] in places[:k]), None)
+    if repeated is not None:
+        raise InputError(f"`{repeated}` is given twice: its rows would count double.")
+    both = set(places) & {p.resolve() for p in verify}
+    if both:
+        raise InputError(
+            f"`{sorted(both)[0].name}` is given both to identify and to verify with: a model that "
+            "has seen a log is not verified by it; use `--split` to divide one log."
+        )
+
+
+def identify(
+    console: Console,
+    path: Path,
+    logs: list[Path],
+    verify: list[Path],
+    split: float | None,
+    output: Path,
+    pdf: bool,
+) -> None:
+    """Estimate the parameters and write a report."""
+    experiment = load_experiment(path)
+    files = [p for p in logs if not p.is_dir()]
+    if not files:
+        raise InputError(
+            "folders of earlier reports stand for their logs, but at least one log must be given "
+            "as a file, for torque errors and figures."
+        )
+    choices = len(files) + 1 if experiment.candidates else 0
+    total = 4 + choices + 2 * (len(files) + len(verify))
+    with stages(open_console(stderr=True), total) as stage:
+        result = identify_logs(experiment, logs, verify, split, stage)
+        stage("writing the report")
+        settings = {
+            "experiment": str(path),
+            "command": command_line(),
+            "identification": [str(p) for p in logs],
+            "verification": [str(p) for p in verify],
+            "split": split,
+            "experiment_text": experiment.text,
+            "filter": str(result.experiment.filter),
+            "decimation": str(experiment.decimation),
+            "min_speed": experiment.min_speed,
+        }
+        errors = result.validation.errors
+        written = write_report(
+            output,
+            result.fit,
+            errors[: result.fitted],
+            errors[result.fitted :],
+            result.validation.definiteness,
+            settings,
+            (*result.experiment.notes, *result.notes, *result.findings),
+            result.alternative,
+            result.choice,
+            (*result.findings, *result.mistakes),
+            pdf,
+        )
+    _show_identification(console, result)
+    show_files(console, output, [p.name for p in written])
+
+
+def _show_identification(console: Console, result: Identification) -> None:
+    fit, robot = result.fit, result.experiment.robot
+    tabulated = () if fit.consistency is None else fit.consistency.findings
+    notes = [*result.experiment.notes, *result.notes]
+    notes += [note for note in fit.notes if note not in tabulated]
+    show(console, robot.summary(), *motor_tables(robot))
+    show_remarks(console, [*notes, *_doubts(result.findings)])
+    show(console, fit.summary())
+    if fit.residual_spectra is not None:
+        show(console, residual_table(fit.residual_spectra, robot))
+    show_remarks(console, _doubts(result.mistakes))
+    if fit.consistency is not None:
+        show(console, body_table(fit.consistency, robot.joint_names))
+    show(console, result.validation.summary())
+    if other := result.alternative:
+        show(console, alternative_table(result.validation.errors, other.errors, other.names))
+
+
+def _doubts(texts: Any) -> list[Remark]:
+    return [Remark(text, Status.DOUBTFUL) for text in texts]
+
+
+def excite(console: Console, path: Path, output: Path, resume: bool, all_criteria: bool) -> None:
+    """Design a motion and write it; the state of the design is kept until it is done."""
+    state = output.with_suffix(".state.npz")
+    if state.exists() and not resume:
+        raise InputError(
+            f"`{state}` is there: a design was stopped before its end. `--resume` goes on with it; "
+            "to begin anew, remove the file, or choose another -o."
+        )
+    experiment, errors = load_experiment(path), open_console(stderr=True)
+    if resume and not state.exists():
+        text = f"`{state}` is not there to go on with: the design begins anew"
+        show_remarks(console, _doubts([text]))
+    try:
+        with stages(errors) as stage:
+            design = design_motion(experiment, stage.design, state, resume)
+    except KeyboardInterrupt:
+        cure = "start again, and give it more time"
+        if state.is_file():
+            cure = f"`--resume` goes on with `{state}`, where it was"
+        said = "the design was stopped before a motion kept all limits, and nothing was written"
+        errors.print(Text(f"jaxid: {said}: {cure}."), soft_wrap=True)
+        raise typer.Exit(STOPPED) from None
+    written = write_design(experiment, design, output, command_line())
+    if not design.plan.interrupted:
+        state.unlink(missing_ok=True)
+    show(console, *design.plan.tables())
+    show_remarks(console, ordered((*plan_remarks(design.plan), *design.remarks)))
+    show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in written])
+    if all_criteria and design.plan.interrupted:
+        show_remarks(console, _doubts(["the design was stopped, and no other criterion was tried"]))
+    elif all_criteria:
+        with stages(errors) as stage:
+            plans = compare_criteria(experiment, stage.design)
+        if plans:
+            show(console, side_by_side_table(plans))
+        done = sum(not plan.interrupted for plan in plans)
+        if done < len(CRITERIA):
+            show_remarks(console, _doubts([f"stopped after {done} of {len(CRITERIA)} criteria"]))
+
+
+def export(
+    report: Path, to: str, path: Path, urdf: Path | None, chain: dict[str, Any], double: bool
+) -> None:
+    """Write the model of a report in a format."""
+    require_writable(path.parent)
+    model = report / MODEL if report.is_dir() else report
+    if not model.is_file():
+        what = f"holds no `{MODEL}`" if report.is_dir() else "is not there"
+        raise InputError(
+            f"`{report}` {what}: give a folder that `jaxid identify` has written, or a model file."
+        )
+    fit = load(model)
+    match to:
+        case "c":
+            export_c(fit, path.parent, name=path.stem, double=double)
+        case "urdf":
+            own = Path(fit.base.model.robot.source) if urdf is None else urdf
+            if urdf is None and (own.suffix != ".urdf" or not own.is_file()):
+                raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
+            export_urdf(fit, own, path, **chain)
+        case "mjcf":
+            export_mjcf(fit, path)
+        case "json":
+            fit.save(path)
+        case "pinocchio":
+            export_pinocchio(fit, path)
+        case "jax":
+            export_jax(fit, path)
+
+
+def compare(console: Console, paths: tuple[Path, Path], level: float, output: Path) -> None:
+    """Decide which parameters have changed between two runs."""
+    names = {path.resolve().name for path in paths}
+    labels = [str(path) if len(names) == 1 else None for path in paths]
+    cold, warm = (read_fit(p, label) for p, label in zip(paths, labels, strict=True))
+    found = compare_fits(cold, warm, level)
+    files = write_comparison(output, found, paths)
+    show(console, found.summary(), found.group_summary())
+    show_files(console, output, [p.name for p in files])
+
+
+def payload(
+    console: Console,
+    path: Path,
+    logs: list[Path],
+    loaded: list[Path],
+    body: str | None,
+    output: Path,
+) -> None:
+    """Find a payload, and print the table of the experiment file that subtracts it."""
+    experiment = load_experiment(path)
+    carrier = None if body is None else joint_number(experiment.robot, body, "--body")
+    (empty, full), doubts = _pair(experiment, logs, loaded)
+    found = identify_payload(empty, full, body=carrier)
+    name = experiment.robot.joint_names[found.body]
+    content = {
+        "body": name,
+        "mass": found.mass,
+        "centre_of_mass": found.centre_of_mass,
+        "inertia": found.inertia,
+        "estimate": found.estimate,
+        "distance": found.distance,
+    }
+    sources = {"unloaded": logs, "loaded": loaded}
+    rows = [
+        *estimate_rows(INERTIAL_NAMES, INERTIAL_UNITS, found.parameters, found.uncertainty),
+        *estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *found.central),
+    ]
+    covariance = found.uncertainty.covariance
+    files = write_estimates(output, "payload", rows, covariance, content, sources)
+    show(console, found.summary())
+    show_remarks(console, _doubts(doubts))
+    _show_lines(
+        console, "to subtract it from other logs, in the experiment file:", _tool(found, name)
+    )
+    show_files(console, output, [p.name for p in files])
+
+
+def gains(console: Console, path: Path, logs: list[Path], loaded: list[Path], output: Path) -> None:
+    """Find the drives' true forces with a load that is known."""
+    experiment = load_experiment(path)
+    if experiment.load is None:
+        raise InputError(
+            f"{path.name}: the table `[load]` is missing: `mass`, `centre_of_mass` and "
+            "`inertia` of what is on the robot in the logs behind `--loaded`."
+        )
+    (empty, full), doubts = _pair(experiment, logs, loaded)
+    found = identify_drive_gains(empty, full, experiment.load)
+    key, values = _corrected(experiment, np.asarray(found.gains))
+    sources = {"unloaded": logs, "loaded": loaded}
+    names, covariance = found.joint_names, found.uncertainty.covariance
+    rows = estimate_rows(names, ("1",) * len(names), found.gains, found.uncertainty)
+    files = write_estimates(output, "gains", rows, covariance, {key: values}, sources)
+    show(console, found.summary())
+    show_remarks(console, _doubts(doubts))
+    shown = ", ".join(significant(v, 5) for v in values)
+    lines = ["[recording]", f"{key} = [{shown}]"]
+    _show_lines(console, "to use them, in the experiment file:", lines)
+    show_files(console, output, [p.name for p in files])
+
+
+def states(console: Console, path: Path, logs: list[Path], output: Path) -> None:
+    """Fit several states of a robot at once: one inertia, friction for each."""
+    experiment = load_experiment(path)
+    names = [log.resolve().stem for log in logs]
+    if len(set(names)) < max(len(names), 2):
+        raise InputError(
+            f"give one log or report for each of two or more states, with different names: they "
+            f"name the states, but are {', '.join(names)}."
+        )
+    runs, doubts = _runs(experiment, [[log] for log in logs], names)
+    found = identify_states(runs)
+    chance = found.sharing[1]
+    content = {
+        "states": found.states,
+        "shared": [found.base.names[k] for k in found.shared],
+        "varying": [found.base.names[k] for k in found.varying],
+        "sharing_chance": chance,
+    }
+    rows = estimate_rows(found.names, found.units, found.parameters, found.uncertainty)
+    covariance = found.uncertainty.covariance
+    files = write_estimates(output, "states", rows, covariance, content, {"states": logs})
+    if chance < UNLIKELY:
+        doubts.append(
+            "the states do not agree on what they share (chance "
+            f"{100 * chance:.2g} %): something else than friction and offsets differs"
+        )
+    show(console, found.summary())
+    show_remarks(console, _doubts(doubts))
+    for other in names[1:]:
+        comparison = found.compare(names[0], other)
+        show(console, comparison.summary(), comparison.group_summary())
+    show_files(console, output, [p.name for p in files])
+
+
+def _pair(
+    experiment: Experiment, logs: list[Path], loaded: list[Path]
+) -> tuple[list[Fit], list[str]]:
+    twice = {p.resolve() for p in logs} & {p.resolve() for p in loaded}
+    if twice:
+        raise InputError(
+            f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
+        )
+    return _runs(experiment, [logs, loaded], ["unloaded", "loaded"])
+
+
+def _runs(
+    experiment: Experiment, groups: list[list[Path]], names: list[str]
+) -> tuple[list[Fit], list[str]]:
+    """Return a run of the logs and reports of each group, and doubts about the logs."""
+    files = [p for paths in groups for p in paths if not p.is_dir()]
+    choices = len(files) + 1 if experiment.candidates else 0
+    total = 1 + len(groups) + choices + 2 * len(files)
+    with stages(open_console(stderr=True), total) as stage:
+        return read_runs(experiment, groups, names, stage)
+
+
+def _tool(found: Payload, joint: str) -> list[str]:
+    J = found.inertia
+    keys = ("xx", "yy", "zz", "xy", "xz", "yz")
+    entries = (J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2])
+    inertia = ", ".join(f"{k} = {v:.6g}" for k, v in zip(keys, entries, strict=True))
+    return [
+        "[robot.tool]",
+        f'body = "{joint}"',
+        f"mass = {found.mass:.6g}",
+        f"centre_of_mass = [{', '.join(f'{v:.6g}' for v in found.centre_of_mass)}]",
+        f"inertia = {{ {inertia} }}",
+    ]
+
+
+def _corrected(experiment: Experiment, gains: np.ndarray) -> tuple[str, list[float]]:
+    """Return the key of the file that corrects forces, and its values."""
+    columns = experiment.columns
+    if columns is not None and columns.torque_constants is not None:
+        return "torque_constants", (np.array(columns.torque_constants) * gains).tolist()
+    known = 1.0 if columns is None or columns.force_gains is None else columns.force_gains
+    return "force_gains", (np.array(known) * gains).tolist()
+
+
+def _show_lines(console: Console, text: str, lines: list[str]) -> None:
+    console.print()
+    console.print(Text(text, style="dim"))
+    for line in lines:
+        console.print(Text(line), soft_wrap=True)
