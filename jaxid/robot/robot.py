@@ -317,7 +317,7 @@ class Robot(eqx.Module):
             Column("speed\nper s", np.asarray(limits.velocity)),
             Column("accel.\nper s²", np.asarray(limits.acceleration)),
             Column("force", self.known_max_forces),
-            Column("unit", [self.force_unit(j) for j in range(self.joints)]),
+            Column("", [self.force_unit(j) for j in range(self.joints)]),
             facts=facts,
             remarks=self.notes,
         )
