@@ -47,6 +47,7 @@ from jaxid.report.identification import (
     motor_tables,
     residual_table,
 )
+from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import (
     MODEL,
     estimate_rows,
@@ -55,7 +56,6 @@ from jaxid.report.result_files import (
     write_estimates,
     write_report,
 )
-from jaxid.report.page import show, show_files, show_remarks
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.table import Remark, Status, Table, significant
 
