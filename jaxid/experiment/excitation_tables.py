@@ -13,7 +13,6 @@ from jaxid.experiment.decoder import Bounds, Count, Positive, Vector
 from jaxid.experiment.robot_tables import RobotSource, joint_number
 from jaxid.robot.collision import (
     GROUND,
-    AbstractObstacle,
     Box,
     Capsule,
     CollisionModel,
@@ -101,7 +100,7 @@ class Collision:
 
     def _fitted(
         self, source: RobotSource, folder: Path
-    ) -> tuple[list[Capsule], list[AbstractObstacle], list[tuple[str, str]] | None]:
+    ) -> tuple[list[Capsule], list[HalfSpace | Box], list[tuple[str, str]] | None]:
         """Return shapes that the robot's source knows, and their pairs if it knows those too."""
         if source.urdf is not None:
             packages = None if self.packages is None else folder / self.packages

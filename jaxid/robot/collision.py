@@ -18,7 +18,6 @@ from jaxid.robot.kinematics import placements
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.shapes import GROUND as GROUND
-from jaxid.robot.shapes import AbstractObstacle as AbstractObstacle
 from jaxid.robot.shapes import Box as Box
 from jaxid.robot.shapes import Capsule as Capsule
 from jaxid.robot.shapes import HalfSpace as HalfSpace
@@ -51,7 +50,7 @@ class CollisionModel(Hashable):
     """
 
     capsules: tuple[Capsule, ...]
-    obstacles: tuple[AbstractObstacle, ...]
+    obstacles: tuple[HalfSpace | Box, ...]
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
 
@@ -59,7 +58,7 @@ class CollisionModel(Hashable):
         self,
         robot: Robot,
         capsules: Sequence[Capsule],
-        obstacles: Sequence[AbstractObstacle] = (),
+        obstacles: Sequence[HalfSpace | Box] = (),
         pairs: Sequence[tuple[str, str]] | None = None,
     ):
         self.capsules, self.obstacles = tuple(capsules), tuple(obstacles)
@@ -237,7 +236,7 @@ def fit_capsules(
         if body == GROUND:
             R, r = mount @ R, place + mount @ r
         for number, element in enumerate(link.findall("collision"), 1):
-            origin = tree.child(element, "origin")
+            origin = element.find("origin")
             centre = r + R @ tree.numbers(origin, "xyz", _ZERO)
             attitude = R @ rpy_rotation(tree.numbers(origin, "rpy", _ZERO))
             start, end, radius = _enclose_geometry(tree, packages, element)
@@ -308,7 +307,7 @@ def _enclose_geometry(
     tree: UrdfTree, packages: str | Path | None, collision: Any
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the capsule around one geometry, in the frame of the geometry."""
-    geometry = tree.child(collision, "geometry")
+    geometry = collision.find("geometry")
     shape = geometry[0] if geometry is not None and len(geometry) else collision
     if shape.tag == "box":
         return enclose(_CORNERS * tree.numbers(shape, "size", _ZERO))

@@ -74,20 +74,14 @@ class Inertia(eqx.Module):
         return self.tensor[..., (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
 
     def moved(self, rotation: Float[AnyArray, "3 3"], position: Float[AnyArray, "3"]) -> "Inertia":
-        """Return the same body in the frame in which its present frame is placed.
-
-        Args:
-            rotation: Attitude of the present frame in the other.
-            position: Origin of the present frame in the other [m].
-        """
+        """Return the same body in the frame in which its present frame is placed."""
         R = rotation
         return Inertia(self.mass, position + self.centre @ R.T, R @ self.tensor @ R.T)
 
     def fault(self, rounding: float = 1e-9) -> str:
         """Return why this single body cannot exist; an empty text if it can, or if JAX traces it.
 
-        Args:
-            rounding: Error of the moments, as a fraction of the largest, that is not a fault.
+        An error of the moments is no fault up to a fraction `rounding` of the largest.
         """
         if is_traced(self):
             return ""
@@ -115,14 +109,7 @@ class Inertia(eqx.Module):
         return ""
 
     def check(self, owner: str) -> None:
-        """Reject a single body that cannot exist.
-
-        Args:
-            owner: Name of the body as the subject of a sentence, such as "the tool".
-
-        Raises:
-            InputError: If no body has this inertia.
-        """
+        """Raise an error if this single body, the `owner` of a sentence, cannot exist."""
         if reason := self.fault():
             raise InputError(f"{owner} cannot exist: {reason}.")
 

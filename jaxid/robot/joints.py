@@ -193,14 +193,7 @@ def _count(joints: int | None, *values: Numbers | None) -> int:
 def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> Any:
     """Check and copy one number for each joint; JAX arrays are taken as they are.
 
-    Args:
-        name: Name of the values in messages.
-        value: One number for each joint, or None if unknown.
-        joints: Number of joints.
-        unknown: Number in place of None; NaN allows NaN among the values.
-
-    Raises:
-        InputError: If there is not one number for each joint, or one is not a number.
+    `unknown` stands in place of None; if it is NaN, the values may contain NaN.
     """
     if isinstance(value, jax.Array):
         return value

@@ -141,10 +141,7 @@ def inverse_kinematics_along(
     robot: Robot,
     positions: Float[np.ndarray, "poses 3"],
     rotation: Numbers,
-    *,
-    posture: Numbers | None = None,
-    starts: int = 32,
-    seed: int = 0,
+    posture: Numbers | None,
 ) -> Float[np.ndarray, "poses joints"]:
     """Return coordinates along a path of close positions, without a jump [rad or m].
 
@@ -153,7 +150,7 @@ def inverse_kinematics_along(
     Raises:
         InputError: If a pose cannot be reached, or only with a jump or beyond the limits.
     """
-    task, goals = _task(robot, posture, starts, seed), _goals(positions, rotation)
+    task, goals = _task(robot, posture, 32, 0), _goals(positions, rotation)
     count, faults = len(goals), []
     for start in _candidates(task, goals[:1], f"pose 1 of {count}")[:8]:
         q = _follow(task, goals, start)

@@ -5,8 +5,6 @@ root is rounded near zero, so that a distance comes out at most `ROUNDING` too s
 large. Where the closest points are not unique, the derivative is that at one pair of them.
 """
 
-from abc import abstractmethod
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -55,26 +53,7 @@ class Capsule(eqx.Module):
             raise InputError(f"`radius` of capsule `{name}` must be positive [m], not {radius}.")
 
 
-class AbstractObstacle(eqx.Module):
-    """A convex solid in the world.
-
-    Attributes:
-        name: Name of the obstacle in messages.
-    """
-
-    name: eqx.AbstractVar[str]
-
-    @abstractmethod
-    def distance(self, start: Vectors, end: Vectors) -> Lengths:
-        """Return the signed distance between segments and the solid's surface [m].
-
-        Args:
-            start: Ends of the segments, in the frame of the ground [m].
-            end: Other ends of the segments [m].
-        """
-
-
-class HalfSpace(AbstractObstacle):
+class HalfSpace(eqx.Module):
     """The solid on one side of a plane: the floor (z = 0 by default), a wall, a ceiling.
 
     Args:
@@ -100,12 +79,12 @@ class HalfSpace(AbstractObstacle):
         self.name, self.normal, self.height = name, n / length, np.array(height, np.float64)
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
-        """Return the height of the lower end above the plane [m]."""
+        """Return the signed distances of segments from the plane [m]: those of the lower ends."""
         n, start, end = (jnp.asarray(x) for x in (self.normal, start, end))
         return jnp.minimum(start @ n, end @ n) - self.height
 
 
-class Box(AbstractObstacle):
+class Box(eqx.Module):
     """A box in the world.
 
     Args:
@@ -136,7 +115,7 @@ class Box(AbstractObstacle):
             raise InputError(f"`rotation` of box `{name}` is no rotation matrix.")
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
-        """Return the signed distance of the segment's deepest or nearest point [m]."""
+        """Return the signed distances of segments' deepest or nearest points [m]."""
         start, end = jnp.asarray(start), jnp.asarray(end)
         first, along = self._local(start), (end - start) @ jnp.asarray(self.rotation)
         # The distance is convex along the segment. Its minimum is found without derivatives: those

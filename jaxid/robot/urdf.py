@@ -10,7 +10,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from jaxid.arrays import AnyArray, Float, Numbers
 from jaxid.errors import InputError
 from jaxid.robot.inertia import Inertia
-from jaxid.robot.joints import FARTHEST, Limits, far_notes, fast_notes, range_fault
+from jaxid.robot.joints import Limits, far_notes, fast_notes, range_fault
 from jaxid.robot.robot import GRAVITY, Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation, snap_angles, snap_directions
 
@@ -64,22 +64,25 @@ def load_urdf(
     tree = UrdfTree(path, base=base, tip=tip, snap_tolerance=snap_tolerance)
     limits, limit_notes = _limits(tree)
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
-    robot = Robot(
-        tree.name,
-        parent=tuple(tree.parent),
-        revolute=tuple(joint.get("type") in _TURNING for joint in tree.joints),
-        axis=tree.axis,
-        rotation=tree.rotation,
-        offset=tree.offset,
-        joint_names=tuple(joint.get("name") for joint in tree.joints),
-        gravity=gravity,
-        limits=limits,
-        tip_body=tip_body,
-        tip_rotation=tip_rotation,
-        tip_offset=tip_offset,
-        source=tree.path,
-        notes=(*tree.notes, *limit_notes, *_inertial_notes(tree)),
-    )
+    try:
+        robot = Robot(
+            tree.name,
+            parent=tuple(tree.parent),
+            revolute=tuple(joint.get("type") in _TURNING for joint in tree.joints),
+            axis=tree.axis,
+            rotation=tree.rotation,
+            offset=tree.offset,
+            joint_names=tuple(joint.get("name") for joint in tree.joints),
+            gravity=gravity,
+            limits=limits,
+            tip_body=tip_body,
+            tip_rotation=tip_rotation,
+            tip_offset=tip_offset,
+            source=tree.path,
+            notes=(*tree.notes, *limit_notes, *_inertial_notes(tree)),
+        )
+    except InputError as error:
+        raise InputError(f"`{path}`: {error}") from error
     return robot.mounted(base_rotation, base_position)
 
 
@@ -176,10 +179,7 @@ class UrdfTree:
         """Return the elements of a tag by their names."""
         found: dict[str, Any] = {}
         for element in root.iterfind(tag):
-            name = self._attribute(element, "name")
-            if not name.isprintable():
-                raise InputError(f"{self.place(element)}: the name {name!r} must be printable.")
-            if name in found:
+            if (name := self._attribute(element, "name")) in found:
                 raise InputError(f"`{self.path}` has two {tag}s named `{name}`: rename one.")
             found[name] = element
         return found
@@ -188,16 +188,16 @@ class UrdfTree:
         """Enter a joint between the links that it connects."""
         self._attribute(joint, "type")
         for tag in ("parent", "child"):
-            if (end := self.child(joint, tag)) is None:
+            if (end := joint.find(tag)) is None:
                 raise InputError(f"{self.place(joint)}: the joint has no `<{tag}>`.")
             if (link := self._attribute(end, "link")) not in self.links:
-                raise self._error(joint, f"connects link `{link}`, which the file does not define")
-        parent, child = (joint.find(tag).get("link") for tag in ("parent", "child"))
+                raise self.error(joint, f"connects link `{link}`, which the file does not define")
+        parent, child = _ends(joint)
         if child in self._above:
-            raise self._error(
+            raise self.error(
                 joint,
                 f"moves link `{child}`, which joint `{self._above[child].get('name')}` moves as "
-                "well; closed loops are not supported, so open the loop by removing one of the two",
+                "well: open the closed loop by removing one of the two",
             )
         self._above[child] = joint
         self._below[parent].append(joint)
@@ -212,10 +212,10 @@ class UrdfTree:
             )
         reached = list(roots)
         for link in reached:
-            reached += [joint.find("child").get("link") for joint in self._below[link]]
+            reached += [_ends(joint)[1] for joint in self._below[link]]
         for link in self.links:
             if link not in reached:
-                raise self._error(
+                raise self.error(
                     self._above[link],
                     f"is part of a closed loop: no path leads from a root link to `{link}`; "
                     "remove one joint of the loop",
@@ -235,7 +235,7 @@ class UrdfTree:
             name, fixed = joint.get("name"), joint.get("type") == "fixed"
             if not fixed and chain is not None and joint not in chain:
                 continue
-            parent, child = (joint.find(tag).get("link") for tag in ("parent", "child"))
+            parent, child = _ends(joint)
             rotation, offset = self._origin(joint, tolerance)
             body, R, r = self.carriers[parent]
             r = r + R @ offset
@@ -269,52 +269,43 @@ class UrdfTree:
                     f"`{self.path}`: no chain leads from `base` `{base}` to `tip` `{tip}`."
                 )
             joints.append(self._above[link])
-            link = joints[-1].find("parent").get("link")
+            link, _ = _ends(joints[-1])
         return joints
 
     def _origin(self, joint: Any, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         """Return attitude and origin of a joint in its parent link."""
-        element = self.child(joint, "origin")
-        offset, rpy = (self.numbers(element, key, _ZERO) for key in ("xyz", "rpy"))
-        for key, values, largest, unit in (
-            ("xyz", offset, FARTHEST, "lengths in a URDF are in metres"),
-            ("rpy", rpy, _LARGEST_ANGLE, "angles in a URDF are in radians, not degrees"),
-        ):
-            if np.abs(values).max() > largest:
-                raise self._error(
-                    joint, f'has `{key}="{_words(values)}"`, which is too large: {unit}'
-                )
+        offset, rpy = (self.numbers(joint.find("origin"), key, _ZERO) for key in ("xyz", "rpy"))
+        if np.abs(rpy).max() > _LARGEST_ANGLE:
+            raise self.error(joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees")
         snapped, notes = snap_angles(joint.get("name"), ("roll", "pitch", "yaw"), rpy, tolerance)
         self.notes += notes
         return rpy_rotation(snapped), offset
 
     def _axis(self, joint: Any, tolerance: float) -> np.ndarray:
         """Return the unit vector of a moving joint's axis."""
-        kind, mimic = joint.get("type"), self.child(joint, "mimic")
-        cure = "choose `tip` (or `base`) so that the chain avoids it, or make it fixed"
-        if kind not in (*_TURNING, "prismatic"):
-            usable = "only revolute, continuous and prismatic joints can be used"
-            raise self._error(joint, f"is {kind}, but {usable}: {cure}")
-        if mimic is not None:
-            other = mimic.get("joint")
-            raise self._error(
-                joint, f"mimics joint `{other}`, but every joint must move freely: {cure}"
+        kind, mimic = joint.get("type"), joint.find("mimic")
+        if kind not in (*_TURNING, "prismatic") or mimic is not None:
+            fault = f"is {kind}" if mimic is None else f"mimics joint `{mimic.get('joint')}`"
+            raise self.error(
+                joint,
+                f"{fault}, but only free revolute, continuous and prismatic joints can be used: "
+                "choose `tip` (or `base`) so that the chain avoids it, or make it fixed",
             )
-        axis = self.numbers(self.child(joint, "axis"), "xyz", (1.0, 0.0, 0.0))
+        axis = self.numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
         length = np.linalg.norm(axis)
         if length < 1e-9:
-            raise self._error(joint, "has the zero vector as its axis: give it a direction")
+            raise self.error(joint, "has the zero vector as its axis: give it a direction")
         snapped, notes = snap_directions(joint.get("name"), "axis", axis / length, tolerance)
         self.notes += notes
         return snapped
 
     def inertial(self, link: str) -> tuple[Inertia, str] | None:
         """Return a link's inertia in its own frame, and why no body has it; None if it has none."""
-        element = self.child(self.links[link], "inertial")
+        element = self.links[link].find("inertial")
         if element is None:
             return None
-        origin, moments = self.child(element, "origin"), self.child(element, "inertia")
-        (mass,) = self.numbers(self.child(element, "mass"), "value", (0.0,))
+        origin, moments = element.find("origin"), element.find("inertia")
+        (mass,) = self.numbers(element.find("mass"), "value", (0.0,))
         rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
         tensor = np.array([[self.numbers(moments, key, (0.0,))[0] for key in row] for row in rows])
         xyz, rpy = (self.numbers(origin, key, _ZERO) for key in ("xyz", "rpy"))
@@ -328,7 +319,8 @@ class UrdfTree:
         """Return file and line of an element, for messages."""
         return f"`{self.path}`, line {element.sourceline}"
 
-    def _error(self, joint: Any, complaint: str) -> InputError:
+    def error(self, joint: Any, complaint: str) -> InputError:
+        """Return an error about a joint: one sentence that names the file and the joint."""
         return InputError(f"`{self.path}`: joint `{joint.get('name')}` {complaint}.")
 
     def _attribute(self, element: Any, key: str) -> str:
@@ -336,24 +328,10 @@ class UrdfTree:
             raise InputError(f"{self.place(element)}: `<{element.tag}>` needs the attribute {key}.")
         return element.get(key)
 
-    def child(self, element: Any, tag: str) -> Any:
-        """Return the only child element of a name, or None."""
-        found = element.findall(tag)
-        if len(found) > 1:
-            raise InputError(
-                f"{self.place(found[1])}: `<{element.tag}>` has a second `<{tag}>`, but only one "
-                "is allowed."
-            )
-        return found[0] if found else None
-
     def numbers(
         self, element: Any, key: str, default: tuple[float, ...], *, infinite: bool = False
     ) -> np.ndarray:
-        """Return the numbers of an attribute, or the default where the element lacks it.
-
-        Raises:
-            InputError: If one is not finite, or there are too few or too many.
-        """
+        """Return the numbers of an attribute, or the default where the element lacks it."""
         text = None if element is None else element.get(key)
         if text is None:
             return np.array(default)
@@ -371,7 +349,12 @@ class UrdfTree:
 
     def limit(self, joint: Any, key: str, unknown: float) -> float:
         """Return a number of a joint's `<limit>`, which may be infinite."""
-        return float(self.numbers(self.child(joint, "limit"), key, (unknown,), infinite=True)[0])
+        return float(self.numbers(joint.find("limit"), key, (unknown,), infinite=True)[0])
+
+
+def _ends(joint: Any) -> tuple[str, str]:
+    """Return the names of the links that a joint connects: parent and child."""
+    return joint.find("parent").get("link"), joint.find("child").get("link")
 
 
 def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
@@ -410,12 +393,9 @@ def _range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
         return -np.inf, np.inf
     if fault := range_fault(low, high, turns):
         unit = "radians, not degrees" if turns else "metres"
-        raise tree._error(joint, f"{fault}: limits in a URDF are in {unit}")
+        raise tree.error(joint, f"{fault}: limits in a URDF are in {unit}")
     if low >= high and (low, high) != (0.0, 0.0):
-        raise tree._error(
-            joint,
-            f"ranges from {low:g} to {high:g}, but the lower end must be below the upper one",
-        )
+        raise tree.error(joint, f"ranges from {low:g} to {high:g}: exchange the ends")
     return low, high
 
 
@@ -441,6 +421,7 @@ def _read_xml(path: str | Path) -> Any:
     """Return the root element of a URDF file."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"the URDF file `{path}` does not exist: check its path.")
+    # No entity of a file makes the parser read other files.
     parser = etree.XMLParser(
         resolve_entities=False, no_network=True, load_dtd=False, remove_comments=True
     )
@@ -449,11 +430,6 @@ def _read_xml(path: str | Path) -> Any:
     except etree.XMLSyntaxError as error:
         line = error.lineno or 1
         raise InputError(f"`{path}`, line {line}: this is not XML ({error.msg}).") from error
-    if document.docinfo.doctype or document.docinfo.internalDTD is not None:
-        raise InputError(
-            f"`{path}` has a DOCTYPE, which a URDF does not need and which could make a parser "
-            "read other files: remove it."
-        )
     robot = document.getroot()
     if any("ros.org/" in str(e.tag) and "xacro" in str(e.tag) for e in robot.iter()):
         raise InputError(

@@ -131,14 +131,6 @@ class RestToRestBasis(AbstractBasis):
         """Return equidistant times over one period [s]."""
         return self.series.times(samples)
 
-    def nearest(self, series: LinearTrajectory) -> LinearTrajectory:
-        """Return the trajectory between standstills with the least change of the coefficients.
-
-        Args:
-            series: Trajectory of a `FourierBasis` with as many harmonics.
-        """
-        return self.trajectory(series.coefficients @ self.directions)
-
 
 def _check_series(harmonics: int, omega: AnyArray | float, least: int) -> None:
     if harmonics < least:
@@ -173,7 +165,6 @@ def random_fourier_series(
     harmonics: int = 5,
     reach: float = 0.95,
     seed: int = 0,
-    points: int = 512,
 ) -> LinearTrajectory:
     """Draw a Fourier series that uses the limits of every joint: a start for designs and tests.
 
@@ -187,13 +178,12 @@ def random_fourier_series(
         harmonics: Number of harmonics.
         reach: Fraction of every limit that may be used, from 0 to 1.
         seed: Seed of the coefficients and offsets.
-        points: Points of a period at which the peaks are measured.
 
     Raises:
         InputError: If `omega` or `harmonics` is not positive, or `reach` not between 0 and 1.
     """
-    if not 1 <= harmonics <= points // 8:
-        raise InputError(f"`harmonics` must be from 1 to {points // 8}, but is {harmonics}.")
+    if not 1 <= harmonics <= 64:
+        raise InputError(f"`harmonics` must be from 1 to 64, but is {harmonics}.")
     if not 0 < reach <= 1:
         raise InputError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
     basis, limits = FourierBasis(harmonics, omega), complete_limits(robot)
@@ -203,7 +193,7 @@ def random_fourier_series(
     random = np.random.default_rng(seed)
     a, b = random.standard_normal((2, robot.joints, harmonics)) / np.arange(1, harmonics + 1)
     x = np.concatenate([np.zeros((robot.joints, 1)), a, b], axis=1)
-    rows, factor = basis.envelope(points)
+    rows, factor = basis.envelope(512)
     q, qd, qdd = (x @ part.T for part in rows[:3])
     middle, swing = 0.5 * (q.max(1) + q.min(1)), 0.5 * factor * np.ptp(q, axis=1)
     scale = np.min(

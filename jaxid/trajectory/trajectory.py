@@ -85,15 +85,13 @@ class Segments(AbstractTrajectory):
 
     Attributes:
         members: Trajectories in the order in which they are run.
-        largest_jump: Largest jump of coordinates, velocities or accelerations where two members
-            meet, in the joint's unit and its rates [rad or m, per s, per s²].
 
     Raises:
-        InputError: If there is no member, or one does not start as the one before it ends.
+        InputError: If there is no member, or one does not start as the one before it ends: with the
+            same coordinates, velocities and accelerations, up to 1e-6.
     """
 
     members: tuple[AbstractTrajectory, ...] = eqx.field(converter=tuple)
-    largest_jump: float = eqx.field(static=True, default=1e-6)
 
     def __check_init__(self):
         if not self.members:
@@ -109,11 +107,11 @@ class Segments(AbstractTrajectory):
                 )
             for name, field in (("coordinate", "q"), ("velocity", "qd"), ("acceleration", "qdd")):
                 jump = np.abs(np.subtract(getattr(start, field), getattr(end, field)))
-                if jump.max() > self.largest_jump:
+                if jump.max() > 1e-6:
                     raise InputError(
                         f"the {name} of joint {int(jump.argmax()) + 1} jumps by {jump.max():.3g} "
                         f"between `members` {k} and {k + 1}: start the second as the first ends, "
-                        "put a spline between them, or raise `largest_jump`."
+                        "or put a spline between them."
                     )
 
     @property
@@ -235,19 +233,14 @@ class AbstractBasis(eqx.Module):
         """
         return self.times(points)
 
-    def retimings(
-        self, shifts: int = 40, tolerance: float = 1e-9
-    ) -> Float[np.ndarray, "retimings variables variables"]:
+    def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:
         """Return maps to the coefficients of the same motion begun later or run backwards.
 
-        Only maps that stay in the family are returned: a periodic motion may begin at any time, a
-        motion between standstills may run backwards. The first map changes nothing. All of them
-        keep the limits of the joint.
-
-        Args:
-            shifts: Number of equidistant times at which the motion may begin.
-            tolerance: Largest relative deviation from the shifted motion.
+        Only maps that stay in the family are returned: a periodic motion may begin at any of 40
+        times, a motion between standstills may run backwards. The first map changes nothing. All of
+        them keep the limits of the joint.
         """
+        shifts, tolerance = 40, 1e-9
         part = -(-4 * self.variables // shifts)
         step = float(self.duration) / (shifts * part)
         rows = np.asarray(self.rows((np.arange(shifts * part) + 0.5) * step)[0])

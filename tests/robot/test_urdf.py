@@ -10,7 +10,7 @@ from forward_kinematics import (
     random_configuration,
     tip_transform,
 )
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from urdf_text import arm, inertial, joint, link, numbers, robot
@@ -25,23 +25,16 @@ FOLDER = Path(str(distribution("example-robot-data").locate_file(SHARE)))
 TREES = {
     "six axes": "ur_description/urdf/ur10_robot.urdf",
     "six continuous axes": "kinova_description/robots/kinova.urdf",
-    "seven axes": "xarm_description/urdf/xarm7.urdf",
     "an arm with a gripper": "z1_description/urdf/z1.urdf",
-    "a printed arm": "so_arm_description/urdf/so101.urdf",
     "a mobile manipulator": "tiago_description/robots/tiago_no_hand.urdf",
-    "two arms and two hands": "tiago_description/robots/tiago_dual.urdf",
     "a humanoid": "talos_data/robots/talos_reduced.urdf",
-    "another humanoid": "g1_description/urdf/g1_29dof_rev_1_0.urdf",
     "oblique axes": "icub_description/robots/icub.urdf",
     "a dog with an arm": "anymal_b_simple_description/robots/anymal-kinova.urdf",
     "wheels and arms": "centauro_description/urdf/centauro.urdf",
-    "a pendulum": "double_pendulum_description/urdf/double_pendulum_continuous.urdf",
 }
 CHAINS = {
     "panda": ("panda_description/urdf/panda.urdf", None, "panda_hand"),
     "baxter": ("baxter_description/urdf/baxter.urdf", "torso", "left_gripper_base_link"),
-    "pr2": ("pr2_description/urdf/pr2.urdf", None, "l_gripper_tool_frame"),
-    "talos": ("talos_data/robots/talos_full_v2.urdf", "torso_2_link", "wrist_right_ft_tool_link"),
     "ur5": ("ur_description/urdf/ur5_robot.urdf", None, "tool0"),
 }
 
@@ -83,26 +76,20 @@ class Oracle:
 
 
 @pytest.mark.parametrize("file", TREES.values(), ids=TREES.keys())
-def test_real_trees_agree_with_pinocchio(file):
+def test_real_trees_agree_with_pinocchio_and_snapping_moves_them_little(file):
     path, oracle = FOLDER / file, Oracle(FOLDER / file)
     ours = load_urdf(path, snap_tolerance=0.0)
     assert sorted(ours.joint_names) == sorted(oracle.model.names[1:])
-    for seed in range(2):
-        q = random_configuration(ours, seed)
-        oracle.set(ours.joint_names, q)
-        expected = np.array([oracle.joint(name) for name in ours.joint_names])
-        np.testing.assert_allclose(body_transforms(ours, q), expected, atol=1e-10)
+    snapped = load_urdf(path)
+    q = random_configuration(ours, 0)
+    oracle.set(ours.joint_names, q)
+    expected = np.array([oracle.joint(name) for name in ours.joint_names])
+    np.testing.assert_allclose(body_transforms(ours, q), expected, atol=1e-10)
+    moved = np.abs(body_transforms(snapped, q) - expected).max()
+    assert moved <= 1e-4 * (1 + len(snapped.notes))
     p = urdf_parameters(path, snap_tolerance=0.0, check=False).reshape(-1, 10)
     expected = [oracle.parameters(name) for name in ours.joint_names]
     np.testing.assert_allclose(p, expected, rtol=1e-9, atol=1e-10)
-
-
-@pytest.mark.parametrize("file", TREES.values(), ids=TREES.keys())
-def test_snapping_moves_a_real_robot_by_less_than_it_says(file):
-    exact, snapped = (load_urdf(FOLDER / file, snap_tolerance=tol) for tol in (0.0, 1e-4))
-    q = random_configuration(exact, 0)
-    moved = np.abs(body_transforms(exact, q) - body_transforms(snapped, q)).max()
-    assert moved <= 1e-4 * (1 + len(snapped.notes))
 
 
 @pytest.mark.parametrize(("file", "base", "tip"), CHAINS.values(), ids=CHAINS.keys())
@@ -174,6 +161,7 @@ def _place(T):
     return {"rpy": numbers(_rpy(T)), "xyz": numbers(T[:3, 3])}
 
 
+@settings(max_examples=15)
 @given(small)
 def test_fixed_joints_in_between_change_nothing(tmp_path_factory, seed):
     folder = tmp_path_factory.mktemp("trees")
@@ -184,19 +172,12 @@ def test_fixed_joints_in_between_change_nothing(tmp_path_factory, seed):
     assert split.joint_names == plain.joint_names
     assert split.parent == plain.parent
     assert split.revolute == plain.revolute
+    assert all(p < i for i, p in enumerate(plain.parent))
+    np.testing.assert_allclose(np.linalg.norm(plain.axis, axis=1), 1.0, atol=1e-15)
     for field in ("axis", "rotation", "offset"):
         np.testing.assert_allclose(getattr(split, field), getattr(plain, field), atol=1e-12)
     p = [urdf_parameters(path, snap_tolerance=0.0, check=False) for path in paths]
     np.testing.assert_allclose(p[1], p[0], atol=1e-11)
-
-
-@given(small)
-def test_every_axis_is_a_unit_vector_and_parents_come_first(tmp_path_factory, seed):
-    path = tmp_path_factory.mktemp("tree") / "tree.urdf"
-    path.write_text(_tree(np.random.default_rng(seed), False))
-    loaded = load_urdf(path)
-    np.testing.assert_allclose(np.linalg.norm(loaded.axis, axis=1), 1.0, atol=1e-15)
-    assert all(p < i for i, p in enumerate(loaded.parent))
 
 
 # Snapping.
@@ -226,12 +207,6 @@ def test_a_rounded_quarter_turn_costs_no_base_parameter(write):
     )
     assert not [n for n in load_urdf(rounded, snap_tolerance=0.0).notes if "snapped" in n]
     assert not [n for n in load_urdf(exact).notes if "snapped" in n]
-
-
-@pytest.mark.parametrize(("angle", "tolerance"), [("1.5708", 1e-4), ("1.57", 1e-3)])
-def test_a_roll_snaps_beside_an_oblique_yaw(write, angle, tolerance):
-    loaded = load_urdf(write(arm(rpy=f"{angle} 0 0.3")), snap_tolerance=tolerance)
-    assert loaded.rotation[0][2].tolist() == [0.0, 1.0, 0.0]
 
 
 def test_axes_and_sums_of_turns_snap(write):
@@ -266,14 +241,12 @@ def _branches():
 
 
 def test_joints_come_depth_first_in_the_order_of_the_file(write):
-    loaded = load_urdf(write(_branches()))
+    loaded = load_urdf(write(_branches()), gravity=(0.0, 0.0, -1.62))
     assert loaded.joint_names == ("jc", "ja", "jb")
     assert loaded.parent == (-1, -1, 1)
     assert loaded.revolute == (False, True, True)
-
-
-def test_without_tip_the_end_effector_ends_the_longest_chain(write):
-    loaded = load_urdf(write(_branches()))
+    assert loaded.gravity.tolist() == [0.0, 0.0, -1.62]
+    # Without `tip` the end-effector ends the longest chain.
     assert loaded.tip_body == 2
     assert loaded.tip_offset.tolist() == [0.5, 0.0, 0.25]
 
@@ -286,19 +259,6 @@ def test_tip_and_base_cut_out_a_chain(write):
     below = load_urdf(path, base="a")
     assert below.joint_names == ("jb",)
     assert below.offset.tolist() == [[1.0, 0.0, 0.0]]
-
-
-def test_base_placement_and_gravity_are_the_users(write):
-    path = write(_branches())
-    base = from_rpy([0.2, 0.1, -1.0], [1.0, 2.0, 3.0])
-    mounted = load_urdf(
-        path, base_rotation=base[:3, :3], base_position=base[:3, 3], gravity=(0.0, 0.0, -1.62)
-    )
-    q = np.array([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(
-        tip_transform(mounted, q), base @ tip_transform(load_urdf(path), q), atol=1e-14
-    )
-    assert mounted.gravity.tolist() == [0.0, 0.0, -1.62]
 
 
 def test_parameters_of_a_chain_hold_what_is_fixed_to_it_and_no_more(write):
@@ -342,11 +302,12 @@ def test_limits(write, kind, limit, expected):
 
 def test_limits_taken_as_unknown_are_noted(write):
     zeros = '<limit lower="0" upper="0" velocity="0" effort="-1"/>'
-    assert load_urdf(write(arm(inner=zeros))).notes[:3] == (
-        "joint `j1`: a range from 0 to 0 is taken as unknown.",
-        "joint `j1`: velocity 0 is taken as unknown.",
-        "joint `j1`: effort -1 is taken as unknown.",
-    )
+    notes = load_urdf(write(arm(inner=zeros))).notes[:3]
+    assert [note.split("`: ")[1].split(" is taken")[0] for note in notes] == [
+        "a range from 0 to 0",
+        "velocity 0",
+        "effort -1",
+    ]
 
 
 def test_the_axis_is_x_where_the_file_has_none(write):
