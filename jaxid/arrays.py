@@ -31,14 +31,7 @@ Numbers = AnyArray | Sequence[Any] | float | int
 
 
 def require_float64(what: str) -> None:
-    """Reject single precision.
-
-    Args:
-        what: The task that needs double precision, as it reads in a sentence.
-
-    Raises:
-        RuntimeError: If JAX's 64-bit mode is off.
-    """
+    """Raise an error if JAX runs in single precision, which `what` (a task) cannot use."""
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             f"{what} needs float64, but JAX runs in float32: call "
@@ -57,11 +50,7 @@ def double_precision() -> AbstractContextManager:
 
 
 def as_array(name: str, value: Numbers) -> AnyArray:
-    """Return an array as it is, and anything else as a NumPy array of float64.
-
-    Raises:
-        InputError: If it does not consist of numbers, or its rows are not equally long.
-    """
+    """Return an array as it is, and anything else, which must be numbers, in NumPy's float64."""
     if isinstance(value, AnyArray):
         return value
     try:
@@ -76,11 +65,7 @@ def one_or_each(value: Any) -> Any:
 
 
 def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | float:
-    """Check one number for all joints, or one for each of those that move with `qd`.
-
-    Raises:
-        InputError: If there are more or fewer than joints.
-    """
+    """Check one number for all joints, or one for each of those that move with `qd`."""
     shape = np.shape(value)
     if shape and shape != qd.shape[-1:]:
         raise InputError(
@@ -110,8 +95,8 @@ def content(tree: Any) -> tuple:
 class Hashable(eqx.Module):
     """Module with NumPy arrays whose methods `jax.jit` takes as they are.
 
-    JAX looks functions up by their hash, also a bound method such as `model.regressor`, and arrays
-    have none. Here the hash is of the numbers.
+    JAX looks a bound method such as `model.regressor` up by the hash of the module, and arrays have
+    none. Here the hash is of the numbers.
     """
 
     def __hash__(self) -> int:

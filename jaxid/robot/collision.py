@@ -63,7 +63,13 @@ class CollisionModel(Hashable):
     ):
         self.capsules, self.obstacles = tuple(capsules), tuple(obstacles)
         names, notes = [shape.name for shape in (*capsules, *obstacles)], []
-        _check_shapes(robot, names, capsules)
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"two shapes are named `{name}`: rename one.")
+        for c in capsules:
+            if not GROUND <= c.body < robot.joints:
+                bodies = f"from 0 to {robot.joints - 1}, or -1 for the ground"
+                raise InputError(f"`body` of capsule `{c.name}` must be {bodies}, but is {c.body}.")
         if pairs is None:
             pairs, together = [], list(_meeting_pairs(robot, capsules, names))
             if together:
@@ -87,12 +93,7 @@ class CollisionModel(Hashable):
         return tuple(f"{shapes[i].name} and {shapes[k].name}" for i, k in self.pairs)
 
     def ends(self, robot: Robot, q: Float[AnyArray, " joints"]) -> Float[Array, "capsules 2 3"]:
-        """Return the ends of all capsules' axes in the frame of the ground [m], for one pose.
-
-        Args:
-            robot: Robot whose bodies carry the capsules.
-            q: Joint coordinates [rad or m].
-        """
+        """Return the ends of all capsules' axes in the frame of the ground [m], for one pose."""
         rotations, origins = placements(robot, q)
         rows = []
         for c in self.capsules:
@@ -105,11 +106,7 @@ class CollisionModel(Hashable):
     def clearances(
         self, ends: Float[AnyArray, "*batch capsules 2 3"]
     ) -> Float[Array, "*batch pairs"]:
-        """Return the distance between the surfaces of every pair, negative where they overlap [m].
-
-        Args:
-            ends: Ends of all axes in the frame of the ground [m].
-        """
+        """Return the clearances [m] for given ends of all axes on the ground [m]."""
         ends, count = jnp.asarray(ends), len(self.capsules)
         start, end = ends[..., 0, :], ends[..., 1, :]
         radii = jnp.stack([jnp.asarray(c.radius) for c in self.capsules])
@@ -164,18 +161,6 @@ def _meeting_pairs(robot: Robot, capsules: Sequence[Capsule], names: list[str]) 
         apart = bodies[i] != bodies[k] and parents[i] != bodies[k] and parents[k] != bodies[i]
         if i < len(capsules) and apart:
             yield names[i], names[k]
-
-
-def _check_shapes(robot: Robot, names: list[str], capsules: Sequence[Capsule]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"two shapes are named `{name}`: rename one.")
-    for c in capsules:
-        if not GROUND <= c.body < robot.joints:
-            raise InputError(
-                f"`body` of capsule `{c.name}` must be from 0 to {robot.joints - 1}, or -1 for the "
-                f"ground, but is {c.body}."
-            )
 
 
 def _indices(names: list[str], capsules: int, pair: tuple[str, str]) -> tuple[int, int]:
@@ -354,10 +339,9 @@ def _mesh_file(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> Path:
         folders = [path.parent, *path.absolute().parents]
     if packages is not None:
         folders = [Path(packages)]
-    for folder in folders:
-        for file in files:
-            if (folder / file).is_file():
-                return folder / file
+    for folder, file in itertools.product(folders, files):
+        if (folder / file).is_file():
+            return folder / file
     raise FileNotFoundError(
         f"{tree.place(mesh)}: the mesh `{name}` does not exist; give by `packages` the folder that "
         "holds its package."

@@ -141,7 +141,7 @@ def inverse_kinematics_along(
     robot: Robot,
     positions: Float[np.ndarray, "poses 3"],
     rotation: Numbers,
-    posture: Numbers | None,
+    posture: Numbers | None = None,
 ) -> Float[np.ndarray, "poses joints"]:
     """Return coordinates along a path of close positions, without a jump [rad or m].
 

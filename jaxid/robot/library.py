@@ -4,13 +4,15 @@ In the library `source` holds the origin of the numbers, `limits.assumed` and `n
 nobody published. Limits that are not listed are infinite, drives are direct.
 """
 
+from typing import Any
+
 import numpy as np
 
 from jaxid.arrays import Numbers
 from jaxid.errors import InputError
 from jaxid.robot.collision import GROUND, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.joints import Drives, Limits
-from jaxid.robot.robot import GRAVITY, Robot, Tool
+from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE, axis_rotation, snap_angles
 
 _HALF = np.pi / 2
@@ -29,13 +31,9 @@ def from_dh(
     base_position: Numbers = (0.0, 0.0, 0.0),
     tip_rotation: Numbers | None = None,
     tip_offset: Numbers = (0.0, 0.0, 0.0),
-    gravity: Numbers = GRAVITY,
-    limits: Limits | None = None,
-    drives: Drives | None = None,
-    tool: Tool | None = None,
     snap_tolerance: float = SNAP_TOLERANCE,
-    source: str = "",
     notes: tuple[str, ...] = (),
+    **fields: Any,
 ) -> Robot:
     r"""Build a serial robot from one row (alpha, a, d) or (alpha, a, d, theta) for each joint.
 
@@ -60,13 +58,9 @@ def from_dh(
         base_position: Origin of that frame on the ground [m].
         tip_rotation: Attitude of the end-effector in the last frame of the table.
         tip_offset: Origin of the end-effector in the last frame of the table [m].
-        gravity: Acceleration of gravity in the frame of the ground [m/s²].
-        limits: Joint limits; infinite if None.
-        drives: Motors and gears; direct drives if None.
-        tool: Known load, in the frame of its body.
         snap_tolerance: Angles this close to a multiple of 90 degrees become exact [rad]; 0 is off.
-        source: Origin of the numbers.
         notes: Changes and assumptions that were made, one sentence each.
+        fields: Further arguments of `Robot`: `gravity`, `limits`, `drives`, `tool`, `source`.
 
     Raises:
         InputError: If the convention has another name, or the table has the wrong shape.
@@ -109,14 +103,10 @@ def from_dh(
         rotation=rotation,
         offset=offset,
         joint_names=joint_names,
-        gravity=gravity,
-        limits=limits,
-        drives=drives,
-        tool=tool,
         tip_rotation=R @ end,
         tip_offset=r + R @ np.asarray(tip_offset, dtype=np.float64),
-        source=source,
         notes=notes,
+        **fields,
     )
     return robot.mounted(base_rotation, base_position)
 
@@ -359,15 +349,9 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
     Raises:
         InputError: If there is no joint, or the lengths do not fit.
     """
-    lengths = np.array(length, dtype=np.float64)
-    if joints < 1:
-        raise InputError(f"`joints` must be at least 1, but is {joints}.")
-    if lengths.shape not in ((), (joints,)):
-        raise InputError(
-            f"`length` must be one length or one for each joint ({joints}), but has shape "
-            f"{lengths.shape}."
-        )
-    lengths = np.broadcast_to(lengths, (joints,))
+    if joints < 1 or np.shape(length) not in ((), (joints,)):
+        raise InputError("`joints` must be at least 1, and `length` one number or one for each.")
+    lengths = np.broadcast_to(np.array(length, dtype=np.float64), (joints,))
     ends = np.outer(lengths, _X)
     return Robot(
         f"planar arm, {joints} joints",

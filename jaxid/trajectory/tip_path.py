@@ -137,11 +137,7 @@ class TipPath(eqx.Module):
         return float(sum(piece.length for piece in self.pieces))
 
     def positions(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
-        """Return positions of the end-effector [m]; it stands still before and after the path.
-
-        Args:
-            t: Times [s].
-        """
+        """Return positions of the end-effector [m] at times [s]; it stands still outside."""
         t = np.asarray(t)
         starts = np.concatenate([[0.0], np.cumsum(self.durations)[:-1]])
         piece = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(starts) - 1)

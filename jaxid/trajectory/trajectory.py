@@ -34,11 +34,7 @@ class AbstractTrajectory(Hashable):
 
     @abstractmethod
     def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """Return the motion at one time or at many.
-
-        Args:
-            t: Times [s].
-        """
+        """Return the motion at one time or at many [s]."""
 
     @property
     def joints(self) -> int:
@@ -46,11 +42,7 @@ class AbstractTrajectory(Hashable):
         return jax.eval_shape(lambda: self.motion(0.0)).q.shape[-1]
 
     def jerk(self, t: Float[AnyArray, "*batch"] | float | int) -> Float[Array, "*batch joints"]:
-        """Return the rate of change of the accelerations [rad/s³ or m/s³].
-
-        Args:
-            t: Times [s].
-        """
+        """Return the rate of change of the accelerations [rad/s³ or m/s³] at times [s]."""
         return _jerk(self, jnp.asarray(t, float))
 
     def sample(self, sample_time: float) -> tuple[Float[np.ndarray, " samples"], Motion]:
@@ -187,10 +179,9 @@ class AbstractBasis(eqx.Module):
 
     @abstractmethod
     def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
-        """Return position, velocity, acceleration and jerk of every function.
+        """Return position, velocity, acceleration and jerk of every function at times [s].
 
-        Args:
-            t: Times [s]; NumPy arrays give NumPy arrays.
+        Times in NumPy give rows in NumPy.
         """
 
     @abstractmethod
@@ -205,11 +196,7 @@ class AbstractBasis(eqx.Module):
         """
 
     def trajectory(self, x: Float[AnyArray, "joints variables"]) -> "LinearTrajectory":
-        """Return the trajectory with these coefficients.
-
-        Args:
-            x: Coefficients, one row for each joint.
-        """
+        """Return the trajectory with these coefficients, one row for each joint."""
         return LinearTrajectory(self, x)
 
     @property
@@ -218,19 +205,11 @@ class AbstractBasis(eqx.Module):
         return self.rows(np.zeros(1)).shape[2]
 
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
-        """Return equidistant times at which a run is measured, without their end [s].
-
-        Args:
-            samples: Number of times.
-        """
+        """Return equidistant times at which a run is measured, without their end [s]."""
         return np.arange(samples) * (float(self.duration) / samples)
 
     def instants(self, points: int) -> Float[np.ndarray, " points"]:
-        """Return equidistant times over the whole motion, for limits that hold throughout [s].
-
-        Args:
-            points: Number of times.
-        """
+        """Return equidistant times over the whole motion, for limits that hold throughout [s]."""
         return self.times(points)
 
     def retimings(self) -> Float[np.ndarray, "retimings variables variables"]:

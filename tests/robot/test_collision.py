@@ -94,17 +94,6 @@ def coal_distance(first, second):
     return coal.distance(*first, *second, request, result)
 
 
-def test_capsules_agree_with_coal():
-    ends, radii = segments(4, 60), (0.05, 0.1)
-    found = np.asarray(segment_distance(*ends)) - sum(radii)
-    for k in range(60):
-        first = coal_capsule(ends[0, k], ends[1, k], radii[0])
-        second = coal_capsule(ends[2, k], ends[3, k], radii[1])
-        expected = coal_distance(first, second)
-        if expected > 1e-3:  # deep overlaps are coal's own approximation
-            assert found[k] == pytest.approx(expected, abs=3e-6)
-
-
 def a_box():
     R = library.tx90l_on_rail().rotation[2]
     turn = np.array([[np.cos(0.4), -np.sin(0.4), 0], [np.sin(0.4), np.cos(0.4), 0], [0, 0, 1]])
@@ -167,23 +156,14 @@ def test_capsules_of_the_rail_robot_lie_along_its_links():
     np.testing.assert_allclose(upright["wrist"][:, 2], [1.528, 1.828], atol=1e-12)
     gap = upright["forearm"][0] - upright["upper arm"][1]
     assert np.linalg.norm(gap) <= 0.051
-    clearance = dict(
-        zip(model.pair_names, np.asarray(model.clearance(robot, np.zeros(7))), strict=True)
-    )
+    # A batch of poses: upright, and folded down, where the forearm meets the ground.
+    q = np.zeros((2, 1, 7))
+    q[1, 0, 2] = 2.3
+    gaps = np.asarray(model.clearance(robot, q))
+    assert gaps[1, 0].min() < 0
+    clearance = dict(zip(model.pair_names, gaps[0, 0], strict=True))
     assert clearance["forearm and ground"] == pytest.approx(0.978 - 0.12, abs=1e-5)
     assert min(clearance.values()) == pytest.approx(0.2227, abs=1e-3)
-    # Folded down: the forearm meets the ground.
-    q = np.zeros(7)
-    q[2] = 2.3
-    assert model.clearance(robot, q).min() < 0
-
-
-def test_clearances_of_many_poses_are_those_of_each():
-    robot, model = library.tx90l_on_rail(), library.tx90l_on_rail_collision()
-    q = np.stack([random_configuration(robot, seed) for seed in range(6)]).reshape(2, 3, 7)
-    many = model.clearance(robot, q)
-    assert many.shape == (2, 3, len(model.pair_names))
-    np.testing.assert_allclose(many[1, 2], model.clearance(robot, q[1, 2]), atol=1e-12)
 
 
 def test_pairs_are_found_where_none_are_named():

@@ -1,7 +1,5 @@
 """Little URDF files as text."""
 
-ONE = (1.0, 0.0, 0.0)
-
 
 def numbers(values):
     return " ".join(repr(float(v)) for v in values)

@@ -13,10 +13,9 @@ PERIODIC = FourierBasis(5, 0.8)
 BETWEEN_RESTS = (
     RestToRestBasis(4, 0.9),
     RestToRestSplineBasis(9, 5.0),
-    LeadsBasis(3, 1.1, lead=0.4),
-    LeadsBasis(5, 0.8, lead=0.4, periods=2),
+    LeadsBasis(3, 0.8, lead=0.4, periods=2),
 )
-BASES = (PERIODIC, FourierBasis(1, 3.0), *BETWEEN_RESTS)
+BASES = (PERIODIC, *BETWEEN_RESTS)
 
 
 @pytest.fixture(params=BASES, ids=lambda basis: type(basis).__name__)
@@ -47,10 +46,10 @@ def test_the_trajectory_is_the_rows_times_the_coefficients(basis):
         np.testing.assert_allclose(rows @ x.T, values, atol=1e-10 * np.abs(values).max())
 
 
-@pytest.mark.parametrize("points", [16, 64, 512])
+@pytest.mark.parametrize("points", [16, 512])
 def test_envelopes_bound_the_motion_at_all_times_and_get_tight(basis, points):
     rows, factor = basis.envelope(points)
-    fine = basis.rows(basis.instants(20_000))
+    fine = basis.rows(basis.instants(5_000))
     for seed in range(5):
         x = coefficients(basis, 1, seed)[0]
         for k in range(4):
@@ -84,7 +83,7 @@ def test_a_periodic_motion_begins_later_or_runs_backwards():
         np.testing.assert_allclose(backwards, turned, atol=1e-9)
 
 
-@pytest.mark.parametrize("basis", BETWEEN_RESTS[:3], ids=lambda basis: type(basis).__name__)
+@pytest.mark.parametrize("basis", BETWEEN_RESTS[:2], ids=lambda basis: type(basis).__name__)
 def test_a_motion_between_standstills_only_runs_backwards(basis):
     maps, x = basis.retimings(), coefficients(basis)
     t = np.linspace(0.0, basis.duration, 41)
@@ -106,40 +105,28 @@ def test_a_fourier_series_is_the_papers_sum():
     np.testing.assert_allclose(fourier_series(offset, a, b, 0.8).motion(t).q, expected, atol=1e-14)
 
 
-def test_gradients_by_coefficients_and_frequency():
-    random, t, k = np.random.default_rng(3), 2.1, np.arange(1, 5)
+def test_the_gradient_by_the_frequency():
+    random = np.random.default_rng(3)
     offset, (a, b) = random.standard_normal(3), random.standard_normal((2, 3, 4))
 
-    def total(offset, a, b, omega):
-        return jnp.sum(fourier_series(offset, a, b, omega).motion(t).q)
+    def total(omega):
+        return jnp.sum(fourier_series(offset, a, b, omega).motion(2.1).q)
 
-    arguments = (*map(jnp.asarray, (offset, a, b)), jnp.asarray(0.8))
-    g = jax.grad(total, argnums=(0, 1, 2, 3))(*arguments)
-    w = 0.8 * k
-    np.testing.assert_array_equal(g[0], np.ones(3))
-    np.testing.assert_allclose(g[1], np.tile(np.sin(w * t) / w, (3, 1)), atol=1e-14)
-    np.testing.assert_allclose(g[2], np.tile(-np.cos(w * t) / w, (3, 1)), atol=1e-14)
     h = 1e-6
-    slope = (total(offset, a, b, 0.8 + h) - total(offset, a, b, 0.8 - h)) / (2 * h)
-    assert float(g[3]) == pytest.approx(float(slope), rel=1e-6)
+    slope = (total(0.8 + h) - total(0.8 - h)) / (2 * h)
+    assert float(jax.grad(total)(jnp.asarray(0.8))) == pytest.approx(float(slope), rel=1e-6)
 
 
-def test_the_nearest_motion_between_rests():
-    random = np.random.default_rng(1)
-    series = PERIODIC.trajectory(random.standard_normal((7, 11)))
-    basis = RestToRestBasis(5, 0.8, periods=2)
-    nearest = basis.nearest(series)
-    Z, order = basis.directions, np.arange(1.0, 6.0)
+def test_directions_keep_both_conditions_of_rest():
+    Z, order = RestToRestBasis(5, 0.8).directions, np.arange(1.0, 6.0)
     assert Z.shape == (11, 9)
     np.testing.assert_allclose(Z.T @ Z, np.eye(9), atol=1e-14)
-    x = nearest.coefficients @ Z.T
-    np.testing.assert_allclose(x[:, 1:6].sum(axis=1), 0.0, atol=1e-14)
-    np.testing.assert_allclose(x[:, 6:] @ order, 0.0, atol=1e-14)
-    np.testing.assert_allclose((series.coefficients - x) @ Z, 0.0, atol=1e-14)
+    np.testing.assert_allclose(Z[1:6].sum(axis=0), 0.0, atol=1e-14)
+    np.testing.assert_allclose(order @ Z[6:], 0.0, atol=1e-14)
 
 
 def test_leads_are_checked_and_one_period_between_them_is_measured():
-    basis = BETWEEN_RESTS[3]
+    basis = BETWEEN_RESTS[2]
     times, instants = basis.times(50), basis.instants(200)
     assert times[0] == pytest.approx(0.4)
     assert times[-1] < 0.4 + basis.series.duration

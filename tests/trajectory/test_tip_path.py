@@ -7,7 +7,7 @@ import pytest
 from jaxid.excitation.constraints import tip_motion
 from jaxid.robot import library
 from jaxid.robot.kinematics import tip_placement
-from jaxid.trajectory.tip_path import Line, TipPath, iso9283_path, joint_path
+from jaxid.trajectory.tip_path import iso9283_path, joint_path
 
 ROBOT = library.tx90l_on_rail()
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -30,16 +30,6 @@ def test_the_path_lies_on_one_inclined_plane_within_the_cube():
     radii = [piece.radius for piece in PATH.pieces if np.isfinite(piece.radius)]
     assert radii == pytest.approx([0.2, 0.02])
     np.testing.assert_allclose(places[0], places[-1], atol=1e-12)
-
-
-def test_rounds_are_run_without_a_stop():
-    twice = iso9283_path([0.0, 0.65, 0.65], 0.5, DOWN, acceleration=3.0, rounds=2)
-    assert twice.length == pytest.approx(PATH.length + 2 * np.pi * 0.22)
-    begin, end = np.cumsum([0.0, *twice.durations])[8:10]
-    t = np.linspace(begin, end, 400)
-    speed = np.linalg.norm(np.diff(twice.positions(t), axis=0), axis=1) / np.diff(t)
-    # A quintic from rest to rest over both rounds: a quarter through, 9/16 of its largest speed.
-    assert speed[100:300].min() == pytest.approx(9 / 16 * speed.max(), rel=0.01)
 
 
 def test_speed_and_acceleration_of_the_tip_stay_within_what_was_asked(followed):
@@ -69,22 +59,3 @@ def test_the_attitude_is_held_and_the_joints_stay_within_their_limits(followed):
     # Round the elbow's singular pose, which is the middle of the ranges, the same path is too fast.
     with pytest.raises(ValueError, match=r"joint `\w+` would need .* times its largest"):
         joint_path(ROBOT, PATH, spacing=0.05)
-
-
-@pytest.mark.parametrize(
-    ("make", "named"),
-    [
-        (lambda: iso9283_path([0.0, 0.0, 0.0], 0.0, DOWN), "edge"),
-        (lambda: iso9283_path([0.0, 0.0], 1.0, DOWN), "centre"),
-        (lambda: iso9283_path([0.0, 0.0, 0.0], 1.0, DOWN, leans_along=2), "leans_along"),
-        (lambda: iso9283_path([0.0, 0.0, 0.0], 1.0, DOWN, speed=0.0), "speed"),
-        (lambda: iso9283_path([0.0, 0.0, 0.0], 1.0, DOWN, rounds=0), "rounds"),
-        (lambda: TipPath((), DOWN), "pieces"),
-        (lambda: TipPath((PATH.pieces[0], PATH.pieces[2]), DOWN), "piece 2 of `pieces`"),
-        (lambda: TipPath((Line(np.zeros(3), np.zeros(3)),), DOWN), "piece 1 of `pieces`"),
-        (lambda: joint_path(ROBOT, PATH, spacing=0.0), "spacing"),
-    ],
-)
-def test_refuses(make, named):
-    with pytest.raises(ValueError, match=named):
-        make()
