@@ -47,14 +47,14 @@ from jaxid.identification.uncertainty.blocks import bootstrap as bootstrap
 from jaxid.measurement import filters as filters
 from jaxid.measurement import units as units
 from jaxid.measurement.columns import Columns as Columns
-from jaxid.measurement.decimation import Decimation as Decimation
-from jaxid.measurement.decimation import Subsample as Subsample
+from jaxid.measurement.filters import Decimation as Decimation
+from jaxid.measurement.filters import Subsample as Subsample
 from jaxid.measurement.filters import ZeroPhaseButterworth as ZeroPhaseButterworth
-from jaxid.measurement.log_on_disk import scan_log as scan_log
 from jaxid.measurement.observations import Observations as Observations
 from jaxid.measurement.observations import observe as observe
+from jaxid.measurement.reading import read_recording as read_recording
+from jaxid.measurement.reading import scan_log as scan_log
 from jaxid.measurement.recording import Recording as Recording
-from jaxid.measurement.recording import read_recording as read_recording
 from jaxid.program.cache import keep_compiled as keep_compiled
 from jaxid.robot import collision as collision
 from jaxid.robot import library as robots  # noqa: F401

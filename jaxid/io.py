@@ -1,4 +1,4 @@
-"""Atomic writes, safe reading of JSON and NPZ files, and modules as JSON values.
+"""Atomic writes, safe reading of JSON, and modules as JSON values.
 
 A module becomes an object with the name of its class under `kind` and one entry for each field; an
 array becomes an object with its dtype as the only key. Numbers are exact to the last bit. Only
@@ -17,37 +17,26 @@ import shutil
 import types
 import typing
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 
 _DTYPES = ("float64", "float32", "int64", "int32", "bool")
-_NOT_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in UTF-8, whole or not at all.
-
-    Args:
-        path: Path of the file; missing folders above it are made.
-        text: Content of the file.
-    """
+    """Write a text file in UTF-8, whole or not at all."""
     write_bytes(path, text.encode())
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file, whole or not at all.
-
-    Args:
-        path: Path of the file; missing folders above it are made.
-        data: Content of the file.
+    """Write a file, whole or not at all; missing folders above it are made.
 
     Raises:
         OSError: If nothing can be written there.
@@ -87,10 +76,7 @@ def atomic_folder(
 
 
 def require_writable(folder: str | Path) -> None:
-    """Check that files can be written to a folder, before long work begins.
-
-    Args:
-        folder: Folder of the files; it need not exist yet.
+    """Check that files can be written to a folder, which need not exist, before long work begins.
 
     Raises:
         OSError: If nothing can be written there.
@@ -135,11 +121,7 @@ def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
 
 
 def read_json(path: str | Path, hook: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
-    """Read a JSON file.
-
-    Args:
-        path: Path of the file.
-        hook: Function that makes an object of its key-value pairs; a dict if None.
+    """Read a JSON file; `hook` makes objects of key-value pairs, dictionaries if None.
 
     Raises:
         OSError: If the file cannot be read.
@@ -149,40 +131,12 @@ def read_json(path: str | Path, hook: Callable[[list[tuple[str, Any]]], Any] | N
         return json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=hook)
     except RecursionError as error:
         raise InputError("its brackets are nested too deeply") from error
-    except InputError:
-        raise
     except ValueError as error:
         raise InputError(str(error)) from error
 
 
-def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an NPZ file; objects, which could run code, are rejected.
-
-    Args:
-        path: Path of the file.
-
-    Raises:
-        OSError: If the file cannot be opened.
-        InputError: If it is no archive of plain arrays, or is damaged.
-    """
-    with Path(path).open("rb") as file:
-        try:
-            with np.load(file, allow_pickle=False) as archive:
-                members = {name: archive[name] for name in archive.files}
-        except AttributeError as error:
-            raise InputError("it is one array, not an archive of them") from error
-        except Exception as error:  # some ten kinds: it depends on which bytes are damaged
-            raise InputError(" ".join(str(error).split()) or type(error).__name__) from error
-    # A member that NumPy did not write comes as bytes.
-    return {name: x for name, x in members.items() if isinstance(x, np.ndarray)}
-
-
 def json_text(content: dict[str, Any]) -> str:
-    """Return the text of a JSON file that programs read exactly and people can read.
-
-    Args:
-        content: Strings, finite numbers, lists and objects.
-    """
+    """Return the text of a JSON file that programs read exactly and people can read."""
     text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     # A list of numbers or texts stands on one line. Texts hold no line breaks, so none is touched.
     return re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text) + "\n"
@@ -206,8 +160,14 @@ def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
         return {"member": f"{type(value).__name__}.{value.name}"}
     if isinstance(value, np.generic):
         return to_json(value.item())
-    if isinstance(value, AnyArray):
-        return _array_to_json(value)
+    if isinstance(value, AnyArray) and getattr(value, "is_fully_addressable", True):
+        array = np.asarray(value)
+        name, entries = array.dtype.name, array.tolist()
+        if name not in _DTYPES:
+            raise InputError(f"a document cannot hold an array of {name}.")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            entries = _name_infinities(entries)
+        return {name: entries} if array.size else {name: [], "shape": list(array.shape)}
     if isinstance(value, float):
         return value if math.isfinite(value) else {"float": repr(value)}
     if isinstance(value, tuple | list) and not hasattr(value, "_fields"):
@@ -217,19 +177,6 @@ def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
         entries = {f.name: to_json(getattr(value, f.name), refused) for f in fields}
         return {"kind": type(value).__name__, **entries}
     raise InputError(f"a document cannot hold {value!r:.60}.")
-
-
-def _array_to_json(value: AnyArray) -> Any:
-    if isinstance(value, jax.Array) and not value.is_fully_addressable:
-        raise InputError("a document cannot hold an array that is spread over processes.")
-    array = np.asarray(value)
-    name = array.dtype.name
-    if name not in _DTYPES:
-        raise InputError(f"a document cannot hold an array of {name}.")
-    entries = array.tolist()
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        entries = _name_infinities(entries)
-    return {name: entries} if array.size else {name: [], "shape": list(array.shape)}
 
 
 def _name_infinities(entries: Any) -> Any:
@@ -249,15 +196,15 @@ def from_json(value: Any, hint: Any, place: str = "") -> Any:
     Raises:
         InputError: If the values do not fit; the message names the place.
     """
+    options = union_members(hint)
     if isinstance(value, dict):
-        result = _object_from_json(value, hint, place)
+        result = _object_from_json(value, options, place)
     elif isinstance(value, list):
-        hints = _element_hints(hint, len(value))
+        hints = _element_hints(options, len(value))
         pairs = enumerate(zip(value, hints, strict=True))
         result = tuple(from_json(x, h, f"{place}[{k}]") for k, (x, h) in pairs)
     else:
         result = value
-    options = union_members(hint)
     if not any(_fits(result, o) for o in options) and isinstance(result, float | np.ndarray):
         # A number and an array without axes are the same.
         result = np.array(result) if isinstance(result, float) else result[()]
@@ -266,62 +213,47 @@ def from_json(value: Any, hint: Any, place: str = "") -> Any:
     return result
 
 
-def _object_from_json(value: dict[str, Any], hint: Any, place: str) -> Any:
+def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:
     if "kind" in value:
-        return _module_from_json(value, hint, place)
-    if set(value) == {"float"}:
-        return _infinity(value["float"], place)
-    if set(value) == {"member"}:
-        return _enum_member(str(value["member"]), hint, place)
+        return _module_from_json(value, options, place)
     names = set(value) - {"shape"}
-    if len(names) != 1 or not names <= set(_DTYPES):
+    if len(names) != 1 or not names <= {*_DTYPES, "float", "member"}:
         raise InputError(f"`{place}` has the keys {', '.join(sorted(map(str, value)))}")
     (name,) = names
+    entries, shape = value[name], value.get("shape")
+    if name == "float":
+        return _number_from_json(entries, float, place)
+    if name == "member":
+        enums = [o for o in options if isinstance(o, type) and issubclass(o, enum.Enum)]
+        for member in (member for option in enums for member in option):
+            if entries == f"{type(member).__name__}.{member.name}":
+                return member
+        raise InputError(f"`{place}` names `{entries}`, which is not known")
+    exact = {"f": float, "i": int, "b": bool}[np.dtype(name).kind]
     try:
-        return _array_from_json(value[name], name, value.get("shape"), place)
-    except (TypeError, OverflowError) as error:
+        if shape is not None:
+            return np.zeros(tuple(shape), name)
+        return np.array(_number_from_json(entries, exact, place), name)
+    except InputError:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"`{place}` is no array of {name}") from error
 
 
-def _enum_member(value: str, hint: Any, place: str) -> enum.Enum:
-    family, _, member = value.partition(".")
-    for option in union_members(hint):
-        if not isinstance(option, type) or not issubclass(option, enum.Enum):
-            continue
-        if family == option.__name__ and member in option.__members__:
-            return option[member]
-    raise InputError(f"`{place}` names `{value}`, which is not known")
+def _number_from_json(entry: Any, kind: type, place: str) -> Any:
+    """Return a number of one type, or nested lists of them; infinities are named."""
+    if isinstance(entry, list):
+        return [_number_from_json(x, kind, place) for x in entry]
+    if kind is float and entry in ("inf", "-inf", "nan"):
+        return float(entry)
+    if type(entry) is not kind:
+        raise InputError(f"`{place}` holds {entry!r:.30} in an array of {kind.__name__}")
+    return entry
 
 
-def _array_from_json(entries: Any, name: str, shape: Any, place: str) -> np.ndarray:
-    if shape is not None:
-        return np.zeros(tuple(shape), name)
-    exact = {"f": float, "i": int, "b": bool}[np.dtype(name).kind]
-
-    def leaf(x: Any) -> Any:
-        if isinstance(x, list):
-            return [leaf(y) for y in x]
-        x = _infinity(x, place) if isinstance(x, str) and exact is float else x
-        if type(x) is not exact:
-            raise InputError(f"`{place}` holds {x!r:.30} in an array of {name}")
-        return x
-
-    checked = leaf(entries)
-    try:
-        return np.array(checked, name)
-    except ValueError as error:
-        raise InputError(f"`{place}` has rows of different lengths") from error
-
-
-def _infinity(word: Any, place: str) -> float:
-    if word not in _NOT_FINITE:
-        raise InputError(f"`{place}` holds {word!r:.30} in the place of a number")
-    return _NOT_FINITE[word]
-
-
-def _module_from_json(value: dict[str, Any], hint: Any, place: str) -> Any:
+def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:
     kind = value["kind"]
-    families = [o for o in union_members(hint) if isinstance(o, type) and issubclass(o, eqx.Module)]
+    families = [o for o in options if isinstance(o, type) and issubclass(o, eqx.Module)]
     named = [c for family in families for c in _subclasses(family) if c.__name__ == kind]
     # Of classes of one name the last one counts; not a twin that Equinox derives for its own ends.
     named = [c for c in named if not any(b in named for b in c.__mro__[1:])]
@@ -331,24 +263,17 @@ def _module_from_json(value: dict[str, Any], hint: Any, place: str) -> Any:
             "defines it, or use a newer version of jaxid"
         )
     fields = {f.name: f for f in dataclasses.fields(named[-1]) if f.init}
-    unknown = [key for key in value if key != "kind" and key not in fields]
-    missing = [f for f in fields.values() if f.name not in value and _is_required(f)]
-    if unknown or missing:
-        complaint = (
-            f"has an unknown key `{unknown[0]}`" if unknown else f"lacks `{missing[0].name}`"
-        )
-        raise InputError(f"`{place or kind}` ({kind}) {complaint}")
-    entries = {
-        name: from_json(value[name], field.type, f"{place}.{name}".strip("."))
-        for name, field in fields.items()
-        if name in value
-    }
-    return named[-1](**entries)
-
-
-def _is_required(field: dataclasses.Field) -> bool:
+    for name in value:
+        if name != "kind" and name not in fields:
+            raise InputError(f"`{place or kind}` ({kind}) has an unknown key `{name}`")
     absent = dataclasses.MISSING
-    return field.default is absent and field.default_factory is absent
+    entries = {}
+    for name, field in fields.items():
+        if name in value:
+            entries[name] = from_json(value[name], field.type, f"{place}.{name}".strip("."))
+        elif field.default is absent and field.default_factory is absent:
+            raise InputError(f"`{place or kind}` ({kind}) lacks `{name}`")
+    return named[-1](**entries)
 
 
 def _subclasses(family: type) -> list[type]:
@@ -357,19 +282,15 @@ def _subclasses(family: type) -> list[type]:
 
 
 def union_members(hint: Any) -> tuple[Any, ...]:
-    """Return the members of a union, or the annotation itself if it is none.
-
-    Args:
-        hint: Annotation of a field or argument.
-    """
+    """Return the members of a union, or the annotation itself if it is none."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         return tuple(o for x in typing.get_args(hint) for o in union_members(x))
     return (hint,)
 
 
-def _element_hints(hint: Any, length: int) -> tuple[Any, ...]:
+def _element_hints(options: Sequence[Any], length: int) -> tuple[Any, ...]:
     """Return the annotations of the elements of a tuple."""
-    for option in union_members(hint):
+    for option in options:
         if typing.get_origin(option) is tuple:
             arguments = typing.get_args(option)
             if len(arguments) == 2 and arguments[1] is Ellipsis:

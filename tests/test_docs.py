@@ -18,7 +18,7 @@ import polars as pl
 import pytest
 
 import jaxid as jid
-from jaxid.diagnosis.mislabelled import BAD, SURE
+from jaxid.diagnosis.diagnosis import BAD, SURE
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.decoder import check_tables, decode
 from jaxid.experiment.experiment import TABLES

@@ -276,10 +276,10 @@ forces_side = "joint"
     assert columns.angles == ("a", "b")
     assert columns.forces == (3, 4)
     assert columns.sample_time == 0.004
-    np.testing.assert_allclose(columns.angle_scale(2), [np.pi / 180, -np.pi / 180])
-    np.testing.assert_allclose(columns.velocity_scale(2), [np.pi / 30, -np.pi / 30])
-    np.testing.assert_allclose(columns.force_scale(2), [-0.5, 0.6e-3])
-    np.testing.assert_allclose(columns.angle_shift(2), [0.1, 0.0])
+    angles, velocities, forces = columns.to_si(np.ones((1, 2)), np.ones((1, 2)), np.ones((1, 2)))
+    np.testing.assert_allclose(angles[0], [np.pi / 180 + 0.1, -np.pi / 180])
+    np.testing.assert_allclose(velocities[0], [np.pi / 30, -np.pi / 30])
+    np.testing.assert_allclose(forces[0], [-0.5, 0.6e-3])
     assert columns.angles_on_motor_side
     assert not columns.forces_on_motor_side
 

@@ -1,6 +1,5 @@
 """Work of the commands for an experiment and its logs, and what they print."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -79,20 +78,13 @@ def inspect(console: Console, path: Path, logs: list[Path]) -> None:
             through = stage.through(recording.samples)
             fit = estimate(experiment.base, observations, experiment.estimation.plain, through)
             stage(f"looking for mistakes in {log.name}")
-            findings = dict.fromkeys((*diagnosis.findings, *diagnosis.fit_findings(fit)))
-            diagnosis = dataclasses.replace(diagnosis, findings=tuple(findings))
-            examined.append((recording, diagnosis, fit))
+            examined.append((diagnosis.with_fit(fit), fit))
     robot = experiment.robot
     show(console, robot.summary(), *motor_tables(robot), experiment.base.summary())
     show_remarks(console, experiment.notes)
-    for log, diagnosis, fit in examined:
-        facts = [
-            ("samples", f"{log.samples} at {significant(1 / log.sample_time, 4)} Hz"),
-            ("duration", f"{significant(log.duration, 4)} s"),
-            ("gaps", str(len(log.segments) - 1 or "none")),
-        ]
-        remarks = [*map(Remark, log.notes), *fit.determination]
-        show(console, diagnosis.summary(), Table("", facts=[*facts, *fit.facts], remarks=remarks))
+    for diagnosis, fit in examined:
+        table = Table("", facts=fit.facts, remarks=fit.determination)
+        show(console, diagnosis.summary(), table)
 
 
 def check_logs(logs: list[Path], verify: list[Path], split: float | None) -> None:

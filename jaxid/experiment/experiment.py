@@ -39,14 +39,12 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.nonlinear_friction import identify_nonlinear
 from jaxid.identification.problem import RegressionProblem
-from jaxid.measurement.chunked_files import estimated_rows
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.decimation import AbstractDecimation
-from jaxid.measurement.filters import AbstractFilter
-from jaxid.measurement.log_on_disk import scan_log
+from jaxid.measurement.filters import AbstractDecimation, AbstractFilter
+from jaxid.measurement.log_files import estimated_rows
 from jaxid.measurement.observations import Observations, Progress, observe
-from jaxid.measurement.recording import Recording, read_recording, remove_delay
-from jaxid.measurement.timestamps import NeedsMemory
+from jaxid.measurement.reading import read_recording, scan_log
+from jaxid.measurement.recording import NeedsMemory, Recording, remove_delay
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot, Tool
 

@@ -34,11 +34,13 @@ from jaxid.experiment.decoder import (
     within,
 )
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.decimation import AbstractDecimation, Decimation, Subsample
 from jaxid.measurement.filters import (
+    AbstractDecimation,
     AbstractFilter,
+    Decimation,
     PaperFilter,
     PeriodicFourier,
+    Subsample,
     ZeroPhaseButterworth,
 )
 from jaxid.measurement.units import Unit

@@ -11,8 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from jaxid.diagnosis import Diagnosis, diagnose
-from jaxid.diagnosis.diagnosis import mistakes_in_logs
-from jaxid.diagnosis.mislabelled import BAD
+from jaxid.diagnosis.diagnosis import BAD, mistakes_in_logs
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
@@ -25,8 +24,7 @@ from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.observations import Progress as Callback
-from jaxid.measurement.recording import Recording
-from jaxid.measurement.timestamps import NeedsMemory
+from jaxid.measurement.recording import NeedsMemory, Recording
 from jaxid.report.identification import solution_name
 from jaxid.report.result_files import MODEL, Alternative
 from jaxid.validation import Validation, comparison_step, torque_errors, validate

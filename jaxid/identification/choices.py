@@ -17,8 +17,12 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem, cross_validation_folds
 from jaxid.identification.uncertainty import AbstractUncertainty
-from jaxid.measurement.decimation import AbstractDecimation, Subsample
-from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth
+from jaxid.measurement.filters import (
+    AbstractDecimation,
+    AbstractFilter,
+    Subsample,
+    ZeroPhaseButterworth,
+)
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.recording import Recording
 

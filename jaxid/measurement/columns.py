@@ -1,25 +1,28 @@
-"""Meaning and units of the columns of a log."""
+"""Meaning and units of the columns of a log, and logs in SI units."""
 
-from collections.abc import Iterable
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.measurement import units
+from jaxid.measurement.log_files import LogTable, Selection, open_table
 from jaxid.measurement.units import Quantity, Unit
 from jaxid.robot.joints import per_joint
 
-Selection = str | int | tuple[str | int, ...]
-"""A name, a pattern with `{}` for the joint's number, a position from 0, or several."""
+Units = Unit | tuple[Unit, ...]
+"""One unit for all joints, or one for each."""
+PerJoint = tuple[float, ...] | None
+"""One number for each joint, or the default for all."""
 
 
-def _selection(value: Selection | range | list) -> Selection:
-    return value if isinstance(value, str | int) else tuple(value)
-
-
-def _optional_selection(value: Selection | range | list | None) -> Selection | None:
-    return None if value is None else _selection(value)
+def _selection(value: Selection | range | list | None) -> Any:
+    return value if value is None or isinstance(value, str | int) else tuple(value)
 
 
 def _numbers(value: Iterable[float | int] | np.ndarray | None) -> tuple[float, ...] | None:
@@ -30,12 +33,8 @@ def _number(value: float | int | None) -> float | None:
     return None if value is None else float(value)
 
 
-def _units(value: Unit | Iterable[Unit]) -> Unit | tuple[Unit, ...]:
-    return value if isinstance(value, Unit) else tuple(value)
-
-
-def _optional_units(value: Unit | Iterable[Unit] | None) -> Unit | tuple[Unit, ...] | None:
-    return None if value is None else _units(value)
+def _units(value: Unit | Iterable[Unit] | None) -> Any:
+    return value if value is None or isinstance(value, Unit) else tuple(value)
 
 
 class Columns(eqx.Module):
@@ -72,28 +71,18 @@ class Columns(eqx.Module):
 
     angles: Selection = eqx.field(static=True, converter=_selection)
     forces: Selection = eqx.field(static=True, converter=_selection)
-    velocities: Selection | None = eqx.field(
-        static=True, converter=_optional_selection, default=None
-    )
+    velocities: Selection | None = eqx.field(static=True, converter=_selection, default=None)
     time: str | int | None = eqx.field(static=True, default=None)
     sample_time: float | None = eqx.field(static=True, converter=_number, default=None)
     time_unit: Unit = eqx.field(static=True, default=units.S)
-    angle_unit: Unit | tuple[Unit, ...] = eqx.field(
-        static=True, converter=_units, default=units.RAD
-    )
-    velocity_unit: Unit | tuple[Unit, ...] | None = eqx.field(
-        static=True, converter=_optional_units, default=None
-    )
-    force_unit: Unit | tuple[Unit, ...] = eqx.field(static=True, converter=_units, default=units.NM)
-    torque_constants: tuple[float, ...] | None = eqx.field(
-        static=True, converter=_numbers, default=None
-    )
-    angle_signs: tuple[float, ...] | None = eqx.field(static=True, converter=_numbers, default=None)
-    force_signs: tuple[float, ...] | None = eqx.field(static=True, converter=_numbers, default=None)
-    angle_offsets: tuple[float, ...] | None = eqx.field(
-        static=True, converter=_numbers, default=None
-    )
-    force_gains: tuple[float, ...] | None = eqx.field(static=True, converter=_numbers, default=None)
+    angle_unit: Units = eqx.field(static=True, converter=_units, default=units.RAD)
+    velocity_unit: Units | None = eqx.field(static=True, converter=_units, default=None)
+    force_unit: Units = eqx.field(static=True, converter=_units, default=units.NM)
+    torque_constants: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
+    angle_signs: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
+    force_signs: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
+    angle_offsets: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
+    force_gains: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
     angles_on_motor_side: bool = eqx.field(static=True, default=False)
     forces_on_motor_side: bool = eqx.field(static=True, default=False)
 
@@ -107,32 +96,14 @@ class Columns(eqx.Module):
             )
         if self.sample_time is not None and not 0 < self.sample_time < np.inf:
             raise InputError(f"`sample_time` must be positive [s], but is {self.sample_time:g}.")
-        for name, given, allowed in (
-            ("time_unit", self.time_unit, (Quantity.TIME,)),
-            ("angle_unit", self.angle_unit, (Quantity.COORDINATE,)),
-            ("velocity_unit", self.velocity_unit, (Quantity.VELOCITY,)),
-            ("force_unit", self.force_unit, (Quantity.FORCE, Quantity.CURRENT)),
-        ):
-            for one in _each(given):
-                if one.quantity not in allowed:
-                    raise InputError(
-                        f"`{name}` must measure {' or '.join(q.value for q in allowed)}, "
-                        f"but `{one.symbol}` measures {one.quantity.value}."
-                    )
-        for name in ("angle_signs", "force_signs"):
-            signs = getattr(self, name)
-            if signs is not None and any(abs(s) != 1 for s in signs):
-                raise InputError(f"`{name}` must be +1 or -1 for each joint, but is {signs}.")
-        constants = self.torque_constants
-        if constants is not None and not all(c != 0 and np.isfinite(c) for c in constants):
-            raise InputError(
-                "`torque_constants` must be numbers other than zero [N m/A], but are "
-                f"{', '.join(f'{c:g}' for c in constants)}."
-            )
-        if self.force_gains is not None and not all(0 < g < np.inf for g in self.force_gains):
-            raise InputError(
-                f"`force_gains` must be positive for each joint, but is {self.force_gains}."
-            )
+        self._require_unit("time_unit", Quantity.TIME)
+        self._require_unit("angle_unit", Quantity.COORDINATE)
+        self._require_unit("velocity_unit", Quantity.VELOCITY)
+        self._require_unit("force_unit", Quantity.FORCE, Quantity.CURRENT)
+        self._require("angle_signs", lambda s: abs(s) == 1, "+1 or -1")
+        self._require("force_signs", lambda s: abs(s) == 1, "+1 or -1")
+        self._require("force_gains", lambda g: 0 < g < np.inf, "positive")
+        self._require("torque_constants", lambda c: c != 0 and np.isfinite(c), "finite, not zero")
         current = any(u.quantity is Quantity.CURRENT for u in _each(self.force_unit))
         if current != (self.torque_constants is not None):
             raise InputError(
@@ -140,43 +111,114 @@ class Columns(eqx.Module):
                 "then: " + ("add them." if current else "leave them out or set `force_unit`.")
             )
 
-    def angle_scale(self, joints: int) -> np.ndarray:
-        """Return the factors from the numbers in the log to angles [rad or m]."""
-        signs = _per_joint("angle_signs", self.angle_signs, joints, 1.0)
-        return signs * _factors("angle_unit", self.angle_unit, joints)
+    def _require_unit(self, name: str, *allowed: Quantity) -> None:
+        for one in _each(getattr(self, name)):
+            if one.quantity not in allowed:
+                raise InputError(
+                    f"`{name}` must measure {' or '.join(q.value for q in allowed)}, "
+                    f"but `{one.symbol}` measures {one.quantity.value}."
+                )
 
-    def angle_shift(self, joints: int) -> np.ndarray:
-        """Return the offsets of the angles [rad or m]."""
-        return _per_joint("angle_offsets", self.angle_offsets, joints, 0.0)
+    def _require(self, name: str, rule: Callable[[float], Any], words: str) -> None:
+        values = getattr(self, name) or ()
+        if not all(map(rule, values)):
+            shown = ", ".join(f"{x:g}" for x in values)
+            raise InputError(f"`{name}` must be {words} for each joint, but is {shown}.")
 
-    def velocity_scale(self, joints: int) -> np.ndarray:
-        """Return the factors from the numbers in the log to velocities [rad/s or m/s]."""
-        if self.velocity_unit is None:
-            return self.angle_scale(joints)
-        signs = _per_joint("angle_signs", self.angle_signs, joints, 1.0)
-        return signs * _factors("velocity_unit", self.velocity_unit, joints)
+    def to_si(
+        self, angles: np.ndarray, velocities: np.ndarray | None, forces: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """Convert the numbers of a log to SI units (samples x joints)."""
 
-    def force_scale(self, joints: int) -> np.ndarray:
-        """Return the factors from the numbers in the log to forces [N m or N]."""
-        scale = _factors("force_unit", self.force_unit, joints)
-        scale = scale * _per_joint("force_signs", self.force_signs, joints, 1.0)
-        scale = scale * _per_joint("force_gains", self.force_gains, joints, 1.0)
-        return scale * _per_joint("torque_constants", self.torque_constants, joints, 1.0)
+        def each(name: str, default: float = 1.0) -> np.ndarray:
+            value = getattr(self, name)
+            if isinstance(value, Unit):
+                return np.full(angles.shape[1], value.factor)
+            if name.endswith("unit"):
+                value = tuple(one.factor for one in value)
+            return per_joint(name, value, angles.shape[1], default)
 
-
-def _each(given: Unit | tuple[Unit, ...] | None) -> tuple[Unit, ...]:
-    if given is None:
-        return ()
-    return (given,) if isinstance(given, Unit) else given
-
-
-def _factors(name: str, given: Unit | tuple[Unit, ...], joints: int) -> np.ndarray:
-    if isinstance(given, Unit):
-        return np.full(joints, given.factor)
-    return _per_joint(name, tuple(one.factor for one in given), joints, 1.0)
+        signs = each("angle_signs")
+        scale = signs * each("angle_unit")
+        if velocities is not None:
+            own = self.velocity_unit is not None
+            velocities = velocities * (signs * each("velocity_unit") if own else scale)
+        gains = each("force_unit") * each("force_signs") * each("force_gains")
+        forces = forces * (gains * each("torque_constants"))
+        return angles * scale + each("angle_offsets", 0.0), velocities, forces
 
 
-def _per_joint(
-    name: str, value: tuple[float, ...] | None, joints: int, default: float
-) -> np.ndarray:
-    return per_joint(name, None if value is None else np.array(value), joints, default)
+def _each(given: Units | None) -> tuple[Unit, ...]:
+    return (given,) if isinstance(given, Unit) else given or ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Log:
+    """Channels of a log in SI units, of one file or of several (the first holds the angles)."""
+
+    tables: tuple[LogTable, ...]
+    columns: Columns
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return self.tables[0].rows
+
+    @functools.cached_property
+    def joints(self) -> int:
+        """Number of joints."""
+        return self.read(0, 1)[0].shape[1]
+
+    def read(
+        self, start: int = 0, stop: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """Return angles, velocities and forces of some rows, on the sides they were recorded."""
+        arrays: dict[str, np.ndarray] = {}
+        for table in self.tables:
+            part = table.read((c for c in table.channels if c != "time"), start, stop)
+            arrays |= {channel: part.array(channel) for channel in part.channels}
+        angles = arrays["angles"]
+        for channel, array in arrays.items():
+            if array.shape[1] != angles.shape[1]:
+                raise InputError(
+                    f"`{channel}` have {array.shape[1]} columns, but the angles in "
+                    f"`{self.tables[0].source}` have {angles.shape[1]}: name one for each joint."
+                )
+        return self.columns.to_si(angles, arrays.get("velocities"), arrays["forces"])
+
+    def stamps(self, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Return time stamps [s]; integers and dates count from `start`."""
+        stamps, dates = self.tables[0].read(("time",), start, stop).stamps()
+        return stamps if dates else stamps * self.columns.time_unit.factor
+
+
+def open_log(
+    path: str | Path,
+    columns: Columns,
+    forces_path: str | Path | None = None,
+    velocities_path: str | Path | None = None,
+    *,
+    on_disk: bool = False,
+) -> Log:
+    """Open the files of a log; with `on_disk`, texts and arrays stay on the disk.
+
+    Raises:
+        InputError: If a file or column is missing, or files differ in their numbers of rows.
+    """
+    if velocities_path is not None and columns.velocities is None:
+        raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")
+    path = Path(path)
+    files: dict[Path, dict[str, Selection]] = {}
+    paths = {"angles": path, "forces": forces_path, "velocities": velocities_path, "time": path}
+    for channel, own in paths.items():
+        selection = getattr(columns, channel)
+        if selection is not None:
+            files.setdefault(Path(own or path), {})[channel] = selection
+    tables = tuple(open_table(file, chosen, on_disk) for file, chosen in files.items())
+    for table in tables:
+        if table.rows != tables[0].rows:
+            raise InputError(
+                f"`{table.source}` has {table.rows} rows, but `{tables[0].source}` has "
+                f"{tables[0].rows}: they must be of one run, row by row."
+            )
+    return Log(tables, columns)

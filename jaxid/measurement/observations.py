@@ -2,9 +2,8 @@
 
 import abc
 import dataclasses
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -14,9 +13,13 @@ from numpy.typing import ArrayLike
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.measurement.decimation import AbstractDecimation, Subsample
-from jaxid.measurement.filters import AbstractFilter, ZeroPhaseButterworth, high_rate_hint
-from jaxid.measurement.recording import Recording
+from jaxid.measurement.filters import (
+    AbstractDecimation,
+    AbstractFilter,
+    Subsample,
+    ZeroPhaseButterworth,
+)
+from jaxid.measurement.recording import Recording, consecutive
 from jaxid.robot.joints import per_joint
 from jaxid.robot.robot import Robot
 
@@ -40,12 +43,7 @@ class AbstractSamples(eqx.Module):
 
 
 class SamplesInMemory(AbstractSamples):
-    """Motion and forces as arrays.
-
-    Attributes:
-        motion: Filtered joint angles, velocities and accelerations.
-        forces: Generalised forces, not filtered [N m or N].
-    """
+    """Filtered motion and unfiltered forces [N m or N] as arrays."""
 
     motion: Motion
     forces: Float[AnyArray, "samples joints"]
@@ -65,9 +63,6 @@ class Chunk(eqx.Module):
         rows: Half-open range of the resulting rows.
         smoothed: Range of smoothed samples that decimation needs, from the chunk's first.
         wanted: Range of decimated samples that are the rows.
-        filter: Filter of forces and columns.
-        decimation: Decimation of forces and columns.
-        sample_time: Time between two samples [s].
     """
 
     samples: tuple[int, int] = eqx.field(static=True)
@@ -198,12 +193,7 @@ class Observations(eqx.Module):
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
         """Times of the samples [s]."""
-        return np.concatenate(
-            [
-                start + self.sample_time * np.arange(b - a)
-                for (a, b), start in zip(self.segments, self.start_times, strict=True)
-            ]
-        )
+        return self._times(_row_samples(self.segments, 0, 1))
 
     @property
     def samples(self) -> int:
@@ -233,24 +223,24 @@ class Observations(eqx.Module):
     @property
     def row_segments(self) -> tuple[tuple[int, int], ...]:
         """Half-open ranges of rows without gaps."""
-        ends = np.cumsum([0, *(len(r) for r in self._row_samples())])
-        return tuple((int(a), int(b)) for a, b in itertools.pairwise(ends))
+        return consecutive(map(len, self._row_samples()))
 
     @property
     def instants(self) -> np.ndarray:
         """Indices of the samples at which the rows lie."""
-        return np.concatenate([np.arange(r.start, r.stop, r.step) for r in self._row_samples()])
+        return np.concatenate([np.asarray(r) for r in self._row_samples()])
 
     def _row_samples(self) -> list[range]:
         edge = self.filter.edge(self.sample_time)
         return _row_samples(self.segments, edge, self.decimation.factor)
 
-    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
-        """Return motion and forces of some samples of one segment.
+    def _times(self, samples: Sequence[range]) -> np.ndarray:
+        """Return the times of samples of each segment [s]."""
+        dt, parts = self.sample_time, zip(samples, self.segments, self.start_times, strict=True)
+        return np.concatenate([t + dt * (np.asarray(own) - a) for own, (a, _), t in parts])
 
-        Raises:
-            InputError: If a file of a log on disk holds something else than numbers there.
-        """
+    def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
+        """Return motion and forces of some samples of one segment."""
         return self.source.read(samples)
 
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Float[np.ndarray, "rows *columns"]:
@@ -339,14 +329,7 @@ class Observations(eqx.Module):
     @property
     def reduced_time(self) -> Float[np.ndarray, " rows"]:
         """Times of the rows [s]."""
-        return np.concatenate(
-            [
-                start + self.sample_time * (np.arange(r.start, r.stop, r.step) - a)
-                for r, (a, _), start in zip(
-                    self._row_samples(), self.segments, self.start_times, strict=True
-                )
-            ]
-        )
+        return self._times(self._row_samples())
 
     @property
     def reduced_forces(self) -> Float[np.ndarray, "rows joints"]:
@@ -387,17 +370,13 @@ def observe(
         InputError: If the numbers of joints differ, forces and columns would be aliased, nothing
             is left between the edges of the segments, or some joint is never fast enough.
     """
-    n = robot.joints
-    if recording.joints != n:
-        raise InputError(
-            f"`{recording.name}` has {recording.joints} joints, but the robot `{robot.name}` has "
-            f"{n}: choose the columns of its joints, or the robot of this log."
-        )
+    require_joints(recording.name, recording.joints, robot)
     decimation = Subsample(1) if decimation is None else decimation
     dt = recording.sample_time
-    decimation.check(filter.low_pass(dt).cutoff, dt)
     used, omitted = usable_segments(recording.segments, filter, decimation, dt, recording.name)
-    notes = [*recording.notes, *omitted, *filter.remarks(recording.velocities is not None)]
+    if recording.velocities is not None and not filter.uses_velocities:
+        kind = type(filter).__name__
+        omitted += [f"the measured velocities are not used: `{kind}` takes them from the angles"]
     angles, velocities, forces = joint_side(
         robot,
         np.asarray(recording.angles),
@@ -411,25 +390,28 @@ def observe(
         for a, b in used
     ]
     motion = Motion(*(np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "qd", "qdd")))
-    ends = [0, *itertools.accumulate(b - a for a, b in used)]
-    segments = tuple(itertools.pairwise(ends))
-    speeds = per_joint(
-        "min_speed", None if min_speed is None else np.asarray(min_speed, np.float64), n, 0.0
-    )
-    rows = _row_samples(segments, filter.edge(dt), decimation.factor)
-    mask = np.abs(motion.qd[np.concatenate([np.asarray(r) for r in rows])]) >= speeds
-    require_fast_rows(mask, speeds, robot, recording.name)
-    return Observations(
+    segments = consecutive(b - a for a, b in used)
+    observations = Observations(
         source=SamplesInMemory(motion, np.concatenate([forces[a:b] for a, b in used])),
         filter=filter,
         decimation=decimation,
         segments=segments,
         start_times=tuple(float(recording.time[a]) for a, _ in used),
-        mask=mask,
+        mask=np.ones((0, robot.joints), bool),
         sample_time=dt,
         name=recording.name if name is None else name,
-        notes=tuple(notes),
+        notes=(*recording.notes, *omitted),
     )
+    return with_fast_rows(observations, robot, min_speed, [motion.qd[observations.instants]])
+
+
+def require_joints(name: str, joints: int, robot: Robot) -> None:
+    """Refuse a log of another robot."""
+    if joints != robot.joints:
+        raise InputError(
+            f"`{name}` has {joints} joints, but the robot `{robot.name}` has {robot.joints}: "
+            "choose the columns of its joints, or the robot of this log."
+        )
 
 
 def usable_segments(
@@ -442,18 +424,19 @@ def usable_segments(
     """Return the segments that are longer than the filter's edges, and remarks on the others.
 
     Raises:
-        InputError: If there is none.
+        InputError: If there is none, or forces and columns would be aliased.
     """
+    decimation.check(filter.low_pass(sample_time).cutoff, sample_time)
     edge = filter.edge(sample_time)
     fewest = 2 * edge + (FEWEST_ROWS - 1) * decimation.factor + 1
     used = [(a, b) for a, b in segments if b - a >= max(fewest, 5)]
     if not used:
         longest = max(b - a for a, b in segments)
         raise InputError(
-            f"the longest segment of `{name}` has {longest} samples, but {edge} at each "
-            f"end are lost to the filter and {FEWEST_ROWS} rows of {decimation.factor} are needed: "
-            "record longer, close the gaps (`largest_gap`), or set a smaller `margin`."
-            f"{high_rate_hint(sample_time)}"
+            f"the longest segment of `{name}` has {longest} samples at {1 / sample_time:.6g} Hz, "
+            f"but {edge} at each end are lost to the filter and {FEWEST_ROWS} rows of "
+            f"{decimation.factor} are needed: record longer, close the gaps (`largest_gap`), set a "
+            "smaller `margin`, or check `time_unit`."
         )
     short = len(segments) - len(used)
     if not short:
@@ -461,24 +444,28 @@ def usable_segments(
     return used, [f"{short} segment(s), shorter than the filter's edges, were left out"]
 
 
-def require_fast_rows(
-    mask: Bool[np.ndarray, "rows joints"],
-    speeds: Float[np.ndarray, " joints"],
+def with_fast_rows(
+    observations: Observations,
     robot: Robot,
-    name: str,
-) -> None:
-    """Refuse a log in which some joint never reaches its minimum speed.
+    min_speed: ArrayLike | tuple[float | int, ...] | None,
+    velocities: Iterable[Float[AnyArray, "rows joints"]],
+) -> Observations:
+    """Return observations in which only rows count whose joint reaches its minimum speed.
 
     Raises:
         InputError: If no row of some joint counts.
     """
+    given = None if min_speed is None else np.asarray(min_speed, np.float64)
+    speeds = per_joint("min_speed", given, robot.joints, 0.0)
+    mask = np.concatenate([np.abs(np.asarray(qd)) >= speeds for qd in velocities])
     slow = np.flatnonzero(~mask.any(axis=0))
     if slow.size:
         j = int(slow[0])
         raise InputError(
             f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of `min_speed` "
-            f"in `{name}`: take a smaller one, or a log in which it moves."
+            f"in `{observations.name}`: take a smaller one, or a log in which it moves."
         )
+    return observations.replace(mask=mask)
 
 
 def joint_side(

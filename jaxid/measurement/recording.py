@@ -3,8 +3,8 @@
 import dataclasses
 import itertools
 import math
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -13,9 +13,19 @@ from scipy.interpolate import CubicSpline
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.measurement.columns import Columns, Selection
-from jaxid.measurement.files import LARGEST, LogTable, read_table
-from jaxid.measurement.timestamps import FEWEST, Resampler, resampler, uniform_grid
+
+JITTER = 0.05
+"""Largest deviation of stamps from a uniform grid, in sample times, that is ignored."""
+REPEATED = 0.1
+"""Distance of two stamps, in sample times, up to which their rows are one sample, logged twice."""
+LARGEST = 1e30
+"""Largest number in a log, in any unit: its square still is finite."""
+FEWEST = 10
+"""Smallest number of samples that can be filtered."""
+
+
+class NeedsMemory(InputError):  # noqa: N818 (the name says what to do)
+    """A log that can be read only as a whole; the message gives the reason."""
 
 
 class Recording(eqx.Module):
@@ -58,7 +68,6 @@ class Recording(eqx.Module):
         forces_on_motor_side: bool = False,
         largest_gap: float | int = 1.75,
         name: str = "recording",
-        notes: tuple[str, ...] = (),
         first_row: int = 1,
     ) -> "Recording":
         """Make a recording of arrays (samples x joints) in SI units, and check them.
@@ -76,7 +85,6 @@ class Recording(eqx.Module):
             forces_on_motor_side: Whether forces are the motors'.
             largest_gap: Longest pause that is bridged by interpolation, in sample times.
             name: Name of the log.
-            notes: Earlier changes, as sentences.
             first_row: Number of the first row in its file, for messages.
 
         Raises:
@@ -86,42 +94,40 @@ class Recording(eqx.Module):
         if not largest_gap > 1.0:
             raise InputError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
         channels = {"angles": angles, "forces": forces, "velocities": velocities}
-        data = {key: _real(name, key, x) for key, x in channels.items() if x is not None}
-        shape = data["angles"].shape
-        for key, array in data.items():
-            _check_channel(name, key, array, shape, first_row)
-        samples = shape[0]
+        data: dict[str, Any] = dict.fromkeys(channels)
+        for key, x in channels.items():
+            if x is not None:
+                data[key] = _finite(name, key, x, np.shape(angles), first_row)
+        samples = len(data["angles"])
         if samples < FEWEST:
             raise InputError(
                 f"`{name}` has {samples} samples, but at least {FEWEST} are needed: is the log cut?"
             )
         if (time is None) == (sample_time is None):
             raise InputError("a recording needs either `time` or `sample_time`, and not both.")
-        if sample_time is not None:
-            if not 0 < sample_time < np.inf:
-                raise InputError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
-            dt = float(sample_time)
-            rows = np.arange(samples)
-            resample = Resampler(rows, dt * rows, uniform_grid(samples, dt))
-        else:
-            stamps = _real(name, "time", time)
+        if time is not None:
+            stamps = np.array(time, np.float64)
             if stamps.shape != (samples,) or not np.isfinite(stamps).all():
                 raise InputError(
                     f"`time` of `{name}` must hold one finite stamp for each of the {samples} "
                     f"samples, but has shape {stamps.shape}."
                 )
-            resample = resampler(stamps, source=name, largest_gap=largest_gap, first_row=first_row)
+            dt, times, added, resample = _resampling(stamps, name, largest_gap, first_row)
+            data = {key: None if x is None else resample(x) for key, x in data.items()}
+        else:
+            dt, added = float(sample_time or 0.0), []
+            if not 0 < dt < np.inf:
+                raise InputError(f"`sample_time` must be positive [s], but is {dt:g}.")
+            times = [dt * np.arange(samples)]
         return cls(
-            time=np.concatenate(resample.times),
-            angles=resample(data["angles"]),
-            forces=resample(data["forces"]),
-            velocities=None if velocities is None else resample(data["velocities"]),
+            time=np.concatenate(times),
+            **data,
             angles_on_motor_side=angles_on_motor_side,
             forces_on_motor_side=forces_on_motor_side,
-            segments=resample.segments,
-            sample_time=resample.grid.sample_time,
+            segments=consecutive(map(len, times)),
+            sample_time=dt,
             name=name,
-            notes=(*notes, *resample.notes),
+            notes=tuple(added),
         )
 
     @property
@@ -145,15 +151,9 @@ class Recording(eqx.Module):
         Raises:
             InputError: If fewer than ten samples are left.
         """
-        slack = 1e-6 * self.sample_time
-        a, b = (int(i) for i in np.searchsorted(self.time, [start - slack, stop - slack]))
-        if b - a < FEWEST:
-            raise InputError(
-                f"`{self.name}` has {max(b - a, 0)} samples from {start:g} s to {stop:g} s, but at "
-                f"least {FEWEST} are needed: it lasts from {self.time[0]:g} s to "
-                f"{self.time[-1]:g} s."
-            )
-        return self._range(a, b)
+        starts = tuple(float(self.time[a]) for a, _ in self.segments)
+        grid = TimeGrid(self.sample_time, self.segments, starts).cropped(start, stop, self.name)
+        return self._range(grid.ranges[0][0], grid.ranges[-1][1])
 
     def split(self, fraction: float) -> "tuple[Recording, Recording]":
         """Return the first fraction (0 to 1) of the recorded time, and the rest.
@@ -181,120 +181,32 @@ class Recording(eqx.Module):
         )
 
 
-def _real(name: str, key: str, value: Any) -> np.ndarray:
+def _finite(
+    name: str, key: str, value: ArrayLike, shape: tuple[int, ...], first_row: int
+) -> np.ndarray:
+    """Return a channel as finite real numbers."""
     if np.iscomplexobj(value):
         raise InputError(f"`{key}` of `{name}` holds complex numbers: give real ones.")
-    return np.array(value, np.float64)
-
-
-def _check_channel(
-    name: str, key: str, array: np.ndarray, shape: tuple[int, ...], first_row: int
-) -> None:
+    array = np.array(value, np.float64)
     if array.ndim != 2 or array.shape != shape:
         raise InputError(
-            f"`{key}` of `{name}` must have one row for each sample and one column for "
-            f"each joint, like `angles` with shape {shape}, but has shape {array.shape}."
+            f"`{key}` of `{name}` must have one row for each sample and one column for each "
+            f"joint, like `angles` with shape {shape}, but has shape {array.shape}."
         )
-    if not np.isfinite(array).all():
-        row, joint = (int(i) for i in np.argwhere(~np.isfinite(array))[0])
+    bad = np.argwhere(~(np.abs(array) <= LARGEST))
+    if bad.size:
+        row, joint = (int(i) for i in bad[0])
         raise InputError(
-            f"`{key}` of `{name}` must be finite, but are {array[row, joint]} for joint "
-            f"{joint + 1} at row {row + first_row}: repair or remove the row."
-        )
-    if np.abs(array).max(initial=0.0) > LARGEST:
-        raise InputError(
-            f"`{key}` of `{name}` must be numbers that can be measured, but go up to "
-            f"{np.abs(array).max():.3g}: check their units, or remove the rows."
-        )
-
-
-def read_recording(
-    path: str | Path,
-    columns: Columns,
-    name: str | None = None,
-    *,
-    forces_path: str | Path | None = None,
-    velocities_path: str | Path | None = None,
-    largest_gap: float | int = 1.75,
-) -> Recording:
-    """Read a log from CSV (any separator, with or without header), Parquet, NPZ or MAT.
-
-    Args:
-        path: File with the angles, and with all other channels that have no file of their own.
-        columns: Meaning of the columns.
-        name: Name of the recording; the file's if None.
-        forces_path: File with the forces.
-        velocities_path: File with the velocities.
-        largest_gap: Longest pause that is bridged by interpolation, in sample times; longer ones
-            split the recording into segments.
-
-    Raises:
-        InputError: If a file, a column, a number or the time is invalid; the message names file,
-            column and line.
-    """
-    if velocities_path is not None and columns.velocities is None:
-        raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")
-    table = read_table(path)
-    forces_table = table if forces_path is None else read_table(forces_path)
-    velocities_table = table if velocities_path is None else read_table(velocities_path)
-    shared: dict = {"angles": columns.angles, "time": columns.time}
-    if forces_path is None:
-        shared["forces"] = columns.forces
-    if velocities_path is None:
-        shared["velocities"] = columns.velocities
-    table.refuse_shared(shared)
-    angles = table.array("angles", columns.angles)
-    joints = angles.shape[1]
-    forces = _channel_like(angles, table, forces_table, "forces", columns.forces)
-    velocities = None
-    if columns.velocities is not None:
-        velocities = _channel_like(
-            angles, table, velocities_table, "velocities", columns.velocities
-        )
-        velocities = velocities * columns.velocity_scale(joints)
-    stamps = None
-    if columns.time is not None:
-        stamps, dates = table.stamps(columns.time)
-        stamps = stamps if dates else stamps * columns.time_unit.factor
-        if len(stamps) != len(angles):
-            raise InputError(
-                f"`time` of `{table.source}` has {len(stamps)} stamps for {len(angles)} samples of "
-                "the angles: arrays must have one row for each sample (transpose them)."
-            )
-    return Recording.of(
-        angles * columns.angle_scale(joints) + columns.angle_shift(joints),
-        forces * columns.force_scale(joints),
-        velocities=velocities,
-        time=stamps,
-        sample_time=columns.sample_time,
-        angles_on_motor_side=columns.angles_on_motor_side,
-        forces_on_motor_side=columns.forces_on_motor_side,
-        largest_gap=largest_gap,
-        name=Path(path).stem if name is None else name,
-        first_row=1 if table.first_line is None else table.first_line,
-    )
-
-
-def _channel_like(
-    angles: np.ndarray,
-    angles_table: LogTable,
-    table: LogTable,
-    channel: str,
-    selection: Selection,
-) -> np.ndarray:
-    """Return a channel with as many samples and joints as the angles."""
-    array = table.array(channel, selection)
-    if len(array) != len(angles):
-        raise InputError(
-            f"`{channel}` in `{table.source}` have {len(array)} samples, but the angles in "
-            f"`{angles_table.source}` have {len(angles)}: they must be of one run, row by row."
-        )
-    if array.shape[1] != angles.shape[1]:
-        raise InputError(
-            f"`{channel}` in `{table.source}` have {array.shape[1]} joints, but the angles in "
-            f"`{angles_table.source}` have {angles.shape[1]}: name one column for each joint."
+            f"`{key}` of `{name}` must be finite and of a size that sensors measure, but are "
+            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: check their "
+            "unit, or repair or remove the row."
         )
     return array
+
+
+def consecutive(lengths: Iterable[int]) -> tuple[tuple[int, int], ...]:
+    """Return half-open ranges of these lengths, one behind the other."""
+    return tuple(itertools.pairwise(itertools.accumulate(lengths, initial=0)))
 
 
 def remove_delay(recording: Recording, seconds: float) -> Recording:
@@ -321,7 +233,6 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
             f"{max(b - a for a, b in recording.segments) * recording.sample_time:g} s."
         )
     kept = [np.arange(a + early, b - late) for a, b in whole]
-    ends = np.cumsum([0, *map(len, kept)]).tolist()
     time = np.asarray(recording.time)
 
     def shift(values):
@@ -338,7 +249,7 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
         angles=shift(recording.angles),
         forces=np.asarray(recording.forces)[samples],
         velocities=None if recording.velocities is None else shift(recording.velocities),
-        segments=tuple(itertools.pairwise(ends)),
+        segments=consecutive(map(len, kept)),
         notes=(*recording.notes, f"a delay of the forces of {1e3 * seconds:.4g} ms was removed"),
     )
 
@@ -347,3 +258,218 @@ def require_finite_delay(seconds: float) -> None:
     """Refuse a delay that is infinite or not a number."""
     if not math.isfinite(seconds):
         raise InputError(f"the delay must be a finite time [s], but is {seconds:g}.")
+
+
+class TimeGrid(NamedTuple):
+    """Uniform stretches of a log: half-open ranges of rows, and the times at which they start [s].
+
+    The `deviation` of the stamps from the grid is the largest, the `jitter` of the steps RMS [s].
+    """
+
+    sample_time: float
+    ranges: tuple[tuple[int, int], ...]
+    start_times: tuple[float, ...] = (0.0,)
+    notes: tuple[str, ...] = ()
+    deviation: float = 0.0
+    jitter: float = 0.0
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the rows lie on the grid as they are."""
+        return self.deviation <= JITTER * self.sample_time
+
+    def cropped(self, start: float, stop: float, name: str) -> "TimeGrid":
+        """Return the part from `start` [s] on and before `stop` [s]."""
+        dt = self.sample_time
+        ranges, times = [], []
+        for (a, b), t in zip(self.ranges, self.start_times, strict=True):
+            limits = np.ceil((np.array([start, stop]) - t) / dt - 1e-6)
+            low, high = (int(x) for x in np.clip(limits, 0, b - a))
+            if low < high:
+                ranges.append((a + low, a + high))
+                times.append(t + low * dt)
+        left = sum(b - a for a, b in ranges)
+        if left < FEWEST:
+            a, b = self.ranges[-1]
+            raise InputError(
+                f"`{name}` has {left} samples from {start:g} s to {stop:g} s, but at least "
+                f"{FEWEST} are needed: it lasts from {self.start_times[0]:g} s to "
+                f"{self.start_times[-1] + (b - a - 1) * dt:g} s."
+            )
+        return self._replace(ranges=tuple(ranges), start_times=tuple(times))
+
+
+def find_grid(
+    read: Callable[[], Iterable[np.ndarray]],
+    source: str,
+    largest_gap: float,
+    first_row: int,
+    in_parts: bool = False,
+) -> TimeGrid:
+    """Find the uniform grid behind time stamps; the typical step is that of the first part.
+
+    Args:
+        read: Function that yields the finite stamps of the rows in consecutive parts [s]; it is
+            called three times.
+        source: Name of the log, for messages.
+        largest_gap: Longest pause that is bridged by interpolation, in sample times.
+        first_row: Number of the first row in its file, for messages.
+        in_parts: Whether the log is too large to move or remove rows.
+
+    Raises:
+        NeedsMemory: If rows of a log in parts must be moved or removed.
+        InputError: If time runs backwards, or does not advance.
+    """
+    first = next(iter(read()), np.zeros(0))
+    steps = np.diff(first)
+    steps = steps[steps > 0]
+    if not steps.size:
+        raise InputError(f"time of `{source}` stands still: check the column of time stamps.")
+    origin, typical = float(first[0]), float(np.median(steps))
+    spread = 1.4826 * float(np.median(np.abs(steps - typical)))
+    # A gap is a pause that neither the limit nor the usual jitter explains.
+    limit = max(largest_gap * typical, typical + 8.0 * spread)
+    starts, start_times, before_gaps, pauses = [0], [0.0], [], []
+    rows, total, count = 0, 0.0, 0
+    for t, row in _linked(read(), origin):
+        steps = np.diff(t)
+        _require_forward(t + origin, steps, row + first_row, source)
+        repeated = np.flatnonzero(steps <= REPEATED * typical)
+        if in_parts and repeated.size:
+            raise NeedsMemory(
+                f"rows of `{source}` repeat the time stamp of the row before, first at row "
+                f"{row + int(repeated[0]) + 1 + first_row}: remove them, or give `sample_time` if "
+                "every row is a sample."
+            )
+        gaps = np.flatnonzero(steps > limit)
+        starts += (row + gaps + 1).tolist()
+        start_times += t[gaps + 1].tolist()
+        before_gaps += t[gaps].tolist()
+        pauses += steps[gaps].tolist()
+        regular = steps[steps < 1.5 * typical + 8.0 * spread]
+        total, count = total + float(regular.sum()), count + len(regular)
+        rows = row + len(t)
+    # Stamps are rounded numbers: a round sample time that fits them as well is the true one.
+    sample_time = total / count
+    short = float(f"{sample_time:.6g}")
+    sample_time = short if abs(short - sample_time) * rows < 0.01 * sample_time else sample_time
+    lengths = np.diff([*starts, rows])
+    kept = lengths >= 4
+    if not kept.any():
+        raise InputError(
+            f"`{source}` has no four rows in sequence: its time stamps are {typical:.6g} s apart "
+            f"at the median, with {len(pauses)} gaps; check `time_unit`, or give `sample_time`."
+        )
+    notes = []
+    if origin != 0:
+        notes.append(f"time counts from the first row, which was stamped {origin:.9g} s")
+    if pauses:
+        notes.append(
+            f"{len(pauses)} gap{'s' if len(pauses) > 1 else ''} in time, the first after "
+            f"{before_gaps[0]:.6g} s, the longest of {max(pauses):.6g} s (sample time "
+            f"{sample_time:.6g} s), split the log into segments; a `largest_gap` above "
+            f"{max(pauses) / sample_time:.3g} would bridge them"
+        )
+    if lost := int(lengths[~kept].sum()):
+        notes.append(f"{lost} rows between gaps are too few for a segment and were left out")
+    grid = TimeGrid(
+        sample_time,
+        tuple((a, a + int(n)) for a, n, keep in zip(starts, lengths, kept, strict=True) if keep),
+        tuple(t for t, keep in zip(start_times, kept, strict=True) if keep),
+        tuple(notes),
+        *_deviation(_linked(read(), origin), starts, start_times, kept, sample_time),
+    )
+    if in_parts and not grid.is_exact:
+        raise NeedsMemory(
+            f"time stamps of `{source}` leave a uniform grid of {sample_time:.6g} s by "
+            f"{grid.deviation:.6g} s: give `sample_time` if the robot samples uniformly and only "
+            "the stamps are late."
+        )
+    return grid
+
+
+def _linked(parts: Iterable[np.ndarray], origin: float) -> Iterable[tuple[np.ndarray, int]]:
+    """Yield the times of each part behind the last one before it, and the row of the first."""
+    last, row = np.zeros(0), 0
+    for part in parts:
+        t = np.concatenate([last, part - origin])
+        yield t, row
+        last, row = t[-1:], row + len(t) - 1
+
+
+def _require_forward(stamps: np.ndarray, steps: np.ndarray, row: int, source: str) -> None:
+    back = np.flatnonzero(steps < 0)
+    if back.size:
+        i = int(back[0])
+        raise InputError(
+            f"time of `{source}` runs backwards from {stamps[i]:.9g} s to {stamps[i + 1]:.9g} s at "
+            f"row {row + i + 1}: sort the log, or split it where the clock was set back."
+        )
+
+
+def _deviation(
+    parts: Iterable[tuple[np.ndarray, int]],
+    starts: Sequence[int],
+    start_times: Sequence[float],
+    kept: np.ndarray,
+    sample_time: float,
+) -> tuple[float, float]:
+    """Return the largest deviation from the grid, and the RMS deviation of the steps."""
+    first_rows, first_times = np.array(starts), np.array(start_times)
+    largest, square, count = 0.0, 0.0, 0
+    for t, row in parts:
+        rows = row + np.arange(len(t))
+        number = np.searchsorted(first_rows, rows, "right") - 1
+        off = t - first_times[number] - sample_time * (rows - first_rows[number])
+        largest = max(largest, float(np.abs(off[kept[number]]).max(initial=0.0)))
+        inside = (number[1:] == number[:-1]) & kept[number[1:]]
+        steps = np.diff(t)[inside] - sample_time
+        square, count = square + float(np.sum(steps**2)), count + len(steps)
+    return largest, float(np.sqrt(square / max(count, 1)))
+
+
+def _resampling(
+    stamps: Float[np.ndarray, " rows"], source: str, largest_gap: float, first_row: int
+) -> tuple[float, list[np.ndarray], list[str], Callable[[np.ndarray], np.ndarray]]:
+    """Return how rows come to the uniform grid behind their time stamps.
+
+    Returns:
+        Time between two samples [s]; times of each segment's samples [s]; remarks; and a function
+        of a channel's rows: its samples as they are, or interpolated by cubic splines.
+
+    Raises:
+        InputError: If time runs backwards, or does not advance.
+    """
+    _require_forward(stamps, np.diff(stamps), first_row, source)
+    kept = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)
+    if len(kept) > 1:
+        steps = np.diff(stamps[kept])
+        kept = kept[np.append(True, steps > REPEATED * float(np.median(steps)))]
+    t = stamps[kept]
+    grid = find_grid(lambda: [t], source, largest_gap, first_row)
+    t, dt, notes = t - stamps[0], grid.sample_time, list(grid.notes)
+    if removed := len(stamps) - len(kept):
+        notes.insert(
+            0,
+            f"{removed} of {len(stamps)} rows repeat the time stamp of the row before and were "
+            "removed; if every row is a sample, give `sample_time` instead of the time stamps",
+        )
+    counts = [b - a for a, b in grid.ranges]
+    if not grid.is_exact:
+        counts = [int(np.floor((t[b - 1] - t[a]) / dt + 1e-3)) + 1 for a, b in grid.ranges]
+        notes.append(
+            f"time stamps jitter by {100 * grid.jitter / dt:.1f} % of the sample time (RMS): "
+            f"resampled to a uniform grid of {dt:.6g} s by cubic splines; if the robot "
+            "samples uniformly and only the stamps are late, give `sample_time` instead"
+        )
+    starts = zip(grid.start_times, counts, strict=True)
+    times = [start + dt * np.arange(count) for start, count in starts]
+
+    def resample(x: np.ndarray) -> np.ndarray:
+        x = x[kept]
+        if grid.is_exact:
+            return np.concatenate([x[a:b] for a, b in grid.ranges])
+        segments = zip(grid.ranges, times, strict=True)
+        return np.concatenate([CubicSpline(t[a:b], x[a:b])(at) for (a, b), at in segments])
+
+    return dt, times, notes, resample

@@ -64,12 +64,7 @@ N = Unit("N", 1.0, Quantity.FORCE)
 A = Unit("A", 1.0, Quantity.CURRENT)
 MA = Unit("mA", 1e-3, Quantity.CURRENT)
 
-ALL = (
-    *(S, MS, US, NS),
-    *(RAD, DEG, REV, M, MM),
-    *(RAD_PER_S, DEG_PER_S, RPM, M_PER_S, MM_PER_S),
-    *(NM, N, A, MA),
-)
+ALL = tuple(known for known in vars().values() if isinstance(known, Unit))
 """All named units."""
 
 

@@ -11,9 +11,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
 from jaxid.measurement import units
-from jaxid.measurement.chunked_files import open_log_file
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.recording import read_recording
+from jaxid.measurement.reading import read_recording
 from jaxid.measurement.units import Quantity, Unit
 
 COLUMNS = Columns(angles="q{}", forces="tau{}", velocities="dq{}", time="t")
@@ -55,18 +54,22 @@ def test_text_files_of_any_separator(tmp_path, separator, header):
     check(read_recording(path, COLUMNS if header else places), a_log())
 
 
-def test_decimal_commas_and_headers_of_savetxt(tmp_path):
+def test_decimal_commas_numbers_from_zero_and_headers_of_savetxt(tmp_path):
     log = a_log()
     cells = ["; ".join(f"{v:.17g}" for v in row) for row in zip(*log.values(), strict=True)]
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["; ".join(log), *cells]).replace(".", ","))
     check(read_recording(path, COLUMNS), log)
+    groups = {f"{g}_{j:02d}": log[f"{g}{j + 1}"] for g in ("q", "tau") for j in range(2)}
+    write_csv(path, {"t": log["t"]} | groups)
+    r = read_recording(path, Columns(angles="q_{}", forces="tau_{}", time="t"))
+    np.testing.assert_array_equal(r.angles, stack(log, "q"))
     np.savetxt(tmp_path / "log.txt", np.stack(list(log.values()), 1), header=" ".join(log))
     recording = read_recording(tmp_path / "log.txt", COLUMNS)
     np.testing.assert_allclose(recording.forces, stack(log, "tau"), rtol=1e-15)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(data=st.data(), joints=st.integers(1, 4), samples=st.integers(10, 20))
 def test_round_trip_of_all_formats(tmp_path_factory, data, joints, samples):
     folder = tmp_path_factory.mktemp("logs")
@@ -80,8 +83,7 @@ def test_round_trip_of_all_formats(tmp_path_factory, data, joints, samples):
     whole = {"q": q, "tau": tau}
     np.savez(folder / "b.npz", **whole)
     savemat(folder / "b.mat", whole)
-    pl.DataFrame({k: v.tolist() for k, v in whole.items()}).write_parquet(folder / "b.parquet")
-    for file in ("a.csv", "a.parquet", "a.npz", "a.mat", "b.npz", "b.mat", "b.parquet"):
+    for file in ("a.csv", "a.parquet", "a.npz", "a.mat", "b.npz", "b.mat"):
         pattern = "" if file[0] == "b" else "{}"
         prefix = "log." if file == "a.mat" else ""
         names = f"{prefix}q{pattern}", f"{prefix}tau{pattern}"
@@ -118,14 +120,6 @@ def test_units_signs_offsets_and_constants(tmp_path):
     path = write_csv(tmp_path / "log.csv", log)
     degrees = Columns("q{}", "tau{}", velocities="dq{}", time="t", angle_unit=units.DEG)
     np.testing.assert_allclose(read_recording(path, degrees).velocities, np.deg2rad(dq), rtol=1e-14)
-
-
-def test_numbering_from_zero_and_leading_zeros(tmp_path):
-    log = a_log()
-    groups = {f"{g}_{j:02d}": log[f"{g}{j + 1}"] for g in ("q", "tau") for j in range(2)}
-    path = write_csv(tmp_path / "log.csv", {"t": log["t"]} | groups)
-    r = read_recording(path, Columns(angles="q_{}", forces="tau_{}", time="t"))
-    np.testing.assert_array_equal(r.angles, stack(log, "q"))
 
 
 def test_nanoseconds_since_1970_keep_their_precision(tmp_path):
@@ -165,7 +159,7 @@ def refused(path, columns, *parts, **kwargs):
 
 @pytest.mark.parametrize(
     ("cell", "complaint"),
-    [("", "is empty"), ("abc", "is `abc`, no number"), ("nan", "not"), ("inf", "not finite")],
+    [("", "is empty"), ("abc", "is `abc`, no number"), ("inf", "not finite")],
 )
 def test_bad_cells_are_named_with_file_column_and_line(tmp_path, cell, complaint):
     rows = ["t,q1,tau1", *(f"{0.01 * i:.2f},{i},{-i}" for i in range(20))]
@@ -190,11 +184,9 @@ SIGNALLING = np.array([0x7F800001], np.uint32).view(np.float32)[0]
     [
         (spoilt(5, np.nan), "row 6"),
         (spoilt(3, (np.inf, -np.inf)), "row 4"),
-        (spoilt(3, 1e200), "row 4"),
         (np.full((20, 2), SIGNALLING), "row 1"),
         (np.zeros((20, 0)), "no columns"),
         (np.array(["a"] * 20), "real numbers"),
-        (np.zeros((20, 2, 2)), "axes"),
     ],
 )
 def test_arrays_that_no_sensor_measures(tmp_path, q, complaint):
@@ -203,15 +195,12 @@ def test_arrays_that_no_sensor_measures(tmp_path, q, complaint):
     refused(tmp_path / "log.npz", columns, "`q`", "`log.npz`", complaint)
 
 
-@pytest.mark.parametrize("cell", [b"\xff", [b"1.0"], [[1.0]]])
+@pytest.mark.parametrize("cell", [b"\xff", [[1.0]]])
 def test_columns_of_no_numbers_are_named(tmp_path, cell):
     path = tmp_path / "log.parquet"
     log = {"t": 0.1 * np.arange(20), "q1": [cell] * 20, "tau1": np.zeros(20)}
     pl.DataFrame(log).write_parquet(path)
-    refused(path, PLAIN, "`q1`", "`log.parquet`", "no numbers")
-    ragged = {"q": [[1.0, 2.0]] * 5 + [[1.0]] * 6, "tau": [[1.0, 2.0]] * 11}
-    pl.DataFrame(ragged).write_parquet(path)
-    refused(path, Columns("q", "tau", sample_time=0.1), "`q`", "row 6")
+    refused(path, PLAIN, "`q1`", "`log.parquet`", "no number")
 
 
 def test_missing_columns_name_the_others_and_the_closest(tmp_path):
@@ -225,7 +214,7 @@ def test_missing_columns_name_the_others_and_the_closest(tmp_path):
     del log["q2"]
     path = write_csv(tmp_path / "hole.csv", log)
     refused(path, COLUMNS, "`q2`", "`q3`")
-    refused(path, Columns(angles=("q1", "q3"), forces="tau{}", time="t"), "3 joints", "have 2")
+    refused(path, Columns(angles=("q1", "q3"), forces="tau{}", time="t"), "3 columns", "have 2")
     path = write_csv(tmp_path / "double.csv", a_log() | {"q01": np.zeros(12)})
     refused(path, COLUMNS, "`q1`", "`q01`", "`angles`")
     path = write_csv(tmp_path / "bare.csv", a_log(), header=False)
@@ -267,19 +256,15 @@ def test_damage_that_polars_takes_for_a_bug_of_its_own(tmp_path, monkeypatch):
     """Its panics are no `Exception`, and depend on which bytes are damaged."""
     path = tmp_path / "log.parquet"
     pl.DataFrame(a_log()).write_parquet(path)
-    file = open_log_file(path, lambda table: tuple(table.columns))
 
     def panic(*_, **__):
         raise pl.exceptions.PanicException("called `Result::unwrap()` on an `Err` value")
 
-    monkeypatch.setattr(pl, "read_parquet", panic)
+    monkeypatch.setattr(pl.LazyFrame, "collect", panic)
     refused(path, COLUMNS, "`log.parquet`", "damaged")
-    monkeypatch.setattr(pl, "scan_parquet", panic)
-    with pytest.raises(ValueError, match=r"`log.parquet`"):
-        file.read(0, 3)
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(places=st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(0, 255)), max_size=4))
 def test_mat_files_with_damaged_bytes(tmp_path_factory, places):
     path = tmp_path_factory.mktemp("mat") / "log.mat"
@@ -302,14 +287,14 @@ def test_lengths_and_shapes_must_agree(tmp_path):
     log = a_log()
     path = write_csv(tmp_path / "q.csv", log)
     forces = write_csv(tmp_path / "tau.csv", {k: v[:-1] for k, v in log.items()})
-    refused(path, COLUMNS, "11 samples", "have 12", forces_path=forces)
+    refused(path, COLUMNS, "11 rows", "has 12", forces_path=forces)
     refused(path, PLAIN, "`Columns.velocities`", velocities_path=forces)
     refused(path, Columns("q{}", "tau{}", time="t", angle_offsets=(1.0,)), "`angle_offsets`")
     short = write_csv(tmp_path / "short.csv", {k: v[:8] for k, v in log.items()})
     refused(short, COLUMNS, "8 samples", "at least 10")
     np.savez(tmp_path / "lying.npz", t=np.arange(50.0), q=np.zeros((2, 50)), tau=np.zeros((2, 50)))
     lying = Columns(angles="q", forces="tau", time="t")
-    refused(tmp_path / "lying.npz", lying, "50 stamps for 2 samples")
+    refused(tmp_path / "lying.npz", lying, "50 samples")
     refused(tmp_path / "none.csv", COLUMNS, "is no file")
 
 
@@ -338,20 +323,3 @@ def test_units_by_symbol():
             units.unit(wrong)
     with pytest.raises(ValueError, match="`factor`"):
         Unit("nothing", 0.0, Quantity.FORCE)
-
-
-def test_measured_robots(shared_data):
-    tx40 = read_recording(
-        shared_data / "tx40" / "motor_position.csv",
-        Columns(angles="Joint_{}", forces="Joint_{}", sample_time=2e-4),
-        forces_path=shared_data / "tx40" / "motor_torque.csv",
-    )
-    assert tx40.angles.shape == (45000, 6)
-    assert tx40.duration == pytest.approx(9.0)
-    assert (tx40.angles[0, 2], tx40.forces[1, 1]) == (-70.685, -0.84434)
-    ur10 = read_recording(shared_data / "ur10" / "exciting_measured.csv", COLUMNS)
-    assert (*ur10.angles.shape, ur10.sample_time) == (3441, 6, 0.008)
-    motors = Columns(angles="q_mot{}", forces="tau_motor{}", velocities="dq_mot{}", time="t")
-    kr300 = read_recording(shared_data / "kr300" / "traj_A.csv", motors)
-    assert (*kr300.angles.shape, kr300.sample_time) == (2501, 6, 0.004)
-    assert kr300.notes == ()

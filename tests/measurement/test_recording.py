@@ -1,7 +1,5 @@
 """Time stamps as loggers write them: twins, gaps, jitter; and parts of recordings."""
 
-import equinox as eqx
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -42,7 +40,7 @@ def test_backward_stamps_are_refused_with_their_row():
         recording(np.zeros(20))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     gaps=st.lists(st.integers(20, 480), min_size=1, max_size=4, unique=True),
     width=st.floats(2.0, 1000.0),
@@ -64,8 +62,10 @@ def test_gaps_split(gaps, width, noise):
 
 def test_short_gaps_are_bridged_on_demand():
     t = np.delete(0.01 * np.arange(200), [50, 120, 121])
-    assert recording(t).segments == ((0, 50), (50, 119), (119, 197))
-    r = recording(t, largest_gap=3.5)
+    split = recording(t)
+    assert split.segments == ((0, 50), (50, 119), (119, 197))
+    bridging = float(split.notes[0].split("`largest_gap` above ")[1].split()[0])
+    r = recording(t, largest_gap=1.05 * bridging)
     assert r.segments == ((0, 200),)
     np.testing.assert_allclose(r.angles[:, 0], np.sin(3 * r.time), atol=1e-6)
 
@@ -78,7 +78,7 @@ def test_lonely_rows_between_gaps_are_left_out():
     assert "2 rows between gaps" in r.notes[1]
 
 
-@pytest.mark.parametrize("jitter", [0.1, 0.2, 0.4])
+@pytest.mark.parametrize("jitter", [0.1, 0.4])
 def test_jitter_is_undone_by_interpolation(jitter):
     rng = np.random.default_rng(3)
     t = 0.01 * np.arange(1000)
@@ -124,20 +124,3 @@ def test_crop_and_split():
     np.testing.assert_array_equal(np.concatenate([first.angles, rest.angles]), r.angles)
     with pytest.raises(ValueError, match="`fraction`"):
         r.split(0.01)
-
-
-def test_is_a_pytree():
-    r = recording(0.01 * np.arange(100))
-    doubled = jax.tree.map(lambda x: 2 * x, r)
-    np.testing.assert_array_equal(doubled.forces, 2 * r.forces)
-    assert eqx.tree_equal(jax.tree.map(lambda x: x / 2, doubled), r)
-    assert hash(jax.tree.structure(r)) is not None
-
-
-def test_gaps_are_said_with_the_key_that_bridges_them():
-    t = 0.01 * np.arange(200.0)
-    t[120:] += 0.05
-    note = recording(t).notes[0]
-    assert "1 gap in time" in note
-    bridging = float(note.split("`largest_gap` above ")[1].split()[0])
-    assert recording(t, largest_gap=1.05 * bridging).segments == ((0, 205),)

@@ -7,8 +7,7 @@ from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
 from jaxid.identification.identify import identify
-from jaxid.measurement.decimation import Subsample
-from jaxid.measurement.filters import ZeroPhaseButterworth
+from jaxid.measurement.filters import Subsample, ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
 from jaxid.robot import library
 from jaxid.simulation.friction import SmoothFriction

@@ -1,0 +1,478 @@
+"""Log files as columns: CSV (any separator, with or without header), Parquet, NPZ and MAT."""
+
+import atexit
+import codecs
+import contextlib
+import dataclasses
+import difflib
+import functools
+import io
+import itertools
+import re
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+import polars as pl
+
+from jaxid.errors import InputError
+from jaxid.measurement.recording import LARGEST
+
+Selection = str | int | tuple[str | int, ...]
+"""A name, a pattern with `{}` for the joint's number, a position from 0, or several."""
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+"""Suffixes of text files."""
+HEAD = 65536
+"""Bytes from which a format is detected."""
+BLOCK = 2**26
+"""Bytes of a text file that are read at once."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LogTable:
+    """Channels of one file, in memory or on disk.
+
+    Attributes:
+        source: Name of the file, for messages.
+        columns: Columns, or whole arrays (samples x joints), by name; or a lazy frame.
+        channels: Names of the columns of each channel, in the order of the joints.
+        first_row: Number of the first row in the file, for messages.
+        unit: Name of a row, for messages: `line` in text files.
+    """
+
+    source: str
+    columns: Any
+    channels: Mapping[str, tuple[str, ...]]
+    first_row: int = 1
+    unit: str = "row"
+
+    @functools.cached_property
+    def rows(self) -> int:
+        """Number of rows."""
+        if isinstance(self.columns, pl.LazyFrame):
+            with _readable_parquet(self.source):
+                rows = int(self.columns.select(pl.len()).collect().item())
+        else:
+            first, *others = itertools.chain(*self.channels.values())
+            rows = len(self.columns[first])
+            for name in others:
+                if len(self.columns[name]) != rows:
+                    raise InputError(
+                        f"`{name}` of `{self.source}` has {len(self.columns[name])} samples, but "
+                        f"`{first}` has {rows}: arrays must have one row for each sample "
+                        "(transpose them)."
+                    )
+        if rows == 0:
+            raise InputError(f"`{self.source}` has no rows: is the log cut?")
+        return rows
+
+    def read(self, channels: Iterable[str], start: int = 0, stop: int | None = None) -> "LogTable":
+        """Return some rows of some channels, in memory."""
+        kept = {channel: self.channels[channel] for channel in channels}
+        names = list(dict.fromkeys(itertools.chain(*kept.values())))
+        columns = self.columns
+        if isinstance(columns, pl.LazyFrame):
+            with _readable_parquet(self.source):
+                length = None if stop is None else stop - start
+                part = columns.select(names).slice(start, length).collect()
+                columns = part.to_dict(as_series=True)
+        else:
+            columns = {name: columns[name][start:stop] for name in names}
+        return dataclasses.replace(
+            self, columns=columns, channels=kept, first_row=self.first_row + start
+        )
+
+    def array(self, channel: str) -> np.ndarray:
+        """Return the finite numbers of a channel (samples x columns)."""
+        return np.concatenate([self.numbers(name) for name in self.channels[channel]], axis=1)
+
+    def stamps(self) -> tuple[np.ndarray, bool]:
+        """Return the time stamps, and whether they are dates (then in seconds).
+
+        Integers and dates count from the first of these rows: nanoseconds since 1970 do not fit
+        into float64, but their differences do.
+        """
+        (name,) = self.channels["time"]
+        column = self.columns[name]
+        if isinstance(column, pl.Series) and column.dtype.is_temporal():
+            fine = pl.Duration("ns") if column.dtype == pl.Duration else pl.Datetime("ns")
+            ticks = column.cast(fine).cast(pl.Int64)
+            self._refuse_first(name, ticks.is_null().to_numpy(), ticks, "is empty")
+            integers = ticks.to_numpy()
+            return (integers - integers[0]) * 1e-9, True
+        if isinstance(column, pl.Series) and column.dtype.is_integer() and not column.null_count():
+            column = column.to_numpy()
+        if isinstance(column, np.ndarray) and column.ndim == 1 and column.dtype.kind in "iu":
+            return (column.astype(np.int64) - np.int64(column[0])).astype(np.float64), False
+        block = self.numbers(name)
+        if block.shape[1] != 1:
+            raise InputError(
+                f"`{name}` of `{self.source}` must be one column of time stamps, "
+                f"but is an array of {block.shape[1]} columns."
+            )
+        return block[:, 0], False
+
+    def numbers(self, name: str) -> np.ndarray:
+        """Return a column as finite numbers (samples x columns)."""
+        column = self.columns[name]
+        if isinstance(column, pl.Series):
+            array = self._series(name, column)
+        elif column.dtype.kind in "iufb" and column.ndim <= 2:
+            with np.errstate(invalid="ignore"):  # signalling NaN
+                array = np.asarray(column, np.float64)
+        else:
+            raise InputError(
+                f"`{name}` of `{self.source}` must be an array of real numbers of one or two "
+                f"axes, but holds {column.dtype} with {column.ndim} axes."
+            )
+        if array.size == 0:
+            raise InputError(f"`{name}` of `{self.source}` has rows, but no columns.")
+        array = np.array(array.reshape(len(array), -1), np.float64)
+        size = np.abs(array).max(axis=1)
+        complaint = "is not finite, or larger than any sensor tells ({} in size)"
+        self._refuse_first(name, ~(size <= LARGEST), size, complaint)
+        return array
+
+    def _series(self, name: str, column: pl.Series) -> np.ndarray:
+        try:
+            numbers = column.cast(pl.Float64, strict=False)
+            if column.dtype == pl.String and numbers.null_count():
+                numbers = column.str.strip_chars().cast(pl.Float64, strict=False)
+        except pl.exceptions.PolarsError as error:
+            raise InputError(
+                f"column `{name}` of `{self.source}` holds {column.dtype} and no numbers: "
+                "write it as floating-point numbers, or name another column."
+            ) from error
+        self._refuse_first(name, column.is_null().to_numpy(), column, "is empty")
+        self._refuse_first(name, numbers.is_null().to_numpy(), column, "is `{}`, no number")
+        return numbers.to_numpy()
+
+    def _refuse_first(self, name: str, bad: np.ndarray, column: Any, complaint: str) -> None:
+        rows = np.flatnonzero(bad)
+        if rows.size:
+            first = int(rows[0])
+            more = f" (and {rows.size - 1} more)" if rows.size > 1 else ""
+            raise InputError(
+                f"column `{name}` of `{self.source}`, {self.unit} {first + self.first_row}, "
+                f"{complaint.format(column[first])}{more}: repair the log or remove those rows."
+            )
+
+
+def open_table(path: Path, selections: Mapping[str, Selection], on_disk: bool) -> LogTable:
+    """Open a file; its suffix tells the format."""
+    if not path.is_file():
+        raise InputError(f"`{path}` is no file: check the path of the log.")
+    suffix = path.suffix.lower()
+    if suffix in SUFFIXES:
+        return _open_text(path, selections, on_disk)
+    if suffix == ".parquet":
+        with _readable_parquet(path.name):
+            columns = pl.scan_parquet(path)
+            names = columns.collect_schema().names()
+    elif suffix == ".npz":
+        columns = names = (_map_arrays(path) if on_disk else None) or _read_npz(path)
+    elif suffix == ".mat":
+        columns = names = _read_mat(path)
+    else:
+        raise InputError(
+            f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet, .npz or .mat, to be read "
+            "as a log: convert it to one of them."
+        )
+    return LogTable(path.name, columns, _Layout(path.name, tuple(names)).channels(selections))
+
+
+def estimated_rows(path: Path) -> int:
+    """Estimate the number of rows of a file; 0 if it cannot be read in parts."""
+    if path.suffix.lower() in SUFFIXES and path.is_file():
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+        return path.stat().st_size * head.count(b"\n") // max(len(head), 1)
+    try:
+        if path.suffix.lower() == ".parquet":
+            with _readable_parquet(path.name):
+                return int(pl.scan_parquet(path).select(pl.len()).collect().item())
+        if path.suffix.lower() == ".npz":
+            return max(map(len, (_map_arrays(path) or {}).values()), default=0)
+    except InputError:
+        pass
+    return 0
+
+
+class _Layout(NamedTuple):
+    """Names of the columns of a file (positions if they are not `named`), and a text's format."""
+
+    source: str
+    names: tuple[str, ...]
+    named: bool = True
+    separator: str = ","
+    decimal_comma: bool = False
+    start: int = 0
+
+    def channels(self, selections: Mapping[str, Selection]) -> dict[str, tuple[str, ...]]:
+        """Return the names of the columns of each channel, each of which has its own."""
+        channels = {c: self._expand(c, selection) for c, selection in selections.items()}
+        used: dict[str, str] = {}
+        for channel, names in channels.items():
+            for name in names:
+                if name in used:
+                    raise InputError(
+                        f"the column `{name}` of `{self.source}` is used for `{used[name]}` and "
+                        f"`{channel}`: one column holds one channel of one joint; name the right "
+                        "one."
+                    )
+                used[name] = channel
+        return channels
+
+    def _expand(self, channel: str, selection: Selection) -> tuple[str, ...]:
+        """Return the names of the columns of a selection, in the order of the joints."""
+        if isinstance(selection, tuple):
+            return tuple(self._name(channel, one) for one in selection)
+        if isinstance(selection, int) or "{}" not in selection:
+            return (self._name(channel, selection),)
+        pattern = re.escape(selection).replace(re.escape("{}"), r"(\d{1,18})")
+        matches: dict[int, str] = {}
+        for column in self.names:
+            if not (match := re.fullmatch(pattern, column)):
+                continue
+            number = int(match[1])
+            if number in matches:
+                raise InputError(
+                    f"`{self.source}` has `{matches[number]}` and `{column}`, which both are "
+                    f"number {number} of `{channel}`: name the columns one by one."
+                )
+            matches[number] = column
+        if not matches:
+            return (self._name(channel, selection.replace("{}", "1")),)
+        numbers = range(min(*matches, 1), max(matches) + 1)
+        missing = next((number for number in numbers if number not in matches), None)
+        if missing is not None:
+            raise InputError(
+                f"`{self.source}` has no column `{selection.replace('{}', str(missing))}` for "
+                f"`{channel}`, though it has `{matches[max(matches)]}`: name the columns one by "
+                "one."
+            )
+        return tuple(matches[number] for number in numbers)
+
+    def _name(self, channel: str, column: str | int) -> str:
+        names = self.names
+        if isinstance(column, int):
+            if not 0 <= column < len(names):
+                raise InputError(
+                    f"`{channel}` asks for column {column} of `{self.source}`, but its columns are "
+                    f"numbered from 0 to {len(names) - 1}."
+                )
+            return names[column]
+        if not self.named:
+            raise InputError(
+                f"`{self.source}` has no header, so `{channel}` cannot name the column `{column}`: "
+                f"give positions from 0 to {len(names) - 1}."
+            )
+        if column in names:
+            return column
+        near = difflib.get_close_matches(column, names, n=1, cutoff=0.5)
+        hint = f" (did you mean `{near[0]}`?)" if near else ""
+        shown = ", ".join(f"`{name}`" for name in names[:40])
+        more = f" and {len(names) - 40} more" if len(names) > 40 else ""
+        raise InputError(
+            f"`{self.source}` has no column `{column}` for `{channel}`{hint}: it has {shown}{more}."
+        )
+
+    def read_lines(self, rows: bytes, line: int) -> dict[str, pl.Series]:
+        """Return the cells of whole lines, of which `line` is the first."""
+        if self.separator == " ":
+            rows = b"\n".join(b" ".join(row.split()) for row in rows.splitlines())
+        if b'"' in rows:
+            for index, text in enumerate(rows.split(b"\n")):
+                if text.count(b'"') % 2:
+                    raise InputError(
+                        f"line {index + line} of `{self.source}` opens a quotation that does not "
+                        "end in that line: remove the quotation mark, or close it there."
+                    )
+        try:
+            frame = pl.read_csv(
+                io.BytesIO(rows),
+                schema=dict.fromkeys(self.names, pl.String()),
+                separator=self.separator,
+                has_header=False,
+                encoding="utf8-lossy",
+            )
+        except pl.exceptions.PolarsError as error:
+            raise InputError(
+                f"`{self.source}` is no table with {len(self.names)} columns in every line: "
+                "repair or remove the lines that differ."
+            ) from error
+        if self.decimal_comma:
+            frame = frame.select(pl.all().str.replace(",", ".", literal=True))
+        return frame.to_dict(as_series=True)
+
+
+_conversions: dict[tuple, Path] = {}
+"""Folders with the Parquet files of long text files."""
+
+
+def _open_text(path: Path, selections: Mapping[str, Selection], on_disk: bool) -> LogTable:
+    """Read the needed columns of a text file, or convert them to Parquet unless this was done."""
+    with path.open("rb") as file:
+        text = _detect_format(path.name, file.read(HEAD))
+        file.seek(text.start)
+        channels = text.channels(selections)
+        table = LogTable(path.name, {}, channels, 1 + int(text.named), "line")
+        frames = _read_frames(file, text, table)
+        if not on_disk:
+            return dataclasses.replace(table, columns=pl.concat(frames).lazy())
+        state = path.stat()
+        key = (path.resolve(), state.st_size, state.st_mtime_ns, *channels.values())
+        if key not in _conversions:
+            folder = Path(tempfile.mkdtemp(prefix="jaxid-"))
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            for number, frame in enumerate(frames):
+                frame.write_parquet(folder / f"{number:09}.parquet")
+            _conversions[key] = folder
+    return dataclasses.replace(table, columns=pl.scan_parquet(_conversions[key] / "*.parquet"))
+
+
+def _read_frames(file: BinaryIO, text: _Layout, table: LogTable) -> Iterator[pl.DataFrame]:
+    """Yield the numbers of consecutive blocks of lines."""
+    names = list(dict.fromkeys(itertools.chain(*table.channels.values())))
+    stamps, exact, line, rest = table.channels.get("time", ()), None, table.first_row, b""
+    while data := file.read(BLOCK) + file.readline():
+        data = rest + data
+        rows = data.rstrip(b"\r\n")
+        rest = data[len(rows) :].partition(b"\n")[2]
+        if not rows:
+            continue
+        cells = text.read_lines(rows, line)
+        part = dataclasses.replace(table, columns=cells, first_row=line)
+        columns: dict[str, Any] = {name: part.numbers(name)[:, 0] for name in names}
+        for name in stamps:
+            # Float64 cannot hold nanoseconds since 1970.
+            exact = np.abs(columns[name]).max() > 2**53 if exact is None else exact
+            ticks = cells[name].str.strip_chars().cast(pl.Int64, strict=False)
+            if exact and not ticks.null_count():
+                columns[name] = ticks
+        yield pl.DataFrame(columns)
+        line += len(cells[names[0]])
+    if line == table.first_row:
+        raise InputError(f"`{table.source}` has no rows: is the log cut?")
+
+
+def _detect_format(source: str, head: bytes) -> _Layout:
+    """Detect the format of a text file by its first bytes."""
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
+    first, _, _ = head.partition(b"\n")
+    if b"\r" in first.rstrip(b"\r"):
+        raise InputError(
+            f"`{source}` ends its lines with carriage returns alone: save it again with line ends "
+            "of Unix or Windows (LF or CRLF)."
+        )
+    line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
+    if not line.strip():
+        raise InputError(f"`{source}` must start with a header or with numbers, but is empty.")
+    separator = next((s for s in (";", "\t", ",", " ") if s in line.strip()), ",")
+    line = " ".join(line.split()) if separator == " " else line
+    cells = [cell.strip().strip('"') for cell in line.split(separator)]
+    named = not all(_is_number(cell) for cell in cells if cell) or not any(cells)
+    names = cells if named else [str(i) for i in range(len(cells))]
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(
+            f"the header of `{source}` names the column `{repeated[0]}` twice: rename one of them."
+        )
+    comma = separator == ";" and re.search(rb"\d,\d", head) is not None
+    mark = len(codecs.BOM_UTF8) if first.startswith(codecs.BOM_UTF8) else 0
+    start = min(len(first) + 1, len(head)) if named else mark
+    return _Layout(source, tuple(names), named, separator, comma, start)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _readable_parquet(source: str) -> Iterator[None]:
+    """Report a Parquet file that polars cannot read as damaged."""
+    try:
+        yield
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+        raise InputError(
+            f"`{source}` is no Parquet file, or is damaged: {_said(error)}."
+        ) from error
+
+
+def _said(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _read_mat(path: Path) -> dict[str, np.ndarray]:
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except NotImplementedError as error:
+        raise InputError(
+            f"`{path.name}` is a MAT file of version 7.3, which cannot be read: save it with "
+            "`save(name, ..., '-v7')`, or as CSV."
+        ) from error
+    except Exception as error:  # of many kinds: it depends on which bytes are damaged
+        raise InputError(f"`{path.name}` is no MAT file, or is damaged: {_said(error)}.") from error
+    return _named_arrays({k: value for k, value in content.items() if not k.startswith("__")})
+
+
+def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+    """Return arrays by name; those in a structure are named like `log.q`."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, value in content.items():
+        if isinstance(value, dict):
+            arrays |= _named_arrays(value, f"{prefix}{name}.")
+        elif isinstance(value, np.ndarray) and value.ndim > 0:
+            # Single rows, as MATLAB writes them, are columns here.
+            arrays[prefix + name] = value.ravel() if 1 in value.shape else value
+    return arrays
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of an NPZ file; objects, which could run code, are rejected."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            # A member that NumPy did not write comes as bytes, which are left out.
+            return _named_arrays({name: archive[name] for name in archive.files})
+    except Exception as error:  # some ten kinds: it depends on which bytes are damaged
+        raise InputError(
+            f"`{path.name}` is no NPZ file of plain arrays ({_said(error)}): save the log with "
+            "`numpy.savez` and without objects."
+        ) from error
+
+
+def _map_arrays(path: Path) -> dict[str, np.ndarray] | None:
+    """Map the arrays of an NPZ file into memory; None if one is compressed or none is there."""
+    arrays = {}
+    try:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
+            for entry in archive.infolist():
+                if entry.compress_type != zipfile.ZIP_STORED:
+                    return None
+                file.seek(entry.header_offset + 26)
+                lengths = np.frombuffer(file.read(4), "<u2")
+                file.seek(entry.header_offset + 30 + int(lengths.sum()))
+                first = np.lib.format.read_magic(file) == (1, 0)
+                form = np.lib.format
+                read = form.read_array_header_1_0 if first else form.read_array_header_2_0
+                shape, fortran, dtype = read(file)
+                order = "F" if fortran else "C"
+                array = np.memmap(path, dtype, "r", file.tell(), shape, order)
+                arrays[entry.filename.removesuffix(".npy")] = array
+    except Exception as error:  # of many kinds: it depends on which bytes are damaged
+        raise InputError(
+            f"`{path.name}` is no NPZ file of numbers, or is damaged ({_said(error)}): write it "
+            "again."
+        ) from error
+    return _named_arrays(arrays) or None

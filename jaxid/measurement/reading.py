@@ -1,0 +1,254 @@
+"""Logs read as a whole, or in parts with overlap for the filters: larger than memory."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxid.arrays import Float
+from jaxid.dynamics.motion import Motion
+from jaxid.measurement.columns import Columns, Log, open_log
+from jaxid.measurement.filters import AbstractDecimation, AbstractFilter, Subsample
+from jaxid.measurement.observations import (
+    AbstractSamples,
+    Observations,
+    Progress,
+    joint_side,
+    require_joints,
+    usable_segments,
+    with_fast_rows,
+)
+from jaxid.measurement.recording import (
+    NeedsMemory,
+    Recording,
+    TimeGrid,
+    consecutive,
+    find_grid,
+)
+from jaxid.robot.robot import Robot
+
+AT_ONCE = 65536
+"""Samples that are read at once."""
+
+
+def read_recording(
+    path: str | Path,
+    columns: Columns,
+    name: str | None = None,
+    *,
+    forces_path: str | Path | None = None,
+    velocities_path: str | Path | None = None,
+    largest_gap: float | int = 1.75,
+) -> Recording:
+    """Read a log from CSV (any separator, with or without header), Parquet, NPZ or MAT.
+
+    Args:
+        path: File with the angles, and with all other channels that have no file of their own.
+        columns: Meaning of the columns.
+        name: Name of the recording; the file's if None.
+        forces_path: File with the forces.
+        velocities_path: File with the velocities.
+        largest_gap: Longest pause that is bridged by interpolation, in sample times; longer ones
+            split the recording into segments.
+
+    Raises:
+        InputError: If a file, a column, a number or the time is invalid; the message names file,
+            column and line.
+    """
+    log = open_log(path, columns, forces_path, velocities_path)
+    angles, velocities, forces = log.read()
+    return Recording.of(
+        angles,
+        forces,
+        velocities=velocities,
+        time=None if columns.time is None else log.stamps(),
+        sample_time=columns.sample_time,
+        angles_on_motor_side=columns.angles_on_motor_side,
+        forces_on_motor_side=columns.forces_on_motor_side,
+        largest_gap=largest_gap,
+        name=Path(path).stem if name is None else name,
+        first_row=log.tables[0].first_row,
+    )
+
+
+class SamplesOnDisk(AbstractSamples):
+    """Samples of a log that stays on disk; each segment begins at its own row of the files.
+
+    Parts are read with `overlap` samples before and behind them, for the filter.
+    """
+
+    log: Log = eqx.field(static=True)
+    robot: Robot
+    filter: AbstractFilter
+    overlap: int = eqx.field(static=True)
+    segments: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    first_rows: tuple[int, ...] = eqx.field(static=True)
+    sample_time: float = eqx.field(static=True)
+
+    def read(self, samples: slice) -> tuple[Motion, np.ndarray]:
+        """Return motion and forces of some samples of one segment, joint side."""
+        begin, end = self.segments[self._segment(samples)]
+        a, b = max(begin, samples.start - self.overlap), min(end, samples.stop + self.overlap)
+        columns = self.log.columns
+        sides = columns.angles_on_motor_side, columns.forces_on_motor_side
+        angles, velocities, forces = joint_side(self.robot, *self.read_rows(slice(a, b)), *sides)
+        motion = self.filter.motion(angles, velocities, self.sample_time)
+        wanted = slice(samples.start - a, samples.stop - a, samples.step)
+        return motion[wanted], forces[wanted]
+
+    def read_all(self) -> tuple[Motion, np.ndarray]:
+        """Return motion and forces of all segments; they must fit into memory."""
+        motions, forces = zip(*(self.read(slice(a, b)) for a, b in self.segments), strict=True)
+        parts = [np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "qd", "qdd")]
+        return Motion(*parts), np.concatenate(forces)
+
+    def read_rows(self, samples: slice) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """Return angles, velocities and forces of a segment's samples as they were recorded."""
+        k = self._segment(samples)
+        behind = self.first_rows[k] - self.segments[k][0]
+        return self.log.read(behind + samples.start, behind + samples.stop)
+
+    def _segment(self, samples: slice) -> int:
+        starts = [a for a, _ in self.segments]
+        return int(np.searchsorted(starts, samples.start, "right")) - 1
+
+
+def scan_log(
+    path: str | Path,
+    columns: Columns,
+    robot: Robot,
+    filter: AbstractFilter,
+    decimation: AbstractDecimation | None = None,
+    min_speed: ArrayLike | tuple[float | int, ...] | None = None,
+    name: str | None = None,
+    *,
+    forces_path: str | Path | None = None,
+    velocities_path: str | Path | None = None,
+    largest_gap: float | int = 1.75,
+    start: float | int = -np.inf,
+    stop: float | int = np.inf,
+    progress: Progress | None = None,
+) -> Observations:
+    """Open a log that need not fit into memory: CSV, Parquet, or uncompressed NPZ.
+
+    The result equals that of `read_recording` and `observe`, but the samples stay on disk. The time
+    stamps are read once to find gaps; between gaps they must be uniform. With `min_speed`, the
+    motion is read once as well.
+
+    Args:
+        path: File with the angles, and with all other channels that have no file of their own.
+        columns: Meaning of the columns.
+        robot: Robot, whose drives convert from motors to joints.
+        filter: Filter of the motion, and of forces and columns, with a finite memory.
+        decimation: Decimation of forces and columns; every sample is a row if None.
+        min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
+        name: Name of the log; the file's if None.
+        forces_path: File with the forces.
+        velocities_path: File with the velocities.
+        largest_gap: Longest pause that is no gap, in sample times.
+        start: Start of the part that counts, from the log's first row on [s].
+        stop: End of the part that counts [s].
+        progress: Callback, called with the completed fraction (0 to 1) of the pass for `min_speed`.
+
+    Raises:
+        NeedsMemory: If the filter needs the whole log at once, or rows must be moved or removed
+            to make the stamps uniform: use `read_recording`.
+        InputError: If the file is of another kind, its columns are not the robot's, forces and
+            columns would be aliased, or no samples are left.
+    """
+    log = open_log(path, columns, forces_path, velocities_path, on_disk=True)
+    source = Path(path)
+    name = source.stem if name is None else name
+    require_joints(name, log.joints, robot)
+    decimation = Subsample(1) if decimation is None else decimation
+    if columns.sample_time is not None:
+        grid = TimeGrid(columns.sample_time, ((0, log.rows),))
+    else:
+        first_row = log.tables[0].first_row
+        grid = find_grid(lambda: _stamps(log), source.name, largest_gap, first_row, in_parts=True)
+    if start > -np.inf or stop < np.inf:
+        grid = grid.cropped(start, stop, name)
+    dt = grid.sample_time
+    used, omitted = usable_segments(grid.ranges, filter, decimation, dt, name)
+    segments = consecutive(b - a for a, b in used)
+    starts = dict(zip(grid.ranges, grid.start_times, strict=True))
+    overlap = filter_memory(filter, dt, columns.velocities is not None)
+    first_rows = tuple(a for a, _ in used)
+    observations = Observations(
+        source=SamplesOnDisk(log, robot, filter, overlap, segments, first_rows, dt),
+        filter=filter,
+        decimation=decimation,
+        segments=segments,
+        start_times=tuple(starts[ends] for ends in used),
+        mask=np.ones((0, robot.joints), bool),
+        sample_time=dt,
+        name=name,
+        notes=(*grid.notes, *omitted),
+    )
+    if min_speed is not None:
+        velocities = _row_velocities(observations, progress)
+        return with_fast_rows(observations, robot, min_speed, velocities)
+    rows = observations.row_segments[-1][1]
+    return observations.replace(mask=np.broadcast_to(np.ones(1, bool), (rows, robot.joints)))
+
+
+def _stamps(log: Log) -> Iterator[np.ndarray]:
+    """Yield the time stamps in parts [s]."""
+    last = 0.0
+    for start in range(0, log.rows, AT_ONCE):
+        # Integers and dates count from a part's first row: the row before links parts.
+        part = log.stamps(max(0, start - 1), min(start + AT_ONCE, log.rows))
+        if start:
+            part = (part - part[0] + last)[1:]
+        last = float(part[-1])
+        yield part
+
+
+def _row_velocities(
+    observations: Observations, progress: Progress | None
+) -> Iterator[Float[np.ndarray, "rows joints"]]:
+    """Yield the velocities of all rows in parts."""
+    o = observations
+    rows = o.row_segments[-1][1]
+    factor, edge = o.decimation.factor, o.filter.edge(o.sample_time)
+    for (a, _), (r0, r1) in zip(o.segments, o.row_segments, strict=True):
+        step = max(1, AT_ONCE // factor)
+        for r in range(r0, r1, step):
+            stop = min(r + step, r1)
+            first = a + edge + (r - r0) * factor
+            motion, _ = o.read(slice(first, first + (stop - 1 - r) * factor + 1, factor))
+            yield np.asarray(motion.qd)
+            if progress is not None:
+                progress(stop / rows)
+
+
+def filter_memory(filter: AbstractFilter, sample_time: float, measured: bool) -> int:
+    """Return after how many samples a filter's motion no longer depends on an angle or velocity.
+
+    Raises:
+        NeedsMemory: If the memory is not finite.
+    """
+    refusal = (
+        f"`{type(filter).__name__}` needs the whole log at once: take another filter, or a log "
+        "that fits into memory (`read_recording`)."
+    )
+    half = 4096
+    while half <= 2**20:
+        impulse = np.zeros((2 * half + 1, 1))
+        impulse[half] = 1e-3
+        try:
+            motion = filter.motion(impulse, impulse if measured else None, sample_time)
+        except ValueError as error:
+            raise NeedsMemory(refusal) from error
+        reach = 0
+        for x in (motion.q, motion.qd, motion.qdd):
+            size = np.abs(np.asarray(x)[:, 0])
+            last = np.flatnonzero(size > 1e-13 * size.max())
+            reach = max(reach, int(np.abs(last - half).max(initial=0)))
+        if reach < half // 2:
+            # The part below rounding decays at the same rate.
+            return int(1.3 * reach) + 4
+        half *= 4
+    raise NeedsMemory(refusal)

@@ -1,0 +1,139 @@
+"""Each finding about a log without a model is raised by its own mistake, and by nothing else."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxid.diagnosis.findings import channel_findings, stuck_findings, unit_findings
+from jaxid.measurement.recording import Recording
+from jaxid.robot.joints import Drives
+from jaxid.robot.library import panda, planar_arm
+from jaxid.trajectory.fourier import random_fourier_series
+
+ROBOT = panda().replace(drives=Drives(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))
+DT = 0.005
+T = np.arange(0.0, 10.0, DT)
+Q = np.asarray(random_fourier_series(ROBOT, omega=0.6, seed=3).motion(T).q)
+NOISE = np.random.default_rng(1).normal(0.0, 0.1, Q.shape)
+TAU = 30.0 * np.sin(Q) + 5.0 * np.sign(np.gradient(Q, axis=0)) + NOISE
+NAME = ROBOT.joint_names[2]
+
+
+def units(angles, on_motor_side=False):
+    return unit_findings(ROBOT, angles.min(axis=0), angles.max(axis=0), on_motor_side)
+
+
+def faults(angles=Q, forces=TAU, **more):
+    return channel_findings(ROBOT, Recording.of(angles, forces, sample_time=DT, **more))
+
+
+def stuck(forces, angles=Q):
+    return stuck_findings(ROBOT, Recording.of(angles, forces, sample_time=DT))
+
+
+def changed(x, rows, value):
+    x = x.copy()
+    x[rows, 2] = value
+    return x
+
+
+def test_units_and_sides_are_recognised_by_ranges():
+    motors = np.asarray(ROBOT.drives.motor_angles(Q))
+    assert units(Q) == units(motors, on_motor_side=True) == []
+    assert unit_findings(planar_arm(2), np.full(2, -9.0), np.full(2, 9.0), False) == []
+    for angles, words in (
+        (np.rad2deg(Q), "would not if those in the log were degrees"),
+        (np.deg2rad(Q), "are the angles of the log in radians"),
+        (motors, 'the motors\' (`recording.side = "motor"`)'),
+    ):
+        (said,) = units(angles)
+        assert words in said
+
+
+@pytest.mark.parametrize("count", [0.0, 1e-4, 2e-3])
+def test_sane_logs_have_none_however_coarse(count):
+    angles = count * np.round(Q / count) if count else Q
+    forces = 0.3 * np.round(TAU / 0.3) if count else TAU
+    assert faults(angles, forces) == stuck(forces) == []
+    assert faults(angles[:100], forces[:100]) == []
+
+
+def test_joints_that_take_turns_stand_and_are_not_held():
+    """They stop as gently as ever, and stand exactly, while others move."""
+    way = np.concatenate([np.linspace(0, 1, 800), np.ones(400), np.linspace(1, 0, 800)])
+    smooth = 3 * way**2 - 2 * way**3
+    turns = np.stack([np.roll(smooth, 250 * j) if j else smooth for j in range(7)], axis=1)
+    turns[:, 1:] = np.where(T[:, None] < 1.25 * np.arange(1, 7), 0.0, turns[:, 1:])
+    assert [text for _, text in faults(turns, TAU[: len(turns)]) if "angle" in text] == []
+
+
+def test_held_angles_are_named_with_their_times():
+    ((joint, text),) = faults(changed(Q, slice(600, None), Q[600, 2]))
+    assert joint == 2
+    assert f"the angle of joint `{NAME}` stays at" in text
+    assert "from 3 s to 9.995 s" in text
+    ((_, text),) = faults(changed(Q, slice(600, 700), 0.0))
+    assert "stays at 0 from 3 s to 3.495 s" in text
+
+
+@pytest.mark.parametrize("value", [0.0, TAU[600, 2]])
+@pytest.mark.parametrize("stop", [700, None])
+def test_held_forces_are_named_with_their_times(value, stop):
+    ((joint, text),) = faults(forces=changed(TAU, slice(600, stop), value))
+    until = "9.995" if stop is None else "3.495"
+    assert joint == 2
+    assert f"`{NAME}` stay at {value:.3g} from 3 s to {until} s" in text
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_spikes_are_named_with_their_times(samples):
+    angles = Q.copy()
+    angles[501 : 501 + samples, 4] += 0.1
+    angles[1200, 4] -= 0.1
+    ((joint, text),) = faults(angles)
+    assert joint == 4
+    assert "and back at 2.505 s, and 1 more" in text
+
+
+@pytest.mark.parametrize("on_motor_side", [False, True])
+def test_turns_that_start_again_are_named(on_motor_side):
+    angles = (100.0 if on_motor_side else 4.0) * Q
+    assert faults(angles, angles_on_motor_side=on_motor_side) == []
+    angles[:, 1] = (angles[:, 1] + np.pi) % (2 * np.pi) - np.pi
+    ((joint, text),) = faults(angles, angles_on_motor_side=on_motor_side)
+    owner = "the motor of joint" if on_motor_side else "joint"
+    assert joint == 1
+    assert f"the angle of {owner} `{ROBOT.joint_names[1]}` jumps by a full turn (6.283)" in text
+    assert any("a full turn (360)" in text for _, text in faults(np.rad2deg(angles)))
+
+
+def test_fast_motors_do_not_wrap():
+    """Half a turn and more from one sample to the next, but smoothly."""
+    assert np.abs(np.diff(600.0 * Q, axis=0)).max() > np.pi
+    assert faults(600.0 * Q, angles_on_motor_side=True) == []
+
+
+def test_gaps_are_no_faults():
+    log = Recording.of(Q, TAU, time=np.where(T < 4.0, T, T + 30.0))
+    angles = np.where(T[:, None] < 4.0, Q, Q + 7.0)
+    assert len(log.segments) == 2
+    assert channel_findings(ROBOT, dataclasses.replace(log, angles=angles)) == []
+
+
+@pytest.mark.parametrize("level", [0.7, 0.9])
+def test_forces_that_are_cut_off_are_recognised(level):
+    forces = 0.01 * np.round(TAU / 0.01)
+    top = level * forces[:, 2].max()
+    forces[:, 2] = np.minimum(forces[:, 2], top)
+    (said,) = stuck(forces)
+    assert f"the forces of joint `{NAME}` stay at {top:.3g} in " in said
+    (said,) = stuck(changed(TAU, slice(None), 1.25))
+    assert f"the forces of joint `{NAME}` are 1.25 throughout" in said
+
+
+def test_a_robot_that_holds_still_at_its_largest_force_is_not_cut_off():
+    moving, forces = Q.copy(), np.round(np.abs(TAU), 2)
+    moving[1200:1800] = moving[1200]
+    forces[1200:1800] = forces.max(axis=0) + 1.0
+    assert stuck(forces, moving) == []
