@@ -20,8 +20,8 @@ from jaxid.excitation.design import design_excitation as design_excitation
 from jaxid.excitation.plan import ExcitationPlan as ExcitationPlan
 from jaxid.excitation.problem import ExcitationProblem as ExcitationProblem
 from jaxid.export.c_code import export_c as export_c
-from jaxid.export.mjcf import export_mjcf as export_mjcf
-from jaxid.export.urdf import export_urdf as export_urdf
+from jaxid.export.simulators import export_mjcf as export_mjcf
+from jaxid.export.simulators import export_urdf as export_urdf
 from jaxid.identification import consistency as consistency
 from jaxid.identification import devices as devices
 from jaxid.identification import estimators as estimators

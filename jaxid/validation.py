@@ -9,7 +9,6 @@ from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.fit import Fit
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.robot.robot import Robot
 from jaxid.table import Column, Remark, Status, Table, percent, significant
 
 POSES = 2000
@@ -79,12 +78,6 @@ class TorqueErrors(eqx.Module):
         r"""Norm of all errors over the norm of all forces, $|Wp - Q| / |Q|$."""
         squares = np.nansum(self.errors**2), np.nansum(self._measured**2)
         return float(np.sqrt(_ratio(*squares)))
-
-    @property
-    def explained(self) -> Float[np.ndarray, " joints"]:
-        """Explained fraction of the variance of each joint, $R^2$."""
-        squares = np.nanmean(self.errors**2, axis=0)
-        return 1.0 - _ratio(squares, np.nanvar(self._measured, axis=0))
 
     @property
     def _measured(self) -> np.ndarray:
@@ -170,8 +163,6 @@ def validate(
     fit: Fit,
     observations: Observations | Sequence[Observations],
     *,
-    poses: int = POSES,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> Validation:
     """Check a model: torque errors on recordings, and the definiteness of its mass matrix.
@@ -179,8 +170,6 @@ def validate(
     Args:
         fit: Fit of the model.
         observations: One or several recordings, preferably not used for the fit.
-        poses: Number of random poses in which the mass matrix is evaluated.
-        seed: Seed of the poses.
         progress: Callback, called with the completed fraction (0 to 1) of each recording.
     """
     single = isinstance(observations, Observations)
@@ -188,7 +177,7 @@ def validate(
     robot = fit.base.model.robot
     return Validation(
         errors=tuple(torque_errors(fit, o, progress) for o in recordings),
-        definiteness=definiteness(fit, poses=poses, seed=seed),
+        definiteness=definiteness(fit),
         joint_names=robot.joint_names,
         units=tuple(robot.force_unit(j) for j in range(robot.joints)),
     )
@@ -238,26 +227,18 @@ def comparison_step(observations: Observations) -> int:
     return -(-observations.rows // ROWS)
 
 
-def definiteness(fit: Fit, *, poses: int = POSES, seed: int = 0) -> Definiteness:
-    """Look for poses in which the identified mass matrix is not positive definite (Sec. 5).
+def definiteness(fit: Fit, poses: int = POSES) -> Definiteness:
+    """Look for random poses in which the identified mass matrix is not positive definite (Sec. 5).
 
-    Args:
-        fit: Fit of the model.
-        poses: Number of random poses over the range of the joints; a joint without limits turns
-            once, a rail without limits stays within a metre of zero.
-        seed: Seed of the poses.
+    They are spread over the range of the joints. A joint without limits turns once, a rail without
+    limits stays within a metre of zero.
     """
     robot = fit.base.model.robot
-    low, high = position_range(robot)
-    q = np.random.default_rng(seed).uniform(low, high, (poses, robot.joints))
+    half = np.where(np.array(robot.revolute), np.pi, 1.0)
+    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
+    low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
+    q = np.random.default_rng(0).uniform(low, high, (poses, robot.joints))
     M = in_numpy(fit.base, fit.base.inertia, q, shared=(fit.parameters,))
     smallest = np.linalg.eigvalsh(M)[:, 0]
     worst = int(np.argmin(smallest))
     return Definiteness(float(smallest[worst]), q[worst], float(np.mean(smallest <= 0.0)), poses)
-
-
-def position_range(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joint ranges; one turn, or a metre to either side, where unlimited [rad or m]."""
-    half = np.where(np.array(robot.revolute), np.pi, 1.0)
-    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
-    return np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)

@@ -56,36 +56,18 @@ def export_c(fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = 
     Raises:
         InputError: If `name` is not an identifier of C.
     """
-    source, header = c_code(fit, name, double)
-    with atomic_folder(folder) as staging:
-        (staging / f"{name}.c").write_text(source, encoding="ascii")
-        (staging / f"{name}.h").write_text(header, encoding="ascii")
-    return Path(folder) / f"{name}.c"
-
-
-def c_code(fit: Fit, name: str, double: bool) -> tuple[str, str]:
-    """Return the texts of the C file and of its header.
-
-    Args:
-        fit: Identified model.
-        name: Name of the files and prefix of the functions.
-        double: Whether the code computes in `double` (otherwise `float`).
-
-    Raises:
-        InputError: If `name` is not an identifier of C.
-    """
     CWriter(double).declaration(name, (), ())
     functions = c_functions(fit)
     writer = CWriter(double, name, [x.program for x in functions])
-    return _source(fit, writer, functions), _header(fit, writer, functions)
+    with atomic_folder(folder) as staging:
+        for suffix, write in ((".c", _source), (".h", _header)):
+            text = write(fit, writer, functions)
+            (staging / f"{name}{suffix}").write_text(text, encoding="ascii")
+    return Path(folder) / f"{name}.c"
 
 
 def c_functions(fit: Fit) -> tuple[CFunction, ...]:
-    """Return all functions of a model, with its estimates as constants.
-
-    Args:
-        fit: Identified model.
-    """
+    """Return all functions of a model, with its estimates as constants."""
     model, base = fit.base.model, fit.base
     one, rest = (model.robot.joints,), np.zeros(model.robot.joints)
     torque, others = torques(fit), other_forces(fit)
@@ -138,12 +120,16 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
     )
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
     terms = ", ".join(type(t).__name__ for t in fit.base.model.terms)
-    prototypes = "\n\n".join(
-        f"/* {x.summary}.\n   {x.program.counts.total} operations: {x.program.counts}.\n"
-        f"   {_sizes(x)} */\n"
-        f"{writer.declaration(f'{name}_{x.name}', x.inputs, (x.output,))};"
-        for x in functions
-    )
+    prototypes = []
+    for x in functions:
+        shapes = zip(x.inputs, x.program.input_shapes, strict=True)
+        inputs = ", ".join(f"{key}[{math.prod(shape)}]" for key, shape in shapes)
+        prototypes.append(
+            f"/* {x.summary}.\n   {x.program.counts.total} operations: {x.program.counts}.\n"
+            f"   From {inputs} to {x.output}[{x.size}]. */\n"
+            f"{writer.declaration(f'{name}_{x.name}', x.inputs, (x.output,))};"
+        )
+    listed = "\n\n".join(prototypes)
     return f"""/* Identified model of the robot "{_ascii(robot.name)}", for a controller.
 
    Model of {fit.date or "an unknown day"}, {fit.checksum}
@@ -178,7 +164,7 @@ extern "C" {{
 /* The estimates: see the list in {name}.c. */
 extern const {writer.type} {name}_parameters[{fit.base.size}];
 
-{prototypes}
+{listed}
 
 #ifdef __cplusplus
 }}
@@ -186,12 +172,6 @@ extern const {writer.type} {name}_parameters[{fit.base.size}];
 
 #endif
 """
-
-
-def _sizes(function: CFunction) -> str:
-    shapes = zip(function.inputs, function.program.input_shapes, strict=True)
-    inputs = ", ".join(f"{x}[{math.prod(shape)}]" for x, shape in shapes)
-    return f"From {inputs} to {function.output}[{function.size}]."
 
 
 def _source(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:

@@ -130,12 +130,7 @@ class Description:
 
 
 def simplest_description(robot: Robot, parameters: Float[np.ndarray, "joints 10"]) -> Description:
-    """Return a description of a robot that leaves few operations.
-
-    Args:
-        robot: Joints and frames.
-        parameters: Ten parameters of each body in the paper's order.
-    """
+    """Return a description of a robot, with ten parameters of each body, of few operations."""
     given = Description(robot, pseudo_inertia(parameters), np.zeros(robot.joints))
     best = given.carry_inward()
     for body in range(robot.joints):
@@ -205,11 +200,7 @@ def torques(fit: Fit) -> Callable[..., Any]:
 
 
 def torque_program(fit: Fit) -> Program:
-    """Return the program of the feed-forward on base parameters (Eq. 39).
-
-    Args:
-        fit: Identified model.
-    """
+    """Return the program of the feed-forward on base parameters (Eq. 39)."""
     one = (fit.base.model.robot.joints,)
     return trace(torques(fit), one, one, one)
 

@@ -341,6 +341,9 @@ def load(path: str | Path) -> Fit:
         OSError: If the file cannot be read.
         InputError: If it is no model file, of another version, or not as it was written.
     """
+    # The file may name a class of this module.
+    from jaxid.identification.consistency.estimator import Consistency
+
     try:
         document = read_json(path, _unique_keys)
     except ValueError as error:
@@ -372,6 +375,8 @@ def load(path: str | Path) -> Fit:
         )
     try:
         fit = from_json(document["model"], Fit)
+        if not isinstance(fit.consistency, Consistency | None):
+            raise InputError("`consistency` is of another class")
         _check(fit)
     except (ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
@@ -394,10 +399,6 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _check(fit: Fit) -> None:
     """Reject arrays of a file that do not belong to its robot."""
-    from jaxid.identification.consistency.estimator import Consistency
-
-    if not isinstance(fit.consistency, Consistency | None):
-        raise InputError("`consistency` is of another class")
     n, joints = fit.base.size, fit.base.model.robot.joints
     for name, array, shape in (
         ("parameters", fit.parameters, (n,)),

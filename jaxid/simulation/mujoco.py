@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.export.mjcf import mjcf_text
+from jaxid.export.simulators import mjcf_text
 from jaxid.simulation.virtual import VirtualRobot
 
 

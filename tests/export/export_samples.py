@@ -1,35 +1,18 @@
-"""Fits with given parameters: what is exported does not depend on how it was found."""
-
-import dataclasses
+"""Fits with given parameters: the export does not depend on how they were found."""
 
 import numpy as np
+import virtual
 
 import jaxid as jid
-from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.uncertainty import Uncertainty
 from jaxid.simulation.virtual import random_bodies
 
 
-def fit_of(model: jid.Model, p: np.ndarray, *, full: bool = False) -> Fit:
+def fit_of(model: jid.Model, p: np.ndarray, *, full: bool = False) -> jid.Fit:
     """A fit whose base parameters, or all, are those of given standard parameters."""
-    base, n = jid.base_parameters(model), model.robot.joints
-    return Fit(
-        base=base,
-        parameters=np.asarray(base.from_standard(p)),
-        uncertainty=Uncertainty(np.eye(base.size), np.full(base.size, np.inf), np.eye(base.size)),
-        weights=np.ones(n),
-        condition_numbers=ConditionNumbers(1.0, 1.0, 1.0),
-        rows=(1,) * n,
-        residual_rms=np.zeros(n),
-        residual=0.0,
-        undetermined=(),
-        estimator=jid.estimators.LeastSquares(),
-        solution=jid.estimators.Complete(),
-        recordings=("first", "second"),
-        notes=(),
-        full_parameters=p if full else None,
-        date="2026-01-31",
-    )
+    base = jid.base_parameters(model)
+    fields = {"recordings": ("first", "second"), "date": "2026-01-31"}
+    full_parameters = p if full else None
+    return virtual.fit_of(base, base.from_standard(p), full_parameters=full_parameters, **fields)
 
 
 def possible(model: jid.Model, seed: int = 0) -> np.ndarray:
@@ -45,7 +28,3 @@ def possible(model: jid.Model, seed: int = 0) -> np.ndarray:
 def motion(joints: int, samples: int, seed: int = 0) -> jid.Motion:
     rng = np.random.default_rng(seed)
     return jid.Motion(*(rng.uniform(-s, s, (samples, joints)) for s in (3.0, 2.0, 5.0)))
-
-
-def changed(fit: Fit, **fields) -> Fit:
-    return dataclasses.replace(fit, **fields)

@@ -1,5 +1,6 @@
 """The C code against NumPy on the same model, against itself, and against its own promises."""
 
+import dataclasses
 import re
 import shutil
 import subprocess
@@ -8,39 +9,57 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiled_model import CompiledModel
-from export_samples import changed, fit_of, motion, possible
+from export_samples import fit_of, motion, possible
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
-from jaxid.export.c_code import c_functions
 from jaxid.export.feed_forward import torque_program
-from jaxid.program import evaluate
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
 STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror", "-O1"]
 
 
-def railed():
-    terms = (
-        jid.RigidBodies(principal_axes=True),
-        jid.terms.AsymmetricCoulombFriction(),
-        jid.ConstantOffset(),
+def tree():
+    """Revolute and prismatic joints about skew axes, bodies with no symmetry."""
+    rng = np.random.default_rng(5)
+    turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(4)]
+    robot = jid.Robot(
+        "tree",
+        parent=(-1, 0, 1, 1),
+        revolute=(True, False, True, True),
+        axis=rng.normal(size=(4, 3)),
+        rotation=[t * np.sign(np.linalg.det(t)) for t in turns],
+        offset=rng.normal(size=(4, 3)),
+        gravity=(1.0, 2.0, -9.0),
     )
-    return jid.Model(jid.robots.tx90l_on_rail(), terms[:2])
+    terms = (jid.RigidBodies(), jid.terms.LinearSpring(0.3), jid.terms.AsymmetricCoulombFriction())
+    return jid.Model(robot, terms)
+
+
+def railed():
+    """A rail and two joints, without products of inertia."""
+    terms = (jid.RigidBodies(principal_axes=True), jid.CoulombFriction(), jid.RotorInertia())
+    robot = jid.Robot(
+        "rail",
+        revolute=(False, True, True),
+        axis=[(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)],
+        rotation=np.tile(np.eye(3), (3, 1, 1)),
+        offset=[(0.0, 0.0, 0.5), (0.0, 0.0, 0.3), (0.2, 0.0, 0.0)],
+    )
+    return jid.Model(robot, terms)
 
 
 def coupled():
-    terms = (*jid.Model(jid.robots.planar_arm(1, 1.0)).terms, jid.terms.CoupledDrives())
-    return jid.Model(jid.robots.tx40(), terms)
+    robot = jid.robots.planar_arm(3, 0.4).replace(
+        drives=jid.Drives(3, reduction=[[9, 0, 0], [0, 9, 0], [0, 5, 9]])
+    )
+    return jid.Model(robot, (*jid.Model(robot).terms, jid.terms.CoupledDrives()))
 
 
-MODELS = {"panda": lambda: jid.Model(jid.robots.panda()), "rail": railed, "coupled": coupled}
-
-
-@pytest.fixture(scope="module", params=MODELS)
+@pytest.fixture(scope="module", params=[tree, railed, coupled])
 def fit(request):
-    model = MODELS[request.param]()
+    model = request.param()
     return fit_of(model, possible(model))
 
 
@@ -83,37 +102,12 @@ def test_all_forms_agree_with_numpy(fit, compiled):
     assert compiled.messages == ""
 
 
-def test_the_factored_form_has_few_operations(fit):
-    counts = {x.name: x.program.counts.total for x in c_functions(fit)}
-    assert len(counts) == 8
-    assert counts["torque"] < 0.6 * counts["torque_of_masses"]
-    assert counts["torque"] < 0.55 * counts["torque_of_parameters"]
-
-
 def test_operations_of_the_factored_form_are_pinned():
     model = jid.Model(jid.robots.panda(), (jid.RigidBodies(),))
     p = np.random.default_rng(0).uniform(0.1, 1.0, model.size)
     counts = torque_program(fit_of(model, p)).counts
     assert (counts.multiplications, counts.additions) == (283, 273)
     assert counts.functions == 12
-
-
-def test_bodies_with_no_symmetry_in_a_tree_with_skew_axes():
-    rng = np.random.default_rng(5)
-    turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(5)]
-    robot = jid.Robot(
-        "tree",
-        parent=(-1, 0, 1, 1, 3),
-        revolute=(True, False, True, True, False),
-        axis=rng.normal(size=(5, 3)),
-        rotation=[t * np.sign(np.linalg.det(t)) for t in turns],
-        offset=rng.normal(size=(5, 3)),
-        gravity=(1.0, 2.0, -9.0),
-    )
-    model = jid.Model(robot, (jid.RigidBodies(), jid.terms.LinearSpring(0.3)))
-    fit = fit_of(model, rng.normal(size=model.size))
-    m = motion(5, 50)
-    close(evaluate(torque_program(fit), m.q.T, m.qd.T, m.qdd.T).T, fit.predict(m))
 
 
 class CubicFriction(jid.terms.AbstractTerm):
@@ -137,22 +131,27 @@ def small():
 
 
 @pytest.mark.parametrize("double", [True, False])
-@pytest.mark.parametrize("language", ["c", "c++"])
-def test_the_file_compiles_without_warnings_and_checks_itself(small, tmp_path, double, language):
+def test_the_file_compiles_without_warnings_and_checks_itself(small, tmp_path, double):
     source = jid.export_c(small, tmp_path, name="my_arm", double=double)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["my_arm.c", "my_arm.h"]
-    standard = {"c": "-std=c99", "c++": "-std=c++11"}[language]
-    command = ["gcc", "-x", language, standard, *STRICT, "-DMY_ARM_SELF_TEST", str(source)]
-    subprocess.run([*command, "-o", str(tmp_path / "check"), "-lm"], check=True)
-    done = subprocess.run([str(tmp_path / "check")], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    assert "this build is right" in done.stdout
+
+    def check(*language):
+        command = ["gcc", *language, *STRICT, "-DMY_ARM_SELF_TEST", str(source), "-lm"]
+        subprocess.run([*command, "-o", str(tmp_path / "check")], check=True)
+        done = subprocess.run(
+            [str(tmp_path / "check")], capture_output=True, text=True, check=False
+        )
+        return done.returncode, done.stdout
+
+    for language in (("-std=c99",), ("-x", "c++", "-std=c++11")):
+        code, said = check(*language)
+        assert code == 0, said
+        assert "this build is right" in said
     text = re.sub(r"(_torque_expected.*\n    \{)", r"\g<1>9", source.read_text("ascii"), count=1)
     source.write_text(text, "ascii")
-    subprocess.run([*command, "-o", str(tmp_path / "check"), "-lm"], check=True)
-    done = subprocess.run([str(tmp_path / "check")], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "WRONG" in done.stdout
+    code, said = check("-std=c99")
+    assert code == 1
+    assert "WRONG" in said
 
 
 def test_single_precision(small):
@@ -194,9 +193,12 @@ def test_names_in_c(small, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["j*/ int x; /*", "j*\\ int x; /*"])
-def test_no_name_ends_a_comment(small, tmp_path, name):
-    renamed = small.base.model.robot.replace(name=name)
+def test_no_name_ends_a_comment(small, tmp_path):
+    renamed = small.base.model.robot.replace(name="j*/ int x; /* j*\\ int x; /*")
     base = jid.base_parameters(jid.Model(renamed, small.base.model.terms))
-    header = jid.export_c(changed(small, base=base), tmp_path).with_suffix(".h").read_text("ascii")
+    header = (
+        jid.export_c(dataclasses.replace(small, base=base), tmp_path)
+        .with_suffix(".h")
+        .read_text("ascii")
+    )
     assert header.splitlines()[0].count("*/") == 0

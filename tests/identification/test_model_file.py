@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from virtual import motion, observations, standard_parameters
+from virtual import motion, observations, planar_base, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.fit import checksum_of
@@ -16,24 +16,16 @@ from jaxid.io import from_json, to_json
 
 
 @pytest.fixture(scope="module")
-def robot():
-    arm = jid.robots.planar_arm(2, 0.4)
-    return arm.replace(limits=jid.Limits(2, force=[40.0, 5.0])).with_tool(
-        mass=0.7, centre_of_mass=(0.0, 0.1, 0.0)
-    )
-
-
-@pytest.fixture(scope="module")
-def fit(robot):
+def fit():
+    robot = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))
     terms = (
         jid.RigidBodies(),
         jid.ViscousFriction(),
         jid.terms.StribeckFriction(speed=[0.1, 0.2], transition=jid.terms.Tanh(1e-3)),
         jid.terms.TemperatureScaled(jid.ConstantOffset(), rate=0.02),
     )
-    model = jid.Model(robot, terms)
-    p = standard_parameters(model)
-    log = observations(model, p, noise=np.array([0.5, 0.1]))
+    model = jid.Model(robot.with_tool(mass=0.7, centre_of_mass=(0.0, 0.1, 0.0)), terms)
+    log = observations(model, standard_parameters(model), noise=np.array([0.5, 0.1]))
     return jid.identify(jid.base_parameters(model), log)
 
 
@@ -49,7 +41,6 @@ def same(a, b):
         for field in dataclasses.fields(a):
             same(getattr(a, field.name), getattr(b, field.name))
     elif isinstance(a, tuple):
-        assert len(a) == len(b)
         for x, y in zip(a, b, strict=True):
             same(x, y)
     elif isinstance(a, np.ndarray):
@@ -69,31 +60,31 @@ def test_everything_comes_back_bit_for_bit(fit, path):
     assert loaded.checksum == fit.checksum
     assert loaded.date == fit.date != ""
     assert [p.name for p in path.parent.iterdir()] == ["arm.json"]
+    before = path.read_bytes()
+    copy.deepcopy(fit).save(path)
+    assert path.read_bytes() == before
+    assert max(map(len, before.splitlines())) > 100  # arrays stand on lines of their own
 
 
-def test_everything_works_as_after_identify(fit, path, robot):
+def test_everything_works_as_after_identify(fit, path):
     loaded, other = jid.load(path), motion(2, 50, seed=3)
-    np.testing.assert_array_equal(loaded.predict(other), fit.predict(other))
-    np.testing.assert_array_equal(loaded.intervals(), fit.intervals())
-    np.testing.assert_array_equal(loaded.base.regressor(other), fit.base.regressor(other))
-    assert loaded.base.expressions == fit.base.expressions
-    assert loaded.trust == fit.trust
-    assert loaded.estimator == fit.estimator
     log = observations(fit.base.model, standard_parameters(fit.base.model), seed=5)
-    np.testing.assert_array_equal(
-        jid.validate(loaded, log).errors[0].rms, jid.validate(fit, log).errors[0].rms
-    )
+    for use in (
+        lambda f: f.predict(other),
+        lambda f: f.intervals(),
+        lambda f: f.base.regressor(other),
+        lambda f: jid.validate(f, log).errors[0].rms,
+        lambda f: jid.identify(f.base, log, f.estimator).parameters,
+    ):
+        np.testing.assert_array_equal(use(loaded), use(fit))
+    assert loaded.base.expressions == fit.base.expressions
     np.testing.assert_array_equal(jid.compare(loaded, fit).difference, 0.0)
-    again = jid.identify(loaded.base, log, loaded.estimator)
-    np.testing.assert_array_equal(again.parameters, jid.identify(fit.base, log).parameters)
 
 
 def test_a_consistent_fit_keeps_bodies_and_verdict(tmp_path):
-    arm = jid.robots.planar_arm(2, 0.4).replace(limits=jid.Limits(2, force=[40.0, 5.0]))
-    model = jid.Model(arm)
-    log = observations(model, standard_parameters(model), noise=0.1)
-    estimator = jid.PhysicallyConsistent(throw=False)
-    fit = jid.identify(jid.base_parameters(model), log, estimator)
+    base = planar_base()
+    log = observations(base.model, standard_parameters(base.model), noise=0.1)
+    fit = jid.identify(base, log, jid.PhysicallyConsistent(throw=False))
     loaded = jid.load(fit.save(tmp_path / "arm.json"))
     same(plain(loaded), plain(fit))
     assert loaded.consistency.outcome is fit.consistency.outcome
@@ -108,11 +99,9 @@ def test_robots_come_back(name):
 
 @pytest.mark.parametrize("number", [0.1, -0.0, 5e-324, 1.7976931348623157e308, np.inf, np.nan])
 def test_every_number_survives(number):
-    array = np.array([[number, 1.0]])
-    values = json.loads(json.dumps(to_json(array), allow_nan=False))
-    assert from_json(values, np.ndarray).tobytes() == array.tobytes()
-    again = from_json(json.loads(json.dumps(to_json(float(number)))), float)
-    assert np.array(again).tobytes() == np.array(number).tobytes()
+    for value, kind in ((np.array([[number, 1.0]]), np.ndarray), (float(number), float)):
+        again = from_json(json.loads(json.dumps(to_json(value), allow_nan=False)), kind)
+        assert np.array(again).tobytes() == np.array(value).tobytes()
 
 
 class TermOfOnesOwn(jid.terms.AbstractTerm):
@@ -125,26 +114,18 @@ class TermOfOnesOwn(jid.terms.AbstractTerm):
         return jnp.diag(qd**3)
 
 
-def test_a_term_of_ones_own_is_found_where_it_is_known():
+def test_only_known_classes_of_the_family_are_looked_up():
     values = to_json(TermOfOnesOwn(2.0))
     assert from_json(values, jid.terms.AbstractTerm) == TermOfOnesOwn(2.0)
-    with pytest.raises(ValueError, match=r"`Cubic` , which|is a `Cubic`, which is not known"):
-        from_json({**values, "kind": "Cubic"}, jid.terms.AbstractTerm)
-
-
-def test_a_class_outside_of_the_family_is_not_looked_up():
-    with pytest.raises(ValueError, match="not known"):
-        from_json({"kind": "WeightedLeastSquares"}, jid.terms.AbstractTerm)
+    for kind in ("Cubic", "WeightedLeastSquares"):
+        with pytest.raises(ValueError, match=f"is a `{kind}`, which is not known"):
+            from_json({**values, "kind": kind}, jid.terms.AbstractTerm)
 
 
 def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
     log = observations(fit.base.model, standard_parameters(fit.base.model))
-    fit = dataclasses.replace(
-        fit,
-        estimator=jid.estimators.NonlinearFriction(
-            free=lambda terms: [terms[1].transition.epsilon]
-        ),
-    )
+    free = lambda terms: [terms[1].transition.epsilon]  # noqa: E731
+    fit = dataclasses.replace(fit, estimator=jid.estimators.NonlinearFriction(free=free))
     loaded = jid.load(fit.save(tmp_path / "arm.json"))
     assert str(loaded.estimator) == str(fit.estimator)
     assert loaded.checksum == fit.checksum
@@ -152,72 +133,52 @@ def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
         jid.identify(loaded.base, log, loaded.estimator)
 
 
-def changed(path, change, sealed=True):
-    document = json.loads(path.read_text("utf-8"))
-    change(document)
-    if sealed and "model" in document:
-        document["checksum"] = checksum_of(document["model"])
-    path.write_text(json.dumps(document), encoding="utf-8")
-
-
 @pytest.mark.parametrize(
-    ("change", "sealed", "message"),
+    ("change", "message"),
     [
-        (lambda d: d.update(version=2), True, "version 2, but this jaxid reads version 1"),
-        (lambda d: d.update(version=True), True, "version True, but this jaxid reads version 1"),
-        (lambda d: d.update(format="arm"), True, "is no model file"),
-        (lambda d: d.update(more=1), True, "must have the keys .* differs by more"),
-        (lambda d: d.pop("model"), True, "differs by model"),
-        (lambda d: d["model"]["parameters"]["float64"].append(1.0), False, "changed by hand"),
-        (lambda d: d["model"]["parameters"]["float64"].append(1.0), True, "shape"),
+        (lambda d: d.update(version=2), "version 2, but this jaxid reads version 1"),
+        (lambda d: d.update(version=True), "version True, but this jaxid reads version 1"),
+        (lambda d: d.update(format="arm"), "is no model file"),
+        (lambda d: d.update(more=1), "must have the keys .* differs by more"),
+        (lambda d: d.pop("model"), "differs by model"),
+        (lambda d: d.update(checksum="sha256:0"), "changed by hand"),
+        (lambda d: d["model"]["parameters"]["float64"].append(1.0), "shape"),
         (
             lambda d: d["model"]["parameters"]["float64"].__setitem__(0, "inf"),
-            True,
             "`parameters` must hold finite numbers",
         ),
-        (lambda d: d["model"].update(extra=1), True, "unknown key `extra`"),
-        (lambda d: d["model"].pop("base"), True, "lacks `base`"),
-        (lambda d: d["model"].update(kind="BaseParameters"), True, "not known"),
-        (lambda d: d["model"].update(weights=None), True, "`weights` holds None"),
-        (lambda d: d["model"].update(weights={"float64": ["one", 1.0]}), True, "'one'"),
-        (lambda d: d["model"].update(weights={"float64": [1, 1.0]}), True, "holds 1 in an array"),
-        (lambda d: d["model"].update(weights={"float64": [[1.0], []]}), True, "weights"),
-        (lambda d: d["model"].update(weights={"object": []}), True, "has the keys object"),
-        (lambda d: d["model"].update(notes="a"), True, "`notes` holds"),
-        (lambda d: d["model"].update(rows=[1.5, 2]), True, r"`rows\[0\]` holds 1.5"),
-        (lambda d: d["model"]["base"]["model"].update(terms=[]), True, "at least one term"),
-        (
-            lambda d: d["model"]["base"]["model"]["robot"].update(parent=[3, 0]),
-            True,
-            "`parent`",
-        ),
+        (lambda d: d["model"].update(extra=1), "unknown key `extra`"),
+        (lambda d: d["model"].pop("base"), "lacks `base`"),
+        (lambda d: d["model"].update(kind="BaseParameters"), "not known"),
+        (lambda d: d["model"].update(consistency=d["model"]["base"]), "`consistency`"),
+        (lambda d: d["model"].update(weights=None), "`weights` holds None"),
+        (lambda d: d["model"].update(weights={"float64": ["one", 1.0]}), "'one'"),
+        (lambda d: d["model"].update(weights={"float64": [1, 1.0]}), "holds 1 in an array"),
+        (lambda d: d["model"].update(weights={"float64": [[1.0], []]}), "weights"),
+        (lambda d: d["model"].update(weights={"object": []}), "has the keys object"),
+        (lambda d: d["model"].update(rows=[1.5, 2]), r"`rows\[0\]` holds 1.5"),
+        (lambda d: d["model"]["base"]["model"].update(terms=[]), "at least one term"),
+        (lambda d: d["model"]["base"]["model"]["robot"].update(parent=[3, 0]), "`parent`"),
     ],
 )
-def test_what_is_no_model_is_refused_in_one_sentence(path, change, sealed, message):
-    changed(path, change, sealed)
+def test_a_wrong_model_file_is_refused_in_one_sentence(path, change, message):
+    document = json.loads(path.read_text("utf-8"))
+    document["checksum"] = None
+    change(document)
+    if document["checksum"] is None and "model" in document:
+        document["checksum"] = checksum_of(document["model"])
+    path.write_text(json.dumps(document), encoding="utf-8")
     with pytest.raises(ValueError, match=message) as error:
         jid.load(path)
     text = str(error.value)
     assert str(path) in text
     assert "\n" not in text
-    assert text.endswith((".", "again."))
+    assert text.endswith(".")
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "null", "[" * 100_000, '{"a": 1, "a": 2}', "\0"])
-def test_what_is_no_document_is_refused(tmp_path, text):
+def test_other_documents_are_refused(tmp_path, text):
     path = tmp_path / "arm.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match="is no model file"):
         jid.load(path)
-
-
-def test_a_file_that_is_not_there_is_the_systems_error(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        jid.load(tmp_path / "arm.json")
-
-
-def test_the_file_is_the_same_for_the_same_fit(fit, path):
-    before = path.read_bytes()
-    copy.deepcopy(fit).save(path)
-    assert path.read_bytes() == before
-    assert max(map(len, before.splitlines())) > 100  # arrays stand on lines of their own

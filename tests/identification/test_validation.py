@@ -1,0 +1,66 @@
+"""Torque errors by hand, and mass matrices that are known to be definite or not."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from virtual import fit_of
+
+import jaxid as jid
+from jaxid.validation import TorqueErrors, definiteness
+
+
+def errors(counted=None):
+    measured, predicted = np.random.default_rng(0).normal(size=(2, 50, 2)) * [10.0, 1.0]
+    counted = np.ones((50, 2), bool) if counted is None else counted
+    limits = np.array([100.0, 5.0])
+    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits)
+
+
+def test_errors_are_those_of_the_paper():
+    e = errors()
+    by_hand = sum(np.abs(p - m) for p, m in zip(e.predicted, e.measured, strict=True)) / 50
+    np.testing.assert_allclose(e.mean, by_hand)
+    np.testing.assert_allclose(e.mean_percent, by_hand * [1.0, 20.0])
+    np.testing.assert_allclose(e.rms**2, np.var(e.errors, axis=0) + e.errors.mean(axis=0) ** 2)
+    relative = np.linalg.norm(e.predicted - e.measured) / np.linalg.norm(e.measured)
+    np.testing.assert_allclose(e.relative, relative)
+    assert dataclasses.replace(e, predicted=e.measured).relative == 0.0
+
+
+def test_rows_that_do_not_count_change_nothing():
+    counted = np.ones((50, 2), bool)
+    counted[10:20, 0] = False
+    e = errors(counted)
+    spoilt = dataclasses.replace(e, measured=np.where(counted, e.measured, 1e9))
+    for name in ("mean", "rms", "rms_relative", "relative"):
+        np.testing.assert_allclose(getattr(spoilt, name), getattr(e, name))
+    np.testing.assert_allclose(e.mean[0], np.abs(e.errors[counted[:, 0], 0]).mean())
+
+
+def test_a_joint_without_any_force_has_no_relative_error():
+    e = errors()
+    silent = dataclasses.replace(e, measured=np.asarray(e.measured) * [1.0, 0.0])
+    np.testing.assert_array_equal(np.isnan(silent.rms_relative), [False, True])
+    assert np.isfinite(silent.relative)
+
+
+@pytest.mark.parametrize(("inertias", "share"), [((0.3, 0.2), 0.0), ((0.3, -0.2), 1.0)])
+def test_definiteness_of_a_diagonal_mass_matrix(inertias, share):
+    limits = jid.Limits(2, position_min=[-1.0, 0.5], position_max=[1.0, 2.0])
+    robot = jid.robots.planar_arm(2, 0.4).replace(limits=limits)
+    base = jid.base_parameters(jid.Model(robot, (jid.RotorInertia(),)))
+    found = definiteness(fit_of(base, np.array(inertias)), 50)
+    assert found.positive_definite == (share == 0.0)
+    assert found.indefinite == share
+    assert found.smallest == pytest.approx(min(inertias))
+    assert -1.0 <= found.pose[0] <= 1.0
+    assert 0.5 <= found.pose[1] <= 2.0
+
+
+def test_an_arm_of_real_bodies_has_a_definite_mass_matrix():
+    base = jid.base_parameters(jid.Model(jid.robots.panda(), (jid.RigidBodies(),)))
+    body = [2.0, 0.02, 0.01, 0.04, 0.03, 0.03, 0.02, 0.0, 0.0, 0.0]
+    p = np.asarray(base.from_standard(np.tile(body, 7)))
+    assert definiteness(fit_of(base, p), 200).positive_definite
+    assert definiteness(fit_of(base, -p), 200).indefinite == 1.0
