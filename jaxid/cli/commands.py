@@ -24,9 +24,7 @@ from jaxid.experiment.session import (
 )
 from jaxid.export.c_code import export_c
 from jaxid.export.feed_forward import export_jax
-from jaxid.export.inertials import export_pinocchio
-from jaxid.export.mjcf import export_mjcf
-from jaxid.export.urdf import export_urdf
+from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
 from jaxid.identification.comparison import compare as compare_fits
 from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit import Fit, load
