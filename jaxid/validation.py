@@ -190,11 +190,6 @@ def torque_errors(
 
     The prediction is filtered and decimated like the measurement, in parts. Of more than `ROWS`
     rows every n-th is compared.
-
-    Args:
-        fit: Fit of the model.
-        observations: Observations of the same robot.
-        progress: Callback, called with the completed fraction (0 to 1).
     """
     known = fit.base.model.robot.known_max_forces
     step = comparison_step(observations)

@@ -16,15 +16,7 @@ from jaxid.program.c import CWriter
 
 
 class CFunction(NamedTuple):
-    """One function of the C file.
-
-    Attributes:
-        name: Name, without that of the model.
-        summary: Description for the header.
-        program: Program of the function.
-        inputs: Names of the inputs.
-        output: Name of the output.
-    """
+    """One function of the C file; its name is without that of the model."""
 
     name: str
     summary: str

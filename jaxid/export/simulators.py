@@ -1,5 +1,6 @@
 """Files for simulators and tools: URDF, MJCF, and the parameters that Pinocchio takes."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ def joint_dynamics(
                 rotors.append(name)
             if not coefficients[:, :, k].any():
                 left_out.append(name)
-    values = dict(zip(("armature", "damping", "friction"), total, strict=True))
+    values = {"armature": total[0], "damping": total[1], "friction": total[2]}
     return values, tuple(rotors), tuple(left_out)
 
 
@@ -224,30 +225,20 @@ def export_mjcf(fit: Fit, path: str | Path) -> Path:
     bodies = _feasible_bodies(fit, "an MJCF file")
     values, _, left_out = joint_dynamics(fit)
     comment = f" Model of {_origin(fit, left_out)}"
-    write_text(path, mjcf_text(fit.base.model.robot, bodies, **values, comment=comment))
+    write_text(path, mjcf_text(fit.base.model.robot, bodies, values, comment=comment))
     return Path(path)
 
 
 def mjcf_text(
     robot: Robot,
     bodies: Float[AnyArray, "joints 10"],
-    *,
-    armature: Float[AnyArray, " joints"],
-    damping: Float[AnyArray, " joints"],
-    friction: Float[AnyArray, " joints"],
+    dynamics: Mapping[str, Float[AnyArray, " joints"]],
     timestep: float = 0.001,
     comment: str = "",
 ) -> str:
-    """Return a robot with given bodies as MJCF; bodies are named after their joints.
+    """Return a robot, its bodies and the `joint_dynamics` as MJCF.
 
-    Args:
-        robot: Geometry, limits and gravity.
-        bodies: Ten parameters of each body in the paper's order.
-        armature: Inertia of the rotors [kg m² or kg].
-        damping: Viscous friction [N m s/rad or N s/m].
-        friction: Dry friction [N m or N].
-        timestep: Time step of the simulation [s].
-        comment: Comment at the top.
+    Each body has ten parameters in the paper's order, and is named after its joint.
     """
     root = etree.Element("mujoco", model=robot.name)
     if comment:
@@ -256,7 +247,8 @@ def mjcf_text(
     etree.SubElement(root, "option", gravity=_text(robot.gravity), timestep=_text(timestep))
     world = etree.SubElement(root, "worldbody")
     actuators = etree.SubElement(root, "actuator")
-    at_joints = {"armature": armature, "damping": damping, "frictionloss": friction}
+    attributes = {"armature": "armature", "damping": "damping", "frictionloss": "friction"}
+    at_joints = {key: dynamics[quantity] for key, quantity in attributes.items()}
     ranges = np.stack([robot.limits.position_min, robot.limits.position_max], axis=1)
     efforts = np.asarray(robot.known_max_forces)
     elements: list[etree._Element] = []

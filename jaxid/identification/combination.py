@@ -26,11 +26,7 @@ from jaxid.identification.uncertainty.blocks import block_covariance
 
 
 def require_same_base(fits: Sequence[Fit]) -> None:
-    """Check that fits have the same base parameters.
-
-    Raises:
-        InputError: If there is no fit, or base parameters differ.
-    """
+    """Check that there are fits, and that they have the same base parameters."""
     if not fits:
         raise InputError("`fits` must hold at least one fit, but is empty.")
     first, a = fits[0], fits[0].base
@@ -56,9 +52,6 @@ def as_least_squares(fit: Fit) -> Fit:
 
     For robust, regularised or consistent estimates the factors are solved again with the same
     weights, and standard deviations come from the block jackknife.
-
-    Raises:
-        InputError: If the fit does not hold its factors.
     """
     if fit.is_least_squares:
         return fit
@@ -80,15 +73,9 @@ def combine(
     maps: Sequence[Float[np.ndarray, "base unknowns"]],
     offsets: Sequence[Float[np.ndarray, " base"]] | None = None,
 ) -> tuple[Float[np.ndarray, " unknowns"], Uncertainty]:
-    """Estimate common unknowns from the factors of several fits (Eq. 33).
+    """Estimate common unknowns from the factors of several fits by least squares (Eq. 33).
 
-    Args:
-        fits: Weighted least squares of different data.
-        maps: For each fit the matrix that gives its base parameters from the unknowns.
-        offsets: For each fit the known part of its base parameters; zero if None.
-
-    Raises:
-        InputError: If two fits have seen the same data.
+    The base parameters of each fit are its map times the unknowns, plus its offset.
     """
     _require_different_rows(fits)
     offsets = [np.zeros(fit.base.size) for fit in fits] if offsets is None else offsets

@@ -222,18 +222,7 @@ def compare_some(
     cross: Float[np.ndarray, "compared compared"],
     level: float,
 ) -> Comparison:
-    """Compare some base parameters of two fits.
-
-    Args:
-        first: One fit.
-        second: Another fit of the same base parameters.
-        indices: Base parameters that are compared.
-        cross: Covariance of the first with the second estimates; zero if their data differ.
-        level: Confidence of intervals and tests, a fraction from 0 to 1.
-
-    Raises:
-        InputError: If `level` is no fraction.
-    """
+    """Compare some base parameters of two fits, whose estimates have a cross-covariance."""
     if not 0 < level < 1:
         raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
     k = list(indices)
@@ -270,12 +259,8 @@ def joint_test(
 ) -> tuple[float, float]:
     r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
 
-    It is chi-squared where the covariance is exact, else Hotelling's $T^2$.
-
-    Args:
-        difference: Differences of estimates.
-        covariance: Covariance of the differences, with finite variances above zero.
-        dof: Degrees of freedom of the covariance.
+    It is chi-squared where the covariance is exact, else Hotelling's $T^2$. All variances must be
+    finite and above zero.
     """
     deviations = np.sqrt(np.diag(covariance))
     correlation = covariance / deviations / deviations[:, None]

@@ -133,15 +133,7 @@ def _add_delays(
 
 
 def without_delay(observations: Observations, seconds: float) -> Observations:
-    """Remove a delay of the forces, like `remove_delay`: rows near the ends are left out.
-
-    Args:
-        observations: Observations whose forces are delayed.
-        seconds: Delay of the forces [s]; negative if they are early.
-
-    Raises:
-        InputError: If no rows are left.
-    """
+    """Remove a delay of the forces [s], like `remove_delay`: rows near the ends are left out."""
     require_finite_delay(seconds)
     time, dt = observations.time, observations.sample_time
     lost = math.ceil(abs(seconds) / dt - 1e-9)

@@ -71,16 +71,8 @@ def fit_problem(
 ) -> Fit:
     """Estimate the base parameters of a regression problem.
 
-    Where only factors are known, standard deviations come from the block jackknife.
-
-    Args:
-        problem: Rows of one or several recordings, or their factors.
-        estimator: Estimator; by default least squares weighted by the largest forces.
-        uncertainty: Method for the standard deviations; by default the spectral sandwich.
-
-    Raises:
-        InputError: If there are fewer rows than parameters, weights are not known, or the estimator
-            needs rows and only factors are known.
+    The other arguments are those of `identify`. Where only factors are known, standard deviations
+    come from the block jackknife.
     """
     count = int(problem.factors.rows.sum())
     if count <= problem.base.size:

@@ -168,15 +168,7 @@ def _nearest_body(
 
 
 def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:
-    """Return the base parameters that unit parameters of a load on a body add.
-
-    Args:
-        base: Base parameters.
-        body: Index of the body (0 is the first).
-
-    Raises:
-        InputError: If there is no such body, or the model lacks some of its ten parameters.
-    """
+    """Return the base parameters that unit parameters of a load on a body add."""
     robot, names = base.model.robot, base.model.parameter_names
     if not 0 <= body < robot.joints:
         raise InputError(f"`body` must be from 0 to {robot.joints - 1}, but is {body}.")

@@ -153,10 +153,7 @@ def identify_states(
 
 
 def state_indices(size: int, varying: Sequence[int], state: int) -> Int[np.ndarray, " base"]:
-    """Return the place of each base parameter of a state among the unknowns of all states.
-
-    Shared parameters come first, then those of each state.
-    """
+    """Return the places of a state's parameters among all: shared ones, then those of each."""
     own = np.isin(np.arange(size), varying)
     indices = np.cumsum(~own) - 1
     indices[own] = size + (state - 1) * own.sum() + np.arange(own.sum())
@@ -174,16 +171,7 @@ def state_maps(
 def varying_parameters(
     base: BaseParameters, varying: Sequence[str] | None, shared: Sequence[str] | None = None
 ) -> tuple[int, ...]:
-    """Return the indices of the base parameters that each state has for itself.
-
-    Args:
-        base: Base parameters.
-        varying: Their names; if None, those that store no energy.
-        shared: Names of the others; an alternative to `varying`.
-
-    Raises:
-        InputError: If both are given, or there is no such base parameter.
-    """
+    """Return which base parameters each state has for itself; by default those without energy."""
     if varying is not None and shared is not None:
         raise InputError("give either `varying` or `shared`, and not both.")
     names = shared if varying is None else varying

@@ -39,9 +39,11 @@ class MujocoRobot(VirtualRobot):
         text = mjcf_text(
             self.robot,
             self._all_bodies(),
-            armature=self.rotors,
-            damping=np.asarray(friction.viscous),
-            friction=np.asarray(friction.coulomb),
+            {
+                "armature": self.rotors,
+                "damping": np.asarray(friction.viscous),
+                "friction": np.asarray(friction.coulomb),
+            },
             timestep=step,
         )
         model = library.MjModel.from_xml_string(text)
