@@ -298,19 +298,12 @@ def _record(study: Study) -> dict[str, Any]:
         "schema": SCHEMAS["demo.json"],
         "versions": versions(),
         "seed": study.seed,
-        "base_parameters": {
-            "standard": base.model.size,
-            "count": base.size,
-            "names": base.names,
-            "truth": study.truth,
-        },
+        "base_parameters": {"count": base.size, "names": base.names, "truth": study.truth},
         "excitation": {
             "designs": [
                 {
                     "criterion": plan.criterion.name,
                     "criteria": {c.name: c.after for c in plan.criteria},
-                    "random": {c.name: c.before for c in plan.criteria},
-                    "gain": plan.mean_gain,
                 }
                 for plan in study.plans
             ],
@@ -331,12 +324,10 @@ def _record(study: Study) -> dict[str, Any]:
         "temperature": [
             {
                 "number": k,
-                "unit": unit,
                 "paper": [cold, warm],
                 "estimates": [float(fit.parameters[k - 1]) for fit in fits],
-                "verdict": study.temperature.verdicts[k - 1].value,
             }
-            for k, (cold, warm, unit) in PUBLISHED.items()
+            for k, (cold, warm, _) in PUBLISHED.items()
         ],
         "coverage": [dict(zip(("filter", "inside", "of"), c, strict=True)) for c in study.coverage],
         "following": [

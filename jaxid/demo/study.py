@@ -35,13 +35,7 @@ AT_REST = 0.02
 
 
 class Model(NamedTuple):
-    """Set of parameters and its errors on identification (0) and verification (1).
-
-    Attributes:
-        name: Name of the estimator.
-        fit: Parameters.
-        validation: Torque errors on both recordings, and definiteness of the mass matrix.
-    """
+    """Parameters by one estimator, validated on identification (0) and verification (1)."""
 
     name: str
     fit: jid.Fit
@@ -53,13 +47,7 @@ class Model(NamedTuple):
 
 
 class PathRun(NamedTuple):
-    """Run along the verification path with a feed-forward.
-
-    Attributes:
-        name: Model that is fed forward.
-        run: Measured motion and torques.
-        distance: Distance of the end-effector from its path, at the samples [m].
-    """
+    """Run with a model fed forward, and the distance of the end-effector from its path [m]."""
 
     name: str
     run: Tracking

@@ -46,13 +46,7 @@ SCHEMAS = {
 
 
 class Alternative(NamedTuple):
-    """Another solution of the same equations, shown beside a fit.
-
-    Attributes:
-        fit: Other fit.
-        errors: Errors of the other fit on the same recordings.
-        names: Names of the fit's own solution and of the other one.
-    """
+    """Another solution of the same equations, its errors, and the names of both solutions."""
 
     fit: Fit
     errors: Sequence[TorqueErrors]
