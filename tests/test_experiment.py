@@ -8,7 +8,7 @@ import pytest
 
 import jaxid as jid
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import keys_of
+from jaxid.experiment.decoder import decode, keys_of
 from jaxid.experiment.experiment import TABLES, load_experiment
 from jaxid.experiment.method_tables import SIDES
 from jaxid.experiment.template import write_template
@@ -106,19 +106,6 @@ def test_defaults_are_said(load):
     assert "largest forces" in experiment.notes[1]
 
 
-def test_weights_are_the_largest_forces_where_they_are_known(load):
-    experiment = load('[robot]\nbuiltin = "ur10"\n')
-    assert isinstance(experiment.estimation.estimator.weights, jid.estimators.MaximumForces)
-    assert len(experiment.notes) == 1
-
-
-def test_base_parameters_are_found_once_and_only_when_asked_for(load):
-    experiment = load(ARM)
-    assert "base" not in vars(experiment)
-    assert experiment.base is experiment.base
-    assert experiment.base.size == jid.base_parameters(experiment.model).size
-
-
 def test_a_table_of_angles_in_degrees_is_the_builtin_robot(load):
     rows = [
         (90, 0.0, 0.1273),
@@ -134,25 +121,6 @@ def test_a_table_of_angles_in_degrees_is_the_builtin_robot(load):
     assert robot.name == "mine"
     np.testing.assert_array_equal(robot.rotation, known.rotation)
     np.testing.assert_array_equal(robot.offset, known.offset)
-
-
-def test_rows_of_a_table_may_slide_and_have_names(load):
-    rows = (
-        '{ alpha = 0, a = 0, d = 0.1, slides = true, name = "rail" }, { alpha = 90, a = 0, d = 0 }'
-    )
-    robot = load(f'[robot]\nconvention = "modified"\ndh = [{rows}]\n').robot
-    assert robot.revolute == (False, True)
-    assert robot.joint_names == ("rail", "joint2")
-
-
-def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
-    (tmp_path / "robots").mkdir()
-    (tmp_path / "robots" / "arm.urdf").write_text(URDF)
-    (tmp_path / "experiments").mkdir()
-    path = tmp_path / "experiments" / "e.toml"
-    path.write_text('[robot]\nurdf = "../robots/arm.urdf"\ntip = "tool"\n')
-    monkeypatch.chdir("/")
-    assert load_experiment(path).robot.joint_names == ("rail", "shoulder")
 
 
 def test_limits_replace_those_of_the_robot_and_nan_keeps_them(load):
@@ -192,13 +160,6 @@ zero = [0, -90, 90, 0, 0, 0]
     np.testing.assert_allclose(drives.zero, known.zero, rtol=1e-15)
     np.testing.assert_array_equal(drives.max_torques, [1, 2, 3, 4, 5, 6])
     assert np.isnan(drives.rotor_inertia).all()
-
-
-def test_coupled_motors_bring_their_term_along(load):
-    matrix = "[drives]\nmatrix = [[10, 0], [20, 20]]\n"
-    assert "Iam2" in load(ARM + matrix).model.parameter_names
-    said = matrix + "[model]\ncoupled_drives = false\n"
-    assert "Iam2" not in load(ARM + said).model.parameter_names
 
 
 def test_base_and_gravity(load):
@@ -246,13 +207,12 @@ asymmetric = true
     dry = model.terms[1]
     np.testing.assert_array_equal(dry.transition.epsilon, [0.1, 0.2])
     assert dry.transition.dead_zone == 0.05
-
-
-def test_friction_with_a_hard_sign_or_none(load):
-    hard = load(ARM + "[model.coulomb]\nhard = true\ndead_zone = [0.1, 0.2]\n").model
+    coupled = "[drives]\nmatrix = [[10, 0], [20, 20]]\n"
+    hard = load(ARM + coupled + "[model.coulomb]\nhard = true\n").model
     assert isinstance(hard.terms[2].transition, jid.terms.HardSign)
-    none = load(ARM + "[model]\ncoulomb = false\noffset = false\n").model
-    assert not any(n.startswith(("fc", "fo")) for n in none.parameter_names)
+    assert "Iam2" in hard.parameter_names
+    none = load(ARM + coupled + "[model]\ncoulomb = false\ncoupled_drives = false\n").model
+    assert not any(n.startswith(("fc", "Iam")) for n in none.parameter_names)
 
 
 def test_columns(load):
@@ -424,17 +384,6 @@ total_mass = 12
     np.testing.assert_array_equal(consistent.bounds.has_ellipsoid, [False, True])
 
 
-@pytest.mark.parametrize("name", ["spectral", "jackknife", "independent"])
-def test_uncertainties(load, name):
-    found = load(f'{ARM}[estimator]\nuncertainty = "{name}"\n').estimation.uncertainty
-    kinds = {
-        "spectral": jid.uncertainty.SpectralSandwich,
-        "jackknife": jid.uncertainty.BlockJackknife,
-        "independent": jid.uncertainty.IndependentRows,
-    }
-    assert found == kinds[name]()
-
-
 def test_logs_are_read_cropped_and_filtered(load, tmp_path):
     t = 0.01 * np.arange(400)
     q = np.stack([np.sin(t), np.cos(2 * t)], 1)
@@ -463,46 +412,32 @@ REFUSALS = [
     ("[robt]\nurdf = 'a'", "`robt`.*did you mean `robot`"),
     ("", "`[robot]`"),
     ("[robot]", "`urdf`, `builtin` and `dh`"),
-    ("[[robot]]", "`[[…]]`"),
     (ARM + 'urdf = "a"', "`urdf` and `builtin`"),
     ('[robot]\nbuiltin = "tx9"', "`robot.builtin`"),
     ('[robot]\nbuiltin = "panda"\ntip = "x"', "`tip` belongs to `urdf`"),
-    (ARM + "snap_tolerance = 0.01", "`snap_tolerance`"),
     ('[robot]\nurdf = "no.urdf"', "`urdf`: `.*no.urdf`"),
     ("[robot]\ndh = [{alpha = 0, a = 0, d = 0}]", "`convention`"),
     ("[robot]\ndh = []\nconvention = 'standard'", "`robot`"),
     ("[robot]\ndh = [{alpha = 0, a = 0}]", "`robot.dh[0].d`.*`[robot.dh]`"),
-    ("[robot]\ndh = [{alpha = 0, a = 0, d = 0, teta = 0}]", "`robot.dh[0].teta`.*`theta`"),
-    (ARM + "gravity = [0, -9.81]", "`robot.gravity`"),
     (ARM + "gravity = [0, 0, 'g']", "`robot.gravity[2]`"),
     (ARM + "gravity = [0, 0, nan]", "`robot.gravity[2]`"),
-    (ARM + "gravty = 1", "`robot.gravty`.*`gravity`"),
     (ARM + "xyzzy = 1", "`robot.xyzzy`.*`[robot]` has urdf"),
     (ARM + 'name = "a\\u001b[31m"', "`robot.name`.*U+001B"),
     (TOOL.replace("mass = 1", "mass = 0"), "`robot.tool.mass`"),
-    (TOOL.replace("mass = 1", "mass = 1e300"), "`mass`"),
     (TOOL + "body = 'hand'", "`body`.*joint1, joint2"),
     (TOOL + "inertia = {xx = 1, yy = 1, zz = 9}", "`inertia`"),
     (ARM + "[limits]\nvelocity = [1, 2, 3]", "`limits`: `velocity`"),
-    (ARM + "[limits]\nvelocity = 1", "`limits.velocity`"),
-    (ARM + "[limits]\nvelocity = [1, -2]", "`limits`: `velocity`"),
-    (ARM + "[limits]\nangle_unit = 'grad'", "`limits.angle_unit`"),
     (ARM + "[limits]\nposition_min = [1, 1]\nposition_max = [0, 2]", "`position_min`"),
     (ARM + "[limits]\nposition_max = [150, 150]", "`joint1`.*`angle_unit"),
     (ARM + "[limits]\nforce = [1e-300, 20]", "`force`"),
-    (ARM + "[limits]\nforce = [80, 1e300]", "`force`"),
     (
         ARM + "[drives]\ngear_ratios = [1, 1]\nmatrix = [[1, 0], [0, 1]]",
         "`gear_ratios` or `matrix`",
     ),
-    (ARM + "[drives]\ngear_ratios = [1]", "`gear_ratios`"),
     (ARM + "[drives]\ngear_ratios = [nan, 1]", "`drives.gear_ratios[0]`"),
     (ARM + "[drives]\ngear_ratios = [1, 0]", "`drives`"),
     (ARM + "[drives]\nmatrix = [[1, 0], [0]]", "`matrix`"),
-    (ARM + "[drives]\nzero = [1]", "`zero`"),
-    (ARM + "[drives]\nzero = [inf, 1]", "`drives.zero[0]`"),
     (ARM + "[drives]\nmax_torques = [0, 1]", "`drives.max_torques[0]`"),
-    (ARM + "[model]\nviscous = 1", "`model.viscous`"),
     (ARM + "[model]\ncoulomb = 'hard'", "`model.coulomb`"),
     (ARM + "[model.coulomb]\nepsilon = 0", "`model.coulomb.epsilon`"),
     (ARM + "[model.coulomb]\nepsilon = [1]", "`coulomb.epsilon`"),
@@ -510,33 +445,21 @@ REFUSALS = [
     (ARM + "[model]\ncoupled_drives = true", "`model`"),
     (ARM + "[recording]\nangles = 'q{}'", "`recording.forces`"),
     (COLUMNS.replace('time = "t"', ""), "`time`.*`sample_time`"),
-    (COLUMNS + "sample_time = 1", "`time`.*`sample_time`"),
-    (COLUMNS + "side = 'link'", "`recording.side`"),
     (COLUMNS + "angle_unit = 'degree'", "`degree`"),
-    (COLUMNS + "angle_unit = ['deg']", "`angle_unit`"),
-    (COLUMNS + "force_unit = 's'", "`force_unit`"),
     (COLUMNS + "force_unit = 'A'", "`torque_constants`"),
-    (COLUMNS + "force_unit = 'A'\ntorque_constants = [0, 1]", "`torque_constants`"),
     (COLUMNS + "angle_signs = [1, 2]", "`angle_signs`"),
-    (COLUMNS + "angle_offsets = [1]", "`angle_offsets`"),
     (COLUMNS + "largest_gap = 0.5", "`recording.largest_gap`"),
-    (COLUMNS + "angels = 1", "`recording.angels`.*`angles`"),
     (ARM + "[filter]\ncutoff = 1", "`filter.kind`"),
     (ARM + "[filter]\nkind = 'buterworth'", "`filter.kind`"),
     (BUTTERWORTH + "cutoff = -3", "`cutoff`"),
-    (BUTTERWORTH + "cutoff = nan", "`cutoff`"),
-    (BUTTERWORTH + "cutoff = 'low'", "`filter.cutoff`"),
     (BUTTERWORTH + "cutoff = []", "`filter.cutoff`"),
-    (BUTTERWORTH + "cutof = 3", "`filter.cutof`.*`cutoff`"),
     (ARM + "[filter]\nkind = 'paper'\ncutoff = 3", "`filter.cutoff`.*velocity"),
     (ARM + "[filter]\nkind = 'periodic'\nperiod = 1\nharmonics = 1.5", "`filter.harmonics`"),
     (ARM + "[rows]\nevery = 2", "`rows.every` was renamed to `step`"),
     (ARM + "[rows]\nslow = 2", "`rows.slow` was renamed to `min_speed`"),
-    (ARM + "[rows]\nstep = 0", "`rows.step`"),
     (ARM + "[rows]\nstep = 2\nfactors = [2]", "`step`.*`factors`"),
     (ARM + "[rows]\nfactors = [50]", "`factors`"),
     (ARM + "[rows]\nmin_speed = [1]", "`min_speed`"),
-    (ARM + "[rows]\nmin_speed = -1", "`rows.min_speed`"),
     (ARM + "[estimator]\nkind = 'wls'", "`estimator.kind`"),
     (ARM + "[estimator]\nweights = 'maximum_forces'", "`weights = .*`joint1`"),
     (
@@ -549,36 +472,20 @@ REFUSALS = [
     (ARM + "[estimator]\nnonlinear_friction = true\nessential = 0.1", "`nonlinear_friction`"),
     (ARM + BODIES + "mass_min = -1", "`mass_min`"),
     (ARM + BODIES + "mass_min = [1, 2, 3]", "`mass_min`"),
-    (ARM + BODIES + "mass_min = 2\nmass_max = 1", "`mass_min`"),
-    (ARM + BODIES + "radius = 0", "`radius`"),
-    (ARM + BODIES + "radius = 'wide'", "`estimator.radius`"),
-    (ARM + BODIES + "centre_min = [0, 0]", "`centre_min`"),
-    (ARM + BODIES + "centre_max = [[1, 1, 1]]", "`centre_max`"),
     (ARM + BODIES + "centre_max = [[1, 1, 1], [1, 1]]", "`estimator.centre_max`"),
-    (ARM + BODIES + "centre_min = [1, 0, 0]\ncentre_max = [0, 1, 1]", "`centre_min`"),
     (ARM + BODIES + "ellipsoid_centre = [0, 0, 0]", "`ellipsoid_axes`"),
-    (ARM + BODIES + "ellipsoid_axes = [0, 1, 1]", "`ellipsoid_axes`"),
     (ARM + "[estimator]\nradius = 1", '`estimator.radius`: belongs to `kind = "consistent"`'),
-    (ARM + "[estimator]\nessential = 1", "`estimator.essential`"),
     (ARM + BODIES + "essential = 0.1", "`estimator.essential`: belongs to"),
     (ARM + "[estimator]\nessential = 0.1\nridge = 0.1", "`essential`.*`ridge`"),
-    (ARM + "[estimator]\ntruncate = 1", "`estimator.truncate`"),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge`"),
     (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`truncate`.*`ridge`"),
-    (ARM + "[excitation.spline]\npionts = 3", "`excitation.spline.pionts`.*`points`"),
     (ARM + "[excitation.spline]\npoints = 3", "`excitation.spline.points`"),
-    (ARM + "[excitation]\nspline = 3", "`excitation.spline`"),
-    (ARM + "[excitation]\nseed = 1180591620717411303424", "`excitation.seed`"),
     (ARM + "[excitation]\nsamples = 1_000_000_000_000_000", "`excitation.samples`"),
-    (ARM + "[excitation]\nnoise = [inf, 1]", "`excitation.noise[0]`"),
-    (ARM + "[excitation]\nharmonics = 1000", "`excitation.harmonics`"),
-    (ARM + "[excitation]\nomega = 1e9", "`excitation.omega`"),
     ("[robot\n", "TOML"),
     (ARM + ARM, "TOML"),
     (ARM + "x = " + 3000 * "[", "TOML"),
     (ARM + "x = " + 9999 * "9", "TOML"),
     (SHAPES.replace('body = "bend"', 'body = "wrist"'), "`collision`: `body`.*turn, lift"),
-    (SHAPES.replace("radius = 0.08", "radius = -1"), "`collision.capsules[1].radius`"),
     (SHAPES.replace("ground = -0.1", 'pairs = [["hand", "chair"]]'), "`chair`"),
     (SHAPES.replace("ground = -0.1", "fit = true"), "`fit`.*`robot.urdf`"),
     (SHAPES.replace("ground = -0.1", "grund = 1.0"), "`collision.grund`.*`ground`"),
@@ -647,26 +554,18 @@ def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):
 def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     text = write_template(tmp_path / "arm.urdf", folder=tmp_path)
-    tool = r"^# (?=\[(robot.tool|load|collision)\]|mass = |centre_of_mass = )"
-    text = re.sub(tool, "", text, flags=re.M)
-    path = tmp_path / "experiment.toml"
+    text = re.sub(r"^# (?=\[(robot.tool|load|collision)\])", "", text, flags=re.M)
     keys = dict.fromkeys(re.findall(r"^# (\w+) = ", text, flags=re.M))
     assert len(keys) > 25
-    for key in keys:
-        path.write_text(re.sub(rf"^# ({key} = )", r"\1", text, count=1, flags=re.M))
-        said = _refusal(path)
-        # The keys of other kinds follow their kind, which stands twice then.
-        foreign = re.search(r"`filter.\w+` is no known key", said)
-        wrong = re.search(r"no known key|must be (a num|a list|a text|true)|is missing", said)
-        assert not wrong or foreign, said
-
-
-def _refusal(path):
-    try:
-        load_experiment(path)
-    except ValueError as error:
-        return str(error)
-    return ""
+    for key in set(keys) - {"kind"}:
+        content = tomllib.loads(re.sub(rf"^# ({key} = )", r"\1", text, count=1, flags=re.M))
+        for name, table in content.items():
+            functions = TABLES[name]
+            if name == "filter":
+                # The keys of other kinds follow their kind, which stays a comment.
+                functions = [f for f in functions if key in keys_of(f)] or functions[:1]
+                table = {key: table[key]} if key in table else {}
+            decode(functions, table, name, complete=False, skip=SIDES)
 
 
 def test_the_template_documents_every_key(tmp_path):
@@ -675,11 +574,6 @@ def test_the_template_documents_every_key(tmp_path):
     for function in (function for functions in TABLES.values() for function in functions):
         for key in set(keys_of(function)) - {*SIDES, "tool"}:
             assert re.search(rf"^(# )?{key} = .", text, flags=re.M), key
-
-
-def test_the_template_of_a_missing_urdf(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        write_template(tmp_path / "none.urdf")
 
 
 def test_the_template_keeps_the_chosen_chain(tmp_path):
@@ -749,26 +643,12 @@ def test_degrees_for_a_rail_are_refused(tmp_path, load, units, sentence):
     assert motors.columns.angles_on_motor_side
 
 
-def test_motors_count_in_newton_metres_whatever_they_move(tmp_path, load):
-    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
-    text = '[robot]\nurdf = "arm.urdf"\n' + RECORDING + "forces_side = 'motor'\nforce_unit = 'N m'"
-    assert load(text).columns.force_unit == units.NM
-
-
 def test_which_largest_force_decides_is_said(load):
     text = ARM + "[limits]\nforce = [80, 20]\n[drives]\ngear_ratios = [50, 50]\n"
     notes = load(text + "max_torques = [2, 0.4]").notes
     assert any("`limits.force`), which decide before" in n for n in notes)
     assert any("joint1 80, not 100 N m." in n for n in notes)
     assert not any("limits.force" in n for n in load(text).notes)
-
-
-def test_the_path_of_the_urdf_where_the_file_goes_elsewhere(tmp_path):
-    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
-    path = tmp_path / "sub" / "experiment.toml"
-    path.parent.mkdir()
-    path.write_text(write_template(tmp_path / "arm.urdf", folder=None), encoding="utf-8")
-    assert load_experiment(path).robot.joints == 2
 
 
 def test_shapes_come_from_the_file(load):

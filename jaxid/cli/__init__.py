@@ -13,10 +13,13 @@ import typer
 from rich.text import Text
 
 from jaxid.cli.options import (
+    Base,
     ExperimentFile,
     Force,
     Loaded,
     OutputFolder,
+    Seed,
+    Tip,
     Unloaded,
     describe_error,
     open_console,
@@ -77,9 +80,7 @@ def _options(
 @app.command()
 def demo(
     output: OutputFolder = Path("demo"),
-    seed: Annotated[
-        int, typer.Option("--seed", metavar="N", min=0, help="Seed of motions and noise.")
-    ] = 0,
+    seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """Do the whole paper on a virtual TX90L on its rail.
@@ -117,9 +118,7 @@ def demo(
 @app.command()
 def example(
     folder: Annotated[Path, typer.Argument(help="Folder of the files.", metavar="DIR")],
-    seed: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Seed of parameters, motion and noise.")
-    ] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Write an experiment to try things on.
 
@@ -138,16 +137,8 @@ def example(
 @app.command()
 def init(
     urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.", metavar="ARM.URDF")],
-    tip: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LINK", help="The end-effector: take only the chain that leads to it."
-        ),
-    ] = None,
-    base: Annotated[
-        str | None,
-        typer.Option(metavar="LINK", help="The link on the ground; by default the root."),
-    ] = None,
+    tip: Tip = None,
+    base: Base = None,
 ) -> None:
     """Print a commented experiment file for a robot.
 
@@ -271,12 +262,8 @@ def export(
         Path | None,
         typer.Option("--urdf", metavar="ARM.URDF", help="The robot's own file, for `--to urdf`."),
     ] = None,
-    tip: Annotated[
-        str | None, typer.Option(metavar="LINK", help="As in the experiment file, for `--to urdf`.")
-    ] = None,
-    base: Annotated[
-        str | None, typer.Option(metavar="LINK", help="As in the experiment file, for `--to urdf`.")
-    ] = None,
+    tip: Tip = None,
+    base: Base = None,
     single: Annotated[
         bool, typer.Option("--float", help="C that computes in single precision.")
     ] = False,

@@ -226,22 +226,16 @@ def export(
             f"`{report}` {what}: give a folder that `jaxid identify` has written, or a model file."
         )
     fit = load(model)
-    match to:
-        case "c":
-            export_c(fit, path.parent, name=path.stem, double=double)
-        case "urdf":
-            own = Path(fit.base.model.robot.source) if urdf is None else urdf
-            if urdf is None and (own.suffix != ".urdf" or not own.is_file()):
-                raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
-            export_urdf(fit, own, path, **chain)
-        case "mjcf":
-            export_mjcf(fit, path)
-        case "json":
-            fit.save(path)
-        case "pinocchio":
-            export_pinocchio(fit, path)
-        case "jax":
-            export_jax(fit, path)
+    if to == "c":
+        export_c(fit, path.parent, name=path.stem, double=double)
+    elif to == "urdf":
+        own = Path(fit.base.model.robot.source) if urdf is None else urdf
+        if urdf is None and (own.suffix != ".urdf" or not own.is_file()):
+            raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
+        export_urdf(fit, own, path, **chain)
+    else:
+        writers = {"mjcf": export_mjcf, "pinocchio": export_pinocchio, "jax": export_jax}
+        writers.get(to, Fit.save)(fit, path)
 
 
 def compare(console: Console, paths: tuple[Path, Path], level: float, output: Path) -> None:
@@ -269,14 +263,8 @@ def payload(
     (empty, full), doubts = _pair(experiment, logs, loaded)
     found = identify_payload(empty, full, body=carrier)
     name = experiment.robot.joint_names[found.body]
-    content = {
-        "body": name,
-        "mass": found.mass,
-        "centre_of_mass": found.centre_of_mass,
-        "inertia": found.inertia,
-        "estimate": found.estimate,
-        "distance": found.distance,
-    }
+    keys = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
+    content = {"body": name, **{key: getattr(found, key) for key in keys}}
     sources = {"unloaded": logs, "loaded": loaded}
     rows = [
         *estimate_rows(INERTIAL_NAMES, INERTIAL_UNITS, found.parameters, found.uncertainty),

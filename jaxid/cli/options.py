@@ -25,6 +25,16 @@ OutputFolder = Annotated[
 Force = Annotated[
     bool, typer.Option("--force", help="Write into a folder that holds other files too.")
 ]
+Seed = Annotated[
+    int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")
+]
+Tip = Annotated[
+    str | None,
+    typer.Option(metavar="LINK", help="The end-effector: take only the chain that leads to it."),
+]
+Base = Annotated[
+    str | None, typer.Option(metavar="LINK", help="The link on the ground; by default the root.")
+]
 Unloaded = Annotated[
     list[Path],
     typer.Argument(

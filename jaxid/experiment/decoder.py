@@ -100,12 +100,6 @@ def keys_of(function: Callable) -> dict[str, Key]:
 def call(function: Callable, table: Any, place: str, *context: Any) -> Any:
     """Call a function with the keys of a table as arguments.
 
-    Args:
-        function: Function or class.
-        table: The table, as `tomllib` reads it.
-        place: Path of the table in the file.
-        context: Arguments of the function that are no keys.
-
     Raises:
         InputError: If a key or a value does not fit, or the function rejects it.
     """
@@ -131,14 +125,9 @@ def decode(
     complete: bool = True,
     skip: Iterable[str] = (),
 ) -> list[dict[str, Any]]:
-    """Return the arguments that a table holds for each of several functions.
+    """Return the arguments that a table holds for each of several functions that share it.
 
-    Args:
-        functions: Functions and classes that share the table.
-        table: The table, as `tomllib` reads it.
-        place: Path of the table in the file.
-        complete: Whether keys without default are needed.
-        skip: Arguments that are no keys.
+    Arguments in `skip` are no keys; keys without default are needed where the table is `complete`.
 
     Raises:
         InputError: If a key is unknown or missing, or a value is not what it should be.
@@ -184,11 +173,6 @@ _OTHER = object()
 
 def decode_value(value: Any, hint: Any, place: str) -> Any:
     """Return a value of the file as an argument with such an annotation.
-
-    Args:
-        value: The value, as `tomllib` reads it.
-        hint: Annotation of the argument.
-        place: Path of the value in the file.
 
     Raises:
         InputError: If it does not fit.

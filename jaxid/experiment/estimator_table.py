@@ -118,13 +118,7 @@ def build_estimation(
     bounds: dict[str, Any],
     *,
     kind: Literal[
-        "weighted",
-        "least_squares",
-        "huber",
-        "tukey",
-        "correlated",
-        "instrumental",
-        "consistent",
+        "weighted", "least_squares", "huber", "tukey", "correlated", "instrumental", "consistent"
     ] = "weighted",
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
     ridge: Fraction | Literal["cross_validated"] | None = None,

@@ -89,12 +89,6 @@ def design_motion(
 ) -> Design:
     """Design the motion that the experiment file asks for.
 
-    Args:
-        experiment: Experiment with its table `[excitation]`, or the defaults.
-        progress: Callback for the progress of the design.
-        state: File that keeps the state of the design.
-        resume: Whether to go on from that file if it is there.
-
     Raises:
         InputError: If the table does not fit the robot, or no motion keeps all limits.
     """
@@ -150,14 +144,7 @@ def compare_criteria(
 def write_design(
     experiment: Experiment, design: Design, output: Path, command: str = ""
 ) -> list[Path]:
-    """Write table, trajectory, ROS message and pictures; return the files.
-
-    Args:
-        experiment: Experiment of the motion.
-        design: The motion.
-        output: Path of the table; the others lie beside it.
-        command: Command line that makes it again, for the page.
-    """
+    """Write table, trajectory, ROS message and pictures; return the files."""
     plan, step, table = design.plan, design.sample_time, experiment.excitation
     robot = plan.base.model.robot
     names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{table.ros}"]

@@ -228,11 +228,7 @@ class Excitation:
         return self.leads if isinstance(self.leads, Leads) else Leads()
 
     def basis(self, constrained: bool) -> AbstractBasis:
-        """Return the basis of the trajectories.
-
-        Args:
-            constrained: Whether there are constraints beside limits of joints: then leads are
-                designed together with the motion, so that they keep them too.
+        """Return the basis of the trajectories; with other constraints, leads are designed too.
 
         Raises:
             InputError: If two kinds are asked for, or one whose end no sample would meet.

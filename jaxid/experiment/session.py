@@ -85,14 +85,7 @@ def stages(console: Console, total: int = 0) -> Iterator[Stages]:
 def load_log(
     experiment: Experiment, path: Path, stage: Stages, name: str | None = None
 ) -> LoadedLog:
-    """Read and diagnose a log; one of many samples stays on the disk.
-
-    Args:
-        experiment: Experiment of the log.
-        path: Path of the log.
-        stage: Progress bar.
-        name: Name of the log; the file's if None.
-    """
+    """Read and diagnose a log; one of many samples stays on the disk."""
     notes = ()
     if experiment.is_long(path):
         try:
@@ -143,11 +136,7 @@ def select_filter(
 ) -> tuple[Experiment, FilterChoice | None]:
     """Return the experiment with the filter that suits some logs best, and the choice.
 
-    Args:
-        experiment: Experiment; unchanged if its file names one filter.
-        logs: Logs to identify with.
-        stage: Progress bar.
-        split: Fraction of each log to identify with; the rest stays unseen here too.
+    The rest of each log beyond the fraction `split` stays unseen.
 
     Raises:
         InputError: If a log and a filter do not go together, or a log is long.
@@ -204,12 +193,6 @@ def read_runs(
     experiment: Experiment, groups: Sequence[Sequence[Path]], names: Sequence[str], stage: Stages
 ) -> tuple[list[Fit], list[str]]:
     """Return a run of the logs and reports of each group, and doubts about the logs.
-
-    Args:
-        experiment: Experiment of the runs.
-        groups: Paths of logs, and of folders of reports, which stand for their logs.
-        names: Names of the runs.
-        stage: Progress bar.
 
     Raises:
         InputError: If the shape of friction is sought, a log is not as the file says, or a folder
@@ -280,13 +263,6 @@ def identify_logs(
     stage: Stages,
 ) -> Identification:
     """Identify with logs and with what earlier reports keep, and validate.
-
-    Args:
-        experiment: Experiment of the logs.
-        paths: Logs to identify with, and folders of earlier reports.
-        verify: Logs to verify with.
-        split: Fraction of each log to identify with; None for all.
-        stage: Progress bar.
 
     Raises:
         InputError: If a log is not as the file says, or a log would verify a model that has seen
