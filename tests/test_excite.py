@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -256,9 +257,10 @@ def test_earlier_results_are_nominal(written, excited, monkeypatch):
         parameters = 1.0 + np.arange(base.size)
 
         def __init__(self, folder):
-            self.names, self.covariance = tuple(names), covariance
+            self.base = SimpleNamespace(names=tuple(names), size=len(names))
+            self.covariance = covariance
 
-    monkeypatch.setattr("jaxid.experiment.excitation.read_estimates", Earlier)
+    monkeypatch.setattr("jaxid.experiment.excitation.read_fit", Earlier)
     found = find_nominal(experiment)
     np.testing.assert_array_equal(found.parameters, 1.0 + np.arange(base.size))
     np.testing.assert_array_equal(found.covariance, covariance)
