@@ -18,7 +18,7 @@ KEYS = [
     ('"t"', '"t"\nforce_delay = 100', "but the longest segment of `a` lasts 6 s"),
     ("cutoff = 10", "cutoff = 99", "take one of 1 samples at most"),
     ("cutoff = 10", "cutoff = -3", "e.toml: `filter`: `cutoff`"),
-    ('"q{}"', '["q1"]', "name one column for each joint"),
+    ('"q{}"', '["q1"]', "for each joint"),
     (COLUMNS, 'angles = ["q1", "q2"]\nforces = ["tau1", "q2"]', "`q2` of `a.csv` is used for"),
     (COLUMNS, 'angles = ["q1", "q2"]\nforces = ["tau1", "tau1"]', "`tau1` of `a.csv` is used twi"),
     ('builtin = "planar_arm"', 'urdf = "lost.urdf"', "`lost.urdf` is no file: paths in an experim"),

@@ -205,9 +205,8 @@ def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, Logs]:
         logs = Logs(**reading)
         on_motor_side = (logs.side == "motor", (logs.forces_side or logs.side) == "motor")
         columns = Columns(**given, **dict(zip(SIDES, on_motor_side, strict=True)))
-        for scale in (columns.angle_scale, columns.angle_shift, columns.velocity_scale):
-            scale(robot.joints)  # refuses lists that do not fit the robot
-        columns.force_scale(robot.joints)
+        still = np.zeros((1, robot.joints))
+        columns.to_si(still, still, still)  # refuses lists that do not fit the robot
         for name, motors in (
             ("angle_unit", on_motor_side[0]),
             ("velocity_unit", on_motor_side[0]),
