@@ -42,11 +42,7 @@ class Inertia(eqx.Module):
 
     @classmethod
     def from_parameters(cls, p: Float[AnyArray, "*batch 10"]) -> "Inertia":
-        """Return the inertia of ten parameters (Eq. 9); its centre is zero where its mass is.
-
-        Args:
-            p: Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin of the frame.
-        """
+        """Return the inertia of ten `parameters` (Eq. 9); its centre is zero where its mass is."""
         m, h = p[..., 0], p[..., 1:4]
         xp = namespace(p)
         r = xp.where((m != 0)[..., None], h / xp.where(m != 0, m, 1.0)[..., None], 0.0)

@@ -63,11 +63,9 @@ def tip_placement(
 
 
 def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> tuple[np.ndarray, ...]:
-    """Return placements of the end-effector and their derivatives by the joints, in NumPy.
+    """Return attitudes and positions [m] of the end-effector, and their derivatives, in NumPy.
 
-    Returns:
-        Attitudes; positions [m]; velocities of the origin, and angular velocities by the rates of
-        the joints, each [poses, joints, 3].
+    The derivatives are velocities of the origin and angular velocities by the rates of the joints.
     """
     poses, n = q.shape
     R, r = np.broadcast_to(np.eye(3), (poses, 3, 3)), np.zeros((poses, 3))

@@ -53,11 +53,7 @@ def rpy_rotation(rpy: Numbers) -> Float[np.ndarray, "3 3"]:
 def snap_angles(
     joint: str, names: tuple[str, ...], angles: Numbers, tolerance: float
 ) -> tuple[Float[np.ndarray, " angles"], Notes]:
-    """Move angles [rad] within `tolerance` of a multiple of 90 degrees onto it; note each.
-
-    Raises:
-        InputError: If the tolerance is negative, or so large that it would change the robot.
-    """
+    """Move angles [rad] within `tolerance` of a multiple of 90 degrees onto it; note each."""
     if not 0.0 <= tolerance < 0.1:
         raise InputError(
             f"`snap_tolerance` must be an angle from 0 (off) to 0.1 rad, but is {tolerance:g}."

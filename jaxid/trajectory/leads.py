@@ -23,17 +23,10 @@ from jaxid.trajectory.trajectory import (
 
 
 def _lead(q: Any, qd: Any, qdd: Any, duration: Any, x: Any, sign: int = 1) -> tuple:
-    r"""Return position, velocity, acceleration and jerk of a lead to a motion.
+    r"""Return position, velocity, acceleration and jerk of a lead at times x from standstill [s].
 
-    The velocity is $\alpha x^2 + \beta x^3$; a lead-out is a lead-in that is run backwards.
-
-    Args:
-        q: Position of the motion where the lead meets it.
-        qd: Velocity there.
-        qdd: Acceleration there.
-        duration: Time of the lead [s].
-        x: Time from the standstill [s].
-        sign: 1 for a lead-in, -1 for a lead-out.
+    The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in q, qd and qdd. A lead-out
+    (`sign` -1) is a lead-in (1) that is run backwards.
     """
     alpha, beta = _cubic(sign * qd, qdd, duration)
     return (
