@@ -92,14 +92,13 @@ def test_observations_are_examined_without_their_recording(motors):
     assert str(diagnose(o, ROBOT)).count("!") >= len(findings)
 
 
-@pytest.mark.parametrize("joint", [0, 3])
-def test_a_sign_is_found_in_the_motors_columns_by_friction_that_must_brake(motors, joint):
+@pytest.mark.parametrize(("joint", "channel"), [(0, "angle"), (3, "force"), (3, "angle")])
+def test_a_sign_is_found_in_the_motors_columns_by_friction_that_must_brake(motors, joint, channel):
     angles, forces = motors
     name, signs = ROBOT.joint_names[joint], np.where(np.arange(4) == joint, -1.0, 1.0)
-    (sentence,) = said(angles, forces * signs)[0]
-    assert f"the sign of the force of joint `{name}` seems to be wrong" in sentence
-    (sentence,) = said(angles * signs, forces)[0]
-    assert f"the sign of the angle of joint `{name}` seems to be wrong" in sentence
+    wrong = (angles, forces * signs) if channel == "force" else (angles * signs, forces)
+    (sentence,) = said(*wrong)[0]
+    assert f"the sign of the {channel} of joint `{name}` seems to be wrong" in sentence
 
 
 def test_motors_columns_that_are_exchanged_are_found(motors):
