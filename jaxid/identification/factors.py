@@ -61,6 +61,11 @@ class RowChunk(NamedTuple):
             part = self.part(slice(own.start - start, own.stop - start))
             yield part._replace(block=self.block + block)
 
+    def residuals(self, p: np.ndarray) -> Float[np.ndarray, "rows joints"]:
+        """Return measured less predicted forces [N m or N]."""
+        pairs = zip(self.columns, self.indices, strict=True)
+        return self.forces - np.stack([theta @ p[list(own)] for theta, own in pairs], axis=1)
+
     def equations(self) -> list[np.ndarray]:
         """Return the masked rows `[columns, force]` of each joint."""
         joints = zip(self.columns, self.forces.T, self.mask.T, strict=True)

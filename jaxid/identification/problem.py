@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.factors import (
@@ -198,7 +197,7 @@ class RegressionProblem:
     ) -> Iterator[tuple[RowChunk, np.ndarray]]:
         """Yield the rows with the residuals of some parameters [rows, joints]."""
         for chunk in self.chunks(spans):
-            yield chunk, chunk_residuals(chunk, p)
+            yield chunk, chunk.residuals(p)
 
     def reweighted(
         self, p: np.ndarray, weight: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -211,18 +210,11 @@ class RegressionProblem:
         """
 
         def equations(chunk: RowChunk) -> list[np.ndarray]:
-            root = np.sqrt(weight(chunk_residuals(chunk, p), chunk.mask))
+            root = np.sqrt(weight(chunk.residuals(p), chunk.mask))
             parts = zip(chunk.equations(), root.T, chunk.mask.T, strict=True)
             return [w[kept, None] * rows for rows, w, kept in parts]
 
         return self.fold(equations)
-
-
-def chunk_residuals(chunk: RowChunk, p: np.ndarray) -> Float[np.ndarray, "rows joints"]:
-    """Return measured less predicted forces of some rows [N m or N]."""
-    pairs = zip(chunk.columns, chunk.indices, strict=True)
-    predicted = [theta @ p[list(own)] for theta, own in pairs]
-    return chunk.forces - np.stack(predicted, axis=1)
 
 
 def block_edges(observations: Observations, blocks: int) -> list[int]:

@@ -125,12 +125,8 @@ class LoopShape(NamedTuple):
         return sum(rate * (n // 2) for rate, n in zip(rates, self.lags, strict=True))
 
 
-class Piece(NamedTuple):
-    """Consecutive rows of one block that the loop adds up in one call, and their samples."""
-
-    block: int
-    rows: tuple[int, int]
-    samples: slice
+Piece = tuple[int, tuple[int, int], slice]
+"""Consecutive rows that the loop adds up in one call: their block, range, and samples."""
 
 
 def stream_blocks(
@@ -203,7 +199,7 @@ class _Stream:
                 end = min(r + most, rows.stop)
                 begin = a + edge + (r - r0) * factor - reach
                 samples = slice(begin, min(begin + self._samples_of(end - r), b), self._stride)
-                yield Piece(block, (r, end), samples)
+                yield block, (r, end), samples
 
     def _samples_of(self, rows: int) -> int:
         shape = self._shape
@@ -212,8 +208,8 @@ class _Stream:
     def _reduce_ends(self, base: BaseParameters) -> Iterator[tuple[int, list[np.ndarray]]]:
         """Yield block and equations of the rows that no piece covers, reduced in NumPy."""
         outer = np.ones(len(self._mask), bool)
-        for piece in self._pieces:
-            outer[slice(*piece.rows)] = False
+        for _, rows, _ in self._pieces:
+            outer[slice(*rows)] = False
         changes = np.flatnonzero(np.diff(np.r_[False, outer, False])).tolist()
         runs = list(zip(changes[::2], changes[1::2], strict=True))
         samples = max(4096, 2 * self._shape.reach)
@@ -239,7 +235,7 @@ class _Stream:
             # As many rows of a piece as an iteration has.
             b = min(b, a + self._shape.rows)
             stop = min(samples.stop, samples.start + self._samples_of(b - a))
-            pieces.append(Piece(block, (a, b), slice(samples.start, stop, samples.step)))
+            pieces.append((block, (a, b), slice(samples.start, stop, samples.step)))
         total = [np.zeros((width, width)) for width in self._widths]
         self._add([total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths])
         return total
@@ -261,8 +257,8 @@ class _Stream:
         progress: Progress | None = None,
     ) -> None:
         """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
-        for done, (piece, grams) in enumerate(self._run(pieces, mixing), 1):
-            for total, G in zip(blocks[piece.block], grams, strict=True):
+        for done, ((block, _, _), grams) in enumerate(self._run(pieces, mixing), 1):
+            for total, G in zip(blocks[block], grams, strict=True):
                 total += G
             if progress is not None:
                 progress(done / len(pieces))
@@ -277,7 +273,7 @@ class _Stream:
         groups = [pieces[k : k + size] for k in range(0, len(pieces), size)]
 
         def read(group: Sequence[Piece]) -> list:
-            return [self._observations.read(piece.samples) for piece in group]
+            return [self._observations.read(samples) for _, _, samples in group]
 
         # The thread only reads: memory that a thread allocates comes back late.
         with ThreadPoolExecutor(1) as reader:
@@ -293,7 +289,7 @@ class _Stream:
         """Return the arrays of one piece, filled up to the shape of the loop."""
         (motion, forces), shape = read, self._shape
         # The first rows come late, and do not count.
-        mask = np.pad(self._mask[slice(*piece.rows)], ((shape.delay, 0), (0, 0)))
+        mask = np.pad(self._mask[slice(*piece[1])], ((shape.delay, 0), (0, 0)))
         length = shape.iterations * shape.samples
         arrays = [
             _filled_up(np.asarray(x, np.float64), length)
@@ -368,25 +364,25 @@ def _compiled(
     fence = default_fence("cpu", jax.__version_info__)
     base_columns = lower(program, fence)
     tool_forces = None if tool is None else lower(tool, fence)
+
+    def entry(j: int, k: int) -> tuple[bool, int | float]:
+        x = program.outputs[j * size + k]
+        return isinstance(x, int), x
+
     # Joints share columns: every distinct one is filtered once.
-    distinct: dict[tuple[bool, int | float], int] = {}
-    first, places = [], []
-    for j, own in enumerate(acting):
-        for k in own:
-            x = program.outputs[j * size + k]
-            if distinct.setdefault((isinstance(x, int), x), len(distinct)) == len(first):
-                first.append(j * size + k)
-        outputs = [program.outputs[j * size + k] for k in own]
-        places.append([distinct[isinstance(x, int), x] for x in outputs])
-    places = [np.array([*own, len(first) + j]) for j, own in enumerate(places)]
+    distinct = {entry(j, k): j * size + k for j, own in enumerate(acting) for k in own}
+    first, rows = list(distinct.values()), {key: row for row, key in enumerate(distinct)}
+    places = [
+        np.array([*(rows[entry(j, k)] for k in own), len(first) + j])
+        for j, own in enumerate(acting)
+    ]
     height = len(first) + joints
 
     def evaluate(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
         packed = base_columns(q, qd, qdd)
-        rows = [jnp.broadcast_to(jnp.asarray(packed[i], float), q.shape[1:]) for i in first]
+        columns = [jnp.broadcast_to(jnp.asarray(packed[i], float), q.shape[1:]) for i in first]
         known = [0.0] * joints if tool_forces is None else tool_forces(q, qd, qdd)
-        rows += [f - k for f, k in zip(forces, known, strict=True)]
-        return rows
+        return columns + [f - k for f, k in zip(forces, known, strict=True)]
 
     def nothing(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
         return [jnp.zeros(q.shape[1:])] * height

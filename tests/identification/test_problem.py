@@ -7,7 +7,6 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.problem import chunk_residuals
 
 WEIGHTS = np.array([0.3, 2.0])
 
@@ -111,7 +110,7 @@ def test_a_fold_of_other_columns_is_that_of_numpy(base, recordings):
     problem = jid.RegressionProblem(base, recordings, divisions=3)
 
     def equations(chunk):
-        r = np.where(chunk.mask, chunk_residuals(chunk, p), 0.0)
+        r = np.where(chunk.mask, chunk.residuals(p), 0.0)
         return [np.column_stack([r[:, :1], r[:, 1:]])]
 
     blocks = problem.fold(equations, [(0,)], 1)

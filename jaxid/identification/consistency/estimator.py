@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, Int, content, require_float64
+from jaxid.arrays import AnyArray, Array, Bool, Float, Hashable, Int, content, require_float64
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 from jaxid.identification.consistency import solver
@@ -334,32 +334,25 @@ class ConsistentBatch(eqx.Module):
     iterations: Int[AnyArray, "*datasets"]
 
 
-class ConsistentSolver:
+class ConsistentSolver(Hashable):
     """Physically consistent estimates of one model: a function of arrays for `jit` and `vmap`.
 
     The factors are those of `Factors.weighted`: their rows are weighted already, so the weights of
     the estimator do not count. Equal solvers share their compiled functions. The solver is a loop
     whose length depends on the data: there are no reverse-mode gradients.
 
-    Args:
+    Attributes:
         base: Base parameters of the factors' columns.
-        estimator: Bounds, margin and priors; wide bounds if None.
-
-    Raises:
-        InputError: If the bounds do not fit the model.
+        estimator: Bounds, margin and priors; by default wide bounds.
     """
 
-    def __init__(self, base: BaseParameters, estimator: PhysicallyConsistent | None = None):
-        self.base = base
-        self.estimator = PhysicallyConsistent() if estimator is None else estimator
-        self.feasible = self.estimator.feasible_set(base)
-        self._key = content((base, self.estimator))
+    base: BaseParameters
+    estimator: PhysicallyConsistent = PhysicallyConsistent()
 
-    def __hash__(self) -> int:
-        return hash(self._key)
+    __hash__ = Hashable.__hash__
 
     def __eq__(self, other: object) -> bool:
-        return type(other) is ConsistentSolver and self._key == other._key
+        return isinstance(other, ConsistentSolver) and content(self) == content(other)
 
     def __call__(
         self,
@@ -373,12 +366,15 @@ class ConsistentSolver:
             R: Upper triangle of the weighted rows.
             z: Weighted forces, of the same decomposition.
             rows: Number of rows behind the factor.
+
+        Raises:
+            InputError: If the bounds do not fit the model.
         """
         require_float64("a physically consistent estimate")
-        R, z = jnp.asarray(R), jnp.asarray(z)
-        data, program = self.estimator.program(jnp, self.base, self.feasible, R, z, rows)
+        R, z, feasible = jnp.asarray(R), jnp.asarray(z), self.estimator.feasible_set(self.base)
+        data, program = self.estimator.program(jnp, self.base, feasible, R, z, rows)
         optimum = solver.solve_compiled(program)
-        p = self.feasible.standard_parameters(jnp, data, optimum.y)
+        p = feasible.standard_parameters(jnp, data, optimum.y)
         own = slice(len(z))  # The rows of a prior come behind.
         free, bounded = data.b[self.base.size : len(z)], data.A[own] @ p - data.b[own]
         return ConsistentBatch(
@@ -422,15 +418,15 @@ def consistent_batch(
             f"height] and [datasets], but have {R.shape}, {z.shape} and {rows.shape}."
         )
     arrays = np.asarray(R, np.float64), np.asarray(z, np.float64), np.asarray(rows, np.int64)
-    of_model = ConsistentSolver(base, estimator)
-    first = (x[0] for x in arrays)
-    of_model.estimator.program(np, base, of_model.feasible, *first)[1].require_interior()
+    estimator = PhysicallyConsistent() if estimator is None else estimator
+    first, feasible = (x[0] for x in arrays), estimator.feasible_set(base)
+    estimator.program(np, base, feasible, *first)[1].require_interior()
     # An accelerator takes all data sets at once; below eight of them another thread does not pay.
     usable = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
     threads = len(usable(0)) if jax.default_backend() == "cpu" else 1
     parts = min(threads, -(-count // 8))
     size = -(-count // parts)
-    solve = _compiled(of_model, (size, *R.shape[1:]))
+    solve = _compiled(ConsistentSolver(base, estimator), (size, *R.shape[1:]))
 
     def part(k: int) -> ConsistentBatch:
         chosen = np.arange(k * size, (k + 1) * size) % count

@@ -53,22 +53,13 @@ class ScaledRows(NamedTuple):
 
 
 class FeasibleSet(NamedTuple):
-    """Feasible parameters: consistent bodies, dissipative friction, nonnegative rotor inertias.
+    """Feasible parameters: consistent bodies, dissipative friction, nonnegative rotor inertias."""
 
-    Attributes:
-        bodies: For each body the columns of its parameters.
-        drives: Columns that are nonnegative.
-        free: Columns without bounds.
-        bounds: Bounds of the bodies.
-        floors: Pseudo-inertias that those of the bodies exceed [bodies, 4, 4].
-        couplings: Matrices of coupled drives.
-    """
-
-    bodies: tuple[tuple[int, ...], ...]
-    drives: tuple[int, ...]
-    free: tuple[int, ...]
+    bodies: tuple[tuple[int, ...], ...]  # columns of each body's parameters
+    drives: tuple[int, ...]  # columns that are nonnegative
+    free: tuple[int, ...]  # columns without bounds
     bounds: BodyBounds
-    floors: np.ndarray
+    floors: np.ndarray  # pseudo-inertias that those of the bodies exceed
     couplings: tuple[Coupling, ...]
 
     @property
@@ -240,39 +231,24 @@ def scaled_rows(
 
 
 class ConeProgram(eqx.Module):
-    r"""$\min \frac12 |A y - b|^2$ over bodies, drives and their couplings.
+    r"""$\min \frac12 |A y - b|^2$ over bodies, drives and their couplings."""
 
-    Attributes:
-        A: Matrix; columns without bounds are projected out of it.
-        b: Right-hand side.
-        floors: Lower bound of each body's pseudo-inertia.
-        rows: Coefficients of each body's linear inequalities.
-        offsets: Constants of these inequalities.
-        couplings: Contributions of variables to further positive semidefinite matrices.
-        members: Variables of these matrices.
-        fillings: Constants of these matrices: ones where they are smaller than four.
-        equal: Functions of all variables that keep their value at the start.
-        pull: Strength of the pull towards the prior's bodies; 0 for none.
-        prior: Inverses of the prior's pseudo-inertias.
-        diameters: Largest distance between two feasible values of each variable.
-        scale: Value of the objective that counts as 1.
-        start: Strictly feasible variables.
-    """
-
-    A: Float[AnyArray, "*batch height variables"]
+    A: Float[AnyArray, "*batch height variables"]  # columns without bounds are projected out
     b: Float[AnyArray, "*batch height"]
-    floors: Float[AnyArray, "*batch bodies 4 4"]
-    rows: Float[AnyArray, "*batch bodies rows width"]
-    offsets: Float[AnyArray, "*batch bodies rows"]
+    floors: Float[AnyArray, "*batch bodies 4 4"]  # lower bounds of the pseudo-inertias
+    rows: Float[AnyArray, "*batch bodies rows width"]  # linear inequalities of each body
+    offsets: Float[AnyArray, "*batch bodies rows"]  # and their constants
+    # Further positive semidefinite matrices: contributions of their variables, and constants, which
+    # are ones where a matrix is smaller than four.
     couplings: Float[AnyArray, "*batch couplings members 4 4"]
     members: Int[AnyArray, "*batch couplings members"]
     fillings: Float[AnyArray, "*batch couplings 4 4"]
-    equal: Float[AnyArray, "*batch equal variables"]
-    pull: Number
-    prior: Float[AnyArray, "*batch bodies 4 4"]
-    diameters: Float[AnyArray, "*batch variables"]
-    scale: Number
-    start: Float[AnyArray, "*batch variables"]
+    equal: Float[AnyArray, "*batch equal variables"]  # functions that keep their value at the start
+    pull: Number  # strength of the pull towards the prior's bodies; 0 for none
+    prior: Float[AnyArray, "*batch bodies 4 4"]  # inverses of the prior's pseudo-inertias
+    diameters: Float[AnyArray, "*batch variables"]  # bounds of distances of feasible values
+    scale: Number  # value of the objective that counts as 1
+    start: Float[AnyArray, "*batch variables"]  # strictly feasible variables
 
     @property
     def bodies(self) -> int:

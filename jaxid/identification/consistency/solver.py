@@ -42,15 +42,10 @@ TINY = 1e-14
 
 
 class Optimum(eqx.Module):
-    """Result of the interior point method.
+    """Result of the interior point method: half the squared residuals, with a bound of the error.
 
-    Attributes:
-        y: Feasible variables.
-        value: Half the squared residuals.
-        error: Bound of the objective's distance to its optimum.
-        certified: Whether the bound is within the tolerance.
-        iterations: Number of iterations.
-        multipliers: Multipliers of the linear inequalities.
+    It is certified if the bound is within the tolerance; the multipliers are those of the linear
+    inequalities.
     """
 
     y: Float[AnyArray, "*batch variables"]
@@ -74,14 +69,8 @@ class _Point(NamedTuple):
     error: Values
 
 
-class _Direction(NamedTuple):
-    """Changes of variables, slacks and multipliers."""
-
-    y: Values
-    S: Values
-    s: Values
-    Z: Values
-    z: Values
+_Direction = tuple[Values, ...]
+"""Changes of `y`, `S`, `s`, `Z` and `z`."""
 
 
 def solve_in_numpy(program: ConeProgram) -> Optimum:
@@ -192,7 +181,7 @@ def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Poi
         dy = solve(right)
         dS, ds = p.linear(xp, dy)
         dZ = rZ - symmetric_part(xp, inverse_S @ dS @ x.Z)
-        return _Direction(dy, dS, ds, dZ, rz - ratio * ds)
+        return dy, dS, ds, dZ, rz - ratio * ds
 
     def toward(mu: Values, second_Z: Values, second_z: Values) -> _Direction:
         """Return the direction towards products `target + mu`, less second-order terms."""
@@ -202,7 +191,8 @@ def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Poi
 
     def correct(mu: Values, d: _Direction) -> _Direction:
         """Return the direction with the products of changes along `d`."""
-        return toward(mu, symmetric_part(xp, inverse_S @ d.S @ d.Z), d.s * d.z / x.s)
+        _, dS, ds, dZ, dz = d
+        return toward(mu, symmetric_part(xp, inverse_S @ dS @ dZ), ds * dz / x.s)
 
     def complementarity(S: Values, s: Values, Z: Values, z: Values) -> Values:
         matrices = xp.sum(S * Z) - 4.0 * p.bodies * p.pull
@@ -220,14 +210,15 @@ def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Poi
     second = correct(centre * mu, first)
     lengths = _length(xp, STEPS, x, first), _length(xp, STEPS, x, second)
     longer = lengths[1] > lengths[0]
-    d = _Direction(*(xp.where(longer, b, a) for a, b in zip(first, second, strict=True)))
+    d = tuple(xp.where(longer, b, a) for a, b in zip(first, second, strict=True))
     length = xp.maximum(*lengths)
 
     def refined() -> tuple[Values, ...]:
         """Remove what rounding has left of the optimality conditions."""
-        rest = p.adjoint(xp, d.Z, d.z) - x.residual - (p.A @ d.y) @ p.A
-        more = direction(xp.zeros_like(d.Z), xp.zeros_like(d.z), rest)
-        total = _Direction(*(a + b for a, b in zip(d, more, strict=True)))
+        dy, _, _, dZ, dz = d
+        rest = p.adjoint(xp, dZ, dz) - x.residual - (p.A @ dy) @ p.A
+        more = direction(xp.zeros_like(dZ), xp.zeros_like(dz), rest)
+        total = tuple(a + b for a, b in zip(d, more, strict=True))
         return *total, _length(xp, STEPS, x, total)
 
     # Near the boundary rounding leaves a residual that the error bound counts.
@@ -244,9 +235,10 @@ def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Poi
 
 def _length(xp: ModuleType, steps: np.ndarray, x: _Point, d: _Direction) -> Values:
     """Return the longest of some steps that leaves everything positive."""
-    fastest = xp.maximum(xp.max(-d.s / x.s), xp.max(-d.z / x.z))
+    _, dS, ds, dZ, dz = d
+    fastest = xp.maximum(xp.max(-ds / x.s), xp.max(-dz / x.z))
     lengths = steps * xp.minimum(1.0, 1.0 / xp.maximum(fastest, 1e-300))
-    matrices, changes = xp.concatenate([x.S, x.Z]), xp.concatenate([d.S, d.Z])
+    matrices, changes = xp.concatenate([x.S, x.Z]), xp.concatenate([dS, dZ])
     tried = matrices[..., None] + changes[..., None] * lengths[None, None, None]
     good = xp.all(are_definite(tried), axis=0)
     return xp.where(xp.any(good), lengths[xp.argmax(good)], 0.0)
