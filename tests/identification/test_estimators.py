@@ -1,11 +1,15 @@
 """The family of estimators: laws for all members, and what each is for."""
 
+import inspect
+
 import numpy as np
 import pytest
 from scipy import optimize
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
+from jaxid.identification.estimators.solutions import Decomposition
+from jaxid.identification.factors import Factors
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 MEASURED = jid.estimators.ResidualVariances(0)
@@ -113,6 +117,60 @@ def weighted(weights):
     return jid.WeightedLeastSquares(jid.estimators.GivenWeights(weights))
 
 
+GIVEN = np.array([0.025, 0.2])
+LINEAR = [
+    jid.estimators.LeastSquares(),
+    weighted(GIVEN),
+    jid.estimators.LeastSquares(jid.estimators.Truncated(1e-6)),
+    jid.WeightedLeastSquares(jid.estimators.GivenWeights(GIVEN), jid.estimators.Ridge(0.1)),
+]
+
+
+@pytest.mark.parametrize("estimator", LINEAR)
+def test_forces_that_add_up_give_parameters_that_do(base, noisy, estimator):
+    first = np.asarray(noisy.forces)
+    second = np.random.default_rng(4).normal(size=first.shape)
+    logs = [noisy.replace(forces=x) for x in (first, second, first - 1.7 * second)]
+    p, q, total = (np.asarray(jid.identify(base, o, estimator).parameters) for o in logs)
+    np.testing.assert_allclose(total, p - 1.7 * q, rtol=1e-8, atol=1e-8 * np.abs(p).max())
+
+
+@pytest.mark.parametrize("power", [-40, 33])
+def test_only_the_ratio_of_weights_counts(base, noisy, power):
+    one, other = (jid.identify(base, noisy, weighted(c * GIVEN)) for c in (1.0, 2.0**power))
+    np.testing.assert_allclose(other.parameters, one.parameters, rtol=1e-9)
+    np.testing.assert_allclose(other.standard_deviations, one.standard_deviations, rtol=1e-9)
+
+
+def test_order_division_and_rows_that_do_not_count_change_nothing(base, noisy):
+    """Rows are samples, since nothing is filtered; masked rows may hold anything."""
+    random = np.random.default_rng(1)
+    m, forces, order = noisy.motion, np.asarray(noisy.forces), random.permutation(noisy.samples)
+    mixed = noisy.replace(motion=m[order], forces=forces[order])
+    one, other = (jid.identify(base, o, weighted(GIVEN)) for o in (noisy, mixed))
+    np.testing.assert_allclose(other.parameters, one.parameters, rtol=1e-10)
+    np.testing.assert_allclose(other.residual_rms, one.residual_rms, rtol=1e-10)
+
+    def solve(factors):
+        return Decomposition.of(*factors.weighted(GIVEN)).solve()
+
+    total, divided = (
+        jid.RegressionProblem(base, [noisy], divisions=n).blocks.total for n in (10, 3)
+    )
+    padded = [j.append(np.zeros((7, len(j.columns) + 1))) for j in total.joints]
+    for factors in (divided, Factors(tuple(padded), base.size)):
+        np.testing.assert_allclose(solve(factors), solve(total), rtol=1e-11)
+
+    mask = random.uniform(size=forces.shape) > 0.2
+    spoilt = np.where(mask, forces, 1e6 * random.standard_normal(forces.shape))
+    logs = [noisy.replace(mask=mask, forces=x) for x in (forces, spoilt)]
+    one, other = (jid.identify(base, o, weighted(GIVEN)) for o in logs)
+    np.testing.assert_allclose(other.parameters, one.parameters, rtol=1e-12)
+    assert other.rows == one.rows == tuple(mask.sum(axis=0))
+
+
+ONES = np.ones((3, 20, 3))
+identify = inspect.unwrap(jid.identify)  # tests check annotations first, users do not
 REFUSALS = [
     (lambda base, o: jid.identify(base, o, weighted(np.zeros(2))), "`weights`"),
     (lambda base, o: jid.identify(base, o, weighted([1.0, -1.0])), "`weights`"),
@@ -130,13 +188,21 @@ REFUSALS = [
         ),
         "`references`",
     ),
+    (lambda base, o: identify(base, o.motion), "`observations`"),
+    (lambda base, o: identify(base.model, o), "`base`"),
+    (lambda base, o: jid.identify(base, o, LINEAR[0]).predict(jid.Motion(*ONES)), "`motion`"),
+    (lambda base, o: jid.Recording.of(1j * ONES[0], ONES[0], sample_time=0.1), "complex"),
+    (
+        lambda base, o: jid.Recording.of(*ONES[:2], sample_time=0.1, largest_gap=-1),
+        "`largest_gap`",
+    ),
     *[(lambda base, o, k=k: alone(base, o, k), "only their factors") for k in range(3, 8)],
 ]
 
 
 @pytest.mark.parametrize(("make", "named"), REFUSALS)
 def test_what_cannot_be_is_rejected(base, noisy, make, named):
-    with pytest.raises(ValueError, match=named):
+    with pytest.raises((TypeError, ValueError), match=named):
         make(base, noisy)
 
 

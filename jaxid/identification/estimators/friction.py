@@ -98,9 +98,9 @@ class Shapes(eqx.Module):
     @property
     def columns_of_terms(self) -> list[int]:
         """Standard parameters of the terms that have shapes."""
-        sizes = [len(term.parameters(self.model.robot)) for term in self.model.terms]
-        ends = np.cumsum(sizes)
-        return [k for i in self._terms for k in range(ends[i] - sizes[i], ends[i])]
+        robot, terms = self.model.robot, self.model.terms
+        owners = [i for i, term in enumerate(terms) for _ in term.parameters(robot)]
+        return [k for k, i in enumerate(owners) if i in self._terms]
 
     @property
     def _terms(self) -> list[int]:
@@ -108,11 +108,7 @@ class Shapes(eqx.Module):
 
     @property
     def values(self) -> Float[np.ndarray, " shapes"]:
-        """Shapes of the model.
-
-        Raises:
-            InputError: If one of them is not positive.
-        """
+        """Shapes of the model; one that is not positive is rejected."""
         terms, n = self.model.terms, (self.model.robot.joints,)
         given = [np.asarray(shape.value(terms[i]), np.float64) for i, shape in self.members]
         x = np.concatenate([np.broadcast_to(value, n) for value in given])

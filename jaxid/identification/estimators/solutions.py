@@ -9,6 +9,7 @@ from jaxid.arrays import AnyArray, Bool, Float, one_or_each
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.factors import Blocks, Factors
+from jaxid.identification.problem import cross_validation_folds
 from jaxid.robot.robot import Robot
 
 NUMERICAL = 1e-11
@@ -174,17 +175,13 @@ class CrossValidated(AbstractSolution):
 
     def choose(self, blocks, weights):
         """Test every candidate on every block; reject a single block."""
-        if len(blocks.parts) < 2:
-            raise InputError(
-                "cross-validation needs at least two `blocks` of rows, but there is one."
-            )
-        squares = np.asarray(weights) ** 2
-        errors = np.empty((len(self.candidates), len(blocks.parts)))
-        for k, held_out in enumerate(blocks.parts):
-            d = Decomposition.of(*blocks.without(k).weighted(weights))
+        squares, count = np.asarray(weights) ** 2, len(blocks.parts)
+        errors = np.empty((len(self.candidates), count))
+        for k, (rest, held_out) in enumerate(cross_validation_folds(blocks, count)):
+            d = Decomposition.of(*rest.total.weighted(weights))
             for i, candidate in enumerate(self.candidates):
                 p = d.solve(candidate.inverse(d.values))
-                errors[i, k] = squares @ held_out.residual_squares(p)
+                errors[i, k] = squares @ held_out.total.residual_squares(p)
         total = errors.sum(axis=1)
         best = int(np.argmin(total))
         margin = errors[best].std(ddof=1) * np.sqrt(errors.shape[1])
