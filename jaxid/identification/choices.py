@@ -296,7 +296,7 @@ def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination],
     while kept:
         p, B = _solve(R, z, kept)
         error = float(squares @ factors.residual_squares(p))
-        held_out = sum(squares @ part.residual_squares(_solve(*r, kept)[0]) for *r, part in folds)
+        held_out = sum(squares @ x.residual_squares(_solve(A, b, kept)[0]) for A, b, x in folds)
         errors = float(np.sqrt(error / total)), float(np.sqrt(held_out / total))
         sets.append(list(kept))
         path.append(Elimination(name, deviation, len(kept), *errors))
