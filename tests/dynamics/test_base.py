@@ -16,13 +16,10 @@ from jaxid.dynamics.terms import (
     CoupledDrives,
     RigidBodies,
     RotorInertia,
-    Tanh,
     ViscousFriction,
 )
 from jaxid.robot import library
-from jaxid.robot.library import from_dh
 from jaxid.robot.robot import Robot
-from jaxid.robot.rotations import axis_rotation
 
 DRIVES = (ViscousFriction(), CoulombFriction(), RotorInertia())
 SEVEN, TEN = RigidBodies(principal_axes=True), RigidBodies()
@@ -175,7 +172,7 @@ def test_standard_parameters_and_back():
     np.testing.assert_array_equal(base.from_standard(base.to_standard(x)), x)
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", range(12))
 def test_both_methods_agree_with_lapack_on_random_trees(seed):
     bodies = SEVEN if seed % 2 else TEN
     model = Model(random_tree(seed, 2 + seed % 4).robot(), (bodies, *DRIVES, ConstantOffset()))
@@ -242,11 +239,3 @@ def test_frames_do_not_matter_with_all_ten_parameters():
         at_wrist = robot.replace(offset=offset)
     assert base_parameters(Model(at_wrist, (TEN, *DRIVES))).size == 57
     assert base_parameters(Model(at_wrist, (SEVEN, *DRIVES))).size == 43
-
-
-def test_smooth_friction_of_any_width_adds_one_column_per_joint():
-    for epsilon in (1e-3, 0.1):
-        terms = (TEN, CoulombFriction(Tanh(epsilon)))
-        arm = from_dh([(0.0, 0.3, 0.0), (0.0, 0.3, 0.0)], convention="standard", name="arm")
-        tilted = arm.mounted(axis_rotation(np.array([1.0, 0.0, 0.0]), np.pi / 2))
-        assert base_parameters(Model(tilted, terms)).size == 6 + 2

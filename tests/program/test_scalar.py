@@ -1,9 +1,7 @@
 """Simplification of expressions: while they are built, and with all uses known."""
 
-import gc
 import importlib.util
 import math
-import weakref
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -111,18 +109,6 @@ def test_known_choices_are_made(x, y):
     assert logic(Operation.AND, less, less) is less
     # This comparison finds NaN.
     assert apply(Operation.NOT_EQUAL, x, x).operation is Operation.NOT_EQUAL
-
-
-def test_a_graph_is_freed_with_its_scalars():
-    class Watched(Graph):
-        __slots__ = ("__weakref__",)
-
-    graph = Watched()
-    x = graph.node(Operation.INPUT, 0, 0) * 2.0
-    alive = weakref.ref(graph)
-    del graph, x
-    gc.collect()
-    assert alive() is None
 
 
 @pytest.mark.parametrize(
