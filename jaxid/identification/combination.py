@@ -77,7 +77,14 @@ def combine(
 
     The base parameters of each fit are its map times the unknowns, plus its offset.
     """
-    _require_different_rows(fits)
+    for one, other in itertools.combinations(fits, 2):
+        if share_rows(one.time_blocks, other.time_blocks):
+            same = one.name == other.name
+            which = f"two fits `{one.name}`" if same else f"fits `{one.name}` and `{other.name}`"
+            raise InputError(
+                f"the {which} have seen the same data, which would count twice: give every log "
+                "once, as itself or by the report that was made of it."
+            )
     offsets = [np.zeros(fit.base.size) for fit in fits] if offsets is None else offsets
     factors = [fit.factor for fit in fits]
     matrix = np.vstack([R @ E for (R, _), E in zip(factors, maps, strict=True)])
@@ -143,17 +150,6 @@ def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
     fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(np.asarray(earlier.weights))))
     name = f"{earlier.name}, {later.name}" if name is None else name
     return replace_estimates(dataclasses.replace(fit, name=name), p, uncertainty)
-
-
-def _require_different_rows(fits: Sequence[Fit]) -> None:
-    for one, other in itertools.combinations(fits, 2):
-        if share_rows(one.time_blocks, other.time_blocks):
-            names = f"fits `{one.name}` and `{other.name}`"
-            which = names if one.name != other.name else f"two fits `{one.name}`"
-            raise InputError(
-                f"the {which} have seen the same data, which would count twice: give every log "
-                "once, as itself or by the report that was made of it."
-            )
 
 
 def share_rows(first: Blocks, second: Blocks) -> bool:
