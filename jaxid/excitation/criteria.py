@@ -160,36 +160,28 @@ class AbstractCriterion(eqx.Module):
 class ConditionNumber(AbstractCriterion):
     r"""Criterion of the paper: condition number of $\Lambda = \Theta_B^T \Theta_B$ (Eq. 36).
 
-    It depends on the units and on the choice of base parameters, and a small one need not mean
-    small standard deviations; use it for comparison.
-    """
-
-    name: ClassVar[str] = "condition number of Λ (Eq. 36)"
-    weighted: ClassVar[bool] = False
-
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
-        """Return the logarithm of the condition number."""
-        return jnp.asarray(spectral(log_condition, information.plain, sharpness))
-
-
-class WeightedConditionNumber(AbstractCriterion):
-    r"""Condition number of $\Theta_B^T W^2 \Theta_B$, the matrix of weighted least squares.
+    It depends on the choice of base parameters, and a small one need not mean small standard
+    deviations; use it for comparison.
 
     Attributes:
+        weighted: Whether it is that of $\Theta_B^T W^2 \Theta_B$, the matrix of weighted least
+            squares.
         scaled: Whether columns are scaled to unit length: then it does not depend on units, and
             measures how similar columns are.
     """
 
+    weighted: bool = eqx.field(static=True, default=False)  # pyright: ignore
     scaled: bool = eqx.field(static=True, default=False)
 
     @property
-    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def name(self) -> str:  # pyright: ignore
         """Name of the number in tables."""
-        return f"condition number, weighted{', columns scaled' if self.scaled else ''}"
+        of = ", weighted" if self.weighted else " of Λ (Eq. 36)"
+        return f"condition number{of}{', columns scaled' if self.scaled else ''}"
 
     def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the condition number."""
-        matrix = jnp.asarray(information.weighted)
+        matrix = jnp.asarray(information.weighted if self.weighted else information.plain)
         matrix = _unit_diagonal(matrix)[0] if self.scaled else matrix
         return jnp.asarray(spectral(log_condition, matrix, sharpness))
 
@@ -246,8 +238,8 @@ class EOptimal(AbstractCriterion):
 
 CRITERIA = (
     ConditionNumber(),
-    WeightedConditionNumber(),
-    WeightedConditionNumber(scaled=True),
+    ConditionNumber(weighted=True),
+    ConditionNumber(weighted=True, scaled=True),
     DOptimal(),
     AOptimal(),
     EOptimal(),

@@ -216,8 +216,9 @@ class Excitation:
     @property
     def objective(self) -> AbstractCriterion:
         """Criterion of that name: `d_optimal` stands for the class `DOptimal`."""
-        if self.criterion == "scaled_condition_number":
-            return criteria.WeightedConditionNumber(scaled=True)
+        if self.criterion.endswith("condition_number"):
+            weighted = self.criterion != "condition_number"
+            return criteria.ConditionNumber(weighted, self.criterion.startswith("scaled"))
         return getattr(criteria, self.criterion.title().replace("_", ""))()
 
     @property

@@ -9,7 +9,6 @@ from jaxid.simulation.friction import FrictionTemperature as FrictionTemperature
 from jaxid.simulation.friction import LuGreFriction as LuGreFriction
 from jaxid.simulation.friction import SmoothFriction as SmoothFriction
 from jaxid.simulation.friction import TorqueRipple as TorqueRipple
-from jaxid.simulation.mechanics import AbstractGear as AbstractGear
 from jaxid.simulation.mechanics import FlexibleGear as FlexibleGear
 from jaxid.simulation.mechanics import RigidGear as RigidGear
 from jaxid.simulation.mechanics import Servo as Servo

@@ -101,27 +101,11 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
 
 
 def virtual_log(robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]) -> Recording:
-    """Return a log of a random motion within the limits, with a period of 8 s, at 500 Hz.
-
-    Args:
-        robot: Virtual robot.
-        name: Name of the log.
-        periods: Number of periods.
-        seed: Seed of motion and noise.
-    """
-    motion_seed, noise_seed = (
-        int(s) for s in np.random.SeedSequence(seed).generate_state(2, np.uint32)
-    )
-    trajectory = random_fourier_series(
-        robot.model.robot, omega=2 * math.pi / 8.0, reach=0.9, seed=motion_seed
-    )
-    return robot.measure(
-        trajectory,
-        duration=periods * 8.0,
-        sample_time=0.002,
-        seed=noise_seed,
-        name=name,
-    )
+    """Return a log of a random motion within the limits, with a period of 8 s, at 500 Hz."""
+    first, second = np.random.SeedSequence(seed).generate_state(2, np.uint32).tolist()
+    motion = random_fourier_series(robot.robot, omega=2 * math.pi / 8.0, reach=0.9, seed=first)
+    duration = periods * 8.0
+    return robot.measure(motion, duration=duration, sample_time=0.002, seed=second, name=name)
 
 
 def write_example(folder: Path, seed: int = 0) -> list[Path]:
@@ -168,8 +152,7 @@ def _truth(robot: VirtualRobot, seed: int) -> dict[str, object]:
     friction: Any = robot.friction
     model, p = robot.model, np.asarray(robot.parameters)
     base = base_parameters(model)
-    first, second = list(base.indices), list(base.dependent)
-    combined = p[first] + np.asarray(base.kappa) @ p[second]
+    combined = np.asarray(base.from_standard(p))
     keys = ("name", "unit", "value")
     standard = zip(model.parameter_names, model.parameter_units, p.tolist(), strict=True)
     regrouped = zip(base.names, base.units, combined.tolist(), strict=True)

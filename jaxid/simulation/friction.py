@@ -7,6 +7,7 @@ standstill, a joint that sticks stays where it is, and no small steps are needed
 
 import dataclasses
 from abc import abstractmethod
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,10 +28,12 @@ class AbstractGearFriction(Hashable):
     Attributes:
         viscous: Viscous friction [N m s/rad or N s/m].
         coulomb: Dry friction at speed [N m or N].
+        dry: Names of all fields that are levels of dry friction.
     """
 
     viscous: eqx.AbstractVar[Joints]
     coulomb: eqx.AbstractVar[Joints]
+    dry: ClassVar[tuple[str, ...]] = ("coulomb",)
 
     @abstractmethod
     def steady(self, qd: Joints) -> Joints:
@@ -53,9 +56,10 @@ class AbstractGearFriction(Hashable):
             bend to $z_0 + r \dot q^+$ [rad or m].
         """
 
-    @abstractmethod
     def scaled(self, viscous: Joints, dry: Joints) -> "AbstractGearFriction":
         """Return the same law with viscous and all dry friction times factors."""
+        levels = {name: getattr(self, name) * dry for name in self.dry}
+        return dataclasses.replace(self, viscous=self.viscous * viscous, **levels)
 
     def settled(self, qd: Joints) -> Joints:
         """Return deflections of the bristles at constant speeds [rad or m]."""
@@ -85,6 +89,7 @@ class SmoothFriction(AbstractGearFriction):
         stribeck_speed: $v_s$ [rad/s or m/s].
     """
 
+    dry: ClassVar[tuple[str, ...]] = ("coulomb", "stribeck")
     viscous: Joints
     coulomb: Joints
     stribeck: Joints | float = 0.0
@@ -106,15 +111,6 @@ class SmoothFriction(AbstractGearFriction):
         force = dry - slope * expected + 0.5 * self.viscous * qd
         return force, slope + 0.5 * self.viscous, z, 0.0 * z
 
-    def scaled(self, viscous, dry):
-        """Return the law with scaled levels; the Stribeck part is dry."""
-        return dataclasses.replace(
-            self,
-            viscous=self.viscous * viscous,
-            coulomb=self.coulomb * dry,
-            stribeck=self.stribeck * dry,
-        )
-
 
 class LuGreFriction(AbstractGearFriction):
     r"""Viscous, Coulomb and Stribeck friction and stiction: the LuGre law of bent bristles.
@@ -134,6 +130,7 @@ class LuGreFriction(AbstractGearFriction):
         damping_time: $\sigma_1 / \sigma_0$ at rest [s].
     """
 
+    dry: ClassVar[tuple[str, ...]] = ("coulomb", "breakaway")
     viscous: Joints
     coulomb: Joints
     breakaway: Joints
@@ -167,15 +164,6 @@ class LuGreFriction(AbstractGearFriction):
         bent = (self._stiffness + damping / step) * kept
         force = bent * z - damping / step * z + 0.5 * self.viscous * qd
         return force, bent * step + 0.5 * self.viscous, kept * z, kept * step
-
-    def scaled(self, viscous, dry):
-        """Return the law with scaled levels; bristles let go at the same deflection."""
-        return dataclasses.replace(
-            self,
-            viscous=self.viscous * viscous,
-            coulomb=self.coulomb * dry,
-            breakaway=self.breakaway * dry,
-        )
 
 
 class FrictionTemperature(eqx.Module):
@@ -235,9 +223,9 @@ class TorqueRipple(AbstractDisturbance):
         phase: Phase at the motor's zero [rad].
     """
 
-    amplitude: Float[AnyArray, " joints"]
-    waves: Float[AnyArray, " joints"]
-    phase: Float[AnyArray, " joints"]
+    amplitude: Joints
+    waves: Joints
+    phase: Joints
 
     def forces(self, robot, q, qd):
         """Return a sine of the motor angle."""

@@ -1,6 +1,5 @@
 """Time steps of a robot with drives: bodies, motors, gears and friction together; its servo."""
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,10 +19,12 @@ from jaxid.simulation.friction import AbstractDisturbance, AbstractGearFriction
 Joints = Float[AnyArray, " joints"]
 
 
-class AbstractGear(Hashable):
-    """Gear between a motor and its joint, with all numbers on the joint side."""
+class RigidGear(Hashable):
+    """Rigid connection of a motor and its joint; others are subclasses.
 
-    @abstractmethod
+    All numbers are on the joint side.
+    """
+
     def transmit(
         self, twist: Joints, rate: Joints, inertia: Joints, drive: Joints, step: float
     ) -> tuple[Joints, Joints, Joints, Joints]:
@@ -42,26 +43,15 @@ class AbstractGear(Hashable):
             $f$, $c$, $w$ and $s$: the force on the joint is $\tau = f - c\,\dot q^+$ [N m or N],
             while its motor turns at $\dot\theta^+ = w + s\,\dot q^+$ [rad/s or m/s].
         """
-
-    @abstractmethod
-    def twist(self, forces: Joints) -> Joints:
-        """Return the twist of the gears under constant forces on the joints [rad or m]."""
-
-
-class RigidGear(AbstractGear):
-    """Rigid connection of motor and joint."""
-
-    def transmit(self, twist, rate, inertia, drive, step):
-        """Return what the motor does not need itself."""
         none = 0.0 * drive
         return drive, inertia, none, none + 1.0
 
-    def twist(self, forces):
-        """Return zeros."""
+    def twist(self, forces: Joints) -> Joints:
+        """Return the twist of the gears under constant forces on the joints [rad or m]."""
         return 0.0 * forces
 
 
-class FlexibleGear(AbstractGear):
+class FlexibleGear(RigidGear):
     """Spring with a damper between motor and joint (Spong, 1987), with backlash if there is play.
 
     Attributes:
@@ -116,7 +106,7 @@ class DriveTrain(Hashable):
     model: Model
     rotors: Joints
     friction: AbstractGearFriction
-    gear: AbstractGear
+    gear: RigidGear
     disturbances: tuple[AbstractDisturbance, ...]
     step: float
 

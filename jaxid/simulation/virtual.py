@@ -24,7 +24,6 @@ from jaxid.simulation.friction import (
     SmoothFriction,
 )
 from jaxid.simulation.mechanics import (
-    AbstractGear,
     DriveTrain,
     RigidGear,
     Servo,
@@ -32,10 +31,6 @@ from jaxid.simulation.mechanics import (
     follow,
 )
 from jaxid.trajectory.trajectory import AbstractTrajectory
-
-Samples = Float[np.ndarray, "samples joints"]
-FeedForward = Callable[[Motion], Float[AnyArray, "samples joints"]]
-"""Function from a desired motion to forces: `fit.predict`, or a model with its parameters."""
 
 
 def random_bodies(
@@ -145,7 +140,7 @@ class Tracking(eqx.Module):
     saturated: Float[AnyArray, " joints"]
 
     @property
-    def tracking_error(self) -> Samples:
+    def tracking_error(self) -> Float[np.ndarray, "samples joints"]:
         """Desired minus true positions [rad or m]."""
         return np.asarray(self.desired.q) - np.asarray(self.actual.q)
 
@@ -173,7 +168,7 @@ class VirtualRobot(Hashable):
     values: Float[AnyArray, " parameters"]
     friction: AbstractGearFriction
     sensors: Sensors
-    gear: AbstractGear = RigidGear()
+    gear: RigidGear = RigidGear()
     disturbances: tuple[AbstractDisturbance, ...] = ()
     heating: FrictionTemperature | None = None
     temperature: Float[AnyArray, " joints"] | None = None
@@ -369,7 +364,7 @@ class VirtualRobot(Hashable):
         *,
         seed: int,
         servo: Servo | None = None,
-        feed_forward: FeedForward | None = None,
+        feed_forward: Callable[[Motion], AnyArray] | None = None,
         duration: float | None = None,
         sample_time: float | None = None,
         substeps: int = 1,
