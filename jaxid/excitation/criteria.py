@@ -74,13 +74,7 @@ def information_map(
 ) -> Callable[[Float[Array, "starts joints variables"]], tuple[Array, Array]]:
     """Return a function from many trajectories' coefficients to plain and weighted information.
 
-    Args:
-        base: Base parameters.
-        basis: Family of trajectories.
-        samples: Number of samples at which motions are evaluated.
-        measured: Number of measured samples for which they stand.
-        weights: Inverse standard deviation of each joint's noise [1/(N m) or 1/N].
-        prior: Information of earlier experiments.
+    Motions are evaluated at `samples`, which stand for those that are `measured`.
     """
     rows = base.joint_regressor.for_gradients
     motion = np.asarray(basis.rows(basis.times(samples))[:3])
@@ -114,11 +108,7 @@ _gram.defvjp(
 
 
 def standard_deviations(weighted: Float[AnyArray, "base base"]) -> Float[np.ndarray, " base"]:
-    """Return standard deviations from weighted information; infinite for undetermined parameters.
-
-    Args:
-        weighted: Weighted information.
-    """
+    """Return standard deviations from weighted information; infinite where undetermined."""
     weighted = np.asarray(weighted, np.float64)
     square = np.diag(weighted)
     scale = 1.0 / np.sqrt(np.where(square > 0, square, 1.0))

@@ -64,7 +64,6 @@ def design_excitation(
         harmonics: Number of harmonics of the Fourier series.
         omega: Ground frequency of the series [rad/s].
         basis: Family of trajectories in place of Fourier series: for instance `RestToRestBasis`.
-            `harmonics` and `omega` are not used then.
         criterion: Criterion to be minimised; D-optimality if None.
         constraints: Constraints beside the limits of the joints.
         noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the largest forces

@@ -18,31 +18,17 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float, Int
 from jaxid.excitation.limits import Grid
 
-STIFFNESS = 0.3
-"""Initial curvature: small, so that first steps are large."""
-TO_BOUNDARY = 0.995
-"""Fraction of the way to the next limit that a step may go."""
-DECREASE = 1e-4
-"""Fraction of the promised decrease that a step must give."""
-DAMPING = 0.1
-"""Fraction of the expected curvature along a step below which it is damped."""
-PATIENCE = 8
-"""Refused steps in a row after which the curvature is forgotten."""
-COOLING = 0.9
-"""Factor of the barrier after a good step."""
-INSIDE = 0.985
-"""Fraction of the bound within which a stage starts."""
+STIFFNESS = 0.3  # initial curvature: small, so that first steps are large
+TO_BOUNDARY = 0.995  # fraction of the way to the next limit that a step may go
+DECREASE = 1e-4  # fraction of the promised decrease that a step must give
+DAMPING = 0.1  # fraction of the expected curvature along a step below which it is damped
+PATIENCE = 8  # refused steps in a row after which the curvature is forgotten
+COOLING = 0.9  # factor of the barrier after a good step
+INSIDE = 0.985  # fraction of the bound within which a stage starts
 
 
 class Evaluation(NamedTuple):
-    """Objective and constraints of some starts; a leading axis for them.
-
-    Attributes:
-        value: Objective.
-        gradient: Its derivatives by the scaled coefficients.
-        excess: Constraints that are not linear; not positive where they are kept.
-        slopes: Their derivatives by the scaled coefficients.
-    """
+    """Objective, and constraints that are not linear, of some starts, with their derivatives."""
 
     value: Float[Array, "*starts"]
     gradient: Float[Array, "*starts scaled"]
@@ -59,10 +45,7 @@ class Evaluation(NamedTuple):
 class Inequalities(NamedTuple):
     """One number for each inequality: its distance from the bound, or its multiplier.
 
-    Attributes:
-        limits: Limits of the joints, upwards and downwards.
-        constraints: Constraints that are not linear, which the slack may exceed.
-        slack: Sign of the slack; one number, or none without constraints.
+    Limits of the joints, upwards and downwards; constraints; sign of the slack if there are any.
     """
 
     limits: Float[Array, "*starts 2 joints rows"]
@@ -114,13 +97,7 @@ class Stage(NamedTuple):
 
 
 def begin(grid: Grid, y: Float[AnyArray, "starts scaled"], constraints: int = 0) -> State:
-    """Return the state of some starts before the first stage.
-
-    Args:
-        grid: Rows of the limits.
-        y: Scaled coefficients of the starts.
-        constraints: Number of constraints that are not linear.
-    """
+    """Return the state of some starts before the first stage, with a number of constraints."""
     starts, size = np.shape(y)
     slacks = 1 if constraints else 0
     none, flat = jnp.zeros(starts), jnp.zeros((starts, size))
@@ -148,14 +125,7 @@ def begin(grid: Grid, y: Float[AnyArray, "starts scaled"], constraints: int = 0)
 
 
 def run(grid: Grid, objective: Callable[[Array], Evaluation], state: State, stage: Stage) -> State:
-    """Move the starts inside the bound of a stage, then iterate until all have converged.
-
-    Args:
-        grid: Rows of the limits.
-        objective: Function from scaled coefficients of all starts to their evaluation.
-        state: State of the starts.
-        stage: Bounds and barrier.
-    """
+    """Move the starts inside the bound of a stage, then iterate until all have converged."""
 
     def proceed(carry: tuple[Array, State]) -> Array:
         number, state = carry
@@ -237,12 +207,7 @@ def _update(grid: Grid, stage: Stage, old: State, trial: Array, evaluation: Eval
 
 
 def _taken(
-    stage: Stage,
-    old: State,
-    trial: Array,
-    slack: Array,
-    evaluation: Evaluation,
-    room: Inequalities,
+    stage: Stage, old: State, trial: Array, slack: Array, evaluation: Evaluation, room: Inequalities
 ) -> State:
     """Return the state of one start after its step was taken."""
     barrier = jnp.where(old.length > 0.1, old.barrier * COOLING, old.barrier)

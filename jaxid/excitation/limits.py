@@ -46,12 +46,8 @@ class Grid(NamedTuple):
     ) -> Float[Array, " scaled"]:
         """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
 
-        Each joint's motion is scaled about its mean, then shifted into its range.
-
-        Args:
-            y: Scaled coefficients of one trajectory.
-            bound: Bound of the rows; that of the grid if None.
-            growth: Largest factor by which a motion may be enlarged where limits leave room.
+        Each joint's motion is scaled about its mean, where limits leave room by up to `growth`,
+        then shifted into its range.
         """
         bound = self.bound if bound is None else bound
         q, peak = self._positions(y)
@@ -70,12 +66,9 @@ class Grid(NamedTuple):
     def fill(
         self, y: Float[Array, " scaled"], places: Float[Array, " joints"], size: Array | float
     ) -> Float[Array, " scaled"]:
-        """Return a motion of the same shape that fills a fraction of its limits.
+        """Return a motion of the same shape that fills a fraction of 95 % of its limits.
 
-        Args:
-            y: Scaled coefficients of one trajectory.
-            places: Place of each joint in the range that is left, from 0 to 1.
-            size: Size relative to a motion that uses 95 % of the limits.
+        `places` are those of the joints in the range that is left, from 0 to 1.
         """
         q, peak = self._positions(y)
         bound = 0.95 * self.bound
@@ -178,11 +171,7 @@ class JointLimits(eqx.Module):
         return y.reshape((*y.shape[:-2], -1))
 
     def grid(self, points: int = 512) -> Grid:
-        """Return the limits on a grid of times, with the bound that certifies all times.
-
-        Args:
-            points: Number of times for bases with few coefficients; more coefficients get more.
-        """
+        """Return the limits on a grid of times; bases with many coefficients get more points."""
         envelope, factor = self.basis.envelope(scale_samples(points, self.basis))
         size, scale = self._sizes, np.asarray(self.scale)
         orders = 4 if np.isfinite(size[3]).any() else 3
@@ -212,13 +201,7 @@ class JointLimits(eqx.Module):
     def random(
         self, key: PRNGKeyArray, count: int, size: float = 1.0
     ) -> Float[Array, "count scaled"]:
-        """Draw motions with random shapes and places that fill their limits, in scaled numbers.
-
-        Args:
-            key: Key of the random numbers.
-            count: Number of motions.
-            size: Size of the motions, relative to those that use 95 % of the limits.
-        """
+        """Draw motions of random shapes and places, of a size relative to 95 % of the limits."""
         joints, variables = self.shape
         shape, place = jax.random.split(key)
         draws = jax.random.normal(shape, (count, joints * variables), float)

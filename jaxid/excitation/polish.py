@@ -25,12 +25,7 @@ from jaxid.excitation.problem import (
 
 
 def polish(problem: ExcitationProblem, start: Float[AnyArray, " scaled"]) -> Candidates:
-    """Return a better motion within all limits, or the same.
-
-    Args:
-        problem: Criterion, limits and constraints.
-        start: Scaled coefficients.
-    """
+    """Return a better motion within all limits, or the same."""
     x: np.ndarray = np.array(start, np.float64)
     grid = problem.limits.grid()
     rows = np.zeros((2, *grid.c.shape), bool)

@@ -208,13 +208,7 @@ class ExcitationProblem:
         sharpness: Sharpness,
         instants: Int[Array, "starts instants"],
     ) -> Evaluation:
-        """Return the criterion and the constraints of several motions, with their derivatives.
-
-        Args:
-            x: Scaled coefficients.
-            sharpness: Sharpness of smooth extremes of eigenvalues; exact if None.
-            instants: Checked instants at which constraints are evaluated, from `watched_instants`.
-        """
+        """Return the criterion, and the constraints at watched instants, of several motions."""
         count = scale_samples(SEARCHED, self.basis)
         values, pull = jax.vjp(lambda y: self.values(y, sharpness, count), x)
         evaluation = Evaluation.unconstrained(values, pull(jnp.ones_like(values))[0])
@@ -353,12 +347,7 @@ class Candidates(NamedTuple):
         return np.argsort(np.asarray(self.value) + PENALTY * self.broken, kind="stable")
 
     def improved(self, other: "Candidates", where: Any = True) -> "Candidates":
-        """Return start by start the better of two; this one where they are equal.
-
-        Args:
-            other: As many motions, or one.
-            where: Starts that may be replaced.
-        """
+        """Return start by start the better of two, or of one, where it may be replaced."""
         a, b = self.broken, other.broken
         better = where & ((b < a) | ((b == a) & (other.value < self.value)))
         return Candidates(
@@ -367,16 +356,11 @@ class Candidates(NamedTuple):
             np.where(better, other.excess, self.excess),
         )
 
-    def survivors(self, other: "Candidates", tolerance: float = 2e-5) -> "Candidates":
-        """Return as many of both together as these are, the best first, duplicates last.
-
-        Args:
-            other: Candidates of the same problem.
-            tolerance: Difference of values up to which two motions count as one found twice.
-        """
+    def survivors(self, other: "Candidates") -> "Candidates":
+        """Return as many of both together as these are, the best first, duplicates last."""
         both = Candidates(*(np.concatenate([a, b]) for a, b in zip(self, other, strict=True)))
         order = both.order()
-        again = np.diff(both.value[order], prepend=np.nan) <= tolerance
+        again = np.diff(both.value[order], prepend=np.nan) <= 2e-5  # one found twice
         again &= np.diff(both.broken[order], prepend=np.nan) == 0.0
         order = np.concatenate([order[~again], order[again]])[: len(self.value)]
         return Candidates(*(np.asarray(part)[order] for part in both))
@@ -414,20 +398,13 @@ def evaluate_within_limits(
     return functools.reduce(Candidates.improved, found)
 
 
-def shrink_to_constraints(
-    problem: ExcitationProblem, x: Float[AnyArray, " scaled"], step: float = 0.05
-) -> Candidates:
-    """Return a motion made so small that it keeps all constraints; unchanged if no size does.
-
-    Args:
-        problem: Criterion, limits and constraints.
-        x: Scaled coefficients of a motion that keeps the limits of the joints.
-        step: First step of the size, which is then halved.
-    """
+def shrink_to_constraints(problem: ExcitationProblem, x: Float[AnyArray, " scaled"]) -> Candidates:
+    """Return a motion made so small that it keeps all constraints; unchanged if no size does."""
 
     def keeps(fraction: float) -> bool:
         return problem.excess(np.asarray(_shrink(problem, x, fraction))) <= 0.0
 
+    step = 0.05
     low = next((s for s in np.arange(1.0 - step, 0.0, -step) if keeps(s)), None)
     if low is None:
         return evaluate(problem, np.asarray(x)[None])

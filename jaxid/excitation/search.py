@@ -66,13 +66,6 @@ LAST = Stage(0.998, 1e-4, 1e-6, 300, 20.0, 100.0)
 class Search:
     """A search that can be stopped after each step, saved and resumed.
 
-    Args:
-        problem: Problem to be solved.
-        key: Key of the random numbers.
-        starts: Number of random motions to start from.
-        generations: Number of generations.
-        polished: Number of the best motions that are polished.
-
     Attributes:
         done: Number of steps done.
         first: Values of the random motions.
@@ -245,12 +238,6 @@ def crossover(
     Limits hold for each joint alone, so that a child keeps the limits that its parents keep. The
     information of a motion does not depend on when its period begins or which way it runs, so that
     two good motions may fit together at one shift only: many children are tried.
-
-    Args:
-        problem: Criterion, limits and constraints.
-        x: Scaled coefficients of the parents.
-        key: Key of the random numbers.
-        tries: Number of children of each motion of which the most promising one is kept.
     """
     retimings = jnp.asarray(problem.basis.retimings())
 

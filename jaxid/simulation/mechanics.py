@@ -127,12 +127,8 @@ class DriveTrain(Hashable):
         r"""Return the state after a step, and where mass matrix and bias are needed for the next.
 
         The state is $(q, \dot q, \ddot q)$ of the joints, the same of the motors on the joint side,
-        and the deflections of the friction's bristles.
-
-        Args:
-            bodies: Mass matrix, row by row, and bias forces half a step ahead.
-            state: State at the start.
-            u: Torques of the drives during the step, on the joint side [N m or N].
+        and the deflections of the friction's bristles. Mass matrix and bias of the bodies are those
+        half a step ahead, $u$ the torques of the drives during the step.
         """
         n, dt = u.shape[0], self.step
         M, h = bodies[: n * n].reshape(n, n), bodies[n * n :]
@@ -161,12 +157,7 @@ class DriveTrain(Hashable):
 
 
 class SimulatedPlant:
-    """One simulation of a robot, step by step; all numbers are on the joint side.
-
-    Args:
-        drives: Bodies, motors, gears and friction.
-        parameters: Parameters of the equations of motion.
-    """
+    """One simulation of a robot, step by step; all numbers are on the joint side."""
 
     def __init__(self, drives: DriveTrain, parameters: Float[AnyArray, " standard"]):
         n = drives.model.robot.joints
@@ -232,11 +223,7 @@ def follow(
     resolution: Joints,
     substeps: int,
 ) -> tuple[Motion, np.ndarray, np.ndarray]:
-    """Let a servo follow a motion, from its start and without an initial error.
-
-    Returns:
-        True motion of the joints, angles of the motors [rad or m], and forces of the drives after
-        each tick [N m or N].
+    """Return true motion, motor angles, and forces after each tick of a servo from no error.
 
     Raises:
         InputError: If the motion diverges.

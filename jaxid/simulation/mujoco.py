@@ -82,12 +82,7 @@ class MujocoRobot(VirtualRobot):
 
 
 class MujocoPlant:
-    """One simulation of MuJoCo.
-
-    Args:
-        model: Compiled model of MuJoCo.
-        joint_names: Names in the order of the robot's joints.
-    """
+    """One simulation of MuJoCo, with joints in the order of the robot."""
 
     def __init__(self, model: Any, joint_names: Sequence[str]):
         self._library, self._model = _mujoco(), model

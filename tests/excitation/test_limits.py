@@ -73,11 +73,6 @@ def test_a_shrunk_motion_is_smaller_about_the_same_place(limits):
     assert (place[0] < np.max(q, axis=0)).all()
 
 
-def test_scaled_coefficients_go_there_and_back(limits, random):
-    x = random.standard_normal((3, *limits.shape))
-    np.testing.assert_allclose(limits.coefficients(limits.scaled(x)), x, atol=1e-12)
-
-
 def test_unknown_limits_are_assumed_and_known_jerks_are_kept(arm):
     free = JointLimits(arm, BASES[0], Limits(2))
     assert np.isfinite(free.limits.acceleration).all()

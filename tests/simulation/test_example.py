@@ -38,15 +38,13 @@ def test_files_are_small_and_the_seed_decides(example, tmp_path):
         assert (tmp_path / file).read_bytes() == (example / file).read_bytes()
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_logs_keep_the_robots_limits(seed):
-    virtual = virtual_panda(seed)
-    robot, log = virtual.model.robot, virtual_log(virtual, "log", 1, (seed, 1))
+def test_logs_keep_the_robots_limits():
+    virtual = virtual_panda(1)
+    robot, log = virtual.robot, virtual_log(virtual, "log", 1, (1, 1))
     assert (log.angles >= robot.limits.position_min).all()
     assert (log.angles <= robot.limits.position_max).all()
     assert (np.abs(log.forces).max(axis=0) < robot.max_forces).all()
-    other = virtual_panda(seed + 1)
-    assert not np.array_equal(virtual.parameters, other.parameters)
+    assert not np.array_equal(virtual.parameters, virtual_panda(2).parameters)
 
 
 def test_the_truth_is_found_again(example):

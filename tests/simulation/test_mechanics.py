@@ -58,23 +58,13 @@ def moved(machine, u, steps, ramp=1):
     return np.array(rows).reshape(steps, 3, 2).transpose(1, 0, 2)
 
 
-@pytest.mark.parametrize("robot", [library.tx90l_on_rail(), library.ur10()], ids=lambda r: r.name)
-def test_forward_dynamics_is_the_inverse_of_inverse_dynamics(robot):
-    model, n, random = Model(robot), robot.joints, np.random.default_rng(0)
-    bodies = random_bodies(robot, np.linspace(20.0, 2.0, n), random)
-    p = np.concatenate([bodies.ravel(), random.uniform(0.1, 1.0, 3 * n)])
-    q, qd, qdd = random.normal(size=(3, 20, n))
+def test_forward_dynamics_is_the_inverse_of_inverse_dynamics():
+    robot, random = library.planar_arm(3), np.random.default_rng(0)
+    bodies = random_bodies(robot, np.linspace(20.0, 2.0, 3), random)
+    model, p = Model(robot), np.concatenate([bodies.ravel(), random.uniform(0.1, 1.0, 9)])
+    q, qd, qdd = random.normal(size=(3, 20, 3))
     forces = model.inverse_dynamics(p, Motion(q, qd, qdd))
     np.testing.assert_allclose(model.forward_dynamics(p, q, qd, forces), qdd, rtol=1e-9, atol=1e-9)
-
-
-def test_forward_dynamics_is_compiled_and_differentiated_like_all_else():
-    import jax
-
-    q, qd, u = np.random.default_rng(1).normal(size=(3, 2))
-    jacobian = jax.jacfwd(lambda x: MODEL.forward_dynamics(PARAMETERS, q, qd, x))(u)
-    inverse = np.linalg.inv(MODEL.mass_matrix(PARAMETERS, q))
-    np.testing.assert_allclose(jacobian, inverse, rtol=1e-12)
 
 
 @pytest.mark.parametrize("gear", [RigidGear(), FlexibleGear(np.array([4e4, 400.0]), ZERO)])
@@ -85,7 +75,7 @@ def test_energy_is_kept_without_friction(gear):
     q, qd, _ = moved(machine, ZERO, 4000)
     energy = MODEL.kinetic_energy(PARAMETERS, q, qd) + MODEL.potential_energy(PARAMETERS, q)
     swing = np.ptp(np.asarray(MODEL.potential_energy(PARAMETERS, q)))
-    elastic = 0.0 if isinstance(gear, RigidGear) else 0.02
+    elastic = 0.02 if isinstance(gear, FlexibleGear) else 0.0
     assert np.abs(energy - energy[0]).max() < (2e-4 + elastic) * swing
     if not elastic:
         # The end-state of 4 s, by a Runge-Kutta method of high order.
@@ -133,15 +123,6 @@ def test_stiction_holds_below_the_breakaway_force_and_lets_go_above(sign):
     assert np.abs(qd[-1, 0]) < 1e-6
 
 
-def test_a_pendulum_stays_where_stiction_holds_it():
-    machine = plant(LUGRE)
-    held = np.array([0.0, np.arcsin(0.4 * 3.6 / (0.8 * 9.81))])
-    machine.start(held, ZERO, ZERO)
-    q, qd, _ = moved(machine, ZERO, 4000)
-    np.testing.assert_allclose(q[-1], held, atol=1e-3)
-    assert np.abs(qd[-1]).max() < 1e-6
-
-
 def test_lugre_at_speed_is_stribecks_curve():
     for speed in (0.02, 0.05, 0.5):
         machine, qd = plant(LUGRE), np.array([speed, 0.0])
@@ -151,20 +132,6 @@ def test_lugre_at_speed_is_stribecks_curve():
         assert steady[0] == pytest.approx(level * 1.0, rel=0.04)
         _, speeds, _ = moved(machine, [level, 0.0], 50)
         np.testing.assert_allclose(speeds[:, 0], speed, rtol=2e-3)
-
-
-def test_steps_that_are_halved_agree():
-    ends = []
-    for step in (1e-3, 2.5e-4):
-        machine = plant(
-            LUGRE, FlexibleGear(np.array([4e4, 400.0]), np.array([20.0, 0.2])), step=step
-        )
-        machine.start(ZERO, ZERO, ZERO)
-        steps = round(0.25 / step)
-        for k in range(4):
-            q, _, _ = moved(machine, [60.0 * (-1) ** k, 6.0], steps)
-        ends.append(q[-1])
-    np.testing.assert_allclose(*ends, atol=2e-3 * np.abs(ends[0]).max())
 
 
 def test_an_elastic_gear_swings_as_its_eigenvalues_say():
