@@ -55,6 +55,7 @@ FILTERS: dict[str, type[AbstractFilter]] = {
 CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
 
+FilterKind = Literal["butterworth", "paper", "periodic"]
 Side = Literal["joint", "motor"]
 
 
@@ -237,7 +238,7 @@ def build_filters(table: dict[str, Any] | None) -> tuple[list[AbstractFilter], l
             "about five times the highest frequency of the motion."
         )
         return [ZeroPhaseButterworth(CUTOFF)], [note]
-    kind = decode_value(table.get("kind", ""), Literal[tuple(FILTERS)], "filter.kind")
+    kind = decode_value(table.get("kind", ""), FilterKind, "filter.kind")
     keys = {name: value for name, value in table.items() if name != "kind"}
     cutoffs = keys.get("cutoff")
     tables = [keys]

@@ -89,7 +89,11 @@ def known_load(
     """
 
     def on(robot: Robot) -> Tool:
-        content = {"mass": mass, "centre_of_mass": centre_of_mass, "inertia": inertia}
+        content: dict[str, Any] = {
+            "mass": mass,
+            "centre_of_mass": centre_of_mass,
+            "inertia": inertia,
+        }
         if body is None:
             return cast(Tool, robot.with_tool(**content).tool)
         return Tool(joint_number(robot, body), **content)
@@ -325,7 +329,11 @@ def replace_drives(
     n = robot.joints
     if matrix is not None and {len(matrix), *map(len, matrix)} != {n}:
         raise InputError(f"`matrix` must hold {n} rows of {n} numbers.")
-    new = {"max_torques": max_torques, "rotor_inertia": rotor_inertia, "reduction": matrix}
+    new: dict[str, Any] = {
+        "max_torques": max_torques,
+        "rotor_inertia": rotor_inertia,
+        "reduction": matrix,
+    }
     if gear_ratios is not None:
         new["reduction"] = per_joint("gear_ratios", gear_ratios, n, 1.0)
     if zero is not None:
