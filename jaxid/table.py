@@ -198,8 +198,8 @@ class Table:
         width = shutil.get_terminal_size((100, 24)).columns if width is None else width
         groups = (self._facts(width), self._grid(width), self._remarks(width))
         filled = [lines for lines in map(list, groups) if lines]
-        if self.title:
-            yield [(self.title, "title")]
+        for line in _wrapped(self.title, width) if self.title else ():
+            yield [(line, "title")]
         for k, lines in enumerate(filled):
             if k:
                 yield []
