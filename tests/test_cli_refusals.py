@@ -113,7 +113,7 @@ def test_trajectories_of_nothing_but_brackets(folder, run):  # noqa: F811
     nested = '{"kind": "PaddedToCycle", "inner": '
     head = '{"format": "jaxid trajectory", "version": 2, "trajectory": '
     (folder / "deep.json").write_text(head + 900 * nested + "1" + 901 * "}")
-    with pytest.raises(ValueError, match="is damaged"):
+    with pytest.raises(ValueError, match="is no trajectory file"):
         load_trajectory(folder / "deep.json")
 
 
