@@ -19,10 +19,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
 SETTLED = 1e-4
-"""Fraction of the impulse response's peak below which the start of a log no longer matters.
-
-At a hundredth, the accelerations near the ends move estimates by several standard deviations.
-"""
+"""Fraction of the impulse response's peak below which the start of a log no longer matters."""
 
 
 def integer(name: str) -> Callable[[float | int], int]:
