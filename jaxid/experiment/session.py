@@ -128,7 +128,7 @@ def load_logs(experiment: Experiment, paths: Sequence[Path], stage: Stages) -> l
 
 
 def _findings(logs: Sequence[LoadedLog]) -> list[str]:
-    return [f"{diagnosis.name}: {text}" for *_, diagnosis in logs for text in diagnosis.findings]
+    return [f"{log.name}: {text}" for log, _, diagnosis in logs for text in diagnosis.findings]
 
 
 def select_filter(
