@@ -219,10 +219,11 @@ class _Layout(NamedTuple):
         for channel, names in channels.items():
             for name in names:
                 if name in used:
+                    other = used[name]
+                    both = "twice" if other == channel else f"for `{other}` and `{channel}`"
                     raise InputError(
-                        f"the column `{name}` of `{self.source}` is used for `{used[name]}` and "
-                        f"`{channel}`: one column holds one channel of one joint; name the right "
-                        "one."
+                        f"the column `{name}` of `{self.source}` is used {both}: one column holds "
+                        "one channel of one joint; name the right one."
                     )
                 used[name] = channel
         return channels
