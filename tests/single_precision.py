@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 HERE = Path(__file__).parent
@@ -49,6 +50,20 @@ key = jax.random.key(0)
 
 def plain():
     return jid.identify(base, cold)
+
+
+def dynamics():
+    """Methods of a model on arrays in float32, whose results have this precision too."""
+    motion = jid.Motion(*(jnp.asarray(x[:9], jnp.float32) for x in jax.tree.leaves(cold.motion)))
+    single = jnp.asarray(p, jnp.float32)
+    found = (
+        model.regressor(motion),
+        model.inverse_dynamics(single, motion),
+        model.mass_matrix(single, motion.q),
+        model.potential_energy(single, motion.q),
+    )
+    assert DOUBLE or {x.dtype for x in found} == {np.dtype(np.float32)}
+    return np.concatenate([np.ravel(x) for x in found])
 
 
 def rounded():
@@ -103,6 +118,7 @@ def designed():
 
 
 CASES = {
+    "dynamics": dynamics,
     "load_urdf": lambda: jax.tree.leaves(jid.load_urdf(FOLDER / "arm.urdf").rotation)[0],
     "base_parameters": lambda: jid.base_parameters(model).kappa,
     "expressions": lambda: list(base.lengths.values()),

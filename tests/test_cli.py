@@ -449,7 +449,7 @@ def test_long_logs_give_what_short_ones_give(folder, words, monkeypatch, kind, c
 
 def test_slips_are_found_in_a_part_of_a_long_log(folder, words, monkeypatch):
     monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
-    monkeypatch.setattr("jaxid.diagnosis.diagnosis._EXAMINED", 800)
+    monkeypatch.setattr("jaxid.diagnosis.diagnosis.EXAMINED", 800)
     log = pl.read_csv("a.csv")
     log.with_columns(-pl.col("tau2")).write_csv("turned.csv")
     said = words("inspect", "experiment.toml", "turned.csv")
