@@ -140,7 +140,7 @@ CASES = {
         ).parameters
     ),
     "essential_parameters": lambda: jid.essential_parameters(plain(), cold).fit.parameters,
-    "identify_states": lambda: jid.identify_states(runs()).found.parameters,
+    "identify_states": lambda: jid.identify_states(runs()).parameters,
     "update": lambda: jid.update(*runs()).parameters,
     "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,
     "validate": lambda: [e.relative for e in validate(plain(), [warm]).errors],
