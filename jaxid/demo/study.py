@@ -290,7 +290,7 @@ def _follow(
     for k, (name, feed_forward) in enumerate(controllers.items()):
         number = 100 + 10 * seed + k
         run = virtual.track(joints, feed_forward=feed_forward, seed=number, name=name)
-        tip = np.asarray(jid.constraints.tip_motion(virtual.robot, run.actual).position)
+        tip = np.asarray(jid.constraints.tip_motion(virtual.robot, run.actual)[0])
         distance = np.linalg.norm(tip - path.positions(np.asarray(run.time)), axis=1)
         runs.append(PathRun(name, run, distance))
     return tuple(runs)

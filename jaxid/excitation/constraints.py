@@ -104,16 +104,10 @@ class AbstractConstraint(eqx.Module):
         return [e._replace(value=float(v)) for e, v in zip(entries, peaks, strict=True)]
 
 
-class TipMotion(NamedTuple):
-    """Position [m], velocity [m/s] and acceleration [m/s²] of the end-effector's origin."""
+def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[Array, "*batch 3"], ...]:
+    """Return position, velocity and acceleration of the end-effector's origin [m, s].
 
-    position: Float[Array, "*batch 3"]
-    velocity: Float[Array, "*batch 3"]
-    acceleration: Float[Array, "*batch 3"]
-
-
-def tip_motion(robot: Robot, motion: Motion) -> TipMotion:
-    """Return the motion of the end-effector's origin in the frame of the ground, without gravity.
+    They are those in the frame of the ground, without gravity.
 
     Args:
         robot: Robot that moves.
@@ -131,7 +125,7 @@ def tip_motion(robot: Robot, motion: Motion) -> TipMotion:
         return jnp.stack([place(q), velocity, acceleration])
 
     states = on_samples(robot, tip, motion.q, motion.qd, motion.qdd)
-    return TipMotion(*(states[..., k, :] for k in range(3)))
+    return tuple(states[..., k, :] for k in range(3))
 
 
 class Clearance(AbstractConstraint):
@@ -205,13 +199,14 @@ class TipLimits(AbstractConstraint):
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the relative excess over each limit."""
-        tip, values = tip_motion(robot, motion), []
-        for vector, limit in ((tip.velocity, self.speed), (tip.acceleration, self.acceleration)):
+        position, velocity, acceleration = tip_motion(robot, motion)
+        values = []
+        for vector, limit in ((velocity, self.speed), (acceleration, self.acceleration)):
             if math.isfinite(limit):
                 # Smooth at zero, and there at most 1e-6 too large.
                 values.append(jnp.sqrt(jnp.sum((vector / limit) ** 2, axis=-1) + 1e-6**2) - 1.0)
         for axis, sign, end, size in self._sides:
-            values.append((sign * tip.position[..., axis] - end) / size)
+            values.append((sign * position[..., axis] - end) / size)
         return jnp.stack(values, axis=-1)
 
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
@@ -286,14 +281,12 @@ class ForceLimits(AbstractConstraint):
             )
         if C is None:
             return
-        if C.shape != (size, size) or not np.isfinite(C).all():
+        fits = C.shape == (size, size) and np.isfinite(C).all()
+        if not fits or np.linalg.eigvalsh(0.5 * (C + C.T))[0] < -1e-9 * np.abs(C).max():
             raise InputError(
-                f"`covariance` must be a finite matrix of {size} rows and columns, but has shape "
-                f"{C.shape}."
+                f"`covariance` must be a finite matrix of {size} rows and columns without "
+                "negative eigenvalues."
             )
-        least = np.linalg.eigvalsh(0.5 * (C + C.T))[0]
-        if least < -1e-9 * np.abs(C).max():
-            raise InputError(f"`covariance` has a negative eigenvalue ({least:.3g}).")
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the relative excess over each limit."""

@@ -63,34 +63,31 @@ def information(
     return Information(plain, weighted, np.ones(base.size) if sizes is None else sizes)
 
 
-def information_map(
+def informations(
     base: BaseParameters,
     basis: AbstractBasis,
+    x: Float[Array, "starts joints variables"],
     *,
     samples: int,
     measured: int,
     weights: Float[AnyArray, " joints"],
     prior: Float[AnyArray, "base base"],
-) -> Callable[[Float[Array, "starts joints variables"]], tuple[Array, Array]]:
-    """Return a function from many trajectories' coefficients to plain and weighted information.
+) -> tuple[Array, Array]:
+    """Return plain and weighted information of many trajectories from their coefficients.
 
     Motions are evaluated at `samples`, which stand for those that are `measured`.
     """
     rows = base.joint_regressor.for_gradients
     motion = np.asarray(basis.rows(basis.times(samples))[:3])
-
-    def evaluate(x: Float[Array, "starts joints variables"]) -> tuple[Array, Array]:
-        arrays = [jnp.einsum("sk,bjk->jbs", part, x) for part in motion]
-        plain = jnp.zeros((x.shape[0], rows.size, rows.size), x.dtype)
-        weighted = plain
-        for own, columns, w in zip(rows.columns, rows(*arrays), weights, strict=True):
-            k = np.array(own, int)
-            gram = measured / samples * jnp.asarray(_gram(columns))
-            plain = plain.at[:, k[:, None], k].add(gram)
-            weighted = weighted.at[:, k[:, None], k].add(w**2 * gram)
-        return plain, weighted + prior[None]
-
-    return evaluate
+    arrays = [jnp.einsum("sk,bjk->jbs", part, x) for part in motion]
+    plain = jnp.zeros((x.shape[0], rows.size, rows.size), x.dtype)
+    weighted = plain
+    for own, columns, w in zip(rows.columns, rows(*arrays), weights, strict=True):
+        k = np.array(own, int)
+        gram = measured / samples * jnp.asarray(_gram(columns))
+        plain = plain.at[:, k[:, None], k].add(gram)
+        weighted = weighted.at[:, k[:, None], k].add(w**2 * gram)
+    return plain, weighted + prior[None]
 
 
 @jax.custom_vjp

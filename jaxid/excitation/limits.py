@@ -163,13 +163,6 @@ class JointLimits(eqx.Module):
         scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
         return y.reshape((*y.shape[:-1], *self.shape)) * scale
 
-    def scaled(
-        self, x: Float[AnyArray, "*batch joints variables"]
-    ) -> Float[AnyArray, "*batch scaled"]:
-        """Return the scaled coefficients of trajectories."""
-        y = x / np.asarray(self.scale)[(None,) * (x.ndim - 2)]
-        return y.reshape((*y.shape[:-2], -1))
-
     def grid(self, points: int = 512) -> Grid:
         """Return the limits on a grid of times; bases with many coefficients get more points."""
         envelope, factor = self.basis.envelope(scale_samples(points, self.basis))

@@ -1,7 +1,6 @@
 """Design problem: criterion, limits and constraints as functions of one vector; its candidates."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +18,7 @@ from jaxid.excitation.criteria import (
     Information,
     Sharpness,
     information,
-    information_map,
+    informations,
 )
 from jaxid.excitation.interior_point import Evaluation, map_starts
 from jaxid.excitation.limits import JointLimits, scale_samples
@@ -96,7 +95,6 @@ class ExcitationProblem:
         # Constraints ask the robot for its limits of force.
         self._robot = robot.replace(limits=self.limits.limits)
         self._rows = np.asarray(self.basis.rows(self.basis.instants(CHECKED))[:3])
-        self._maps: dict[int, Callable] = {}
         self._checked = jax.jit(self._constrained)
         self.sizes = np.ones(base.size)
         motions = self.limits.random(jax.random.key(0), 8)
@@ -185,17 +183,15 @@ class ExcitationProblem:
         samples: int | None = None,
     ) -> Float[Array, " starts"]:
         """Return `value` of several motions at once."""
-        count = self.samples if samples is None else samples
-        if count not in self._maps:
-            self._maps[count] = information_map(
-                self.base,
-                self.basis,
-                samples=count,
-                measured=self.samples,
-                weights=1.0 / self.noise,
-                prior=self.prior,
-            )
-        plain, weighted = self._maps[count](self.limits.coefficients(x))
+        plain, weighted = informations(
+            self.base,
+            self.basis,
+            self.limits.coefficients(x),
+            samples=self.samples if samples is None else samples,
+            measured=self.samples,
+            weights=1.0 / self.noise,
+            prior=self.prior,
+        )
 
         def evaluate(plain: Array, weighted: Array) -> Array:
             return self.criterion(Information(plain, weighted, self.sizes), sharpness)

@@ -264,11 +264,10 @@ def _draw_children(
     which = jax.random.randint(time_key, (starts,), 0, len(retimings))
     T = retimings[jnp.where(jax.random.uniform(kind_key, (starts,), float) < 0.5, 0, which)]
     mates = problem.limits.coefficients(x[(jnp.arange(starts) + ahead) % starts])
-    mates = problem.limits.scaled(jnp.einsum("bvw,bjw->bjv", T, mates))
+    second = jnp.einsum("bvw,bjw->bjv", T, mates) / np.asarray(problem.limits.scale)[None]
     # A child has this expected fraction of joints from its second parent, and at least one.
     share = jax.random.uniform(share_key, (starts, 1), float, 0.1, 0.5)
     taken = jax.random.uniform(other_key, (starts, joints), float) < share
     surely = jax.random.randint(joint_key, (starts, 1), 0, joints)
     taken = (taken | (surely == np.arange(joints)[None]))[:, :, None]
-    first, second = (z.reshape(starts, joints, -1) for z in (x, mates))
-    return jnp.where(taken, second, first).reshape(x.shape)
+    return jnp.where(taken, second, x.reshape(second.shape)).reshape(x.shape)

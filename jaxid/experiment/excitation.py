@@ -28,13 +28,7 @@ from jaxid.report.excitation import list_joints, write_excitation
 from jaxid.report.result_files import read_fit
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.table import Remark, Status
-from jaxid.trajectory.files import (
-    load_trajectory,
-    save_trajectory,
-    write_csv,
-    write_ros_json,
-    write_ros_yaml,
-)
+from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
 from jaxid.trajectory.leads import with_leads
 from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
 
@@ -148,7 +142,6 @@ def write_design(
     plan, step, table = design.plan, design.sample_time, experiment.excitation
     robot = plan.base.model.robot
     names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{table.ros}"]
-    write_ros = write_ros_json if table.ros == "json" else write_ros_yaml
     settings = {"facts": (("seed", str(table.seed)),), "experiment_text": experiment.text}
     settings["command"] = command
     with double_precision(), atomic_folder(output.parent) as folder:

@@ -151,9 +151,9 @@ def path_figure(
         title: Title of the figure; the robot's name if None.
     """
     with double_precision():
-        tip = tip_motion(robot, motion)
-    step = slice(None, None, max(1, len(np.asarray(tip.position)) // 1500))
-    position, velocity = np.asarray(tip.position)[step], np.asarray(tip.velocity)[step]
+        position, velocity, _ = (np.asarray(x) for x in tip_motion(robot, motion))
+    step = slice(None, None, max(1, len(position) // 1500))
+    position, velocity = position[step], velocity[step]
     speed = np.linalg.norm(velocity, axis=1)
     low, high = position.min(axis=0), position.max(axis=0)
     span = np.maximum(high - low, max(0.25 * np.max(high - low), 0.05))

@@ -323,8 +323,6 @@ def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndar
         vertices = np.asarray(loaded.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
     except Exception as error:  # readers of many formats raise many exceptions
         raise InputError(f"`{file}` is no mesh that can be read: {error}.") from error
-    if not len(vertices):
-        raise InputError(f"`{file}` has no vertices.")
     return vertices
 
 

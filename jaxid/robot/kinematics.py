@@ -22,6 +22,8 @@ from jaxid.robot.rotations import rotation_about
 
 _REACHED = 1e-9
 """Distance at which a pose is reached [m, and rad], and slack of a range relative to its half."""
+_STARTS = 32
+"""Number of random coordinates to start from."""
 _LARGEST_STEP = 0.2
 """Largest step of a joint, relative to half its range."""
 _SINGULAR = 1e-11
@@ -110,8 +112,6 @@ def inverse_kinematics(
     rotation: Numbers | None = None,
     *,
     posture: Numbers | None = None,
-    starts: int = 32,
-    seed: int = 0,
 ) -> Float[np.ndarray, " joints"]:
     """Return joint coordinates within the limits that bring the end-effector to a pose [rad or m].
 
@@ -123,16 +123,13 @@ def inverse_kinematics(
         position: Position of the end-effector on the ground [m].
         rotation: Attitude on the ground, whose columns are the end-effector's axes; any if None.
         posture: Preferred coordinates [rad or m]; the middle of the ranges if None.
-        starts: Number of random coordinates to start from.
-        seed: Seed of the starts.
 
     Raises:
         InputError: If the pose cannot be reached: the message says how near the end-effector comes,
             or which limit prevents it.
     """
     goal = _goals(np.asarray(as_array("position", position))[None], rotation)
-    task = _task(robot, posture, starts, seed)
-    return _candidates(task, goal, "the pose")[0]
+    return _candidates(_task(robot, posture), goal, "the pose")[0]
 
 
 def inverse_kinematics_along(
@@ -148,7 +145,7 @@ def inverse_kinematics_along(
     Raises:
         InputError: If a pose cannot be reached, or only with a jump or beyond the limits.
     """
-    task, goals = _task(robot, posture, 32, 0), _goals(positions, rotation)
+    task, goals = _task(robot, posture), _goals(positions, rotation)
     count, faults = len(goals), []
     for start in _candidates(task, goals[:1], f"pose 1 of {count}")[:8]:
         q = _follow(task, goals, start)
@@ -176,10 +173,8 @@ class _Task(NamedTuple):
     starts: Float[np.ndarray, "starts joints"]
 
 
-def _task(robot: Robot, posture: Numbers | None, starts: int, seed: int) -> _Task:
+def _task(robot: Robot, posture: Numbers | None) -> _Task:
     """Return the checked task of a robot; joints without limits get a range of their own."""
-    if starts < 1:
-        raise InputError(f"`starts` must be at least 1, but is {starts}.")
     low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
     known = np.isfinite(low) & np.isfinite(high)
     with np.errstate(invalid="ignore"):
@@ -192,7 +187,7 @@ def _task(robot: Robot, posture: Numbers | None, starts: int, seed: int) -> _Tas
                 f"`posture` must hold one number for each joint ({robot.joints}), but has "
                 f"shape {middle.shape}."
             )
-    begin = np.random.default_rng(seed).uniform(-1.0, 1.0, (starts, robot.joints))
+    begin = np.random.default_rng(0).uniform(-1.0, 1.0, (_STARTS, robot.joints))
     begin[0] = 0.0
     return _Task(robot, middle, half, low, high, middle + half * begin)
 
@@ -348,7 +343,7 @@ def _explanation(task: _Task, goal: np.ndarray) -> str:
         least = beyond[int(beyond.max(axis=1).argmin())]
         return (
             f"can be reached by `{robot.name}` only beyond the range of joint "
-            f"`{robot.joint_names[int(least.argmax())]}`: choose another pose, or more `starts`."
+            f"`{robot.joint_names[int(least.argmax())]}`: choose another pose."
         )
     nearest = distances[int(np.argmin(distances.sum(axis=1)))]
     angle = "" if len(nearest) == 1 else f" and {nearest[1]:.3g} rad"

@@ -167,12 +167,8 @@ class UrdfTree:
                     f"`{argument}` must be a link of `{self.path}`, but is `{link}`; its links are "
                     f"{_listed(list(self.links))}."
                 )
-        self.joints: list[Any] = []
-        self.parent: list[int] = []
-        self.axis: list[np.ndarray] = []
-        self.rotation: list[np.ndarray] = []
-        self.offset: list[np.ndarray] = []
-        self.notes: list[str] = []
+        self.joints, self.parent, self.notes = [], [], []
+        self.axis, self.rotation, self.offset = [], [], []
         self._merge(root if base is None else base, tip, snap_tolerance)
 
     def _named(self, root: Any, tag: str) -> dict[str, Any]:

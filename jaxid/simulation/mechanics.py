@@ -205,7 +205,7 @@ class Servo(eqx.Module):
         proportional: $K_p$ [N m/rad or N/m].
         derivative: $K_d$ [N m s/rad or N s/m].
         sample_time: Time between two ticks [s].
-        smoothing: Time constant of the low-pass; 0 for none [s].
+        smoothing: Time constant of the low-pass [s].
     """
 
     proportional: Joints
@@ -234,7 +234,7 @@ def follow(
         np.asarray(x, np.float64).tolist()
         for x in (servo.proportional, servo.derivative, limits, resolution)
     )
-    keep = float(np.exp(-servo.sample_time / servo.smoothing)) if servo.smoothing else 0.0
+    keep = float(np.exp(-servo.sample_time / servo.smoothing))
     gain = (1.0 - keep) / servo.sample_time
     joints = range(n)
     plant.start(*(np.asarray(x)[0] for x in (desired.q, desired.qd, desired.qdd)))

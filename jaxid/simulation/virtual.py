@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from scipy import signal
 
@@ -37,7 +38,6 @@ def random_bodies(
     robot: Robot,
     masses: Float[AnyArray, " joints"],
     random: np.random.Generator,
-    radius: float = 0.05,
 ) -> Float[np.ndarray, "joints 10"]:
     """Draw inertial parameters of bodies that can exist: clouds of point masses along the links.
 
@@ -47,7 +47,6 @@ def random_bodies(
         robot: Robot with its links.
         masses: Masses of the bodies [kg].
         random: Random number generator.
-        radius: Standard deviation of the points about the link's line [m].
     """
     points = 12  # enough to fill all directions
     bodies = np.empty((robot.joints, 10))
@@ -55,7 +54,7 @@ def random_bodies(
         children = [c for c, parent in enumerate(robot.parent) if parent == i]
         end = robot.offset[children[0]] if children else robot.tip_offset
         along = random.uniform(0.0, 1.0, (points, 1))
-        r = along * np.asarray(end) + radius * random.standard_normal((points, 3))
+        r = along * np.asarray(end) + 0.05 * random.standard_normal((points, 3))
         m = random.dirichlet(np.full(points, 3.0)) * mass
         r = np.append(r, np.ones((points, 1)), axis=1)
         bodies[i] = inertial_parameters(np.einsum("k,ki,kj->ij", m, r, r))
@@ -325,22 +324,20 @@ class VirtualRobot(Hashable):
             self.robot, motion.q, forces, sample_time=sample_time, seed=seed, name=name
         )
 
-    def servo(
-        self, frequency: float = 8.0, damping: float = 1.0, sample_time: float = 1e-3
-    ) -> Servo:
+    def servo(self, sample_time: float = 1e-3) -> Servo:
         """Return a servo whose gains suit the mean inertia of each joint over random poses.
 
+        Each joint by itself has a natural frequency of 8 Hz, and no overshoot.
+
         Args:
-            frequency: Natural frequency of each joint by itself [Hz].
-            damping: Damping ratio; 1 for no overshoot.
             sample_time: Time between two ticks [s].
         """
         model, turns = self.bodies, np.array(self.robot.revolute)
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, self.robot.joints)) * turns
         M = in_numpy(model, model.inertia, q, shared=(np.asarray(self.values),))
         inertia = np.diagonal(M, axis1=1, axis2=2).mean(axis=0)
-        w = 2.0 * np.pi * frequency
-        return Servo(w**2 * inertia, 2.0 * damping * w * inertia, sample_time)
+        w = 2.0 * np.pi * 8.0
+        return Servo(w**2 * inertia, 2.0 * w * inertia, sample_time)
 
     def plant(self, step: float) -> Any:
         """Return a simulation of the robot with a time step [s]: `start`, `step`, `read`.
@@ -403,8 +400,7 @@ class VirtualRobot(Hashable):
                 f"least that, but they are {sample_time:g} s and {duration:g} s."
             )
         time = tick * np.arange(round(duration / tick))
-        motion = trajectory.motion(time)
-        desired = Motion(*(np.asarray(x) for x in (motion.q, motion.qd, motion.qdd)))
+        desired = jax.tree.map(np.asarray, trajectory.motion(time))
         forward = np.zeros(desired.q.shape)
         if feed_forward is not None:
             forward = np.asarray(feed_forward(desired), np.float64)
@@ -423,8 +419,8 @@ class VirtualRobot(Hashable):
         kept = slice(None, None, every)
         return Tracking(
             time=time[kept],
-            desired=Motion(desired.q[kept], desired.qd[kept], desired.qdd[kept]),
-            actual=Motion(actual.q[kept], actual.qd[kept], actual.qdd[kept]),
+            desired=desired[kept],
+            actual=actual[kept],
             forces=mean_forces[kept],
             recording=self.sensors.record(
                 self.robot,

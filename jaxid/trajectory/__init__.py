@@ -4,8 +4,7 @@ from jaxid.trajectory.files import joint_trajectory as joint_trajectory
 from jaxid.trajectory.files import load_trajectory as load_trajectory
 from jaxid.trajectory.files import save_trajectory as save_trajectory
 from jaxid.trajectory.files import write_csv as write_csv
-from jaxid.trajectory.files import write_ros_json as write_ros_json
-from jaxid.trajectory.files import write_ros_yaml as write_ros_yaml
+from jaxid.trajectory.files import write_ros as write_ros
 from jaxid.trajectory.fourier import FourierBasis as FourierBasis
 from jaxid.trajectory.fourier import RestToRestBasis as RestToRestBasis
 from jaxid.trajectory.fourier import fourier_series as fourier_series

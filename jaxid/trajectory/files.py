@@ -121,23 +121,19 @@ def joint_trajectory(
     }
 
 
-def write_ros_json(
+def write_ros(
     trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
 ) -> None:
-    """Write a `JointTrajectory` as JSON; arguments as of `joint_trajectory` and the file's path."""
-    message = joint_trajectory(trajectory, robot, sample_time=sample_time)
-    write_text(path, json.dumps(message, allow_nan=False) + "\n")
+    """Write a `JointTrajectory` as JSON (if the path ends in `.json`) or YAML.
 
-
-def write_ros_yaml(
-    trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
-) -> None:
-    """Write a `JointTrajectory` as YAML; arguments as of `joint_trajectory` and the file's path.
-
-    `ros2 topic pub --once TOPIC trajectory_msgs/msg/JointTrajectory "$(cat FILE)"` publishes it.
+    `ros2 topic pub --once TOPIC trajectory_msgs/msg/JointTrajectory "$(cat FILE)"` publishes YAML.
+    Arguments are those of `joint_trajectory`, and the file's path.
     """
-    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
     message = joint_trajectory(trajectory, robot, sample_time=sample_time)
+    if Path(path).suffix == ".json":
+        write_text(path, json.dumps(message, allow_nan=False) + "\n")
+        return
+    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
     points = [json.dumps(point, allow_nan=False) for point in message.pop("points")]
     lines = [f"{key}: {json.dumps(value)}" for key, value in message.items()]
     lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", f"- {x}") for x in points)]

@@ -41,7 +41,10 @@ class FourierBasis(AbstractBasis):
     omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
 
     def __check_init__(self):
-        _check_series(self.harmonics, self.omega, least=1)
+        if self.harmonics < 1:
+            raise InputError(f"`harmonics` must be at least 1, but is {self.harmonics}.")
+        if not is_traced(self.omega) and not 0 < self.omega < math.inf:
+            raise InputError(f"`omega` must be a positive frequency [rad/s], not {self.omega:g}.")
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
@@ -75,7 +78,25 @@ class FourierBasis(AbstractBasis):
         return tuple(rows), 1.0 / math.cos(math.pi * self.harmonics / points)
 
 
-class RestToRestBasis(AbstractBasis):
+class PeriodsBasis(AbstractBasis):
+    """Whole periods of a Fourier series between two standstills: base of two families."""
+
+    harmonics: int = eqx.field(static=True)
+    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    periods: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        if self.periods < 1:
+            raise InputError(f"`periods` must be at least 1, but is {self.periods}.")
+        FourierBasis(self.harmonics, self.omega)
+
+    @property
+    def series(self) -> FourierBasis:
+        """Fourier series without the conditions at the ends."""
+        return FourierBasis(self.harmonics, self.omega)
+
+
+class RestToRestBasis(PeriodsBasis):
     r"""Whole periods of a Fourier series between standstill and standstill.
 
     Velocity $\sum_l a_{i,l}$ and acceleration $\omega \sum_l l\, b_{i,l}$ at the start of a period
@@ -92,19 +113,9 @@ class RestToRestBasis(AbstractBasis):
         InputError: If there is one harmonic only, or another number is not positive.
     """
 
-    harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
-    periods: int = eqx.field(static=True, default=1)
-
     def __check_init__(self):
-        _check_series(self.harmonics, self.omega, least=2)
-        if self.periods < 1:
-            raise InputError(f"`periods` must be at least 1, but is {self.periods}.")
-
-    @property
-    def series(self) -> FourierBasis:
-        """Fourier series without the conditions at the ends."""
-        return FourierBasis(self.harmonics, self.omega)
+        if self.harmonics < 2:
+            raise InputError(f"`harmonics` must be at least 2, but is {self.harmonics}.")
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
@@ -130,13 +141,6 @@ class RestToRestBasis(AbstractBasis):
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
         """Return equidistant times over one period [s]."""
         return self.series.times(samples)
-
-
-def _check_series(harmonics: int, omega: AnyArray | float, least: int) -> None:
-    if harmonics < least:
-        raise InputError(f"`harmonics` must be at least {least}, but is {harmonics}.")
-    if not is_traced(omega) and not 0 < omega < math.inf:
-        raise InputError(f"`omega` must be a positive frequency [rad/s], but is {omega:g}.")
 
 
 def fourier_series(
@@ -182,8 +186,6 @@ def random_fourier_series(
     Raises:
         InputError: If `omega` or `harmonics` is not positive, or `reach` not between 0 and 1.
     """
-    if not 1 <= harmonics <= 64:
-        raise InputError(f"`harmonics` must be from 1 to 64, but is {harmonics}.")
     if not 0 < reach <= 1:
         raise InputError(f"`reach` must be above 0 and at most 1, but is {reach:g}.")
     basis, limits = FourierBasis(harmonics, omega), complete_limits(robot)

@@ -7,16 +7,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision, is_traced, namespace
-from jaxid.dynamics.motion import Motion
+from jaxid.arrays import AnyArray, Float, double_precision, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.joints import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import FourierBasis, complete_limits
+from jaxid.trajectory.fourier import PeriodsBasis, complete_limits
 from jaxid.trajectory.trajectory import (
-    AbstractBasis,
     AbstractTrajectory,
     Envelope,
+    States,
     as_scalar,
     stand_outside,
 )
@@ -41,7 +40,7 @@ def _cubic(qd: Any, qdd: Any, duration: Any) -> tuple[Any, Any]:
     return 3 * qd / duration**2 - qdd / duration, qdd / duration**2 - 2 * qd / duration**3
 
 
-class LeadsBasis(AbstractBasis):
+class LeadsBasis(PeriodsBasis):
     """Fourier series with a lead-in and a lead-out; the coefficients are those of the series.
 
     All joints start together and take the time `lead` into the series, and out of it at the end.
@@ -58,22 +57,11 @@ class LeadsBasis(AbstractBasis):
         InputError: If one of them is not positive.
     """
 
-    harmonics: int = eqx.field(static=True)
-    omega: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
     lead: Float[AnyArray, ""] = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
-    periods: int = eqx.field(static=True, default=1, kw_only=True)
 
     def __check_init__(self):
-        FourierBasis(self.harmonics, self.omega)
         if not is_traced(self.lead) and not 0 < self.lead < math.inf:
             raise InputError(f"`lead` must be a positive time [s], but is {self.lead:g}.")
-        if self.periods < 1:
-            raise InputError(f"`periods` must be at least 1, but is {self.periods}.")
-
-    @property
-    def series(self) -> FourierBasis:
-        """Fourier series between the leads."""
-        return FourierBasis(self.harmonics, self.omega)
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:
@@ -157,26 +145,19 @@ class WithLeads(AbstractTrajectory):
         """Time from standstill to standstill [s]."""
         return self.window[1] + jnp.max(jnp.asarray(self.lead_out))
 
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """Return the motion at one time or at many [s]; standstill outside."""
-        return _motion_with_leads(self, jnp.asarray(t, float))
-
-
-@eqx.filter_jit
-def _motion_with_leads(whole: WithLeads, t: Array) -> Motion:
-    begin, end = whole.window
-    time = t.reshape(-1, 1)
-    lead_in, lead_out = (jnp.asarray(x)[None] for x in (whole.lead_in, whole.lead_out))
-    first = whole.inner.motion(jnp.reshape(whole.start, 1))
-    last = whole.inner.motion(jnp.reshape(whole.start + whole.length, 1))
-    since = jnp.clip(time - begin + lead_in, 0.0, lead_in)
-    left = jnp.clip(end + lead_out - time, 0.0, lead_out)
-    early = _lead(first.q, first.qd, first.qdd, lead_in, since)
-    late = _lead(last.q, last.qd, last.qdd, lead_out, left, -1)
-    inner = whole.inner.motion(whole.start + time[:, 0] - begin)
-    parts = zip(early, (inner.q, inner.qd, inner.qdd), late, strict=False)
-    values = (jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts)
-    return Motion(*(x.reshape(*t.shape, -1) for x in values))
+    def states(self, t: Float[AnyArray, " samples"]) -> States:
+        """Return the motion between the leads, and the leads; standstill outside."""
+        begin, end = self.window
+        time = t[:, None]
+        lead_in, lead_out = (jnp.asarray(x)[None] for x in (self.lead_in, self.lead_out))
+        first = self.inner.states(jnp.reshape(self.start, 1))
+        last = self.inner.states(jnp.reshape(self.start + self.length, 1))
+        since = jnp.clip(time - begin + lead_in, 0.0, lead_in)
+        left = jnp.clip(end + lead_out - time, 0.0, lead_out)
+        early, late = _lead(*first, lead_in, since), _lead(*last, lead_out, left, -1)
+        inner = self.inner.states(self.start + t - begin)
+        parts = zip(early, inner, late, strict=False)
+        return tuple(jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts)
 
 
 def with_leads(

@@ -4,18 +4,17 @@ import functools
 import math
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
-from jaxid.arrays import AnyArray, Array, Float, Numbers, as_array, is_traced, namespace
-from jaxid.dynamics.motion import Motion
+from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.trajectory.trajectory import (
     AbstractBasis,
     AbstractTrajectory,
     Envelope,
     LinearTrajectory,
+    States,
     as_scalar,
 )
 
@@ -39,15 +38,9 @@ class PiecewisePolynomial(AbstractTrajectory):
         """Time of the end [s]."""
         return self.times[-1]
 
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """Return the motion at one time or at many [s]."""
-        return _polynomial_motion(self.times, self.coefficients, jnp.asarray(t, float))
-
-
-@eqx.filter_jit
-def _polynomial_motion(times: AnyArray, coefficients: AnyArray, t: Array) -> Motion:
-    derivatives = _evaluate(times, coefficients, t.reshape(-1))[:3]
-    return Motion(*(x.reshape(*t.shape, -1) for x in derivatives))
+    def states(self, t: Float[AnyArray, " samples"]) -> States:
+        """Return the polynomials and two derivatives."""
+        return tuple(_evaluate(self.times, self.coefficients, t)[:3])
 
 
 def _evaluate(

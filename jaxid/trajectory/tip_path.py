@@ -131,11 +131,6 @@ class TipPath(eqx.Module):
         """Total time [s]."""
         return float(sum(self.durations))
 
-    @property
-    def length(self) -> float:
-        """Total length [m]."""
-        return float(sum(piece.length for piece in self.pieces))
-
     def positions(self, t: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
         """Return positions of the end-effector [m] at times [s]; it stands still outside."""
         t = np.asarray(t)
@@ -179,8 +174,6 @@ def iso9283_path(
     Raises:
         InputError: If the centre is no point, the cube has no size, or a limit is not positive.
     """
-    if not 0 < edge < np.inf:
-        raise InputError(f"`edge` of the cube must be positive [m], but is {edge:g}.")
     c = as_array("centre", centre)
     if c.shape != (3,):
         raise InputError("`centre` must hold three numbers [m].")

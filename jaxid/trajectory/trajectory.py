@@ -18,6 +18,9 @@ from jaxid.arrays import AnyArray, Array, Float, Hashable, is_traced, namespace,
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
+States = tuple[Float[AnyArray, "samples joints"], ...]
+"""Positions, velocities and accelerations."""
+
 
 def as_scalar(value: Any) -> Any:
     """Return one number as an array, so that compiled functions do not depend on its value."""
@@ -33,8 +36,12 @@ class AbstractTrajectory(Hashable):
         """Time from the start at zero to the end [s]; one period of a periodic motion."""
 
     @abstractmethod
+    def states(self, t: Float[AnyArray, " samples"]) -> States:
+        """Return positions, velocities and accelerations at times [s], under `jit`."""
+
     def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
         """Return the motion at one time or at many [s]."""
+        return _motion(self, jnp.asarray(t, float))
 
     @property
     def joints(self) -> int:
@@ -63,6 +70,12 @@ class AbstractTrajectory(Hashable):
         steps = max(math.ceil(duration / sample_time * (1 - 1e-9)), 1)
         times = np.linspace(0.0, duration, steps + 1)
         return times, jax.tree.map(np.asarray, self.motion(times))
+
+
+@eqx.filter_jit
+def _motion(trajectory: AbstractTrajectory, t: Array) -> Motion:
+    states = trajectory.states(t.reshape(-1))
+    return Motion(*(x.reshape(*t.shape, -1) for x in states))
 
 
 @eqx.filter_jit
@@ -111,21 +124,15 @@ class Segments(AbstractTrajectory):
         """Total time of all members [s]."""
         return sum(member.duration for member in self.members)
 
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """Return the motion at one time or at many [s]."""
-        return _segment_motion(self.members, jnp.asarray(t, float))
-
-
-@eqx.filter_jit
-def _segment_motion(members: tuple[AbstractTrajectory, ...], t: Array) -> Motion:
-    begin, motion = 0.0, members[0].motion(t)
-    for before, member in itertools.pairwise(members):
-        begin = begin + before.duration
-        later = (t >= begin)[..., None]
-        motion = jax.tree.map(
-            lambda x, y, later=later: jnp.where(later, y, x), motion, member.motion(t - begin)
-        )
-    return motion
+    def states(self, t: Float[AnyArray, " samples"]) -> States:
+        """Return the states of the member that runs at each time."""
+        begin, states = 0.0, self.members[0].states(t)
+        for before, member in itertools.pairwise(self.members):
+            begin = begin + before.duration
+            later = (t >= begin)[:, None]
+            pairs = zip(states, member.states(t - begin), strict=True)
+            states = tuple(jnp.where(later, y, x) for x, y in pairs)
+        return states
 
 
 class PaddedToCycle(AbstractTrajectory):
@@ -144,9 +151,9 @@ class PaddedToCycle(AbstractTrajectory):
         """First whole number of cycles in which the motion has ended [s]."""
         return count_cycles(float(self.inner.duration), self.sample_time) * self.sample_time
 
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
+    def states(self, t: Float[AnyArray, " samples"]) -> States:
         """Return the motion, and its final pose after its end."""
-        return self.inner.motion(jnp.minimum(jnp.asarray(t, float), self.inner.duration))
+        return self.inner.states(jnp.minimum(t, self.inner.duration))
 
 
 def count_cycles(duration: float, sample_time: float) -> int:
@@ -252,15 +259,10 @@ class LinearTrajectory(AbstractTrajectory):
         """Duration of the basis [s]."""
         return self.basis.duration
 
-    def motion(self, t: Float[AnyArray, "*batch"] | float | int) -> Motion:
-        """Return the motion at one time or at many [s]."""
-        return _linear_motion(self.basis, self.coefficients, jnp.asarray(t, float))
-
-
-@eqx.filter_jit
-def _linear_motion(basis: AbstractBasis, x: AnyArray, t: Array) -> Motion:
-    rows = jnp.asarray(basis.rows(t.reshape(-1)))
-    return Motion(*((part @ x.T).reshape(*t.shape, -1) for part in rows[:3]))
+    def states(self, t: Float[AnyArray, " samples"]) -> States:
+        """Return the rows of the basis times the coefficients."""
+        rows = jnp.asarray(self.basis.rows(t))
+        return tuple(part @ self.coefficients.T for part in rows[:3])
 
 
 def stand_outside(

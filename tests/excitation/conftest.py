@@ -54,3 +54,17 @@ def pendulum():
 @pytest.fixture(scope="package")
 def random():
     return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="package")
+def excess():
+    """A function of a plan: largest excess of its dense samples over the joints' limits."""
+
+    def excess(plan):
+        motion = plan.trajectory.motion(np.linspace(0.0, float(plan.trajectory.duration), 8000))
+        own = plan.base.model.robot.limits
+        q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
+        beyond = q - own.position_max, own.position_min - q, abs(qd) - own.velocity
+        return max(float(np.max(x)) for x in (*beyond, abs(qdd) - own.acceleration))
+
+    return excess

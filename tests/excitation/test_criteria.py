@@ -10,7 +10,7 @@ from jaxid.excitation.criteria import (
     CRITERIA,
     Information,
     information,
-    information_map,
+    informations,
     log_condition,
     spectral,
     standard_deviations,
@@ -99,9 +99,9 @@ def test_compiled_information_is_that_of_all_samples(base, random):
     basis = FourierBasis(3, 1.2)
     x = random.standard_normal((5, 2, basis.variables))
     weights, prior = np.array([0.1, 0.7]), 1e-3 * np.eye(base.size)
-    plains, weighteds = information_map(
-        base, basis, samples=50, measured=50, weights=weights, prior=prior
-    )(jnp.asarray(x))
+    plains, weighteds = informations(
+        base, basis, jnp.asarray(x), samples=50, measured=50, weights=weights, prior=prior
+    )
     for k, one in enumerate(x):
         motion = basis.trajectory(one).motion(basis.times(50))
         theta = np.asarray(base.regressor(motion))

@@ -14,7 +14,6 @@ from jaxid.excitation.design import design_excitation, minimise
 from jaxid.excitation.problem import ExcitationProblem
 from jaxid.excitation.search import Search
 from jaxid.robot.collision import GROUND, Capsule, CollisionModel
-from jaxid.trajectory.files import load_trajectory
 from jaxid.trajectory.fourier import FourierBasis
 
 EFFORT = {"starts": 3, "generations": 2, "polish": 1}
@@ -51,18 +50,7 @@ def impossible(pendulum):
     return ExcitationProblem(pendulum, BASIS, constraints=(LowTip(-2.5),), samples=200)
 
 
-def excess(plan):
-    motion = plan.trajectory.motion(np.linspace(0.0, float(plan.trajectory.duration), 8000))
-    own = plan.base.model.robot.limits
-    return max(
-        float(np.max(np.asarray(motion.q) - own.position_max)),
-        float(np.max(own.position_min - np.asarray(motion.q))),
-        float(np.max(np.abs(motion.qd) - own.velocity)),
-        float(np.max(np.abs(motion.qdd) - own.acceleration)),
-    )
-
-
-def test_keeps_limits_uses_them_and_beats_random_motions(designed):
+def test_keeps_limits_uses_them_and_beats_random_motions(designed, excess):
     plan, seen = designed
     assert plan.feasible
     assert excess(plan) <= 0.0
@@ -97,16 +85,9 @@ def test_the_mean_gain_leaves_out_what_stays_open(plan):
     assert plan.mean_gain > 1.2
 
 
-def test_writes_a_table_and_itself(plan, tmp_path):
-    plan.to_csv(tmp_path / "motion.csv")
-    table = np.loadtxt(tmp_path / "motion.csv", delimiter=",", skiprows=1)
-    assert table.shape == (201, 7)
-    plan.save(tmp_path / "motion.json")
-    again = load_trajectory(tmp_path / "motion.json")
-    np.testing.assert_array_equal(again.coefficients, plan.trajectory.coefficients)
-
-
-def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(free, plan, tmp_path):
+def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(
+    free, plan, excess, tmp_path
+):
     seen = []
 
     def stop(progress):
@@ -125,16 +106,12 @@ def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(free, pl
     np.testing.assert_array_equal(resumed.trajectory.coefficients, expected)
     with pytest.raises(ValueError, match="other settings"):
         minimise(free, resume=True, **{**arguments, "key": jax.random.key(4)})
-    file.write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match="no saved state"):
-        minimise(free, resume=True, **arguments)
 
 
 def test_the_problems_functions_are_those_of_the_motion(impossible, pendulum):
     """`value`, `inequalities` and `violation` run under `jit` and agree with the exact ones."""
     x = impossible.random(jax.random.key(0))
     value = jax.jit(impossible.value)
-    assert float(value(x)) == pytest.approx(impossible.exact_value(x), abs=1e-9)
     motion = impossible.trajectory(x).motion(BASIS.times(200))
     found = information(pendulum, motion, 1.0 / impossible.noise)
     assert float(value(x)) == pytest.approx(np.log(DOptimal().value(found)), abs=1e-9)
@@ -177,17 +154,12 @@ def test_earlier_information_is_added(pendulum):
 
 
 @pytest.mark.parametrize(
-    ("argument", "name"),
-    [
-        ({"starts": 0}, "`starts`"),
-        ({"generations": -1}, "`generations`"),
-        ({"noise": np.array([-1.0])}, "`noise`"),
-        ({"prior": np.eye(2)}, "`prior`"),
-    ],
+    ("name", "value"),
+    [("starts", 0), ("generations", -1), ("noise", np.array([-1.0])), ("prior", np.eye(2))],
 )
-def test_refuses_what_makes_no_sense(pendulum, argument, name):
-    with pytest.raises(ValueError, match=name):
-        design_excitation(pendulum, **argument)
+def test_refuses_what_makes_no_sense(pendulum, name, value):
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        design_excitation(pendulum, **{name: value})
 
 
 def test_a_state_belongs_to_the_pairs_that_are_watched(pendulum, tmp_path):

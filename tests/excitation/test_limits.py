@@ -57,22 +57,6 @@ def test_what_is_within_is_not_touched(limits):
     np.testing.assert_allclose(again, middle, atol=1e-12)
 
 
-def test_a_shrunk_motion_is_smaller_about_the_same_place(limits):
-    fine = limits.grid(512)
-    y = limits.random(jax.random.key(1), 1)[0]
-    half = fine.shrink(y, 0.5)
-    assert peaks(limits, limits.coefficients(half)) <= 0.0
-    rows = limits.basis.rows(np.linspace(0.0, limits.basis.duration, 100))
-    (q, qd), (q_half, qd_half) = (
-        [part @ np.asarray(limits.coefficients(z)).T for part in rows[:2]] for z in (y, half)
-    )
-    np.testing.assert_allclose(qd_half, 0.5 * qd, atol=1e-12)
-    place = 2 * q_half - q
-    np.testing.assert_allclose(place, np.broadcast_to(place[0], place.shape), atol=1e-12)
-    assert (np.min(q, axis=0) < place[0]).all()
-    assert (place[0] < np.max(q, axis=0)).all()
-
-
 def test_unknown_limits_are_assumed_and_known_jerks_are_kept(arm):
     free = JointLimits(arm, BASES[0], Limits(2))
     assert np.isfinite(free.limits.acceleration).all()

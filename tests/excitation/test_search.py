@@ -22,8 +22,9 @@ def test_start_and_direction_of_a_period_do_not_matter(free):
     """Children rely on this: all joints retimed together give the same information."""
     x = free.random(jax.random.key(0))
     coefficients = free.limits.coefficients(np.asarray(x))
+    scale = free.limits.scale
     retimed = [
-        free.exact_value(free.limits.scaled(coefficients @ T.T)) for T in BASIS.retimings()[::9]
+        free.exact_value((coefficients @ T.T / scale).ravel()) for T in BASIS.retimings()[::9]
     ]
     np.testing.assert_allclose(retimed, free.exact_value(x), atol=1e-9)
 
@@ -45,14 +46,6 @@ def test_each_joint_of_a_child_moves_as_in_a_parent(free, parents):
     np.testing.assert_array_equal(crossover(free, parents, jax.random.key(2)), children)
     # Limits hold for each joint alone: children keep them like their parents.
     assert (limits.use(limits.coefficients(np.asarray(children[0])))[:3] < 1.01).all()
-
-
-def test_the_most_promising_children_are_kept(free, parents):
-    many = evaluate(free, crossover(free, parents, jax.random.key(4))).value
-    firsts = [
-        evaluate(free, crossover(free, parents, jax.random.key(k), 1)).value for k in range(4)
-    ]
-    assert np.mean(many) < min(np.mean(one) for one in firsts)
 
 
 def test_constraints_count_among_children(base, free, parents):

@@ -63,15 +63,6 @@ def test_distances_never_come_out_too_large():
     assert (np.asarray(segment_distance(*ends)) <= np.array(exact) + 1e-15).all()
 
 
-def test_derivatives_of_segments_are_difference_quotients():
-    ends = segments(2)
-    gradient = jax.grad(lambda x: jnp.sum(segment_distance(*x)))(jnp.asarray(ends))
-    h, direction = 1e-6, np.random.default_rng(3).standard_normal(ends.shape)
-    up, down = (np.asarray(segment_distance(*(ends + s * h * direction))) for s in (1, -1))
-    along = np.sum(np.asarray(gradient) * direction, axis=(0, 2))
-    np.testing.assert_allclose(along, (up - down) / (2 * h), atol=2e-7)
-
-
 def coal_pose(R, r):
     coal = pytest.importorskip("coal")
     return coal.Transform3s(np.ascontiguousarray(R), np.ascontiguousarray(r))
@@ -124,17 +115,6 @@ def test_the_depth_in_a_box_is_that_to_the_nearest_face():
     assert float(through) == pytest.approx(-0.8, abs=2e-6)
 
 
-def test_derivatives_of_boxes_and_planes_are_difference_quotients():
-    ends = jnp.asarray(segments(6)[:2] * 1.5)
-    direction = np.random.default_rng(7).standard_normal(ends.shape)
-    for obstacle in (a_box(), HalfSpace("wall", normal=(1.0, 2.0, 0.5), height=0.3)):
-        gradient = jax.grad(lambda x, o=obstacle: jnp.sum(o.distance(*x)))(ends)
-        h = 1e-6
-        up, down = (np.asarray(obstacle.distance(*(ends + s * h * direction))) for s in (1, -1))
-        along = np.sum(np.asarray(gradient) * direction, axis=(0, 2))
-        np.testing.assert_allclose(along, (up - down) / (2 * h), atol=1e-6)
-
-
 def test_ends_are_where_plain_numpy_puts_them():
     robot, model = library.tx90l_on_rail(), library.tx90l_on_rail_collision()
     q = random_configuration(robot, 3)
@@ -144,26 +124,6 @@ def test_ends_are_where_plain_numpy_puts_them():
         T = poses[capsule.body] if capsule.body >= 0 else np.eye(4)
         np.testing.assert_allclose(start, T[:3, :3] @ capsule.start + T[:3, 3], atol=1e-13)
         np.testing.assert_allclose(end, T[:3, :3] @ capsule.end + T[:3, 3], atol=1e-13)
-
-
-def test_capsules_of_the_rail_robot_lie_along_its_links():
-    robot, model = library.tx90l_on_rail(), library.tx90l_on_rail_collision()
-    upright = dict(
-        zip((c.name for c in model.capsules), model.ends(robot, np.zeros(7)), strict=True)
-    )
-    np.testing.assert_allclose(upright["upper arm"][:, 2], [0.478, 0.978], atol=1e-12)
-    np.testing.assert_allclose(upright["forearm"][:, 2], [0.978, 1.528], atol=1e-12)
-    np.testing.assert_allclose(upright["wrist"][:, 2], [1.528, 1.828], atol=1e-12)
-    gap = upright["forearm"][0] - upright["upper arm"][1]
-    assert np.linalg.norm(gap) <= 0.051
-    # A batch of poses: upright, and folded down, where the forearm meets the ground.
-    q = np.zeros((2, 1, 7))
-    q[1, 0, 2] = 2.3
-    gaps = np.asarray(model.clearance(robot, q))
-    assert gaps[1, 0].min() < 0
-    clearance = dict(zip(model.pair_names, gaps[0, 0], strict=True))
-    assert clearance["forearm and ground"] == pytest.approx(0.978 - 0.12, abs=1e-5)
-    assert min(clearance.values()) == pytest.approx(0.2227, abs=1e-3)
 
 
 def test_pairs_are_found_where_none_are_named():
@@ -182,3 +142,19 @@ def test_pairs_are_found_where_none_are_named():
     model = CollisionModel(robot, fat)
     assert "link 0 and link 3" not in model.pair_names
     assert any("link 0 and link 3" in note for note in model.notes)
+
+
+@pytest.mark.parametrize(
+    ("distance", "ends"),
+    [
+        (segment_distance, segments(2)),
+        (a_box().distance, segments(6)[:2] * 1.5),
+        (HalfSpace("wall", normal=(1.0, 2.0, 0.5), height=0.3).distance, segments(6)[:2] * 1.5),
+    ],
+)
+def test_derivatives_are_difference_quotients(distance, ends):
+    gradient = jax.grad(lambda x: jnp.sum(distance(*x)))(jnp.asarray(ends))
+    h, direction = 1e-6, np.random.default_rng(3).standard_normal(ends.shape)
+    up, down = (np.asarray(distance(*jnp.asarray(ends + s * h * direction))) for s in (1, -1))
+    along = np.sum(np.asarray(gradient) * direction, axis=(0, 2))
+    np.testing.assert_allclose(along, (up - down) / (2 * h), atol=1e-6)

@@ -23,8 +23,6 @@ ROWS = np.array(
     ]
 )
 kinds = st.lists(st.booleans(), min_size=5, max_size=5).map(tuple)
-
-
 few = settings(max_examples=20)
 
 
@@ -78,6 +76,3 @@ def test_rounded_twists_and_offsets_are_snapped_and_noted():
         "joint `joint1`: alpha 1.5708 rad snapped to 90 degrees.",
         "joint `joint1`: theta -3.14159 rad snapped to -180 degrees.",
     )
-    off = from_dh([(1.5708, 0, 0.1)], convention="modified", snap_tolerance=0.0)
-    assert not off.notes
-    assert off.rotation[0][1, 1] == pytest.approx(np.cos(1.5708), abs=1e-15)

@@ -61,16 +61,3 @@ def test_a_rotation_is_left_alone_unless_all_of_it_is_near(roll, pitch, yaw):
 def test_rounding_is_cleaned_even_without_tolerance():
     R = Rotation.from_euler("x", np.pi / 2).as_matrix() + 6e-17
     assert set(np.abs(snap_directions("j", "attitude", R, 0.0)[0]).ravel()) == {0.0, 1.0}
-
-
-def test_axes_snap_to_signed_coordinate_axes_and_are_noted():
-    near = np.array([0.0, -1.0, 5e-6])
-    snapped, (note,) = snap_directions("elbow", "axis", near, 1e-4)
-    assert np.array_equal(snapped, [0.0, -1.0, 0.0])
-    assert note == "joint `elbow`: axis snapped to the coordinate axes (by 5e-06)."
-    assert np.array_equal(snap_directions("elbow", "axis", near, 0.0)[0], near)
-
-
-def test_notes_name_the_joint_and_the_angle():
-    _, notes = snap_angles("elbow", ("roll", "pitch", "yaw"), [1.5708, 0.3, 1e-14], 1e-4)
-    assert notes == ("joint `elbow`: roll 1.5708 rad snapped to 90 degrees.",)

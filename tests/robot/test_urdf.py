@@ -6,14 +6,10 @@ import pinocchio as pin
 import pytest
 from forward_kinematics import (
     body_transforms,
-    from_rpy,
     random_configuration,
     tip_transform,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
-from urdf_text import arm, inertial, joint, link, numbers, robot
+from urdf_text import arm, inertial, joint, link, robot
 
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
@@ -112,72 +108,6 @@ def test_panda_of_the_library_is_the_panda_of_the_file():
     q = random_configuration(urdf, 2)
     np.testing.assert_allclose(tip_transform(panda(), q), tip_transform(urdf, q), atol=1e-12)
     assert set(np.abs(urdf.rotation).ravel()) == {0.0, 1.0}
-
-
-# Laws.
-
-small = st.integers(0, 10_000)
-
-
-def _tree(rng, split):
-    """A random tree of five bodies; with `split`, fixed joints lie between all of its parts."""
-    parts = [link("base")]
-    for i in range(5):
-        parent = "base" if i == 0 else f"link{rng.integers(-1, i)}"
-        parent = "base" if parent == "link-1" else parent
-        kind = ["revolute", "continuous", "prismatic"][rng.integers(3)]
-        rpy, xyz = rng.uniform(-3, 3, 3), rng.uniform(-1, 1, 3)
-        axis = numbers(rng.normal(size=3))
-        between = from_rpy(rng.uniform(-1.4, 1.4, 3), rng.uniform(-1, 1, 3))
-        com, turned = rng.uniform(-0.3, 0.3, 3), rng.uniform(-1.4, 1.4, 3)
-        moments = [*rng.uniform(1, 2, 6)]
-        if not split:
-            parts.append(link(f"link{i}", inertial(2.5, com, turned, moments)))
-            parts.append(
-                joint(
-                    f"j{i}", parent, f"link{i}", kind, rpy=numbers(rpy), xyz=numbers(xyz), axis=axis
-                )
-            )
-            continue
-        parts += [link(f"link{i}"), link(f"mid{i}")]
-        rest = np.linalg.inv(between) @ from_rpy(rpy, xyz)
-        parts.append(_fixed(f"first{i}", parent, f"mid{i}", between))
-        parts.append(joint(f"j{i}", f"mid{i}", f"link{i}", kind, axis=axis, **_place(rest)))
-        load = np.linalg.inv(between) @ from_rpy(turned, com)
-        parts.append(link(f"load{i}", inertial(2.5, load[:3, 3], _rpy(load), moments)))
-        parts.append(_fixed(f"second{i}", f"link{i}", f"load{i}", between))
-    return robot(*parts)
-
-
-def _rpy(T):
-    return Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
-
-
-def _fixed(name, parent, child, T):
-    return joint(name, parent, child, "fixed", **_place(T))
-
-
-def _place(T):
-    return {"rpy": numbers(_rpy(T)), "xyz": numbers(T[:3, 3])}
-
-
-@settings(max_examples=15)
-@given(small)
-def test_fixed_joints_in_between_change_nothing(tmp_path_factory, seed):
-    folder = tmp_path_factory.mktemp("trees")
-    paths = folder / "plain.urdf", folder / "split.urdf"
-    for path, split in zip(paths, (False, True), strict=True):
-        path.write_text(_tree(np.random.default_rng(seed), split))
-    plain, split = (load_urdf(path, snap_tolerance=0.0) for path in paths)
-    assert split.joint_names == plain.joint_names
-    assert split.parent == plain.parent
-    assert split.revolute == plain.revolute
-    assert all(p < i for i, p in enumerate(plain.parent))
-    np.testing.assert_allclose(np.linalg.norm(plain.axis, axis=1), 1.0, atol=1e-15)
-    for field in ("axis", "rotation", "offset"):
-        np.testing.assert_allclose(getattr(split, field), getattr(plain, field), atol=1e-12)
-    p = [urdf_parameters(path, snap_tolerance=0.0, check=False) for path in paths]
-    np.testing.assert_allclose(p[1], p[0], atol=1e-11)
 
 
 # Snapping.
@@ -297,19 +227,6 @@ def test_limits(write, kind, limit, expected):
     limits = load_urdf(write(arm(kind=kind, inner=f"<limit {limit}/>" if limit else ""))).limits
     read = (limits.position_min, limits.position_max, limits.velocity, limits.force)
     assert [values.item() for values in read] == list(expected)
-
-
-def test_limits_taken_as_unknown_are_noted(write):
-    zeros = '<limit lower="0" upper="0" velocity="0" effort="-1"/>'
-    notes = " ".join(load_urdf(write(arm(inner=zeros))).notes)
-    assert all(f"`j1`: {x}" in notes for x in ("a range from 0 to 0", "velocity 0", "effort -1"))
-
-
-def test_foreign_elements_and_comments_go_unread(write):
-    junk = "<!-- c --><gazebo><plugin/></gazebo><transmission/><material/><link_extra a='1'/>"
-    text = arm(inner="<!-- c --><safety_controller/><dynamics damping='x'/>")
-    loaded = load_urdf(write(text.replace("<joint", junk + "<joint")))
-    assert loaded.joint_names == ("j1",)
 
 
 def test_defaults_of_name_and_axis(write):

@@ -3,43 +3,32 @@
 import numpy as np
 import pytest
 from forward_kinematics import body_transforms
+from urdf_text import joint, link, robot
 
 from jaxid.robot.collision import CollisionModel, enclose, fit_capsules
 from jaxid.robot.urdf import load_urdf
 
-TEXT = """<robot name="arm">
-  <link name="base">
-    <collision><geometry><cylinder radius="0.2" length="0.4"/></geometry></collision>
-  </link>
-  <joint name="j1" type="revolute">
-    <parent link="base"/><child link="upper"/><origin xyz="0 0 0.4"/><axis xyz="0 0 1"/>
-  </joint>
-  <link name="upper">
-    <collision>
-      <origin xyz="0.3 0 0" rpy="0 1.5707963267948966 0"/>
-      <geometry><cylinder radius="0.05" length="0.6"/></geometry>
-    </collision>
-    <collision><origin xyz="0 0 0.1"/><geometry><sphere radius="0.08"/></geometry></collision>
-  </link>
-  <joint name="flange" type="fixed">
-    <parent link="upper"/><child link="plate"/><origin xyz="0.6 0 0" rpy="0 0 0.3"/>
-  </joint>
-  <link name="plate">
-    <collision><geometry><box size="0.1 0.3 0.02"/></geometry></collision>
-  </link>
-  <joint name="j2" type="revolute">
-    <parent link="plate"/><child link="tool"/><origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
-  </joint>
-  <link name="tool">
-    <collision><geometry>{tool}</geometry></collision>
-  </link>
-</robot>"""
-SPHERE = '<sphere radius="0.03"/>'
+
+def collision(geometry, origin=""):
+    return f"<collision>{origin}<geometry>{geometry}</geometry></collision>"
 
 
-def written(tmp_path, tool=SPHERE):
+def written(tmp_path, tool='<sphere radius="0.03"/>'):
+    turned = '<origin xyz="0.3 0 0" rpy="0 1.5707963267948966 0"/>'
+    upper = collision('<cylinder radius="0.05" length="0.6"/>', turned)
+    upper += collision('<sphere radius="0.08"/>', '<origin xyz="0 0 0.1"/>')
     path = tmp_path / "arm.urdf"
-    path.write_text(TEXT.format(tool=tool))
+    path.write_text(
+        robot(
+            link("base", collision('<cylinder radius="0.2" length="0.4"/>')),
+            link("upper", upper),
+            link("plate", collision('<box size="0.1 0.3 0.02"/>')),
+            link("tool", collision(tool)),
+            joint("j1", "base", "upper", xyz="0 0 0.4"),
+            joint("flange", "upper", "plate", "fixed", xyz="0.6 0 0", rpy="0 0 0.3"),
+            joint("j2", "plate", "tool", xyz="0 0 0.1", axis="0 1 0"),
+        )
+    )
     return path
 
 
@@ -90,7 +79,7 @@ def test_few_or_flat_points(count):
 
 def test_capsules_hold_the_geometry_on_its_bodies(tmp_path):
     path = written(tmp_path)
-    robot = load_urdf(path, base_position=(0.0, 0.0, 1.0))
+    arm = load_urdf(path, base_position=(0.0, 0.0, 1.0))
     capsules = fit_capsules(path, base_position=(0.0, 0.0, 1.0))
     names = [c.name for c in capsules]
     assert names == ["base", "upper", "upper 2", "plate", "tool"]
@@ -107,10 +96,10 @@ def test_capsules_hold_the_geometry_on_its_bodies(tmp_path):
     assert outside(placed, plate.start, plate.end, plate.radius).max() <= 1e-9
     assert float(plate.radius) < 0.06
     np.testing.assert_allclose(tool.start, 0.0, atol=1e-12)
-    model = CollisionModel(robot, capsules)
+    model = CollisionModel(arm, capsules)
     assert "base and tool" in model.pair_names
     # The frames are those of the robot: the upright cylinder is where its joint is.
-    pose = body_transforms(robot, np.zeros(2))
+    pose = body_transforms(arm, np.zeros(2))
     np.testing.assert_allclose(pose[0][:3, 3], [0, 0, 1.4], atol=1e-12)
 
 
@@ -129,5 +118,5 @@ def test_a_mesh_is_held_whole(tmp_path):
     assert outside(points, tool.start, tool.end, tool.radius).max() <= 1e-7
     assert float(tool.radius) < 0.034
     (meshes / "tool.stl").rename(meshes / "other.stl")
-    with pytest.raises(FileNotFoundError, match=r"line 25: the mesh .* `packages`"):
+    with pytest.raises(FileNotFoundError, match=r"line 6: the mesh .* `packages`"):
         fit_capsules(path)

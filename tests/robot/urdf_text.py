@@ -19,15 +19,7 @@ def inertial(mass, xyz, rpy, inertia):
 
 
 def joint(
-    name,
-    parent,
-    child,
-    kind="revolute",
-    *,
-    xyz="0 0 0",
-    rpy="0 0 0",
-    axis="0 0 1",
-    inner="",
+    name, parent, child, kind="revolute", *, xyz="0 0 0", rpy="0 0 0", axis="0 0 1", inner=""
 ):
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/>'

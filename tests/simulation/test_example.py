@@ -10,7 +10,7 @@ from jaxid.experiment.experiment import load_experiment
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia
 from jaxid.identification.identify import identify
 from jaxid.robot import library
-from jaxid.simulation.example import FILES, virtual_log, virtual_panda, write_example
+from jaxid.simulation.example import FILES, virtual_panda, write_example
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation import validate
 
@@ -36,15 +36,6 @@ def test_files_are_small_and_the_seed_decides(example, tmp_path):
     write_example(tmp_path)
     for file in FILES:
         assert (tmp_path / file).read_bytes() == (example / file).read_bytes()
-
-
-def test_logs_keep_the_robots_limits():
-    virtual = virtual_panda(1)
-    robot, log = virtual.robot, virtual_log(virtual, "log", 1, (1, 1))
-    assert (log.angles >= robot.limits.position_min).all()
-    assert (log.angles <= robot.limits.position_max).all()
-    assert (np.abs(log.forces).max(axis=0) < robot.max_forces).all()
-    assert not np.array_equal(virtual.parameters, virtual_panda(2).parameters)
 
 
 def test_the_truth_is_found_again(example):

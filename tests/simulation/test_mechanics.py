@@ -88,17 +88,6 @@ def test_energy_is_kept_without_friction(gear):
         np.testing.assert_allclose(q[999], exact, atol=2e-5)
 
 
-def test_friction_brakes_as_much_as_the_law_says():
-    friction = SmoothFriction(np.array([30.0, 0.0]), np.array([20.0, 0.0]))
-    machine = plant(friction)
-    q, qd = np.array([0.0, 0.0]), np.array([1.0, 0.0])
-    machine.start(q, qd, ZERO)
-    # At a steady speed the drive gives what friction takes, and the pendulum hangs.
-    _, qd, qdd = moved(machine, [50.0, 0.0], 500)
-    np.testing.assert_allclose(qd[:, 0], 1.0, rtol=1e-9)
-    np.testing.assert_allclose(qdd, 0.0, atol=1e-8)
-
-
 LUGRE = LuGreFriction(
     viscous=np.array([10.0, 0.1]),
     coulomb=np.array([30.0, 3.0]),

@@ -3,12 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
-from jaxid.identification.identify import identify
-from jaxid.measurement.filters import Subsample, ZeroPhaseButterworth
-from jaxid.measurement.observations import observe
 from jaxid.robot import library
 from jaxid.simulation.friction import SmoothFriction
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
@@ -69,26 +65,6 @@ def test_the_same_experiment_gives_the_same_torques(dry, tolerance):
     assert difference.max() < tolerance
     apart = np.abs(np.asarray(ours.actual.q) - np.asarray(theirs.actual.q)).max(axis=0)
     assert apart.max() < 2e-3
-
-
-def test_mujocos_data_lead_to_the_true_parameters():
-    virtual = ur10()
-    trajectory = random_fourier_series(virtual.robot, omega=1.0, reach=0.8, seed=3)
-    run = MujocoRobot(virtual).track(
-        trajectory, feed_forward=virtual.forces, duration=6.0, substeps=2, seed=0
-    )
-    base = base_parameters(virtual.model)
-    seen = observe(run.recording, virtual.robot, ZeroPhaseButterworth(20.0), Subsample(20))
-    fit = identify(base, seen)
-    truth = np.asarray(base.from_standard(virtual.parameters))
-    predicted = fit.predict(run.actual)
-    wanted = np.asarray(base.inverse_dynamics(truth, run.actual))
-    error = np.sqrt(np.mean((predicted - wanted) ** 2, axis=0))
-    assert (error < 2e-3 * np.asarray(virtual.robot.max_forces)).all()
-    masses = np.array([n.startswith(("m", "Ia")) for n in base.names])
-    np.testing.assert_allclose(
-        np.asarray(fit.parameters)[masses], truth[masses], atol=0.02 * np.abs(truth[masses]).max()
-    )
 
 
 def test_what_mujoco_does_not_know_is_refused():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.robot.joints import Drives, Limits
 from jaxid.simulation.tx90l import cad_tx90l_on_rail, virtual_tx90l_on_rail
@@ -79,20 +78,11 @@ def test_the_log_is_on_the_motors_side_in_steps_of_the_encoders(virtual, run):
     np.testing.assert_allclose(rms(noise), 0.01, rtol=0.1)
 
 
-def test_seeds_decide_and_a_log_can_be_slower(virtual, motion, run):
-    again = virtual.track(
-        motion,
-        feed_forward=feeding(virtual, virtual.parameters),
-        duration=DURATION,
-        sample_time=0.004,
-        seed=1,
-    )
+def test_a_log_can_be_slower_than_the_servo(virtual, motion, run):
+    known = feeding(virtual, virtual.parameters)
+    again = virtual.track(motion, feed_forward=known, duration=DURATION, sample_time=0.004, seed=1)
     np.testing.assert_array_equal(again.actual.q, run.actual.q[::4])
     assert again.recording.sample_time == pytest.approx(0.004)
-    other = virtual.sensors.record(
-        virtual.robot, run.actual.q, run.forces, sample_time=1e-3, seed=2, name="other"
-    )
-    assert np.abs(other.forces - run.recording.forces).max() > 0
 
 
 def test_drives_do_not_give_more_than_they_can(virtual, motion):
@@ -124,10 +114,3 @@ def diverge(virtual, motion):
 def test_invalid_input_is_rejected(virtual, motion, name, call):
     with pytest.raises(InputError, match=name):
         call(virtual, motion)
-
-
-def test_the_model_to_identify_has_frictions_columns_behind_the_bodies(virtual):
-    names = virtual.model.parameter_names
-    assert names[49:63] == (*(f"fv{i}" for i in range(1, 8)), *(f"fc{i}" for i in range(1, 8)))
-    assert isinstance(virtual.bodies, Model)
-    assert virtual.parameters.shape == (70,)

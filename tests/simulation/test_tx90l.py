@@ -5,7 +5,7 @@ import pytest
 
 from jaxid.dynamics.base import base_parameters
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia
-from jaxid.simulation.tx90l import cad_tx90l_on_rail, virtual_tx90l_on_rail
+from jaxid.simulation.tx90l import virtual_tx90l_on_rail
 from jaxid.trajectory.fourier import random_fourier_series
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}
@@ -51,18 +51,6 @@ def test_bodies_could_exist(warm):
     bodies = np.zeros((7, 10))
     bodies[:, :7] = virtual_tx90l_on_rail(warm=warm).values[:49].reshape(7, 7)
     assert (np.linalg.eigvalsh(pseudo_inertia(bodies))[:, 0] > 1e-7).all()
-
-
-def test_cad_is_off_by_some_ten_percent_and_knows_no_friction():
-    virtual = virtual_tx90l_on_rail()
-    truth, cad = virtual.parameters, cad_tx90l_on_rail()
-    assert cad.shape == truth.shape
-    inertial = np.r_[np.arange(49), np.arange(63, 70)]
-    inertial = inertial[truth[inertial] != 0.0]
-    errors = np.abs(cad[inertial] / truth[inertial] - 1.0)
-    assert errors.min() + 1e-12 >= 0.1
-    assert errors.max() < 0.2
-    assert not cad[49:63].any()
 
 
 def test_motors_are_the_papers():

@@ -117,14 +117,6 @@ def test_the_gradient_by_the_frequency():
     assert float(jax.grad(total)(jnp.asarray(0.8))) == pytest.approx(float(slope), rel=1e-6)
 
 
-def test_directions_keep_both_conditions_of_rest():
-    Z, order = RestToRestBasis(5, 0.8).directions, np.arange(1.0, 6.0)
-    assert Z.shape == (11, 9)
-    np.testing.assert_allclose(Z.T @ Z, np.eye(9), atol=1e-14)
-    np.testing.assert_allclose(Z[1:6].sum(axis=0), 0.0, atol=1e-14)
-    np.testing.assert_allclose(order @ Z[6:], 0.0, atol=1e-14)
-
-
 def test_leads_are_checked_and_one_period_between_them_is_measured():
     basis = BETWEEN_RESTS[2]
     times, instants = basis.times(50), basis.instants(200)

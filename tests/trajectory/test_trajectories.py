@@ -5,7 +5,6 @@ import json
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import polars as pl
 import pytest
@@ -22,7 +21,6 @@ from jaxid.trajectory import (
     RestToRestSplineBasis,
     Segments,
     TipPath,
-    WithLeads,
     fourier_series,
     iso9283_path,
     joint_path,
@@ -33,8 +31,7 @@ from jaxid.trajectory import (
     spline_through,
     with_leads,
     write_csv,
-    write_ros_json,
-    write_ros_yaml,
+    write_ros,
 )
 
 PANDA = library.panda()
@@ -123,33 +120,23 @@ def test_splines_pass_their_points_and_keep_to_the_range_of_their_handles():
     assert (q >= POINTS.min(axis=0) - 1e-12).all()
 
 
-@pytest.mark.parametrize(("harmonics", "seed"), [(1, 0), (5, 1), (20, 2)])
-def test_random_series_keep_and_use_limits_on_a_finer_grid(harmonics, seed):
+@pytest.mark.parametrize(("harmonics", "seed", "reach"), [(1, 0, 1.0), (5, 1, 0.5), (20, 2, 1.0)])
+def test_random_series_keep_and_use_limits_on_a_finer_grid(harmonics, seed, reach):
     robot = library.tx90l_on_rail()
-    s = random_fourier_series(robot, omega=0.8, harmonics=harmonics, reach=1.0, seed=seed)
+    s = random_fourier_series(robot, omega=0.8, harmonics=harmonics, reach=reach, seed=seed)
     m = s.motion(np.arange(5_000) * s.duration / 5_000)
     lim = robot.limits
-    assert (np.asarray(m.q) >= lim.position_min - 1e-9).all()
-    assert (np.asarray(m.q) <= lim.position_max + 1e-9).all()
+    middle = 0.5 * (lim.position_min + lim.position_max)
+    half = lim.position_max - middle
+    assert np.max(np.abs(m.q - middle) / half) <= reach + 1e-9
     use = [
-        np.ptp(m.q, axis=0) / (lim.position_max - lim.position_min),
+        np.ptp(m.q, axis=0) / (2 * half),
         np.abs(m.qd).max(0) / lim.velocity,
         np.abs(m.qdd).max(0) / lim.acceleration,
     ]
-    assert np.max(use) <= 1 + 1e-9
+    assert np.max(use) <= reach + 1e-9
     # Every joint meets its tightest limit, up to the bound for what lies between grid points.
-    assert np.max(use, axis=0).min() > math.cos(math.pi * harmonics / 512) - 1e-3
-
-
-def test_reach_leaves_room_and_the_seed_decides():
-    first, again, other = (series(PANDA, seed, 0.5) for seed in (5, 5, 6))
-    np.testing.assert_array_equal(first.coefficients, again.coefficients)
-    assert not np.array_equal(first.coefficients, other.coefficients)
-    m, lim = first.motion(np.linspace(0.0, first.duration, 5000)), PANDA.limits
-    low, high = lim.position_min, lim.position_max
-    assert (np.abs(np.asarray(m.q) - 0.5 * (low + high)) <= 0.25 * (high - low)).all()
-    assert (np.abs(m.qd).max(0) <= 0.5 * lim.velocity).all()
-    assert (np.abs(m.qdd).max(0) <= 0.5 * lim.acceleration).all()
+    assert np.max(use, axis=0).min() > reach * (math.cos(math.pi * harmonics / 512) - 1e-3)
 
 
 def test_unknown_limits_are_assumed_as_documented():
@@ -182,23 +169,6 @@ def test_leads_keep_the_limits_and_follow_the_series_between():
         expected = inner.motion(t - begin + led.start).q
         np.testing.assert_allclose(led.motion(t).q, expected, atol=1e-9)
         assert begin < 1.0
-
-
-def test_leads_are_differentiable_in_their_series():
-    led = FAMILY["with leads"]
-
-    @jax.jit
-    def total(x):
-        whole = WithLeads(
-            led.inner.basis.trajectory(x), led.start, led.length, led.lead_in, led.lead_out
-        )
-        return jnp.sum(whole.motion(np.linspace(0.0, 9.0, 40)).q ** 2)
-
-    x, h = jnp.asarray(led.inner.coefficients), 1e-6
-    direction = np.random.default_rng(0).standard_normal(x.shape)
-    quotient = (total(x + h * direction) - total(x - h * direction)) / (2 * h)
-    slope = float(jnp.sum(jax.grad(total)(x) * direction))
-    assert slope == pytest.approx(float(quotient), rel=1e-7)
 
 
 def test_impossible_leads_name_the_joint():
@@ -239,7 +209,6 @@ SIDE = Line(np.zeros(3), np.array([1.0, 0.0, 0.0]))
         (jump(1e-3), r"coordinate of joint \d"),
         (jump(0.0), "velocity of joint"),
         (lambda: Segments((series(), series(PANDA))), "`members` 1 and 2 must move the same"),
-        (lambda: iso9283_path([0.0, 0.0, 0.0], 0.0, DOWN), "edge"),
         (lambda: iso9283_path([0.0, 0.0], 1.0, DOWN), "centre"),
         (lambda: TipPath((SIDE,), DOWN, speed=0.0), "speed"),
         (lambda: TipPath((), DOWN), "pieces"),
@@ -266,17 +235,12 @@ def test_files_that_hold_no_trajectory_are_refused(tmp_path):
     inner = good["trajectory"]
     for change, name in (
         ({"format": "other"}, "`format`"),
-        ({"version": 1}, "version 1"),
         ({"trajectory": {**inner, "kind": "Waltz"}}, "`Waltz`"),
         ({"trajectory": {**inner, "coefficients": "fast"}}, r"`trajectory\.coefficients`"),
-        ({"trajectory": {k: inner[k] for k in inner if k != "basis"}}, "`basis`"),
     ):
         path.write_text(json.dumps({**good, **change}))
         with pytest.raises(ValueError, match=name):
             load_trajectory(path)
-    path.write_text("{")
-    with pytest.raises(ValueError, match=r"t\.json`"):
-        load_trajectory(path)
 
 
 def test_a_table_has_units_and_exact_numbers(tmp_path):
@@ -303,16 +267,15 @@ def test_ros_messages_parse_back(tmp_path):
     names = ('rail, "x"', "1e-5: b # c")
     robot = ARM.replace(joint_names=names)
     message = joint_trajectory(tiny, robot, sample_time=0.5)
-    write_ros_json(tiny, robot, tmp_path / "t.json", sample_time=0.5)
-    write_ros_yaml(tiny, robot, tmp_path / "t.yaml", sample_time=0.5)
+    for name in ("t.json", "t.yaml"):
+        write_ros(tiny, robot, tmp_path / name, sample_time=0.5)
     assert json.loads((tmp_path / "t.json").read_text()) == message
     assert yaml.safe_load((tmp_path / "t.yaml").read_text()) == message
     assert message["joint_names"] == list(names)
     times, motion = tiny.sample(0.5)
     point, t = message["points"][7], message["points"][-1]["time_from_start"]
-    np.testing.assert_array_equal(point["positions"], motion.q[7])
-    np.testing.assert_array_equal(point["velocities"], motion.qd[7])
-    np.testing.assert_array_equal(point["accelerations"], motion.qdd[7])
+    rows = [point[key] for key in ("positions", "velocities", "accelerations")]
+    np.testing.assert_array_equal(rows, [motion.q[7], motion.qd[7], motion.qdd[7]])
     assert t["sec"] + 1e-9 * t["nanosec"] == pytest.approx(times[-1], abs=1e-9)
     write_csv(tiny, robot, tmp_path / "t.csv", sample_time=1.0)
     with (tmp_path / "t.csv").open(newline="") as file:
