@@ -108,8 +108,6 @@ class ExcitationProblem:
                 f"`noise` must hold one positive number for each joint ({joints}), but is "
                 f"{self.noise}."
             )
-        if self.samples < 2:
-            raise InputError(f"`samples` must be at least 2, but is {self.samples}.")
         if self.prior.shape != (size, size):
             raise InputError(
                 f"`prior` must be a matrix of the {size} base parameters, but has shape "

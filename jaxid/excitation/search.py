@@ -34,8 +34,6 @@ from jaxid.io import write_bytes
 
 FINE = 256
 """Rows of each order by which limits are kept in the end."""
-POLISHING = 4
-"""Time of polishing one motion, relative to a step of the schedule."""
 
 SCHEDULE = (
     Stage(2.0, 1e-2, 1e-3, 80),
@@ -102,10 +100,8 @@ class Search:
 
     @property
     def fraction(self) -> float:
-        """Completed fraction of the work, from 0 to 1."""
-        polished = max(self.done - self._searching, 0)
-        total = self._searching + POLISHING * self._polished
-        return (self.done - polished + POLISHING * polished) / total
+        """Completed fraction of the steps, from 0 to 1."""
+        return self.done / self.steps
 
     def advance(self) -> None:
         """Do the next step."""

@@ -205,13 +205,15 @@ class Servo(eqx.Module):
         proportional: $K_p$ [N m/rad or N/m].
         derivative: $K_d$ [N m s/rad or N s/m].
         sample_time: Time between two ticks [s].
-        smoothing: Time constant of the low-pass [s].
     """
 
     proportional: Joints
     derivative: Joints
     sample_time: float = 1e-3
-    smoothing: float = 2e-3
+
+
+SMOOTHING = 2e-3
+"""Time constant of the low-pass in a servo [s]."""
 
 
 def follow(
@@ -234,7 +236,7 @@ def follow(
         np.asarray(x, np.float64).tolist()
         for x in (servo.proportional, servo.derivative, limits, resolution)
     )
-    keep = float(np.exp(-servo.sample_time / servo.smoothing))
+    keep = float(np.exp(-servo.sample_time / SMOOTHING))
     gain = (1.0 - keep) / servo.sample_time
     joints = range(n)
     plant.start(*(np.asarray(x)[0] for x in (desired.q, desired.qd, desired.qdd)))

@@ -160,9 +160,7 @@ class WithLeads(AbstractTrajectory):
         return tuple(jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts)
 
 
-def with_leads(
-    series: AbstractTrajectory, robot: Robot, *, periods: int = 1, reach: float = 1.0
-) -> WithLeads:
+def with_leads(series: AbstractTrajectory, robot: Robot, *, periods: int = 1) -> WithLeads:
     """Add a lead-in and a lead-out to a periodic motion, within the robot's limits.
 
     The motion enters the period at the instant that makes the leads shortest. Limits of position,
@@ -175,7 +173,6 @@ def with_leads(
         series: Periodic motion, for instance of a `FourierBasis`.
         robot: Robot whose limits hold.
         periods: Number of periods between the leads.
-        reach: Fraction of every limit that may be used, from 0 to 1.
 
     Raises:
         InputError: If there is no period, the motion is not one of this robot, or no instant of
@@ -193,8 +190,8 @@ def with_leads(
         at = series.motion(phases)
     q, qd, qdd = (np.asarray(x) for x in (at.q, at.qd, at.qdd))
     limits = complete_limits(robot)
-    lead_in, excess_in = _shortest_leads(q, qd, qdd, limits, reach)
-    lead_out, excess_out = _shortest_leads(q, -qd, qdd, limits, reach)
+    lead_in, excess_in = _shortest_leads(q, qd, qdd, limits)
+    lead_out, excess_out = _shortest_leads(q, -qd, qdd, limits)
     total = lead_in.max(axis=1) + lead_out.max(axis=1)
     best = int(np.argmin(total))
     if not np.isfinite(total[best]):
@@ -211,7 +208,7 @@ def with_leads(
 
 
 def _shortest_leads(
-    q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, limits: Limits, reach: float
+    q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, limits: Limits
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the shortest lead of every phase and joint within the limits, and the least excess.
 
@@ -227,15 +224,15 @@ def _shortest_leads(
     place, speed, rate, jerk = (np.stack(values) for values in zip(*found, strict=True))
     low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    excess = np.max(
+    use = np.max(
         [
-            (place.max(0) - middle) / half - reach,
-            (middle - place.min(0)) / half - reach,
-            np.abs(speed).max(0) / limits.velocity - reach,
-            np.abs(rate).max(0) / limits.acceleration - reach,
-            np.abs(jerk).max(0) / limits.jerk - reach,
+            (place.max(0) - middle) / half,
+            (middle - place.min(0)) / half,
+            np.abs(speed).max(0) / limits.velocity,
+            np.abs(rate).max(0) / limits.acceleration,
+            np.abs(jerk).max(0) / limits.jerk,
         ],
         axis=0,
     )
-    durations = np.where(excess <= 1e-9 * reach, T, np.inf).min(axis=0)
-    return durations, excess.min(axis=0) / reach
+    durations = np.where(use - 1.0 <= 1e-9, T, np.inf).min(axis=0)
+    return durations, use.min(axis=0) - 1.0
