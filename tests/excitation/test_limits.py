@@ -23,13 +23,9 @@ def peaks(limits, x, samples=8000):
     rows = limits.basis.rows(np.linspace(0.0, limits.basis.duration, samples))
     q, qd, qdd = (part @ np.asarray(x).T for part in rows[:3])
     own = limits.limits
-    half = (own.position_max - own.position_min) / 2
-    return max(
-        ((q - own.position_max) / half).max(),
-        ((own.position_min - q) / half).max(),
-        (np.abs(qd) / own.velocity - 1).max(),
-        (np.abs(qdd) / own.acceleration - 1).max(),
-    )
+    middle = (own.position_max + own.position_min) / 2
+    use = (q - middle) / (own.position_max - middle), qd / own.velocity, qdd / own.acceleration
+    return np.max(np.abs(use)) - 1.0
 
 
 def test_random_and_restored_motions_keep_limits_and_use_them(limits):

@@ -63,26 +63,14 @@ def test_distances_never_come_out_too_large():
     assert (np.asarray(segment_distance(*ends)) <= np.array(exact) + 1e-15).all()
 
 
-def coal_pose(R, r):
-    coal = pytest.importorskip("coal")
-    return coal.Transform3s(np.ascontiguousarray(R), np.ascontiguousarray(r))
-
-
-def coal_capsule(start, end, radius):
+def coal_capsule(coal, start, end, radius):
     """Coal's capsule about its own z axis, and its pose."""
-    coal = pytest.importorskip("coal")
     length = np.linalg.norm(end - start)
     z = (end - start) / length
     x = np.cross(z, [1.0, 0, 0] if abs(z[0]) < 0.9 else [0, 1.0, 0])
     x /= np.linalg.norm(x)
     R = np.stack([x, np.cross(z, x), z], axis=1)
-    return coal.Capsule(radius, length), coal_pose(R, 0.5 * (start + end))
-
-
-def coal_distance(first, second):
-    coal = pytest.importorskip("coal")
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    return coal.distance(*first, *second, request, result)
+    return coal.Capsule(radius, length), coal.Transform3s(R, 0.5 * (start + end))
 
 
 def a_box():
@@ -95,10 +83,12 @@ def test_boxes_agree_with_coal():
     coal = pytest.importorskip("coal")
     box, ends = a_box(), segments(5, 80)[:2] * 1.5
     found = np.asarray(box.distance(*map(jnp.asarray, ends)))
-    other = coal.Box(*box.size), coal_pose(box.rotation, box.centre)
+    place = coal.Transform3s(np.ascontiguousarray(box.rotation), box.centre)
     compared = 0
     for k in range(80):
-        expected = coal_distance(coal_capsule(ends[0, k], ends[1, k], 1e-9), other)
+        capsule = coal_capsule(coal, ends[0, k], ends[1, k], 1e-9)
+        request, result = coal.DistanceRequest(), coal.DistanceResult()
+        expected = coal.distance(*capsule, coal.Box(*box.size), place, request, result)
         if expected > 1e-3:
             compared += 1
             assert found[k] == pytest.approx(expected, abs=3e-6)

@@ -67,12 +67,3 @@ def test_base_and_tip_frames_multiply_from_both_sides(convention):
     q = random_configuration(robot, 1)
     expected = base @ dh_frames(ROWS[:, :3], q, convention)[-1] @ tip
     np.testing.assert_allclose(tip_transform(robot, q), expected, atol=1e-13)
-
-
-def test_rounded_twists_and_offsets_are_snapped_and_noted():
-    robot = from_dh([(1.5708, 0, 0.1, -3.14159), (0.3, 0, 0, 0)], convention="modified")
-    assert set(np.abs(robot.rotation[0]).ravel()) == {0.0, 1.0}
-    assert robot.notes == (
-        "joint `joint1`: alpha 1.5708 rad snapped to 90 degrees.",
-        "joint `joint1`: theta -3.14159 rad snapped to -180 degrees.",
-    )

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag, eigh
 
 from jaxid.dynamics.model import Model
@@ -78,9 +79,7 @@ def test_energy_is_kept_without_friction(gear):
     elastic = 0.02 if isinstance(gear, FlexibleGear) else 0.0
     assert np.abs(energy - energy[0]).max() < (2e-4 + elastic) * swing
     if not elastic:
-        # The end-state of 4 s, by a Runge-Kutta method of high order.
-        from scipy.integrate import solve_ivp
-
+        # By a Runge-Kutta method of high order.
         def rate(_, x):
             return np.concatenate([x[2:], MODEL.forward_dynamics(PARAMETERS, x[:2], x[2:], ZERO)])
 

@@ -69,9 +69,7 @@ def test_the_same_experiment_gives_the_same_torques(dry, tolerance):
 
 def test_what_mujoco_does_not_know_is_refused():
     virtual = ur10()
-    other = virtual.replace(
-        terms=(*virtual.terms, ConstantOffset()),
-        values=np.concatenate([virtual.values, np.ones(6)]),
-    )
+    values = np.concatenate([virtual.values, np.ones(6)])
+    other = virtual.replace(terms=(*virtual.terms, ConstantOffset()), values=values)
     with pytest.raises(ValueError, match="`terms`"):
         MujocoRobot(other).plant(1e-3)

@@ -122,8 +122,5 @@ def test_leads_are_checked_and_one_period_between_them_is_measured():
     times, instants = basis.times(50), basis.instants(200)
     assert times[0] == pytest.approx(0.4)
     assert times[-1] < 0.4 + basis.series.duration
-    assert instants[0] == 0.0
-    assert instants[-1] == pytest.approx(basis.duration)
+    np.testing.assert_allclose(instants[[0, -1]], [0.0, basis.duration], atol=1e-12)
     assert (np.diff(instants) > 0).all()
-    assert (instants < 0.4).any()
-    assert (instants > basis.duration - 0.4).any()

@@ -41,8 +41,7 @@ def test_speed_and_acceleration_of_the_tip_stay_within_what_was_asked(followed):
     along = np.einsum("ki,ki->k", velocity, acceleration)[speed > 0.05]
     along = np.abs(along) / speed[speed > 0.05]
     assert 2.9 < along.max() <= 3.0 + 1e-6
-    ends = np.cumsum(PATH.durations)[:-1]
-    still = followed.motion(ends)
+    still = followed.motion(np.cumsum(PATH.durations)[:-1])
     np.testing.assert_allclose(still.qd, 0.0, atol=1e-9)
     np.testing.assert_allclose(still.qdd, 0.0, atol=1e-7)
 
@@ -52,8 +51,7 @@ def test_the_attitude_is_held_and_the_joints_stay_within_their_limits(followed):
     R, _ = jax.vmap(lambda q: tip_placement(ROBOT, q))(motion.q)
     np.testing.assert_allclose(R, np.broadcast_to(DOWN, R.shape), atol=1e-9)
     limits = ROBOT.limits
-    assert (motion.q >= limits.position_min).all()
-    assert (motion.q <= limits.position_max).all()
+    assert ((motion.q >= limits.position_min) & (motion.q <= limits.position_max)).all()
     assert (np.abs(motion.qd) <= limits.velocity).all()
     assert (np.abs(motion.qdd) <= limits.acceleration).all()
     # Round the elbow's singular pose, which is the middle of the ranges, the same path is too fast.

@@ -144,12 +144,10 @@ def test_unknown_limits_are_assumed_as_documented():
     robot = robot.replace(limits=Limits(7, position_min=[0.2, *[-np.inf] * 6]))
     s = random_fourier_series(robot, omega=0.8, seed=4)
     m = s.motion(np.linspace(0.0, s.duration, 5000))
-    assert np.min(m.q[:, 0]) >= 0.2
-    assert np.max(m.q[:, 0]) <= 2.2
-    assert np.abs(m.q[:, 1:]).max() <= np.pi
+    assert 0.2 <= np.min(m.q[:, 0]) <= np.max(m.q[:, 0]) <= 2.2
     assert np.abs(m.qd[:, 0]).max() <= 0.5
-    assert np.abs(m.qd[:, 1:]).max() <= np.pi / 2
-    assert np.abs(m.qdd[:, 1:]).max() <= 2 * np.pi
+    for x, limit in ((m.q, np.pi), (m.qd, np.pi / 2), (m.qdd, 2 * np.pi)):
+        assert np.abs(x[:, 1:]).max() <= limit
 
 
 def test_leads_keep_the_limits_and_follow_the_series_between():
@@ -160,8 +158,7 @@ def test_leads_keep_the_limits_and_follow_the_series_between():
         times = np.linspace(0.0, float(led.duration), 10_000)
         m, lim = jax.tree.map(np.asarray, led.motion(times)), robot.limits
         assert np.max([m.q - lim.position_max, lim.position_min - m.q]) <= 1e-8
-        assert (np.abs(m.qd) / lim.velocity).max() <= 1 + 1e-8
-        assert (np.abs(m.qdd) / lim.acceleration).max() <= 1 + 1e-8
+        assert np.max(np.abs([m.qd / lim.velocity, m.qdd / lim.acceleration])) <= 1 + 1e-8
         assert (np.abs(np.asarray(led.jerk(times))) / lim.jerk).max() <= 1 + 1e-6
         begin, end = (float(x) for x in led.window)
         assert end - begin == pytest.approx(2 * inner.duration)
@@ -248,14 +245,11 @@ def test_a_table_has_units_and_exact_numbers(tmp_path):
     trajectory = random_fourier_series(robot, omega=0.8, seed=0)
     write_csv(trajectory, robot, tmp_path / "t.csv", sample_time=0.01)
     table = pl.read_csv(tmp_path / "t.csv")
-    assert table.columns[:3] == ["time [s]", "q_rail [m]", "q_joint1 [rad]"]
-    assert table.columns[8] == "qd_rail [m/s]"
-    assert table.columns[-1] == "qdd_joint6 [rad/s^2]"
+    names = [table.columns[k] for k in (0, 1, 8, -1)]
+    assert names == ["time [s]", "q_rail [m]", "qd_rail [m/s]", "qdd_joint6 [rad/s^2]"]
     times, motion = trajectory.sample(0.01)
     expected = np.column_stack([times, motion.q, motion.qd, motion.qdd])
     np.testing.assert_array_equal(table.to_numpy(), expected)
-    assert np.diff(times).max() <= 0.01 + 1e-15
-    assert times[-1] == trajectory.duration
     with pytest.raises(ValueError, match="`trajectory` must move the 6 joints of `UR10`"):
         write_csv(series(), library.ur10(), tmp_path / "t.csv", sample_time=0.1)
 
