@@ -10,8 +10,9 @@ Each script leaves its figures in `measured/NAME.json`, with machine, versions a
 it ends; all of them are written as tables to `results/measured.md`. A script that fails or takes
 too long keeps its old figures, is named at the end, and the exit code is 1.
 
-`--check` runs every script with `--quick`, and the notebooks. It prints a table of results, writes
-it to `results/check.md`, and exits with 1 if something failed. It measures nothing.
+`--check` runs every script with `--quick`, the notebooks, and the tests with run-time checks of
+shapes. It prints a table of results, writes it to `results/check.md`, and exits with 1 if something
+failed. It measures nothing.
 """
 
 import argparse
@@ -177,11 +178,14 @@ def measure_all(scripts, resume):
     return failed
 
 
-def check(scripts, notebooks):
+def check(scripts, whole):
     """Run everything small, write the table of results, and return the names of what failed."""
     jobs = {f"benchmarks/{s.name}.py --quick": [*s.command, "--quick"] for s in scripts}
-    if notebooks:
+    if whole:
         jobs["notebooks/run_all.py"] = [sys.executable, str(REPOSITORY / "notebooks/run_all.py")]
+        jobs["tests with checked shapes"] = [
+            *("env", "JAXID_CHECK_SHAPES=1", sys.executable, "-m", "pytest")
+        ]
     rows, begun = [], time.perf_counter()
     for name, command in jobs.items():
         start = time.perf_counter()
@@ -206,7 +210,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     known = {script.name: script for script in SCRIPTS}
     parser.add_argument("scripts", nargs="*", help=f"only these: {', '.join(known)}")
-    parser.add_argument("--check", action="store_true", help="everything small, and the notebooks")
+    parser.add_argument(
+        "--check", action="store_true", help="everything small; the tests"
+    )
     parser.add_argument("--resume", action="store_true", help="skip what was measured today")
     parser.add_argument("--methods", action="store_true", help="also the quality of the methods")
     parser.add_argument("--tables", action="store_true", help="only write the tables again")
@@ -220,7 +226,7 @@ def main():
         write_tables()
         return
     if options.check:
-        failed = check(scripts, notebooks=not options.scripts)
+        failed = check(scripts, whole=not options.scripts)
     else:
         failed = measure_all(scripts, options.resume)
     if failed:

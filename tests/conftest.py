@@ -1,4 +1,8 @@
-"""What all tests share: float64, shapes that are enforced, and the measured data where they are."""
+"""What all tests share: float64, and the measured data where they are.
+
+With `JAXID_CHECK_SHAPES=1` shapes and types of all arguments are checked at run time, which takes
+about half of the time of a run: `benchmarks/run.py --check` does so before a release.
+"""
 
 import os
 
@@ -13,7 +17,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 from jaxtyping import install_import_hook
 
-install_import_hook("jaxid", "beartype.beartype")
+if os.environ.get("JAXID_CHECK_SHAPES"):
+    install_import_hook("jaxid", "beartype.beartype")
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,115 +1,21 @@
-"""Golden results: numbers of whole runs that no change of the code may move.
+"""Golden results of the example, of exported models, and of a design with a fixed key.
 
-Each case runs a command of the README, or a design with a fixed key, and compares its numbers with
-those in the JSON file beside this one. The tolerance is 1e-9 relative; `JAXID_GOLDEN_TOLERANCE`
-widens it for machines with other instruction sets. To record new values after an intended change,
-delete the file of that case, run the test, and say in CHANGELOG.md what changed and why.
+Those of measured robots are compared in `tests/real_data`, those of the demo in `test_demo.py`.
 """
 
 import ctypes
-import json
-import os
 import shutil
 import subprocess
-import sys
-from pathlib import Path
 from xml.etree import ElementTree
 
 import jax
 import numpy as np
 import pytest
+from golden_results import TOLERANCE, command, compare, golden, numbers_of_report
 
 import jaxid as jid
-from jaxid import cli
-from jaxid.demo.study import run_study
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
-
-HERE = Path(__file__).resolve().parent
-TOLERANCE = float(os.environ.get("JAXID_GOLDEN_TOLERANCE", "1e-9"))
-LOGS = {
-    "tx40_100hz": ("tx40_100hz.toml", "tx40/motor_position.csv"),
-    "tx40": ("tx40.toml", "tx40/motor_position.csv", "--split", "0.6"),
-    "ur10": ("ur10.toml", "ur10/exciting_measured.csv"),
-    "ur10_split": ("ur10.toml", "ur10/exciting_measured.csv", "--split", "0.6"),
-    "kr300": (
-        "kr300.toml",
-        "kr300/traj_A.csv",
-        "--verify",
-        "kr300/traj_B.csv",
-        "--verify",
-        "kr300/traj_C.csv",
-    ),
-}
-
-
-def command(*words):
-    """Run a command line in this process; fail unless it ends well."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["jaxid", *map(str, words)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-    assert stopped.value.code == 0
-
-
-def numbers_of_report(folder):
-    """Return the numbers of a report that belong to the estimates."""
-    found = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-    errors = found["errors"]["identification"] + found["errors"]["verification"]
-    return {
-        "parameters": {p["name"]: p["estimate"] for p in found["base_parameters"]},
-        "deviations": {p["name"]: p["standard_deviation"] for p in found["base_parameters"]},
-        "condition_numbers": found["fit"]["condition_numbers"],
-        "residual": found["fit"]["residual"],
-        "residual_rms": found["fit"]["residual_rms"],
-        "errors": {e["recording"]: [j["rms"] for j in e["joints"]] for e in errors},
-        "relative_errors": {e["recording"]: e["relative"] for e in errors},
-    }
-
-
-def compare(case, found, tolerance=TOLERANCE):
-    """Compare numbers with the golden file of a case; write it and fail where there is none."""
-    path = HERE / f"{case}.json"
-    if not path.exists():
-        path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-        pytest.fail(f"`{path.name}` was missing and has been recorded: check it, then run again.")
-    _compare(case, json.loads(json.dumps(found)), golden(case), tolerance)
-
-
-def golden(case):
-    """Return the golden values of a case."""
-    return json.loads((HERE / f"{case}.json").read_text(encoding="utf-8"))
-
-
-def _compare(place, found, golden, tolerance):
-    assert type(found) is type(golden), place
-    if isinstance(golden, dict):
-        assert list(found) == list(golden), place
-        # Values of one kind share a scale: a parameter near zero is compared with the largest.
-        flat = all(isinstance(x, float | int) for x in golden.values())
-        if flat and golden and "condition" not in place:
-            _close(place, list(found.values()), list(golden.values()), tolerance)
-            return
-        for key in golden:
-            _compare(f"{place}.{key}", found[key], golden[key], tolerance)
-    else:
-        _close(place, found, golden, tolerance)
-
-
-def _close(place, found, golden, tolerance):
-    found, golden = np.asarray(found, float), np.asarray(golden, float)
-    scale = np.maximum(np.abs(golden), 1e-3 * np.abs(golden).max(initial=0.0))
-    worst = np.max(np.abs(found - golden) / np.where(scale > 0, scale, 1.0), initial=0.0)
-    assert worst <= tolerance, f"{place}: {worst:.1e}"
-
-
-@pytest.mark.parametrize("case", LOGS)
-def test_measured_robots(case, shared_data, tmp_path):
-    experiment, *words = LOGS[case]
-    words = [shared_data / w if w.endswith(".csv") else w for w in words]
-    place = HERE.parent / "real_data" / experiment
-    command("identify", place, *words, "-o", tmp_path / "report")
-    compare(case, numbers_of_report(tmp_path / "report"))
 
 
 @pytest.fixture(scope="module")
@@ -211,21 +117,3 @@ def test_design():
     # A search ends in one of several optima that are nearly equal: its value is what counts.
     (designed,) = [c for c in plan.criteria if c.name == plan.criterion.name]
     assert designed.after <= golden("design")["value"] * 1.02
-
-
-def test_identification_of_the_demo():
-    robot = jid.robots.tx90l_on_rail()
-    motion = jid.random_fourier_series(robot, omega=0.8, reach=0.7, seed=1)
-    study = run_study(0, lambda name, fraction: None, draws=1, periods=1, motion=motion)
-    fit = study.weighted.fit
-    # A servo on quantised encoders with stiction amplifies rounding: a coefficient of the motion
-    # changed by 4e-16 moves these parameters by 1e-4 (relative to the largest of their kind).
-    compare(
-        "demo",
-        {
-            "parameters": dict(zip(fit.base.names, map(float, fit.parameters), strict=True)),
-            "deviations": list(map(float, fit.standard_deviations)),
-            "errors": [study.weighted.mean_errors(k) for k in (0, 1)],
-        },
-        max(TOLERANCE, 2e-3),
-    )

@@ -1,16 +1,14 @@
-"""Measured robots, each identified by one command; the numbers are those of published pipelines.
+"""Measured robots, each identified by the README's command.
 
-`tests/golden` runs the other commands and keeps their numbers, which are compared here.
+The numbers are compared with golden results, and with those of published pipelines.
 """
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-from jaxid import cli
+from golden_results import command, compare, numbers_of_report
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -18,40 +16,33 @@ HERE = Path(__file__).resolve().parent
 
 
 @pytest.fixture
-def identify(shared_data, tmp_path, monkeypatch, capsys):
-    """Runs `jaxid identify` on the logs of a robot and reads its result."""
+def identify(shared_data, tmp_path, capsys):
+    """Run `jaxid identify` on logs, compare with golden results, return result and messages."""
 
-    def identify(experiment, *args):
-        words = [str(shared_data / a) if a.endswith(".csv") else a for a in args]
-        command = ["identify", str(HERE / experiment), *words, "-o", str(tmp_path / "report")]
-        monkeypatch.setattr(sys, "argv", ["jaxid", *command])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        printed = capsys.readouterr()
-        assert stopped.value.code == 0, printed.err
+    def identify(case, experiment, *words):
+        words = [shared_data / word if word.endswith(".csv") else word for word in words]
+        command("identify", HERE / experiment, *words, "-o", tmp_path / "report")
+        compare(case, numbers_of_report(tmp_path / "report"))
         found = json.loads((tmp_path / "report" / "result.json").read_text(encoding="utf-8"))
-        return found, " ".join(printed.out.split())
+        return found, " ".join(capsys.readouterr().out.split())
 
     return identify
 
 
-def golden(case):
-    return json.loads((HERE.parent / "golden" / f"{case}.json").read_text(encoding="utf-8"))
-
-
-def test_tx40_as_a_whole():
-    found = golden("tx40_100hz")
-    assert len(found["parameters"]) == 61
-    assert found["condition_numbers"]["raw"] == pytest.approx(1031, rel=0.02)
-    assert found["residual"] <= 0.052
-    (rms,) = found["errors"].values()
+def test_tx40_as_a_whole(identify):
+    found, _ = identify("tx40_100hz", "tx40_100hz.toml", "tx40/motor_position.csv")
+    assert len(found["base_parameters"]) == 61
+    assert found["fit"]["condition_numbers"]["raw"] == pytest.approx(1031, rel=0.02)
+    assert found["fit"]["residual"] <= 0.052
+    rms = [joint["rms"] for joint in found["errors"]["identification"][0]["joints"]]
     np.testing.assert_allclose(rms, [1.52, 1.49, 1.06, 0.50, 0.98, 0.52], rtol=0.05)
-    viscous = [found["parameters"][f"fv{i}"] for i in range(1, 7)]
+    estimates = {p["name"]: p["estimate"] for p in found["base_parameters"]}
+    viscous = [estimates[f"fv{i}"] for i in range(1, 7)]
     np.testing.assert_allclose(viscous, [8.05, 5.53, 1.97, 1.11, 1.86, 0.65], rtol=0.05)
 
 
 def test_tx40_split_in_time(identify):
-    found, _ = identify("tx40.toml", "tx40/motor_position.csv", "--split", "0.6")
+    found, _ = identify("tx40", "tx40.toml", "tx40/motor_position.csv", "--split", "0.6")
     train, test = (
         np.array([joint["mean_percent"] for joint in found["errors"][role][0]["joints"]])
         for role in ("identification", "verification")
@@ -64,19 +55,23 @@ def test_tx40_split_in_time(identify):
     assert found["fit"]["undetermined"] == []
 
 
-def test_ur10():
-    found = golden("ur10")
-    assert len(found["parameters"]) == 58
-    assert found["residual"] <= 0.053
-    assert found["condition_numbers"]["raw"] == pytest.approx(133, rel=0.02)
-    train, test = golden("ur10_split")["relative_errors"].values()
-    assert train <= 0.046
-    assert test <= 0.077
+def test_ur10(identify):
+    found, _ = identify("ur10", "ur10.toml", "ur10/exciting_measured.csv")
+    assert len(found["base_parameters"]) == 58
+    assert found["fit"]["residual"] <= 0.053
+    assert found["fit"]["condition_numbers"]["raw"] == pytest.approx(133, rel=0.02)
+
+
+def test_ur10_split_in_time(identify):
+    log = ("ur10/exciting_measured.csv", "--split", "0.6")
+    found, _ = identify("ur10_split", "ur10.toml", *log)
+    assert found["errors"]["identification"][0]["relative"] <= 0.046
+    assert found["errors"]["verification"][0]["relative"] <= 0.077
 
 
 def test_kr300_is_said_to_be_undetermined_and_a_ridge_transfers(identify):
     verify = ("--verify", "kr300/traj_B.csv", "--verify", "kr300/traj_C.csv")
-    found, printed = identify("kr300.toml", "kr300/traj_A.csv", *verify)
+    found, printed = identify("kr300", "kr300.toml", "kr300/traj_A.csv", *verify)
     assert len(found["base_parameters"]) == 58
     assert len(found["fit"]["undetermined"]) >= 5
     pairs = [set(direction["parameters"]) for direction in found["fit"]["undetermined"]]
