@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -157,12 +157,7 @@ def _with_motion(widest: Observations, own: Observations) -> Observations:
     return widest.replace(motion=own.motion)
 
 
-def _held_out_errors(
-    problem: RegressionProblem,
-    test: RegressionProblem,
-    estimator: AbstractEstimator,
-    squares: Float[np.ndarray, " joints"],
-) -> Float[np.ndarray, " folds"]:
+def _held_out_errors(problem, test, estimator: AbstractEstimator, squares) -> np.ndarray:
     """Return the errors on held-out parts, relative to the forces of all parts."""
     folds = cross_validation_folds(problem.blocks), cross_validation_folds(test.blocks)
     pairs = [(rest, part) for (rest, _), (_, part) in zip(*folds, strict=True)]
@@ -184,21 +179,17 @@ def _correlation(problem: RegressionProblem, estimator: AbstractEstimator) -> fl
     return float(np.mean(product / np.where(power > 0, power, 1.0)))
 
 
-class Elimination(eqx.Module):
+class Elimination(NamedTuple):
     """One step of backward elimination.
 
     Attributes:
         name: Base parameter that is eliminated; empty before the first step.
-        deviation: Its standard deviation relative to its size.
         remaining: Number of remaining parameters.
-        error: Weighted error on the rows themselves, relative to the forces.
         held_out: Weighted error on held-out blocks of time, relative to the forces.
     """
 
-    name: str = eqx.field(static=True)
-    deviation: float
-    remaining: int = eqx.field(static=True)
-    error: float
+    name: str
+    remaining: int
     held_out: float
 
 
@@ -291,20 +282,16 @@ def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination],
     naive = _naive_deviations(factors, weights, *_solve(R, z, kept))
     deviations = np.asarray(fit.standard_deviations)
     known = np.isfinite(deviations) & (naive > 0)
-    ratio = np.where(known, deviations / np.where(naive > 0, naive, 1.0), np.inf)
-    path, sets, name, deviation = [], [], "", 0.0
+    ratio = np.divide(deviations, naive, out=np.full_like(naive, np.inf), where=known)
+    path, sets, name = [], [], ""
     while kept:
-        p, B = _solve(R, z, kept)
-        error = float(squares @ factors.residual_squares(p))
         held_out = sum(squares @ x.residual_squares(_solve(A, b, kept)[0]) for A, b, x in folds)
-        errors = float(np.sqrt(error / total)), float(np.sqrt(held_out / total))
         sets.append(list(kept))
-        path.append(Elimination(name, deviation, len(kept), *errors))
+        path.append(Elimination(name, len(kept), float(np.sqrt(held_out / total))))
+        p, B = _solve(R, z, kept)
         size = np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
         relative = ratio[kept] * _naive_deviations(factors, weights, p, B) / size
-        worst = int(np.argmax(relative))
-        name, deviation = fit.base.names[kept[worst]], float(relative[worst])
-        del kept[worst]
+        name = fit.base.names[kept.pop(int(np.argmax(relative)))]
     return path, sets
 
 
@@ -316,9 +303,7 @@ def _solve(R: np.ndarray, z: np.ndarray, kept: list[int]) -> tuple[np.ndarray, n
     return p, B
 
 
-def _naive_deviations(
-    factors: Factors, weights: np.ndarray, p: np.ndarray, B: np.ndarray
-) -> np.ndarray:
+def _naive_deviations(factors: Factors, weights, p: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return standard deviations for independent rows, and a variance of each joint."""
     variances = factors.residual_squares(p) / np.maximum(factors.rows, 1)
     total = np.zeros(B.shape[1])

@@ -22,11 +22,9 @@ from jaxid.identification.estimators.friction import (
     search_shapes,
 )
 from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.factors import Blocks
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.uncertainty import Uncertainty
 from jaxid.measurement.observations import Observations, Progress
 
 
@@ -130,14 +128,7 @@ def identify_nonlinear(
     fit = fit_problem(RegressionProblem(shaped, recordings), estimator.linear)
     linearised = _with_slopes(shaped, dataclasses.replace(shapes, model=shaped.model), x, fit)
     both = fit_problem(RegressionProblem(linearised, recordings), estimator.linear).uncertainty
-    covariance = np.asarray(both.covariance)
-    uncertainty = Uncertainty(
-        covariance[:size, :size],
-        np.asarray(both.dof)[:size],
-        np.asarray(both.naive_covariance)[:size, :size],
-        None if both.jackknife is None else np.asarray(both.jackknife)[:size],
-        both.notes,
-    )
+    uncertainty = jax.tree.map(lambda x: x[(slice(size),) * x.ndim], both)
     return NonlinearFit(
         fit=dataclasses.replace(
             fit, uncertainty=uncertainty, estimator=estimator, notes=(*fit.notes, *notes)
@@ -145,19 +136,13 @@ def identify_nonlinear(
         names=tuple(name for name, _ in shapes.parameters),
         units=tuple(unit for _, unit in shapes.parameters),
         shapes=x,
-        shape_covariance=covariance[size:, size:],
+        shape_covariance=both.covariance[size:, size:],
         linear=before,
         held_out=_held_out_errors(linear_problem.blocks, separable, x, weights, progress),
     )
 
 
-def _held_out_errors(
-    blocks: Blocks,
-    problem: SeparableProblem,
-    found: Float[np.ndarray, " shapes"],
-    weights: Float[np.ndarray, " joints"],
-    progress: Progress | None,
-) -> HeldOutErrors:
+def _held_out_errors(blocks, problem: SeparableProblem, found, weights, progress) -> HeldOutErrors:
     """Test both models on held-out blocks; searches begin at the shapes of all blocks."""
     squares, errors, count = weights**2, [], len(blocks.parts)
     folds = [part.tolist() for part in np.array_split(np.arange(count), min(5, count))]
@@ -209,9 +194,7 @@ class ShapeSlopes(AbstractTerm):
         return jax.jacfwd(forces)(jnp.asarray(self.x, q.dtype))
 
 
-def _with_slopes(
-    base: BaseParameters, shapes: Shapes, x: Float[np.ndarray, " shapes"], fit: Fit
-) -> BaseParameters:
+def _with_slopes(base: BaseParameters, shapes: Shapes, x: np.ndarray, fit: Fit) -> BaseParameters:
     """Return base parameters with small changes of shapes as further parameters."""
     model, n = base.model, base.model.size
     p = np.asarray(base.to_standard(np.asarray(fit.parameters)))

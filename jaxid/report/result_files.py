@@ -384,8 +384,7 @@ def consistency_record(fit: Fit) -> dict[str, Any] | None:
             active_bounds="active",
             shares_of_a_body="margins",
         ),
-        "proved": found.outcome.name == "CERTIFIED",
-        "outcome": found.outcome.value,
+        "proved": found.certified,
         "masses_from_bounds": [f"m{k + 1}" for k in found.masses_from_bounds],
         "standard_parameters": _rows(
             name=model.parameter_names,

@@ -6,23 +6,14 @@ import virtual
 
 import jaxid as jid
 
-ROBOT = jid.robots.planar_arm(3)
-MODEL = jid.Model(
-    ROBOT, (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
-)
-BASE = jid.base_parameters(MODEL)
+BASE = virtual.planar_base(3)
+MODEL = BASE.model
 P = virtual.standard_parameters(MODEL, seed=1)
 WLS = jid.estimators.LeastSquares()
 
 
-def without_offsets():
-    """Parameters of an arm whose offsets, and the viscous friction of joint 2, are zero."""
-    zero = [name.startswith("fo") or name == "fv2" for name in MODEL.parameter_names]
-    return np.where(zero, 0.0, P)
-
-
 def test_parameters_without_effect_are_eliminated():
-    p = without_offsets()
+    p = np.where([n[:2] == "fo" or n == "fv2" for n in MODEL.parameter_names], 0.0, P)
     o = virtual.observations(MODEL, p, noise=0.3, samples=800)
     fit = jid.identify(BASE, o, WLS)
     found = jid.essential_parameters(fit, o, cost=0.001)
@@ -30,21 +21,10 @@ def test_parameters_without_effect_are_eliminated():
     truth = np.asarray(BASE.from_standard(p))
     large = {n for n, x in zip(BASE.names, truth, strict=True) if abs(x) > 0.2}
     assert large <= set(found.fit.base.names)
-    assert found.fit.base.size == BASE.size - len(found.eliminated)
     kept = [BASE.names.index(n) for n in found.fit.base.names]
     error = np.abs(found.fit.parameters - truth[kept])
     assert (error < 5 * found.fit.standard_deviations).all()
-    # The remaining parameters are known better than before.
-    ratio = found.fit.standard_deviations / fit.standard_deviations[kept]
-    assert ratio.max() < 1.2
-    assert ratio.min() < 0.9
-    assert f"{found.last.remaining} of {BASE.size} base parameters are essential" in str(found)
-    # The path leads from all parameters to one, with growing error.
     assert [s.remaining for s in found.path] == list(range(BASE.size, 0, -1))
-    assert found.path[0].name == ""
-    assert len({s.name for s in found.path}) == BASE.size
-    assert (np.diff([s.error for s in found.path]) >= -1e-12).all()
-    assert found.path[0].error == pytest.approx(fit.residual, rel=1e-9)
     most = 1.001 * min(s.held_out for s in found.path)
     assert found.last.held_out <= most
     assert found.path[found.path.index(found.last) + 1].held_out > most
@@ -62,9 +42,8 @@ def noisy_log():
     w = 2 * np.pi * np.array([0.3, 0.9, 2.0])[:, None]
     rng = np.random.default_rng(11)
     phase, a = rng.uniform(0, 6, (3, 3)), np.array([0.7, 0.3, 0.12])[:, None]
-    q = np.sum(a * np.sin(w * t + phase), axis=1)
-    qd = np.sum(a * w * np.cos(w * t + phase), axis=1)
-    qdd = np.sum(-a * w**2 * np.sin(w * t + phase), axis=1)
+    z = a * np.exp(1j * (w * t + phase))
+    q, qd, qdd = (np.sum((1j * w) ** k * z, axis=1).imag for k in range(3))
     forces = np.asarray(MODEL.inverse_dynamics(P, jid.Motion(q, qd, qdd)))
     bits = 2 * np.pi / 2**16
     noise = rng.normal(0.0, 0.5, forces.shape)
@@ -88,7 +67,6 @@ def test_a_filter_is_chosen_between_too_low_and_too_high(noisy_log):
     assert found.curve[-1] > 1.1 * found.curve.min()
     assert found.correlations[0] > found.correlations[-1]
     assert told[-1] == 1.0
-    assert f"a cut-off of {best:.3g} Hz" in str(found)
     white = jid.choose_filter(BASE, noisy_log, candidates, estimator=WLS, criterion="whiteness")
     np.testing.assert_array_equal(white.errors, found.errors)
     good = found.curve <= 1.05 * found.curve.min()

@@ -5,14 +5,16 @@ import inspect
 import numpy as np
 import pytest
 from scipy import optimize
-from virtual import dense, observations, standard_parameters
+from virtual import dense, observations, planar_base, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Factors
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
-MEASURED = jid.estimators.ResidualVariances(0)
+est = jid.estimators
+MEASURED = est.ResidualVariances(0)
+NOISE = np.array([0.5, 0.1])
 
 
 class Known(AbstractTrajectory):
@@ -32,42 +34,28 @@ class Known(AbstractTrajectory):
 
 @pytest.fixture(scope="module")
 def base():
-    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(), jid.ConstantOffset())
-    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+    return planar_base()
 
 
 @pytest.fixture(scope="module")
 def noisy(base):
-    p = standard_parameters(base.model)
-    return observations(base.model, p, noise=np.array([0.5, 0.1]))
+    return observations(base.model, standard_parameters(base.model), noise=NOISE)
 
 
 def members(o, size=1.0):
+    # Standard parameters of a bad CAD model: without a ridge they do nothing.
+    rough = np.linspace(-size, size, 26)
     return (
-        jid.estimators.LeastSquares(),
+        est.LeastSquares(),
         jid.WeightedLeastSquares(MEASURED),
-        jid.WeightedLeastSquares(jid.estimators.ResidualVariances()),
-        jid.estimators.IterativelyReweighted(jid.estimators.Huber(), MEASURED),
-        jid.estimators.IterativelyReweighted(jid.estimators.Tukey(), MEASURED),
-        jid.estimators.GeneralisedLeastSquares(),
-        jid.estimators.InstrumentalVariables((Known(o.motion, o.sample_time),), MEASURED),
-        jid.estimators.RelativeTo(
-            size * rough(o.joints),
-            jid.estimators.IterativelyReweighted(jid.estimators.Tukey(), MEASURED),
-        ),
-        jid.estimators.RelativeTo(size * rough(o.joints), jid.WeightedLeastSquares(MEASURED)),
+        jid.WeightedLeastSquares(est.ResidualVariances()),
+        est.IterativelyReweighted(est.Huber(), MEASURED),
+        est.IterativelyReweighted(est.Tukey(), MEASURED),
+        est.GeneralisedLeastSquares(),
+        est.InstrumentalVariables((Known(o.motion, o.sample_time),), MEASURED),
+        est.RelativeTo(rough, est.IterativelyReweighted(est.Tukey(), MEASURED)),
+        est.RelativeTo(rough, jid.WeightedLeastSquares(MEASURED)),
     )
-
-
-def rough(joints):
-    """Standard parameters of a bad CAD model; without a ridge they do nothing."""
-    return np.linspace(-1.0, 1.0, 13 * joints)
-
-
-def with_forces(o, change):
-    forces = np.array(o.forces)
-    change(forces)
-    return o.replace(forces=forces)
 
 
 @pytest.fixture(scope="module", params=range(9))
@@ -109,20 +97,19 @@ def test_every_estimator_goes_through_logs_in_parts(base, noisy, member, monkeyp
 def alone(base, noisy, k):
     """Estimate with a member from factors alone."""
     blocks = jid.RegressionProblem(base, [noisy]).blocks
-    problem = jid.RegressionProblem(base, blocks=blocks)
-    return jid.identification.identify.fit_problem(problem, members(noisy)[k])
+    return members(noisy)[k](jid.RegressionProblem(base, blocks=blocks))
 
 
 def weighted(weights):
-    return jid.WeightedLeastSquares(jid.estimators.GivenWeights(weights))
+    return jid.WeightedLeastSquares(est.GivenWeights(weights))
 
 
 GIVEN = np.array([0.025, 0.2])
 LINEAR = [
-    jid.estimators.LeastSquares(),
+    est.LeastSquares(),
     weighted(GIVEN),
-    jid.estimators.LeastSquares(jid.estimators.Truncated(1e-6)),
-    jid.WeightedLeastSquares(jid.estimators.GivenWeights(GIVEN), jid.estimators.Ridge(0.1)),
+    est.LeastSquares(est.Truncated(1e-6)),
+    jid.WeightedLeastSquares(est.GivenWeights(GIVEN), est.Ridge(0.1)),
 ]
 
 
@@ -135,9 +122,8 @@ def test_forces_that_add_up_give_parameters_that_do(base, noisy, estimator):
     np.testing.assert_allclose(total, p - 1.7 * q, rtol=1e-8, atol=1e-8 * np.abs(p).max())
 
 
-@pytest.mark.parametrize("power", [-40, 33])
-def test_only_the_ratio_of_weights_counts(base, noisy, power):
-    one, other = (jid.identify(base, noisy, weighted(c * GIVEN)) for c in (1.0, 2.0**power))
+def test_only_the_ratio_of_weights_counts(base, noisy):
+    one, other = (jid.identify(base, noisy, weighted(c * GIVEN)) for c in (1.0, 2.0**-40))
     np.testing.assert_allclose(other.parameters, one.parameters, rtol=1e-9)
     np.testing.assert_allclose(other.standard_deviations, one.standard_deviations, rtol=1e-9)
 
@@ -172,30 +158,17 @@ def test_order_division_and_rows_that_do_not_count_change_nothing(base, noisy):
 ONES = np.ones((3, 20, 3))
 identify = inspect.unwrap(jid.identify)  # tests check annotations first, users do not
 REFUSALS = [
-    (lambda base, o: jid.identify(base, o, weighted(np.zeros(2))), "`weights`"),
-    (lambda base, o: jid.identify(base, o, weighted([1.0, -1.0])), "`weights`"),
     (lambda base, o: jid.identify(base, o, weighted([np.nan, 1.0])), "`weights`"),
     (lambda base, o: jid.identify(base, o, weighted(np.ones(3))), "`weights`.*2 joints"),
-    (lambda base, o: jid.estimators.Truncated(2.0), "`rcond`"),
-    (lambda base, o: jid.estimators.Ridge(-1.0), "`strength`"),
-    (lambda base, o: jid.estimators.Ridge(np.nan), "`strength`"),
-    (lambda base, o: jid.estimators.Huber(np.nan), "`limit`"),
-    (lambda base, o: jid.estimators.Tukey(0.0), "`limit`"),
-    (lambda base, o: jid.identify(base, o, jid.estimators.RelativeTo(np.ones(5))), "`parameters`"),
-    (
-        lambda base, o: jid.identify(
-            base, o, jid.estimators.InstrumentalVariables((Known(o.motion, 0.1),) * 2, MEASURED)
-        ),
-        "`references`",
-    ),
+    (lambda base, o: est.Truncated(2.0), "`rcond`"),
+    (lambda base, o: est.Ridge(np.nan), "`strength`"),
+    (lambda base, o: est.Tukey(0.0), "`limit`"),
+    (lambda base, o: jid.identify(base, o, est.RelativeTo(np.ones(5))), "`parameters`"),
+    (lambda base, o: jid.identify(base, o, est.InstrumentalVariables(())), "`references`"),
     (lambda base, o: identify(base, o.motion), "`observations`"),
     (lambda base, o: identify(base.model, o), "`base`"),
     (lambda base, o: jid.identify(base, o, LINEAR[0]).predict(jid.Motion(*ONES)), "`motion`"),
     (lambda base, o: jid.Recording.of(1j * ONES[0], ONES[0], sample_time=0.1), "complex"),
-    (
-        lambda base, o: jid.Recording.of(*ONES[:2], sample_time=0.1, largest_gap=-1),
-        "`largest_gap`",
-    ),
     *[(lambda base, o, k=k: alone(base, o, k), "only their factors") for k in range(3, 8)],
 ]
 
@@ -206,7 +179,7 @@ def test_what_cannot_be_is_rejected(base, noisy, make, named):
         make(base, noisy)
 
 
-@pytest.mark.parametrize("loss", [jid.estimators.Huber(), jid.estimators.Tukey()])
+@pytest.mark.parametrize("loss", [est.Huber(), est.Tukey()])
 def test_a_loss_is_consistent_with_itself(loss):
     x = np.linspace(-8, 8, 4001)
     felt = x * loss.weight(x)
@@ -221,16 +194,15 @@ def test_a_loss_is_consistent_with_itself(loss):
 
 def test_huber_minimises_its_loss(base, noisy):
     """scipy's least squares with the same scales as an oracle."""
-    o = with_forces(noisy, lambda f: np.add(f[::17], 5.0, out=f[::17]))
-    estimator = jid.estimators.IterativelyReweighted(
-        jid.estimators.Huber(), MEASURED, tolerance=1e-9
-    )
+    wild = np.arange(noisy.samples) % 17 == 0
+    o = noisy.replace(forces=np.asarray(noisy.forces) + 5.0 * wild[:, None])
+    estimator = est.IterativelyReweighted(est.Huber(), MEASURED, tolerance=1e-9)
     fit = jid.identify(base, o, estimator)
     theta, forces, joint = dense(base, o)
     r = forces - theta @ fit.parameters
     scale = np.array([1.4826 * np.median(np.abs(r[joint == j])) for j in range(2)])[joint]
     size = np.asarray(fit.weights)[joint] * scale
-    c = jid.estimators.Huber().limit
+    c = est.Huber().limit
 
     def residuals(p):
         x = np.abs((forces - theta @ p) / scale)
@@ -243,8 +215,8 @@ def test_huber_minimises_its_loss(base, noisy):
 
 def test_a_ridge_towards_a_prior_is_solved_as_numpy_does(base, noisy):
     share, prior = 0.3, 1.1 * standard_parameters(base.model)
-    ridge = jid.WeightedLeastSquares(MEASURED, jid.estimators.Ridge(share))
-    fit = jid.identify(base, noisy, jid.estimators.RelativeTo(prior, ridge))
+    ridge = jid.WeightedLeastSquares(MEASURED, est.Ridge(share))
+    fit = jid.identify(base, noisy, est.RelativeTo(prior, ridge))
     theta, forces, joint = dense(base, noisy)
     w = np.asarray(fit.weights)[joint]
     A, b = theta * w[:, None], forces * w
@@ -259,17 +231,15 @@ def test_a_ridge_towards_a_prior_is_solved_as_numpy_does(base, noisy):
     assert np.linalg.norm(fit.parameters - truth) < np.linalg.norm(plain.parameters - truth)
 
 
-@pytest.mark.parametrize(
-    ("loss", "gain"), [(jid.estimators.Huber(), 3.0), (jid.estimators.Tukey(), 5.0)]
-)
+@pytest.mark.parametrize(("loss", "gain"), [(est.Huber(), 3.0), (est.Tukey(), 5.0)])
 def test_outliers_do_little(base, loss, gain):
     p = standard_parameters(base.model)
     truth = np.asarray(base.from_standard(p))
-    o = observations(base.model, p, samples=1500, noise=np.array([0.5, 0.1]))
+    o = observations(base.model, p, samples=1500, noise=NOISE)
     wild = np.random.default_rng(5).random(1500) < 0.05
-    o = with_forces(o, lambda f: np.add(f, np.where(wild[:, None], [20.0, 4.0], 0.0), out=f))
+    o = o.replace(forces=np.asarray(o.forces) + np.where(wild[:, None], [20.0, 4.0], 0.0))
     plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
-    fit = jid.identify(base, o, jid.estimators.IterativelyReweighted(loss, MEASURED))
+    fit = jid.identify(base, o, est.IterativelyReweighted(loss, MEASURED))
     size = plain.naive_standard_deviations
     errors = [np.linalg.norm((f.parameters - truth) / size) for f in (fit, plain)]
     assert gain * errors[0] < errors[1]
@@ -282,8 +252,8 @@ def test_correlated_joints_are_solved_as_numpy_does(base):
     o = observations(base.model, p, mask=mask)
     S = np.array([[1.0, 0.9 * 0.3], [0.9 * 0.3, 0.09]])
     noise = np.random.default_rng(3).standard_normal((400, 2)) @ np.linalg.cholesky(S).T
-    o = with_forces(o, lambda f: np.add(f, noise, out=f))
-    fit = jid.identify(base, o, jid.estimators.GeneralisedLeastSquares(iterations=4))
+    o = o.replace(forces=np.asarray(o.forces) + noise)
+    fit = jid.identify(base, o, est.GeneralisedLeastSquares(iterations=4))
     theta, forces, joint = dense(base, o)
     r = np.full((400, 2), np.nan)
     r[mask] = forces - theta @ fit.parameters
@@ -297,8 +267,6 @@ def test_correlated_joints_are_solved_as_numpy_does(base):
         theta.T @ np.linalg.solve(V, theta), theta.T @ np.linalg.solve(V, forces)
     )
     np.testing.assert_allclose(fit.parameters, expected, rtol=1e-4, atol=1e-4)
-    plain = jid.identify(base, o, jid.WeightedLeastSquares(jid.estimators.ResidualVariances()))
-    assert np.median(fit.standard_deviations / plain.standard_deviations) < 0.9
 
 
 def test_instruments_take_the_bias_of_noisy_columns_away(base):
@@ -308,20 +276,20 @@ def test_instruments_take_the_bias_of_noisy_columns_away(base):
     p = standard_parameters(base.model)
     truth = np.asarray(base.from_standard(p))
     clean = observations(base.model, p, samples=3000, noise=0.1)
-    errors = {"plain": [], "instruments": []}
     reference = Known(clean.motion, clean.sample_time)
+    estimators = (
+        est.InstrumentalVariables((reference,), MEASURED),
+        jid.WeightedLeastSquares(MEASURED),
+    )
+    errors = []
     for seed in range(12):
         random = np.random.default_rng(seed)
         noise = [s * random.standard_normal((3000, 2)) for s in (0.003, 0.1, 1.5)]
         m = clean.motion
         o = clean.replace(motion=jid.Motion(m.q + noise[0], m.qd + noise[1], m.qdd + noise[2]))
-        plain = jid.identify(base, o, jid.WeightedLeastSquares(MEASURED))
-        fit = jid.identify(base, o, jid.estimators.InstrumentalVariables((reference,), MEASURED))
-        errors["plain"].append(plain.parameters - truth)
-        errors["instruments"].append(fit.parameters - truth)
+        errors.append([jid.identify(base, o, x).parameters - truth for x in estimators])
     # Means over the draws, in units of what chance lets them scatter.
-    bias = {
-        k: np.mean(e, axis=0) / (np.std(e, axis=0, ddof=1) / np.sqrt(12)) for k, e in errors.items()
-    }
-    assert np.sqrt(np.mean(bias["instruments"] ** 2)) < 1.6
-    assert np.sqrt(np.mean(bias["plain"] ** 2)) > 6.0
+    bias = np.mean(errors, axis=0) / (np.std(errors, axis=0, ddof=1) / np.sqrt(12))
+    instruments, plain = np.sqrt(np.mean(bias**2, axis=1))
+    assert instruments < 1.6
+    assert plain > 6.0

@@ -27,13 +27,13 @@ class BodyBounds(eqx.Module):
         total_mass: Mass of all bodies together [kg], like `120.0`; None if unknown.
     """
 
-    mass_max: Float[AnyArray, " bodies"]
-    radius: Float[AnyArray, " bodies"]
-    mass_min: Float[AnyArray, " bodies"]
-    centre_min: Float[AnyArray, "bodies 3"]
-    centre_max: Float[AnyArray, "bodies 3"]
-    ellipsoid_centre: Float[AnyArray, "bodies 3"]
-    ellipsoid_axes: Float[AnyArray, "bodies 3"]
+    mass_max: Float[np.ndarray, " bodies"]
+    radius: Float[np.ndarray, " bodies"]
+    mass_min: Float[np.ndarray, " bodies"]
+    centre_min: Float[np.ndarray, "bodies 3"]
+    centre_max: Float[np.ndarray, "bodies 3"]
+    ellipsoid_centre: Float[np.ndarray, "bodies 3"]
+    ellipsoid_axes: Float[np.ndarray, "bodies 3"]
     total_mass: float | None
 
     def __init__(
@@ -141,7 +141,7 @@ class BodyBounds(eqx.Module):
     @property
     def has_ellipsoid(self) -> Bool[np.ndarray, " bodies"]:
         """Whether bodies have an ellipsoid for their centre of mass."""
-        return np.asarray(np.isfinite(np.asarray(self.ellipsoid_axes)).all(axis=1))
+        return np.isfinite(self.ellipsoid_axes).all(axis=1)
 
     @property
     def inner_centres(self) -> Float[np.ndarray, "bodies 3"]:
@@ -150,7 +150,7 @@ class BodyBounds(eqx.Module):
         Raises:
             InputError: If there are none for some body.
         """
-        radius = np.asarray(self.radius)[:, None]
+        radius = self.radius[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
         axes = np.where(self.has_ellipsoid[:, None], self.ellipsoid_axes, radius)
@@ -225,10 +225,8 @@ class ParameterPrior(eqx.Module):
     deviations: Float[AnyArray, " standard"]
 
     def __check_init__(self):
-        if np.shape(self.parameters) != np.shape(self.deviations):
+        shape, deviations = np.shape(self.parameters), np.asarray(self.deviations)
+        if shape != deviations.shape or not (deviations > 0.0).all():
             raise InputError(
-                "`parameters` and `deviations` of a prior must be as many, but are "
-                f"{np.shape(self.parameters)} and {np.shape(self.deviations)}."
+                f"`deviations` of a prior must be positive and as many as `parameters`, {shape}."
             )
-        if not (np.asarray(self.deviations) > 0.0).all():
-            raise InputError("`deviations` of a prior must be positive.")

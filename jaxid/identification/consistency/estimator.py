@@ -1,11 +1,9 @@
 """Physically consistent estimation: parameters of bodies that can exist, of one or many logs."""
 
 import dataclasses
-import enum
 import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
-from types import ModuleType
 
 import equinox as eqx
 import jax
@@ -27,7 +25,6 @@ from jaxid.identification.consistency.program import (
     scaled_rows,
 )
 from jaxid.identification.consistency.pseudo_inertia import (
-    Values,
     consistency_margin,
     pseudo_inertia,
 )
@@ -39,20 +36,12 @@ from jaxid.identification.estimators import (
     MaximumForces,
 )
 
-
-class Outcome(enum.Enum):
-    """Outcomes of the search for the optimum."""
-
-    CERTIFIED = "the optimum was found, with a proof of its error bound."
-    STALLED = (
-        "rounding kept the error bound from falling below its tolerance: the data are scaled "
-        "badly, or bounds nearly contradict each other; widen the bounds, or pass `throw=False` "
-        "to accept the estimate with its error bound."
-    )
-    ITERATIONS = (
-        "the iterations did not suffice for the error bound to fall below its tolerance; pass "
-        "`throw=False` to accept the estimate with its error bound."
-    )
+UNPROVED = (
+    "the search ended before its error bound fell below its tolerance: the data are scaled badly, "
+    "or bounds nearly contradict each other; widen the bounds, or pass `throw=False` to accept the "
+    "estimate with its error bound."
+)
+"""What a user reads where the optimum was not proved."""
 
 
 class Consistency(eqx.Module):
@@ -64,7 +53,7 @@ class Consistency(eqx.Module):
         bounds: Bounds of the bodies.
         residual_increase: Relative increase of the norm of the weighted residuals by the bounds.
         error_bound: Bound of the objective's relative distance to the optimum.
-        outcome: Outcome of the search.
+        certified: Whether the error bound is below its tolerance: a proof of the optimum.
         iterations: Number of iterations of the search.
         determined: Standard parameters that the data determine alone, without the bounds.
         active: Names of the active bounds.
@@ -75,7 +64,7 @@ class Consistency(eqx.Module):
     bounds: BodyBounds
     residual_increase: float
     error_bound: float
-    outcome: Outcome = eqx.field(static=True)
+    certified: bool = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
     determined: Bool[np.ndarray, " standard"]
     active: tuple[str, ...] = eqx.field(static=True)
@@ -143,27 +132,26 @@ class PhysicallyConsistent(AbstractEstimator):
         R, z = rows.factors.weighted(weights)
         feasible = self.feasible_set(base)
         data, program = self.program(np, base, feasible, R, z, int(rows.factors.rows.sum()))
-        optimum, outcome = _solve(program)
+        program.require_interior()
+        optimum = solver.solve_in_numpy(program)
         error_bound = float(optimum.error / max(optimum.value, program.scale))
-        if self.throw and outcome is not Outcome.CERTIFIED:
+        if self.throw and not optimum.certified:
             raise RuntimeError(
-                f"no physically consistent estimate with a proof: {outcome.value} The bound is "
+                f"no physically consistent estimate with a proof: {UNPROVED} The bound is "
                 f"{error_bound:.1e} of the objective."
             )
         p = feasible.standard_parameters(np, data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
-        ours, best = (
-            float(np.sum((R @ x - z) ** 2)) for x in (parameters, np.asarray(free.parameters))
-        )
+        ours, best = (float(np.sum((R @ x - z) ** 2)) for x in (parameters, free.parameters))
         found = Consistency(
             bodies=bodies,
             margins=consistency_margin(bodies),
             bounds=feasible.bounds,
             residual_increase=float(np.sqrt(ours / best) - 1.0) if best > 0 else np.inf,
             error_bound=error_bound,
-            outcome=outcome,
+            certified=bool(optimum.certified),
             iterations=int(optimum.iterations),
             determined=np.array([x is Identifiability.ALONE for x in base.identifiability]),
             active=_active_bounds(base, feasible, program, optimum, bodies),
@@ -175,8 +163,8 @@ class PhysicallyConsistent(AbstractEstimator):
             "standard deviations are those of the estimate without bounds: where bounds are "
             "active, estimates scatter less.",
         ]
-        if outcome is not Outcome.CERTIFIED:
-            notes.append(outcome.value)
+        if not optimum.certified:
+            notes.append(UNPROVED)
         changes = {"parameters": parameters, "standard": p, "consistency": found}
         return dataclasses.replace(free, **changes, notes=tuple(notes))
 
@@ -190,23 +178,12 @@ class PhysicallyConsistent(AbstractEstimator):
         bounds = BodyBounds.from_geometry(robot) if self.bounds is None else self.bounds
         return feasible_set(base.model, bounds, self.margin)
 
-    def program(
-        self,
-        xp: ModuleType,
-        base: BaseParameters,
-        feasible: FeasibleSet,
-        R: Float[AnyArray, "height base"],
-        z: Float[AnyArray, " height"],
-        rows: Values | int,
-    ) -> tuple[ScaledRows, ConeProgram]:
-        """Return the rows in units of the noise, and the convex program; see `scaled_rows`.
-
-        Raises:
-            InputError: If priors do not fit the model.
-        """
+    def program(self, xp, base, feasible, R, z, rows) -> tuple[ScaledRows, ConeProgram]:
+        """Return the rows in units of the noise, and the convex program; see `scaled_rows`."""
         data, size = scaled_rows(xp, base, R, z, rows), base.model.size
         if self.prior is not None:
-            _require_as_many("parameters", self.prior.parameters, size, "standard parameters")
+            if len(self.prior.parameters) != size:
+                raise InputError(f"`parameters` of a prior must be the model's {size}.")
             inverse = 1.0 / np.asarray(self.prior.deviations, np.float64)
             known = inverse > 0.0
             more = (inverse * np.asarray(self.prior.parameters))[known]
@@ -218,35 +195,13 @@ class PhysicallyConsistent(AbstractEstimator):
         if bodies is None:
             prior = nominal_bodies(feasible.bounds)
         else:
-            _require_as_many("bodies", bodies, len(feasible.bodies), "bodies")
+            if len(bodies) != len(feasible.bodies):
+                raise InputError(f"`bodies` of a prior must be the model's {len(feasible.bodies)}.")
             prior = pseudo_inertia(bodies)
         return data, cone_program(xp, feasible, data, self.pull.strength, prior)
 
 
-def _require_as_many(name: str, values: AnyArray, count: int, what: str) -> None:
-    if len(values) != count:
-        raise InputError(
-            f"`{name}` of a prior must be those of the model's {count} {what}, but are "
-            f"{len(values)}."
-        )
-
-
-def _solve(program: ConeProgram) -> tuple[solver.Optimum, Outcome]:
-    program.require_interior()
-    optimum = solver.solve_in_numpy(program)
-    if bool(optimum.certified):
-        return optimum, Outcome.CERTIFIED
-    most = int(optimum.iterations) >= solver.MAX_ITERATIONS
-    return optimum, Outcome.ITERATIONS if most else Outcome.STALLED
-
-
-def _active_bounds(
-    base: BaseParameters,
-    feasible: FeasibleSet,
-    program: ConeProgram,
-    optimum: solver.Optimum,
-    bodies: Float[AnyArray, "bodies 10"],
-) -> tuple[str, ...]:
+def _active_bounds(base, feasible, program, optimum: solver.Optimum, bodies) -> tuple[str, ...]:
     """Name the bounds whose multipliers exceed their slacks (strict complementarity)."""
 
     def numbers(chosen: np.ndarray) -> str:
@@ -307,9 +262,11 @@ def consistent_body(
     b = A @ np.asarray(estimate, np.float64)
     feasible = FeasibleSet((tuple(range(10)),), (), (), bounds, np.zeros((1, 4, 4)), ())
     data = ScaledRows(A, b, np.float64(len(b)))
-    optimum, outcome = _solve(cone_program(np, feasible, data))
-    if throw and outcome is not Outcome.CERTIFIED:
-        raise RuntimeError(f"no consistent body with a proof: {outcome.value}")
+    program = cone_program(np, feasible, data)
+    program.require_interior()
+    optimum = solver.solve_in_numpy(program)
+    if throw and not optimum.certified:
+        raise RuntimeError(f"no consistent body with a proof: {UNPROVED}")
     parameters = feasible.standard_parameters(np, data, optimum.y)
     return parameters, float(np.sqrt(2.0 * optimum.value)), float(optimum.error)
 

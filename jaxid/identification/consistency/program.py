@@ -68,9 +68,9 @@ class FeasibleSet(NamedTuple):
         return len(self.bodies[0])
 
     @property
-    def body_scales(self) -> Float[np.ndarray, "bodies width"]:
+    def body_scales(self) -> np.ndarray:
         """Largest mass of each body, and its products with the radius and the squared radius."""
-        mass, L = np.asarray(self.bounds.mass_max), np.asarray(self.bounds.radius)
+        mass, L = self.bounds.mass_max, self.bounds.radius
         powers = np.array([0, 1, 1, 1, *[2] * 6])[: self.width]
         return mass[:, None] * L[:, None] ** powers
 
@@ -122,12 +122,12 @@ class FeasibleSet(NamedTuple):
         A bound holds where coefficients times a body's scaled variables plus constant is positive.
         """
         bounds, w, K = self.bounds, self.width, len(self.bodies)
-        mass, L = np.asarray(bounds.mass_max), np.asarray(bounds.radius)
+        mass, L = bounds.mass_max, bounds.radius
         upper, sphere = np.zeros((2, K, w))
         upper[:, 0], sphere[:, 0], sphere[:, 4:7] = -1.0, 1.0, -0.5
         found = [("largest mass", upper, np.ones(K)), ("sphere", sphere, np.zeros(K))]
         if np.any(bounds.mass_min):
-            found.append(("smallest mass", -upper, -np.asarray(bounds.mass_min) / mass))
+            found.append(("smallest mass", -upper, -bounds.mass_min / mass))
         sides = (("lower", 1.0, bounds.centre_min), ("upper", -1.0, bounds.centre_max))
         for side, sign, corner in sides:
             for axis in range(3):
@@ -174,11 +174,11 @@ def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> Feasi
     )
 
 
-def nominal_bodies(bounds: BodyBounds) -> Float[np.ndarray, "bodies 4 4"]:
+def nominal_bodies(bounds: BodyBounds) -> np.ndarray:
     """Return the pseudo-inertias of balls of medium size within the bounds."""
-    low, high = np.asarray(bounds.mass_min), np.asarray(bounds.mass_max)
+    low, high = bounds.mass_min, bounds.mass_max
     mass = np.clip(0.05 * high, low + 0.05 * (high - low), high)
-    centre, L = bounds.inner_centres, np.asarray(bounds.radius)
+    centre, L = bounds.inner_centres, bounds.radius
     room = np.sqrt(1.0 - np.sum((centre / L[:, None]) ** 2, axis=1))
     return ball(mass, centre, 0.5 * L * room)
 
@@ -188,7 +188,9 @@ def _couplings(model: Model) -> tuple[Coupling, ...]:
     robot, found = model.robot, []
     total = np.concatenate([term.drive_matrices(robot) for term in model.terms], axis=-1)
     for kind, matrix in zip(("RotorInertia", "ViscousFriction"), total, strict=True):
-        for group in _connected_axes((matrix != 0).any(axis=-1)):
+        count, labels = connected_components((matrix != 0).any(axis=-1), directed=False)
+        groups = [np.flatnonzero(labels == k) for k in range(count)]
+        for group in (group for group in groups if len(group) > 1):
             if len(group) > 4:
                 raise InputError(
                     f"drives that couple more than 4 axes have no consistent estimate yet: "
@@ -208,16 +210,7 @@ def _couplings(model: Model) -> tuple[Coupling, ...]:
     return tuple(found)
 
 
-def _connected_axes(joined: np.ndarray) -> list[list[int]]:
-    """Return the connected groups of more than one axis."""
-    count, labels = connected_components(joined, directed=False)
-    groups = [np.flatnonzero(labels == k).tolist() for k in range(count)]
-    return [group for group in groups if len(group) > 1]
-
-
-def scaled_rows(
-    xp: ModuleType, base: BaseParameters, R: Values, z: Values, rows: Values | int
-) -> ScaledRows:
+def scaled_rows(xp: ModuleType, base: BaseParameters, R, z, rows) -> ScaledRows:
     """Divide the weighted triangle of so many rows by the standard deviation of its residuals."""
     rest = z[base.size :]
     dof = xp.maximum(xp.asarray(rows - base.size, float), 1.0)
@@ -321,11 +314,7 @@ def indicators(places: Values, size: int) -> Values:
 
 
 def cone_program(
-    xp: ModuleType,
-    feasible: FeasibleSet,
-    data: ScaledRows,
-    strength: float = 0.0,
-    prior: Float[np.ndarray, "bodies 4 4"] | None = None,
+    xp, feasible: FeasibleSet, data: ScaledRows, strength=0.0, prior=None
 ) -> ConeProgram:
     """Return the convex program of least squares, with a pull towards the bodies of a prior."""
     bounds, units = feasible.bounds, feasible.scales(xp, data)
@@ -333,8 +322,8 @@ def cone_program(
     _, rows, offsets = feasible.linear_bounds()
     couplings, members, fillings = _coupled(xp, feasible, units[K * w :])
     shrink = np.ones((K, 4))
-    shrink[:, :3] = 1.0 / np.asarray(bounds.radius)[:, None]
-    shrink = shrink[:, :, None] * shrink[:, None, :] / np.asarray(bounds.mass_max)[:, None, None]
+    shrink[:, :3] = 1.0 / bounds.radius[:, None]
+    shrink = shrink[:, :, None] * shrink[:, None, :] / bounds.mass_max[:, None, None]
     A, b = data.A[:, np.array(feasible.order)] * units[None], data.b
     if feasible.free:
         F, inverse = feasible.free_columns(xp, data.A)
@@ -342,7 +331,7 @@ def cone_program(
         b = b - F @ (inverse @ (F.T @ b))
     equal = np.zeros((int(bounds.total_mass is not None), K * w + n))
     if bounds.total_mass is not None:
-        equal[0, : K * w : w] = np.asarray(bounds.mass_max) / bounds.total_mass
+        equal[0, : K * w : w] = bounds.mass_max / bounds.total_mass
     return ConeProgram(
         A=A,
         b=b,
@@ -361,9 +350,7 @@ def cone_program(
     )
 
 
-def _coupled(
-    xp: ModuleType, feasible: FeasibleSet, largest: Values
-) -> tuple[Values, np.ndarray, np.ndarray]:
+def _coupled(xp: ModuleType, feasible: FeasibleSet, largest: Values):
     """Return the matrices of ellipsoids and couplings in scaled variables, filled up to size four.
 
     The units of the drives' variables are `largest`.
@@ -403,20 +390,18 @@ def _ellipsoid(bounds: BodyBounds, k: int) -> np.ndarray:
     return basis
 
 
-def _start(
-    xp: ModuleType, feasible: FeasibleSet, A: Values, b: Values, prior: np.ndarray | None
-) -> Values:
+def _start(xp: ModuleType, feasible: FeasibleSet, A, b, prior) -> Values:
     """Return balls at inner centres of mass, as heavy as fits the forces, and some friction.
 
     Where a prior's bodies satisfy all bounds the start lies close to them.
     """
     bounds, K, w, n = feasible.bounds, len(feasible.bodies), feasible.width, len(feasible.drives)
-    most = np.asarray(bounds.mass_max)
-    centre = bounds.inner_centres / np.asarray(bounds.radius)[:, None]
+    most = bounds.mass_max
+    centre = bounds.inner_centres / bounds.radius[:, None]
     room = 1.0 - np.sum(centre**2, axis=1)
     balls = inertial_parameters(ball(np.ones(K), centre, np.sqrt(0.5 * room * 5.0 / 3.0)))[:, :w]
     floor = inertial_parameters(feasible.floors)[:, :w] / feasible.body_scales
-    low = np.maximum(np.asarray(bounds.mass_min) / most, floor[:, 0])
+    low = np.maximum(bounds.mass_min / most, floor[:, 0])
     if bounds.total_mass is None:
         forces = A @ xp.asarray(np.concatenate([balls.ravel(), np.zeros(n)]))
         fitting = xp.clip((forces @ b) / xp.maximum(forces @ forces, 1e-300), 0.02, 0.5)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Float
 
 Values = Any
 """Arrays of NumPy or JAX, and NumPy scalars."""
@@ -50,19 +50,14 @@ def inertial_parameters(pseudo: Float[AnyArray, "*batch 4 4"]) -> Float[np.ndarr
     return np.stack([P[..., 3, 3], *first_moments, yy + zz, xx + zz, xx + yy, *products], axis=-1)
 
 
-def ball(
-    mass: Float[AnyArray, "*batch"],
-    centre: Float[AnyArray, "*batch 3"],
-    radius: Float[AnyArray, "*batch"],
-) -> Float[np.ndarray, "*batch 4 4"]:
-    """Return the pseudo-inertias of solid balls [kg, m]."""
-    m, c = np.asarray(mass, np.float64), np.asarray(centre, np.float64)
-    spread = np.asarray(radius, np.float64)[..., None, None] ** 2 / 5.0 * np.eye(3)
-    P = np.empty((*m.shape, 4, 4))
-    P[..., :3, :3] = spread + c[..., :, None] * c[..., None, :]
-    P[..., :3, 3] = P[..., 3, :3] = c
+def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inertias [*batch, 4, 4] of solid balls [kg, m]."""
+    P = np.empty((*mass.shape, 4, 4))
+    P[..., :3, :3] = radius[..., None, None] ** 2 / 5.0 * np.eye(3)
+    P[..., :3, :3] += centre[..., :, None] * centre[..., None, :]
+    P[..., :3, 3] = P[..., 3, :3] = centre
     P[..., 3, 3] = 1.0
-    return P * m[..., None, None]
+    return P * mass[..., None, None]
 
 
 def consistency_margin(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*batch"]:
@@ -94,7 +89,7 @@ def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
     return L
 
 
-def are_definite(P: Float[AnyArray, "stack n n many"]) -> Bool[AnyArray, "stack many"]:
+def are_definite(P: Values) -> Values:
     """Return whether matrices, side by side along the last axis, are positive definite."""
     good = P[:, 0, 0] > 0
     for _ in range(P.shape[1] - 1):
@@ -104,7 +99,7 @@ def are_definite(P: Float[AnyArray, "stack n n many"]) -> Bool[AnyArray, "stack 
     return good
 
 
-def log_determinant(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[AnyArray, "*stack"]:
+def log_determinant(xp: ModuleType, P: Values) -> Values:
     """Return the logarithms of the determinants of positive definite matrices."""
     L = _cholesky(xp, P)
     total = xp.log(L[0][0])
@@ -113,7 +108,7 @@ def log_determinant(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[A
     return 2.0 * total
 
 
-def inverse(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[AnyArray, "*stack n n"]:
+def inverse(xp: ModuleType, P: Values) -> Values:
     """Return the inverses of positive definite matrices."""
     L = _cholesky(xp, P)
     n = P.shape[-1]
@@ -130,8 +125,6 @@ def inverse(xp: ModuleType, P: Float[AnyArray, "*stack n n"]) -> Float[AnyArray,
     return xp.swapaxes(M, -1, -2) @ M
 
 
-def symmetric_part(
-    xp: ModuleType, P: Float[AnyArray, "*stack n n"]
-) -> Float[AnyArray, "*stack n n"]:
+def symmetric_part(xp: ModuleType, P: Values) -> Values:
     """Return the symmetric parts of matrices."""
     return 0.5 * (P + xp.swapaxes(P, -1, -2))

@@ -244,9 +244,7 @@ def _length(xp: ModuleType, steps: np.ndarray, x: _Point, d: _Direction) -> Valu
     return xp.where(xp.any(good), lengths[xp.argmax(good)], 0.0)
 
 
-def _barriers(
-    xp: ModuleType, p: ConeProgram, inverse_S: Values, Z: Values, ratio: Values
-) -> Values:
+def _barriers(xp: ModuleType, p: ConeProgram, inverse_S, Z, ratio) -> Values:
     """Return the contribution of the bounds to the matrix of Newton's equations."""
     K, w, n = p.bodies, p.width, p.drives
     flat = BASIS[:w].reshape(w, 16)
@@ -274,19 +272,14 @@ def _products(xp: ModuleType, inverse_S: Values, Z: Values) -> Values:
 
 def _newton_solver(xp: ModuleType, p: ConeProgram, H: Values) -> Callable[[Values], Values]:
     """Return the solver of Newton's equations within the equality constraints."""
-    if xp is np:
-        try:
-            factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            return lambda r: np.full_like(r, np.nan)
+    linalg = scipy.linalg if xp is np else jax.scipy.linalg
+    try:
+        factor = linalg.cho_factor(H, lower=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        return lambda r: np.full_like(r, np.nan)
 
-        def solve(r: Values) -> Values:
-            return scipy.linalg.cho_solve(factor, r, check_finite=False)
-    else:
-        L = jax.lax.linalg.cholesky(H, symmetrize_input=False)
-
-        def solve(r: Values) -> Values:
-            return jax.scipy.linalg.cho_solve((L, True), r)
+    def solve(r: Values) -> Values:
+        return linalg.cho_solve(factor, r, check_finite=False)
 
     if not p.equal.shape[0]:
         return solve

@@ -105,8 +105,6 @@ class Estimate(eqx.Module):
         problem: RegressionProblem,
         weights: Float[AnyArray, " joints"],
         solution: AbstractSolution,
-        blocks: Blocks | None = None,
-        influence: Influence | None = None,
     ) -> "Estimate":
         """Return the least-squares estimate of rows that are weighted by joint (Eqs. 28, 33).
 
@@ -114,23 +112,19 @@ class Estimate(eqx.Module):
             problem: Regression problem.
             weights: Weights of the joints' rows [1/(N m) or 1/N].
             solution: Solution of the weighted system.
-            blocks: Factors by blocks of time; by default those of the problem.
-            influence: Influence of the rows; by default that of rows weighted by joint.
         """
-        factors = problem.factors if blocks is None else blocks.total
-        blocks = problem.blocks if blocks is None else blocks
-        chosen = solution.choose(blocks, weights)
-        decomposition = Decomposition.of(*factors.weighted(weights))
+        chosen = solution.choose(problem.blocks, weights)
+        decomposition = Decomposition.of(*problem.factors.weighted(weights))
         inverse = chosen.inverse(decomposition.values)
         return cls(
             base=problem.base,
             parameters=decomposition.solve(inverse),
             weights=np.asarray(weights),
-            blocks=blocks,
+            blocks=problem.blocks,
             inverse=decomposition.inverse_information(inverse),
-            influence=joint_rows(weights) if influence is None else influence,
+            influence=joint_rows(weights),
             solution=chosen,
-            effective_parameters=float(np.sum(inverse * np.asarray(decomposition.values) ** 2)),
+            effective_parameters=float(np.sum(inverse * decomposition.values**2)),
         )
 
 

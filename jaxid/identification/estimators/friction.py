@@ -60,9 +60,7 @@ class NonlinearFriction(AbstractEstimator):
         estimate = self.linear(problem.with_base(base))
         return dataclasses.replace(estimate, notes=(*estimate.notes, *notes))
 
-    def search(
-        self, problem: RegressionProblem, weights: Float[np.ndarray, " joints"]
-    ) -> tuple["SeparableProblem", Float[np.ndarray, " shapes"], tuple[str, ...]]:
+    def search(self, problem: RegressionProblem, weights: np.ndarray):
         """Return the separable problem, the shapes found, and notes about the search."""
         separable = SeparableProblem(problem, select_shapes(problem.base, self.free))
         start = separable.shapes.values
@@ -155,10 +153,7 @@ def select_shapes(base: BaseParameters, free: Selection | None = None) -> Shapes
         (i, s, s.value(numbered[i])) for i, t in enumerate(terms) for s in t.nonlinear_parameters
     ]
     if selected is not None and not selected <= {leaf for _, _, leaf in known}:
-        raise InputError(
-            "`free` selects a leaf that is no shape of a friction law: select one like "
-            "`terms[2].transition.epsilon` or `terms[2].speed`."
-        )
+        raise InputError("`free` must select shapes of friction laws, like `terms[2].speed`.")
     members = tuple(
         (i, shape)
         for i, shape, leaf in known
@@ -170,12 +165,9 @@ def select_shapes(base: BaseParameters, free: Selection | None = None) -> Shapes
             "the `model` has no friction law with a shape to identify: use a smooth transition "
             "(`Tanh`) or `StribeckFriction`, or select leaves by `free`."
         )
-    if len(set(names)) < len(names):
-        double = next(n for n in names if names.count(n) > 1)
-        raise InputError(
-            f"two terms have a shape called `{double}`: select one of them by `free`, and give "
-            "the other its value."
-        )
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two terms have a shape called `{name}`: select one by `free`.")
     return Shapes(base.model, members)
 
 
@@ -192,9 +184,6 @@ class SeparableProblem:
         pairs: For each derivative the column, as an index of a base parameter, and the shape.
         size: Number of columns.
     """
-
-    max_numbers = 2**28
-    """Largest size (two gigabytes) of the columns in memory."""
 
     def __init__(self, problem: RegressionProblem, shapes: Shapes):
         problem.require_samples("nonlinear friction")
@@ -222,16 +211,7 @@ class SeparableProblem:
             ]
             for j in range(n[0])
         ]
-        self._pieces, size = [], 0
-        for chunk in problem.chunks():
-            self._pieces.append(self._factor(chunk))
-            size += sum(Q.size for Q in self._pieces[-1][0].columns)
-            if size > self.max_numbers:
-                raise InputError(
-                    "nonlinear friction keeps the columns of all rows of the `observations` in "
-                    f"memory, but these are more than {self.max_numbers:.0e} numbers: decimate, or "
-                    "take a part of the log."
-                )
+        self._pieces = [self._factor(chunk) for chunk in problem.chunks()]
 
     def _factor(self, chunk: RowChunk) -> tuple[RowChunk, list[np.ndarray], list[np.ndarray]]:
         """Return orthonormal bases of each joint's fixed columns, triangles, and other forces."""
@@ -265,9 +245,7 @@ class SeparableProblem:
             parts.setdefault(chunk.block, []).append(Factors(tuple(joints), self.size))
         return Blocks(tuple(functools.reduce(lambda a, b: a + b, parts[k]) for k in sorted(parts)))
 
-    def _shaped_rows(
-        self, observations: Observations, x: Float[np.ndarray, " shapes"]
-    ) -> list[np.ndarray]:
+    def _shaped_rows(self, observations: Observations, x: np.ndarray) -> list[np.ndarray]:
         """Return the rows of everything that depends on shapes, for each joint."""
         entries = [entry for own in self._entries for _, entry in own]
         rows = np.empty((observations.rows, len(entries)))
@@ -289,11 +267,11 @@ def join_blocks(blocks: Blocks, chosen: Sequence[int]) -> Factors:
 
 def search_shapes(
     problem: SeparableProblem,
-    weights: Float[np.ndarray, " joints"],
-    start: Float[np.ndarray, " shapes"],
-    begin: Float[np.ndarray, " shapes"],
+    weights: np.ndarray,
+    start: np.ndarray,
+    begin: np.ndarray,
     blocks: Sequence[int] | None = None,
-) -> tuple[Float[np.ndarray, " shapes"], tuple[str, ...]]:
+) -> tuple[np.ndarray, tuple[str, ...]]:
     """Search for shapes by Levenberg-Marquardt over their logarithms; return notes as well.
 
     Where the rows of some blocks of time (by default all) hardly determine a shape, a weak pull
@@ -333,9 +311,7 @@ def search_shapes(
     )
 
 
-def project(
-    problem: SeparableProblem, factors: Factors, weights: Float[np.ndarray, " joints"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def project(problem: SeparableProblem, factors: Factors, weights: np.ndarray):
     """Return the best linear parameters, the weighted residual, and its derivatives by shapes."""
     size = problem.base.size
     R, z = factors.weighted(weights)
@@ -355,9 +331,7 @@ def project(
     return c, residual, -orthogonal - N @ (B @ products)
 
 
-def _best_multiples(
-    problem: SeparableProblem, weights: np.ndarray, start: Float[np.ndarray, " shapes"]
-) -> Float[np.ndarray, " shapes"]:
+def _best_multiples(problem: SeparableProblem, weights: np.ndarray, start: np.ndarray):
     """Return for each joint the multiples of its shapes that explain its own rows best."""
     kinds, joints = len(problem.shapes.members), problem.shapes.model.robot.joints
     candidates = np.array(list(itertools.product((0.2, 1.0, 5.0), repeat=min(kinds, 2))))

@@ -5,6 +5,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
@@ -28,7 +29,7 @@ from jaxid.identification.estimators.solutions import (
     MaximumForces,
     ResidualVariances,
 )
-from jaxid.identification.factors import Blocks, Factors, RowChunk
+from jaxid.identification.factors import Blocks, JointFactor, RowChunk
 from jaxid.identification.problem import RegressionProblem, Span
 from jaxid.measurement.observations import Observations, SamplesInMemory
 from jaxid.trajectory.trajectory import AbstractTrajectory
@@ -95,13 +96,13 @@ class GeneralisedLeastSquares(AbstractEstimator):
                 return [np.column_stack(x[2:4])[mask] / w for x, w, mask in mixed]
 
             blocks = problem.fold(equations, [tuple(range(size))] * n)
-            estimate = Estimate.solve(problem, weights, self.solution, blocks, influence)
+            mixed = RegressionProblem(problem.base, blocks=blocks)
+            estimate = Estimate.solve(mixed, weights, self.solution)
+            estimate = dataclasses.replace(estimate, influence=influence)
         return estimate
 
 
-def _residual_covariance(
-    problem: RegressionProblem, p: Float[np.ndarray, " base"]
-) -> Float[np.ndarray, "joints joints"]:
+def _residual_covariance(problem: RegressionProblem, p: np.ndarray) -> np.ndarray:
     """Return the covariance of the joints' residuals at the same instants [N² m², N m N or N²]."""
     n = problem.robot.joints
     products, counts = np.zeros((n, n)), np.zeros((n, n))
@@ -117,7 +118,7 @@ def _residual_covariance(
     return definite * size * size[:, None]
 
 
-def whitened_rows(S: Float[np.ndarray, "joints joints"], size: int) -> Influence:
+def whitened_rows(S: np.ndarray, size: int) -> Influence:
     """Return the influence of the joints' rows at one instant, multiplied by S^(-1/2).
 
     The channels are combinations of joints whose residuals are not correlated.
@@ -245,7 +246,7 @@ class IterativelyReweighted(AbstractEstimator):
         for chunk, residuals in problem.residuals(p):
             slopes += np.sum(np.where(chunk.mask, self.loss.slope(residuals / scale), 0.0), axis=0)
         slope = np.maximum(slopes / np.maximum(problem.factors.rows, 1), 0.1)
-        blocks = _reweight(problem, p, self.loss, scale)
+        blocks = problem.reweighted(p, lambda r, _: self.loss.weight(r / scale))
         solution = self.solution.choose(blocks, weights)
 
         def influence(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
@@ -270,14 +271,12 @@ class IterativelyReweighted(AbstractEstimator):
             effective_parameters=None,
         )
 
-    def _iterate(
-        self, problem: RegressionProblem, weights: np.ndarray, p: np.ndarray, loss: AbstractLoss
-    ) -> tuple[np.ndarray, float]:
+    def _iterate(self, problem, weights, p, loss: AbstractLoss) -> tuple[np.ndarray, float]:
         """Return parameters that reweighting no longer changes, and the last change."""
         change = np.inf
-        scale = _residual_scale(problem, p)
         for _ in range(self.iterations):
-            blocks = _reweight(problem, p, loss, scale)
+            scale = _residual_scale(problem, p)
+            blocks = problem.reweighted(p, lambda r, _, scale=scale: loss.weight(r / scale))
             R, z = blocks.total.weighted(weights)
             d = Decomposition.of(R, z)
             new = d.solve(self.solution.choose(blocks, weights).inverse(d.values))
@@ -286,19 +285,10 @@ class IterativelyReweighted(AbstractEstimator):
             p, change = new, step / rest if rest > 0 else 0.0
             if change <= self.tolerance:
                 break
-            scale = _residual_scale(problem, p)
         return p, change
 
 
-def _reweight(
-    problem: RegressionProblem, p: np.ndarray, loss: AbstractLoss, scale: np.ndarray
-) -> Blocks:
-    return problem.reweighted(p, lambda residuals, mask: loss.weight(residuals / scale))
-
-
-def _residual_scale(
-    problem: RegressionProblem, p: Float[np.ndarray, " base"]
-) -> Float[np.ndarray, " joints"]:
+def _residual_scale(problem: RegressionProblem, p: np.ndarray) -> np.ndarray:
     """Return the standard deviation of each joint's ordinary residuals, by medians [N m or N]."""
     # Of more than a million rows some suffice, evenly spread.
     step = max(1, -(-int(problem.factors.rows.max()) // 2**20))
@@ -376,9 +366,7 @@ class InstrumentalVariables(AbstractEstimator):
         )
 
 
-def _columns(
-    base: BaseParameters, observations: Observations, reference: AbstractTrajectory, start: float
-) -> tuple[np.ndarray, ...]:
+def _columns(base, observations: Observations, reference: AbstractTrajectory, start: float):
     """Return the columns of a reference for each joint, filtered like those of the recording."""
     m = reference.motion(np.asarray(observations.time) - start)
     motion = Motion(*(np.asarray(x, np.float64) for x in (m.q, m.qd, m.qdd)))
@@ -442,14 +430,12 @@ class _RelativeProblem(RegressionProblem):
             yield chunk._replace(forces=forces)
 
 
-def _subtract_forces(blocks: Blocks, p: Float[np.ndarray, " base"]) -> Blocks:
+def _subtract_forces(blocks: Blocks, p: np.ndarray) -> Blocks:
     """Return the factors of the same rows with the forces of some parameters subtracted."""
-    parts = []
-    for part in blocks.parts:
-        joints = []
-        for joint in part.joints:
-            R = np.array(joint.R)
-            R[:, -1] -= R[:, :-1] @ p[list(joint.columns)]
-            joints.append(dataclasses.replace(joint, R=R))
-        parts.append(Factors(tuple(joints), part.size))
-    return Blocks(tuple(parts))
+
+    def subtracted(joint: JointFactor) -> JointFactor:
+        R = np.array(joint.R)
+        R[:, -1] -= R[:, :-1] @ p[list(joint.columns)]
+        return dataclasses.replace(joint, R=R)
+
+    return jax.tree.map(subtracted, blocks, is_leaf=lambda x: isinstance(x, JointFactor))

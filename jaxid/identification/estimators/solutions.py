@@ -31,16 +31,14 @@ class Decomposition(eqx.Module):
         rest: Norm of the forces that the columns cannot explain.
     """
 
-    scale: Float[AnyArray, " base"]
-    values: Float[AnyArray, " base"]
-    directions: Float[AnyArray, "base base"]
-    forces: Float[AnyArray, " base"]
+    scale: Float[np.ndarray, " base"]
+    values: Float[np.ndarray, " base"]
+    directions: Float[np.ndarray, "base base"]
+    forces: Float[np.ndarray, " base"]
     rest: float
 
     @classmethod
-    def of(
-        cls, R: Float[AnyArray, "height base"], z: Float[AnyArray, " height"]
-    ) -> "Decomposition":
+    def of(cls, R: AnyArray, z: AnyArray) -> "Decomposition":
         """Decompose a weighted factor and its right-hand side."""
         missing = max(0, np.shape(R)[1] - len(R))
         R, z = np.pad(np.asarray(R), ((0, missing), (0, 0))), np.pad(np.asarray(z), (0, missing))
@@ -56,26 +54,24 @@ class Decomposition(eqx.Module):
     @property
     def unknown(self) -> Bool[np.ndarray, " base"]:
         """Which parameters take part in directions that are only rounding."""
-        s = np.asarray(self.values)
-        null = np.asarray(self.directions)[s <= NUMERICAL * s.max(initial=0.0)]
+        s = self.values
+        null = self.directions[s <= NUMERICAL * s.max(initial=0.0)]
         return np.sum(null**2, axis=0) > 1e-8
 
-    def solve(self, inverse: Float[AnyArray, " base"] | None = None) -> Float[np.ndarray, " base"]:
+    def solve(self, inverse: np.ndarray | None = None) -> np.ndarray:
         """Return the parameters for an inverse of the information along each direction.
 
         Args:
             inverse: Substitute of 1 / value² for each direction; by default that of `Complete`.
         """
-        inverse = Complete().inverse(self.values) if inverse is None else np.asarray(inverse)
-        along = inverse * np.asarray(self.values) * np.asarray(self.forces)
-        return np.asarray(self.directions).T @ along / np.asarray(self.scale)
+        inverse = Complete().inverse(self.values) if inverse is None else inverse
+        along = inverse * self.values * self.forces
+        return self.directions.T @ along / self.scale
 
-    def inverse_information(
-        self, inverse: Float[AnyArray, " base"] | None = None
-    ) -> Float[np.ndarray, "base base"]:
+    def inverse_information(self, inverse: np.ndarray | None = None) -> np.ndarray:
         """Return the inverse of the information in the parameters' units; see `solve`."""
-        inverse = Complete().inverse(self.values) if inverse is None else np.asarray(inverse)
-        V = np.asarray(self.directions) / np.asarray(self.scale)
+        inverse = Complete().inverse(self.values) if inverse is None else inverse
+        V = self.directions / self.scale
         return (V.T * inverse) @ V
 
 
@@ -287,13 +283,13 @@ def undetermined(
     $k$ gives the deviation $\sqrt{\sum g_k^2 K/(K-1)} / s^2$. Where parameters may thus make forces
     of a tenth of the whole recording that cancel each other, the direction is not determined.
     """
-    s, V = np.asarray(decomposition.values), np.asarray(decomposition.directions)
+    s, V = decomposition.values, decomposition.directions
     size = np.hypot(np.linalg.norm(decomposition.forces), decomposition.rest)
     inverse, p = Complete().inverse(s), decomposition.solve()
     sums = np.zeros(len(s))
     for part in blocks.parts:
         R, z = part.weighted(weights)
-        sums += (V @ ((R.T @ (R @ p - z)) / np.asarray(decomposition.scale))) ** 2
+        sums += (V @ ((R.T @ (R @ p - z)) / decomposition.scale)) ** 2
     count = len(blocks.parts)
     deviations = np.sqrt(sums * count / max(count - 1, 1)) * inverse
     floor = np.finfo(float).eps * size

@@ -37,7 +37,7 @@ class BlockJackknife(AbstractUncertainty):
             return Uncertainty(naive, dof, naive, None, (note,)), None
         size = np.sqrt(np.diag(naive))
         known = np.isfinite(size) & (size > 0)
-        ratio = np.where(known, deviations, 0.0) / np.where(known, size, 1.0)
+        ratio = np.divide(deviations, size, out=np.zeros_like(size), where=known)
         covariance = np.where(np.isfinite(naive), naive, 0.0) * ratio * ratio[:, None]
         unknown = np.isinf(size)
         covariance[unknown, unknown] = np.inf
@@ -55,9 +55,7 @@ def jackknife(estimate: Estimate) -> Float[np.ndarray, " base"] | None:
     return np.sqrt(np.diag(covariance))
 
 
-def block_covariance(
-    blocks: Sequence[Block], inverse: Float[AnyArray, "unknowns unknowns"]
-) -> tuple[Float[np.ndarray, "unknowns unknowns"], float]:
+def block_covariance(blocks: Sequence[Block], inverse: AnyArray) -> tuple[np.ndarray, float]:
     r"""Return the block jackknife's covariance of an estimate, and its degrees of freedom.
 
     Without block $k$ the estimate moves by $(1 - B G_k)^{-1} B g_k$, where $G_k$ is the block's
@@ -82,10 +80,7 @@ def block_covariance(
 
 
 def bootstrap(
-    blocks: Blocks,
-    weights: Float[AnyArray, " joints"],
-    draws: int,
-    key: PRNGKeyArray,
+    blocks: Blocks, weights: Float[AnyArray, " joints"], draws: int, key: PRNGKeyArray
 ) -> Float[Array, "draws base"]:
     r"""Return estimates from blocks of time that are drawn with replacement.
 

@@ -44,8 +44,8 @@ class Uncertainty(eqx.Module):
     def ratios(self) -> Float[np.ndarray, " base"]:
         """Standard deviations relative to the naive ones; NaN where nothing is known."""
         naive = self.naive_standard_deviations
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(naive > 0, self.standard_deviations / naive, np.nan)
+        unknown = np.full_like(naive, np.nan)
+        return np.divide(self.standard_deviations, naive, out=unknown, where=naive > 0)
 
     def half_widths(self, level: float = 0.95) -> Float[np.ndarray, " base"]:
         """Return half the widths of confidence intervals, by the t distribution.

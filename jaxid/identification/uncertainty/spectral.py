@@ -9,15 +9,14 @@ with the leverage $h$ of each line: the fit has explained that fraction of the e
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from types import ModuleType
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float
-from jaxid.identification.estimators.estimate import Channel, Estimate
+from jaxid.identification.estimators.estimate import Estimate
 from jaxid.identification.factors import RowChunk
 from jaxid.identification.problem import RegressionProblem, Span
 from jaxid.identification.uncertainty.blocks import BlockJackknife, jackknife
@@ -62,8 +61,7 @@ class SpectralSandwich(AbstractUncertainty):
         exact = np.diag(naive)
         if not complete:
             known = (white > 0) & np.isfinite(exact)
-            ratio = np.where(known, exact, 1.0) / np.where(known, white, 1.0)
-            ratio = np.sqrt(np.where(known, ratio, 1.0))
+            ratio = np.sqrt(np.divide(exact, white, out=np.ones_like(white), where=known))
             covariance = covariance * ratio * ratio[:, None]
         unknown = np.isinf(exact)
         covariance[unknown, unknown] = np.inf
@@ -142,14 +140,7 @@ def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
     return m
 
 
-def _transform(
-    n: int,
-    pieces: list[list[Channel]],
-    residuals: np.ndarray,
-    inverse: np.ndarray,
-    observations: Observations,
-    correlated: np.ndarray,
-) -> Lines:
+def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> Lines:
     """Return the lines of one stretch; add the energies of pairs to `correlated`."""
     row_time = observations.row_time
     frequency = np.fft.rfftfreq(n, row_time)
@@ -226,9 +217,7 @@ def _gain(observations: Observations, frequency: Float[np.ndarray, " lines"]) ->
     return gain
 
 
-def _gather(
-    problem: RegressionProblem, stretches: list[Span], p: np.ndarray
-) -> Iterator[tuple[Span, list[tuple[RowChunk, np.ndarray]]]]:
+def _gather(problem: RegressionProblem, stretches: list[Span], p: np.ndarray):
     """Yield each stretch with its chunks and residuals, in one pass over the rows."""
     remaining = iter(stretches)
     stretch = next(remaining, None)
@@ -247,9 +236,7 @@ def _gather(
             stretch, parts = next(remaining, None), []
 
 
-def window_sums(
-    frequency: Float[np.ndarray, " lines"], longest: float
-) -> tuple[Callable[[AnyArray], AnyArray], Callable[[AnyArray], AnyArray]]:
+def window_sums(frequency: Float[np.ndarray, " lines"], longest: float):
     """Return functions that sum arrays over windows of lines, and over the windows with a line.
 
     A window reaches 30 % of its frequency to either side, at least 0.25 Hz and four lines of the
@@ -285,16 +272,7 @@ class SpectralTable:
     `jax.numpy`. The other arguments are those of `Lines`, of all lengths of stretches together.
     """
 
-    def __init__(
-        self,
-        xp: ModuleType,
-        frequency: Float[np.ndarray, " lines"],
-        multiplicity: Float[np.ndarray, " lines"],
-        energy: Float[AnyArray, "base channels lines"],
-        leverage: Float[AnyArray, "channels lines"],
-        exposure: Float[AnyArray, "channels lines"],
-        longest: float,
-    ):
+    def __init__(self, xp, frequency, multiplicity, energy, leverage, exposure, longest):
         self._xp = xp
         self._sums, transposed_sums = window_sums(frequency, longest)
         self._half = half = 0.5 * multiplicity[None]
@@ -311,19 +289,11 @@ class SpectralTable:
     @classmethod
     def of(cls, lines: Sequence[Lines]) -> "SpectralTable":
         """Return the table of the spectra of every length of stretches."""
-        parts = [
-            (
-                x.frequency,
-                x.multiplicity,
-                x.energy,
-                x.leverage,
-                x.exposure[:, None] + 0 * x.leverage,
-            )
-            for x in lines
-        ]
-        f, m, energy, leverage, exposure = (np.concatenate(x, -1) for x in zip(*parts, strict=True))
+        names = "frequency", "multiplicity", "energy", "leverage"
+        arrays = [[getattr(x, name) for x in lines] for name in names]
+        arrays.append([x.exposure[:, None] + 0 * x.leverage for x in lines])
         longest = max(x.length * x.row_time for x in lines)
-        return cls(np, f, m, energy, leverage, exposure, longest)
+        return cls(np, *(np.concatenate(parts, -1) for parts in arrays), longest)
 
     def density(self, power: np.ndarray) -> np.ndarray:
         """Return the spectrum of the errors at each line, from the periodogram of residuals."""
@@ -339,9 +309,7 @@ class SpectralTable:
         return variance, dof
 
 
-def sandwich(
-    lines: Sequence[Lines], correlated: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sandwich(lines: Sequence[Lines], correlated: np.ndarray):
     """Return the covariance of an estimate, degrees of freedom, and variances for white errors."""
     count, table = len(correlated), SpectralTable.of(lines)
     power = np.concatenate([x.power for x in lines], axis=1)
@@ -401,16 +369,8 @@ LineSums = tuple[Array, Array, Array, Array]
 """Energy, leverage, power [draws, joints, lines], and exposure of chunks, added up; see `Lines`."""
 
 
-def line_sums(
-    own: tuple[tuple[int, ...], ...],
-    weights: Float[AnyArray, " joints"],
-    inverse: Float[Array, "base base"],
-    p: Float[Array, "draws base"],
-    columns: list[Array],
-    forces: list[Array],
-    exposure: Float[Array, " joints"],
-) -> LineSums:
-    """Return the spectra of consecutive rows of some estimates, in JAX.
+def line_sums(own, weights, inverse, p, columns, forces, exposure) -> LineSums:
+    """Return the spectra of consecutive rows of estimates `p` [draws, base], in JAX.
 
     Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row does not
     count; the columns belong to its own parameters; `exposure` is the fraction of rows that count.
@@ -430,9 +390,7 @@ def line_sums(
     return jnp.stack(energy, axis=1), jnp.stack(leverage), jnp.stack(power, axis=1), exposure
 
 
-def variances(
-    sums: LineSums, length: int, row_time: float
-) -> tuple[Float[Array, "draws base"], Float[Array, "draws base"]]:
+def variances(sums: LineSums, length: int, row_time: float) -> tuple[Array, Array]:
     """Return variances and degrees of freedom from chunks of `length` rows, in JAX."""
     energy, leverage, power, exposure = sums
     frequency, m = np.fft.rfftfreq(length, row_time), multiplicity(length)

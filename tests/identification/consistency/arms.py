@@ -7,6 +7,14 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.consistency.program import ScaledRows, scaled_rows
 from jaxid.simulation.virtual import random_bodies
 
+TERMS = (
+    jid.RigidBodies(),
+    jid.ViscousFriction(),
+    jid.CoulombFriction(),
+    jid.RotorInertia(),
+    jid.ConstantOffset(),
+)
+
 
 def truth(model: jid.Model, seed: int) -> np.ndarray:
     """Bodies that could exist and drives that brake, of any model with ten numbers for a body."""
