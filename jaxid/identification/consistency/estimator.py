@@ -56,6 +56,7 @@ class Consistency(eqx.Module):
         certified: Whether the error bound is below its tolerance: a proof of the optimum.
         iterations: Number of iterations of the search.
         determined: Standard parameters that the data determine alone, without the bounds.
+        masses_from_bounds: Bodies (0 is the first) whose masses reflect bounds or priors.
         active: Names of the active bounds.
     """
 
@@ -67,13 +68,8 @@ class Consistency(eqx.Module):
     certified: bool = eqx.field(static=True)
     iterations: int = eqx.field(static=True)
     determined: Bool[np.ndarray, " standard"]
+    masses_from_bounds: tuple[int, ...] = eqx.field(static=True)
     active: tuple[str, ...] = eqx.field(static=True)
-
-    @property
-    def masses_from_bounds(self) -> tuple[int, ...]:
-        """Bodies (0 is the first) whose masses reflect bounds or priors rather than data."""
-        width = self.bodies.shape[1]
-        return tuple(k for k in range(len(self.bodies)) if not self.determined[k * width])
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -145,6 +141,7 @@ class PhysicallyConsistent(AbstractEstimator):
         bodies = p[np.array(feasible.bodies)]
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
         ours, best = (float(np.sum((R @ x - z) ** 2)) for x in (parameters, free.parameters))
+        determined = np.array([x is Identifiability.ALONE for x in base.identifiability])
         found = Consistency(
             bodies=bodies,
             margins=consistency_margin(bodies),
@@ -153,7 +150,10 @@ class PhysicallyConsistent(AbstractEstimator):
             error_bound=error_bound,
             certified=bool(optimum.certified),
             iterations=int(optimum.iterations),
-            determined=np.array([x is Identifiability.ALONE for x in base.identifiability]),
+            determined=determined,
+            masses_from_bounds=tuple(
+                k for k, own in enumerate(feasible.bodies) if not determined[own[0]]
+            ),
             active=_active_bounds(base, feasible, program, optimum, bodies),
         )
         notes = [

@@ -44,8 +44,8 @@ class Uncertainty(eqx.Module):
     def ratios(self) -> Float[np.ndarray, " base"]:
         """Standard deviations relative to the naive ones; NaN where nothing is known."""
         naive = self.naive_standard_deviations
-        unknown = np.full_like(naive, np.nan)
-        return np.divide(self.standard_deviations, naive, out=unknown, where=naive > 0)
+        known, ratios = np.isfinite(naive) & (naive > 0), np.full_like(naive, np.nan)
+        return np.divide(self.standard_deviations, naive, out=ratios, where=known)
 
     def half_widths(self, level: float = 0.95) -> Float[np.ndarray, " base"]:
         """Return half the widths of confidence intervals, by the t distribution.
