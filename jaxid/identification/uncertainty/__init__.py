@@ -1,8 +1,8 @@
 """Uncertainty of estimates: spectral sandwich, block jackknife, residual spectra."""
 
-from jaxid.identification.uncertainty.blocks import BlockJackknife as BlockJackknife
-from jaxid.identification.uncertainty.result import AbstractUncertainty as AbstractUncertainty
-from jaxid.identification.uncertainty.result import IndependentRows as IndependentRows
-from jaxid.identification.uncertainty.result import ResidualSpectra as ResidualSpectra
-from jaxid.identification.uncertainty.result import Uncertainty as Uncertainty
-from jaxid.identification.uncertainty.spectral import SpectralSandwich as SpectralSandwich
+from .blocks import BlockJackknife as BlockJackknife
+from .result import AbstractUncertainty as AbstractUncertainty
+from .result import IndependentRows as IndependentRows
+from .result import ResidualSpectra as ResidualSpectra
+from .result import Uncertainty as Uncertainty
+from .spectral import SpectralSandwich as SpectralSandwich
