@@ -150,10 +150,7 @@ def _inner_rows(observations: Observations, edge: int) -> Observations:
 def _with_motion(widest: Observations, own: Observations) -> Observations:
     """Return a candidate's motion with forces and rows of the widest band."""
     if widest.samples != own.samples:
-        raise InputError(
-            f"the filters of `candidates` leave different parts of `{widest.name}`, whose gaps are "
-            "close together: choose on a log without, or take filters with similar edges."
-        )
+        raise InputError(f"`candidates` leave different parts of `{widest.name}`: avoid its gaps.")
     return widest.replace(motion=own.motion)
 
 

@@ -251,16 +251,12 @@ def temperature_law(
     warmer = np.asarray(temperatures, np.float64) - reference
     if warmer.shape != (len(fits),) or len(np.unique(warmer)) < 2:
         raise InputError(
-            "`temperatures` must hold one temperature for each fit, and at least two different "
-            f"ones, but there are {len(fits)} fits and temperatures of shape {warmer.shape}."
+            "`temperatures` must be one for each fit, and at least two different ones."
         )
     robot = fits[0].base.model.robot
     names = tuple(name for name, _ in term.parameters(robot))
     if len(names) != robot.joints or any(set(names) - set(fit.base.names) for fit in fits):
-        raise InputError(
-            f"`term` must have one parameter for each joint ({robot.joints}) that all fits have, "
-            f"but has {', '.join(names)}."
-        )
+        raise InputError(f"`term` must have one parameter for each joint, in all fits: {names}.")
     places = [[fit.base.names.index(name) for name in names] for fit in fits]
     f = np.array([np.asarray(fit.parameters)[k] for fit, k in zip(fits, places, strict=True)])
     s = np.array([fit.standard_deviations[k] for fit, k in zip(fits, places, strict=True)])

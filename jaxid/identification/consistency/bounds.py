@@ -57,10 +57,7 @@ class BodyBounds(eqx.Module):
         def each(name: str, value: Numbers, *shape: int) -> np.ndarray:
             array = np.array(value, np.float64)
             if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
-                raise InputError(
-                    f"`{name}` must hold numbers for all bodies or for each of the {bodies}, but "
-                    f"has shape {array.shape}."
-                )
+                raise InputError(f"`{name}` must be for all or each of {bodies} bodies: {value}.")
             return np.broadcast_to(array, (bodies, *shape)).copy()
 
         self.mass_max = each("mass_max", mass_max)
@@ -205,10 +202,7 @@ class EntropicPull(eqx.Module):
             raise InputError(f"`strength` must be positive, but is {self.strength}.")
         if self.bodies is not None and not (consistency_margin(self.bodies) > 0.0).all():
             k = int(np.argmin(consistency_margin(self.bodies))) + 1
-            raise InputError(
-                "`bodies` of a prior must be physically consistent, with some extent in all "
-                f"directions, but body {k} is not: give it a mass and an inertia."
-            )
+            raise InputError(f"body {k} of the prior's `bodies` needs a mass and an inertia.")
 
 
 class ParameterPrior(eqx.Module):
@@ -225,8 +219,6 @@ class ParameterPrior(eqx.Module):
     deviations: Float[AnyArray, " standard"]
 
     def __check_init__(self):
-        shape, deviations = np.shape(self.parameters), np.asarray(self.deviations)
-        if shape != deviations.shape or not (deviations > 0.0).all():
-            raise InputError(
-                f"`deviations` of a prior must be positive and as many as `parameters`, {shape}."
-            )
+        deviations = np.asarray(self.deviations)
+        if np.shape(self.parameters) != deviations.shape or not (deviations > 0.0).all():
+            raise InputError("`deviations` must be positive and as many as `parameters`.")

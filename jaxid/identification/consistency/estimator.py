@@ -132,10 +132,7 @@ class PhysicallyConsistent(AbstractEstimator):
         optimum = solver.solve_in_numpy(program)
         error_bound = float(optimum.error / max(optimum.value, program.scale))
         if self.throw and not optimum.certified:
-            raise RuntimeError(
-                f"no physically consistent estimate with a proof: {UNPROVED} The bound is "
-                f"{error_bound:.1e} of the objective."
-            )
+            raise RuntimeError(f"no physically consistent estimate with a proof: {UNPROVED}")
         p = feasible.standard_parameters(np, data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
@@ -255,9 +252,7 @@ def consistent_body(
     try:
         L = np.linalg.cholesky(C / size[:, None] / size)
     except np.linalg.LinAlgError as error:
-        raise InputError(
-            "`covariance` must be positive definite, but is not: is some parameter not determined?"
-        ) from error
+        raise InputError("`covariance` must be positive definite, but is not.") from error
     A = np.linalg.inv(L) / size
     b = A @ np.asarray(estimate, np.float64)
     feasible = FeasibleSet((tuple(range(10)),), (), (), bounds, np.zeros((1, 4, 4)), ())

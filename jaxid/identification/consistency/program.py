@@ -156,10 +156,7 @@ def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> Feasi
     if not any(widths):
         raise InputError("the model has no bodies to make consistent: add `RigidBodies()`.")
     if len(bounds.radius) != robot.joints:
-        raise InputError(
-            f"`bounds` must be those of the {robot.joints} bodies of `{robot.name}`, but are "
-            f"of {len(bounds.radius)}."
-        )
+        raise InputError(f"`bounds` must be those of the {robot.joints} bodies of the robot.")
     lower = np.concatenate([term.lower_bounds(robot) for term in model.terms])
     first = next(k for k, width in enumerate(widths) if width)
     columns = starts[first] + np.arange(sizes[first]).reshape(robot.joints, widths[first])
@@ -192,18 +189,12 @@ def _couplings(model: Model) -> tuple[Coupling, ...]:
         groups = [np.flatnonzero(labels == k) for k in range(count)]
         for group in (group for group in groups if len(group) > 1):
             if len(group) > 4:
-                raise InputError(
-                    f"drives that couple more than 4 axes have no consistent estimate yet: "
-                    f"`{robot.name}` couples {len(group)}."
-                )
+                raise InputError(f"drives may couple 4 axes, but `{robot.name}` has more.")
             inside = matrix[np.ix_(group, group)]
             columns = np.flatnonzero(inside.any(axis=(0, 1)))
             alone = [columns[inside[k, k, columns] != 0] for k in range(len(group))]
             if not all(map(len, alone)):
-                raise InputError(
-                    "coupled drives are consistent only together with the drives' own columns: "
-                    f"add `{kind}()`."
-                )
+                raise InputError(f"coupled drives need the drives' own columns: add `{kind}()`.")
             basis = np.moveaxis(inside[:, :, columns], -1, 0)
             diagonal = tuple(int(own[0]) for own in alone)
             found.append(Coupling(tuple(columns.tolist()), basis, diagonal))

@@ -112,10 +112,7 @@ class Shapes(eqx.Module):
         x = np.concatenate([np.broadcast_to(value, n) for value in given])
         if not (x > 0).all():
             name, _ = self.parameters[int(np.argmin(x))]
-            raise InputError(
-                f"the search for `{name}` must start at a positive number, but starts at "
-                f"{x.min():g}."
-            )
+            raise InputError(f"`{name}` must start at a positive number, not at {x.min():g}.")
         return x
 
     def set_in_terms(self, x: Float[AnyArray, " shapes"]) -> tuple[AbstractTerm, ...]:
@@ -161,10 +158,7 @@ def select_shapes(base: BaseParameters, free: Selection | None = None) -> Shapes
     )
     names = [shape.name for _, shape in members]
     if not names:
-        raise InputError(
-            "the `model` has no friction law with a shape to identify: use a smooth transition "
-            "(`Tanh`) or `StribeckFriction`, or select leaves by `free`."
-        )
+        raise InputError("the `model` has no friction with a shape: use `StribeckFriction`.")
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two terms have a shape called `{name}`: select one by `free`.")

@@ -158,10 +158,7 @@ class AbstractLoss(eqx.Module):
 
     def __check_init__(self):
         if not self.limit > 0.0:
-            raise InputError(
-                f"`limit` of `{type(self).__name__}` must be a positive number of standard "
-                f"deviations, but is {self.limit}."
-            )
+            raise InputError(f"`limit` must be positive, but is {self.limit}.")
 
     @abstractmethod
     def weight(self, x: Float[np.ndarray, "*rows"]) -> Float[np.ndarray, "*rows"]:
@@ -331,10 +328,7 @@ class InstrumentalVariables(AbstractEstimator):
         given = {"references": self.references, "starts": self.starts}
         for name, values in given.items():
             if len(values) not in (1, len(recordings)):
-                raise InputError(
-                    f"`{name}` must hold one entry, or one for each of {len(recordings)} "
-                    f"recordings, but holds {len(values)}."
-                )
+                raise InputError(f"`{name}` must hold one entry for all or each of the recordings.")
         each = [x * len(recordings) if len(x) == 1 else x for x in given.values()]
         triples = zip(recordings, *each, strict=True)
         instruments = [_columns(problem.base, *triple) for triple in triples]
@@ -398,10 +392,7 @@ class RelativeTo(AbstractEstimator):
         """Subtract the prior's forces, estimate, and add the prior."""
         size = problem.base.model.size
         if np.shape(self.parameters) != (size,):
-            raise InputError(
-                f"`parameters` of `RelativeTo` must be the {size} standard parameters of the "
-                f"model, but have the shape {np.shape(self.parameters)}."
-            )
+            raise InputError(f"`parameters` must be the {size} standard parameters of the model.")
         prior = np.asarray(self.parameters)
         found = self.estimator(_RelativeProblem(problem, prior))
         origin = np.asarray(found.base.from_standard(prior))

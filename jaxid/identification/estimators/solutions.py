@@ -119,10 +119,7 @@ class Truncated(AbstractSpectralSolution):
 
     def __check_init__(self):
         if not 0.0 <= self.rcond < 1.0:
-            raise InputError(
-                f"`rcond` of `Truncated` must be at least 0 and below 1, but is {self.rcond}: from "
-                "1 on nothing would be left."
-            )
+            raise InputError(f"`rcond` must be at least 0 and below 1, but is {self.rcond}.")
 
     def inverse(self, values):
         """Return the inverse squares; zero for weak directions."""
@@ -143,10 +140,7 @@ class Ridge(AbstractSpectralSolution):
 
     def __check_init__(self):
         if not 0.0 <= self.strength < np.inf:
-            raise InputError(
-                "`strength` of `Ridge` must be a finite number of at least 0, but is "
-                f"{self.strength}."
-            )
+            raise InputError(f"`strength` must be finite and at least 0, but is {self.strength}.")
 
     def inverse(self, values):
         """Return bounded inverse squares."""
