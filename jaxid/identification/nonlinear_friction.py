@@ -250,9 +250,7 @@ def temperature_law(
     """
     warmer = np.asarray(temperatures, np.float64) - reference
     if warmer.shape != (len(fits),) or len(np.unique(warmer)) < 2:
-        raise InputError(
-            "`temperatures` must be one for each fit, and at least two different ones."
-        )
+        raise InputError("`temperatures` must be one for each fit, at least two different.")
     robot = fits[0].base.model.robot
     names = tuple(name for name, _ in term.parameters(robot))
     if len(names) != robot.joints or any(set(names) - set(fit.base.names) for fit in fits):
