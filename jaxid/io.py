@@ -120,15 +120,15 @@ def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
         os.replace(path, folder / path.name)
 
 
-def read_json(path: str | Path, hook: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
-    """Read a JSON file; `hook` makes objects of key-value pairs, dictionaries if None.
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file.
 
     Raises:
         OSError: If the file cannot be read.
         InputError: If it is no JSON in UTF-8.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"), object_pairs_hook=hook)
+        return json.loads(Path(path).read_text(encoding="utf-8"))
     except RecursionError as error:
         raise InputError("its brackets are nested too deeply") from error
     except ValueError as error:

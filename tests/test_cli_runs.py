@@ -184,7 +184,7 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
     assert added["fit"]["rows"] == together["fit"]["rows"]
     assert added["settings"]["identification"] == ["first", "b.csv"]
     assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
-    said = "the two fits `a` have seen the same data"
+    said = "have seen the same data"
     assert refused(run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said)
     said = "a report that was given has seen the data of `a`"
     seen = ("first", "b.csv", "--verify", "a.csv", "-o", "twice")

@@ -254,6 +254,7 @@ def _table(name: str, writer: CWriter, rows: Float[np.ndarray, "states entries"]
 
 def _ascii(text: str) -> str:
     """Return words that can stand in a comment for any compiler."""
-    for symbol, word in (("²", "^2"), ("³", "^3"), ("°", "deg"), ("\\", "/"), ("*/", "* /")):
+    words = {"²": "^2", "³": "^3", "°": "deg", "\\": "/", "*/": "* /", "/*": "/ *"}
+    for symbol, word in words.items():
         text = text.replace(symbol, word)
     return " ".join(text.encode("ascii", "replace").decode().split())

@@ -110,28 +110,21 @@ def identify_batch(
 
 
 def _check(base, motion, forces, mask, robots) -> None:
-    n = base.model.robot.joints
-    if forces.shape[-1] != n or motion.q.shape[-1] != n:
-        raise InputError(
-            f"`motion` and `forces` must have the {n} joints of `{base.model.robot.name}`, but "
-            f"have {motion.q.shape[-1]} and {forces.shape[-1]}."
-        )
-    if forces.ndim < 3 or motion.q.shape != (forces.shape[0], *forces.shape[-2:]):
-        raise InputError(
-            "`motion` must have the shape [datasets, samples, joints] of `forces`, but has "
-            f"{motion.q.shape} and `forces` has {forces.shape}."
-        )
-    if mask is not None and mask.shape != motion.q.shape:
-        raise InputError(
-            f"`mask` must have the shape {motion.q.shape} of the motion, but has {mask.shape}."
-        )
+    n, samples = base.model.robot.joints, forces.shape[-2]
+    wanted = (len(forces), samples, n)
+    for name, array in (("motion", motion.q), ("mask", motion.q if mask is None else mask)):
+        if array.shape != wanted:
+            raise InputError(
+                f"`{name}` must have the shape [datasets, samples, joints], here {wanted} by "
+                f"`forces` and the robot, but has {array.shape}."
+            )
     if robots is not None and len(robots) != len(forces):
         raise InputError(
             f"`robots` must be one for each of {len(forces)} data sets, but are {len(robots)}."
         )
-    if forces.shape[-2] * n <= base.size:
+    if samples * n <= base.size:
         raise InputError(
-            f"there are {forces.shape[-2] * n} rows for {base.size} base parameters: record longer."
+            f"there are {samples * n} rows for {base.size} base parameters: record longer."
         )
 
 
@@ -191,14 +184,12 @@ def _solved_again(
 def _blocks(rows: JointRegressor, one: DataSets, forces: np.ndarray) -> Blocks:
     """Return the triangular factors of one data set and one draw of its forces, by time."""
     samples = len(forces)
-    edges = np.unique(np.linspace(0, samples, max(10, -(-samples // 65536)) + 1).astype(int))
     counted = np.ones(forces.shape, bool) if one.mask is None else one.mask > 0
     parts: list[Factors] = []
-    for start, stop in itertools.pairwise(edges):
-        own = slice(start, stop)
+    for own in filter(len, np.array_split(np.arange(samples), max(10, -(-samples // 65536)))):
         arrays = [x[own].T for x in jax.tree.leaves(one.motion)]
         if one.numbers is not None:
-            arrays.append(np.repeat(one.numbers[:, None], stop - start, axis=1))
+            arrays.append(np.repeat(one.numbers[:, None], len(own), axis=1))
         joints = zip(rows.in_numpy(*arrays), forces[own].T, counted[own].T, strict=True)
         equations = [np.column_stack([theta.T, Q])[kept] for theta, Q, kept in joints]
         parts.append(empty_factors(rows.columns, rows.size).append(equations))
@@ -214,22 +205,17 @@ def _estimate_each(
     row_time: float | None,
 ) -> BatchFit:
     """Return the estimates of `identify` for each data set and draw, on all cores."""
-    q, qd, qdd = (np.asarray(x) for x in (motion.q, motion.qd, motion.qdd))
+    motion = jax.tree.map(np.asarray, motion)
     Q = np.asarray(forces).reshape(len(forces), -1, *forces.shape[-2:])
-    counted = np.ones(q.shape, bool) if mask is None else np.asarray(mask) > 0
+    counted = np.ones(motion.q.shape, bool) if mask is None else np.asarray(mask) > 0
     uncertainty = IndependentRows() if row_time is None else None
 
     def one(case: tuple[int, int]) -> Fit:
         k, draw = case
-        o = Observations.of(
-            q[k],
-            qd[k],
-            qdd[k],
-            np.where(counted[k], Q[k, draw], 0.0),
-            sample_time=1.0 if row_time is None else row_time,
-            mask=counted[k],
-            name=f"data set {k + 1}",
-        )
+        kept, own = counted[k], motion[k]
+        kept_forces = np.where(kept, Q[k, draw], 0.0)
+        options = {"sample_time": row_time or 1.0, "mask": kept, "name": f"data set {k + 1}"}
+        o = Observations.of(own.q, own.qd, own.qdd, kept_forces, **options)
         return identify(base, o, estimator, uncertainty=uncertainty)
 
     cases = itertools.product(range(len(Q)), range(Q.shape[1]))
@@ -242,14 +228,12 @@ def _stacked(fits: list[Fit]) -> BatchFit:
     """Return some fits as one; only those that determine all have a condition number."""
     known = np.array([np.isfinite(fit.naive_standard_deviations).all() for fit in fits])
     condition = np.array([fit.condition_numbers.scaled for fit in fits])
+    names = ("parameters", "standard_deviations", "residual_rms", "naive_standard_deviations")
     return BatchFit(
-        jnp.stack([fit.parameters for fit in fits]),
-        jnp.stack([fit.standard_deviations for fit in fits]),
-        jnp.stack([fit.residual_rms for fit in fits]),
-        jnp.asarray(np.where(known, condition, np.inf)),
-        jnp.asarray(known),
-        jnp.stack([fit.naive_standard_deviations for fit in fits]),
-        jnp.stack([fit.uncertainty.dof for fit in fits]),
+        **{name: jnp.stack([getattr(fit, name) for fit in fits]) for name in names},
+        condition_numbers=jnp.asarray(np.where(known, condition, np.inf)),
+        determined=jnp.asarray(known),
+        dof=jnp.stack([fit.uncertainty.dof for fit in fits]),
     )
 
 
@@ -290,16 +274,12 @@ def _family(
 ) -> tuple[RobotFamily, Float[np.ndarray, "datasets numbers"]]:
     """Return robots of one topology as one definition, and for each robot its own numbers."""
     own = base.model.robot
-    for k, robot in enumerate(robots):
-        if robot.parent != own.parent or robot.revolute != own.revolute:
+    for robot in robots:
+        alike = robot.parent == own.parent and robot.revolute == own.revolute
+        if not alike or robot.tool is not None:
             raise InputError(
-                f"`robots` must have the topology of `{own.name}`, but number {k}, "
-                f"`{robot.name}`, has other joints: identify it with its own base parameters."
-            )
-        if robot.tool is not None:
-            raise InputError(
-                f"number {k} of `robots`, `{robot.name}`, carries a known tool: subtract its "
-                "forces beforehand and take the robot without it."
+                f"`robots` must have the topology of `{own.name}` and no known tools, but "
+                f"`{robot.name}` differs: identify it with its own base parameters."
             )
     numbers = np.array([_geometry(robot) for robot in robots])
     varying = tuple(np.flatnonzero((numbers != _geometry(own)).any(axis=0)).tolist())

@@ -32,19 +32,14 @@ def require_same_base(fits: Sequence[Fit]) -> None:
     first, a = fits[0], fits[0].base
     for fit in fits[1:]:
         b = fit.base
-        if a.names == b.names and a.indices == b.indices:
-            if np.allclose(a.kappa, b.kappa, rtol=1e-6, atol=1e-9):
-                continue
-            differs = "the lengths in them differ"
-        elif a.size != b.size:
-            differs = f"{a.size} and {b.size} in number"
-        else:
-            pairs = zip(a.names, b.names, strict=True)
-            differs = "`{}` in the place of `{}`".format(*next((x, y) for x, y in pairs if x != y))
-        raise InputError(
-            f"the fits `{first.name}` and `{fit.name}` have different base parameters ({differs}): "
-            "use one robot with one geometry and the same terms for both."
-        )
+        same = a.names == b.names and a.indices == b.indices
+        if not same or not np.allclose(a.kappa, b.kappa, rtol=1e-6, atol=1e-9):
+            others = sorted({*a.names} ^ {*b.names})
+            differs = f"`{others[0]}` is in one of them only" if others else "lengths differ"
+            raise InputError(
+                f"the fits `{first.name}` and `{fit.name}` have different base parameters "
+                f"({differs}): use one robot with one geometry and the same terms for both."
+            )
 
 
 def as_least_squares(fit: Fit) -> Fit:
@@ -79,11 +74,9 @@ def combine(
     """
     for one, other in itertools.combinations(fits, 2):
         if share_rows(one.time_blocks, other.time_blocks):
-            same = one.name == other.name
-            which = f"two fits `{one.name}`" if same else f"fits `{one.name}` and `{other.name}`"
             raise InputError(
-                f"the {which} have seen the same data, which would count twice: give every log "
-                "once, as itself or by the report that was made of it."
+                f"the fits `{one.name}` and `{other.name}` have seen the same data, which would "
+                "count twice: give every log once, as itself or by the report that was made of it."
             )
     offsets = [np.zeros(fit.base.size) for fit in fits] if offsets is None else offsets
     factors = [fit.factor for fit in fits]

@@ -77,14 +77,13 @@ class Comparison(eqx.Module):
     @property
     def determined(self) -> Bool[np.ndarray, " compared"]:
         """Which differences have a standard deviation."""
-        variances = np.diag(self.uncertainty.covariance)
-        return np.isfinite(variances) & (variances > 0)
+        return np.isfinite(self.standard_deviations)
 
     @property
     def standard_deviations(self) -> Float[np.ndarray, " compared"]:
         """Standard deviations of the differences; infinite where nothing is known."""
-        known, variances = self.determined, np.diag(self.uncertainty.covariance)
-        return np.where(known, np.sqrt(np.where(known, variances, 1.0)), np.inf)
+        variances = np.diag(self.uncertainty.covariance)
+        return np.sqrt(np.where(variances > 0, variances, np.inf))
 
     @property
     def half_widths(self) -> Float[np.ndarray, " compared"]:
@@ -122,38 +121,27 @@ class Comparison(eqx.Module):
         Each has `name`, the number of determined `parameters`, the `statistic` (about that number
         where nothing has changed), its `p_value`, and whether the group has `changed`.
         """
-        kinds, determined = np.array(self.kinds), self.determined
-        names = list(dict.fromkeys(kinds.tolist()))
-        members = [np.flatnonzero(determined & (kinds == name)) for name in names]
-        tests = [self._test(group) for group in members]
-        changed = _holm(np.array([p for _, p in tests])) <= 1.0 - self.level
-        return [
-            {
-                "name": name,
-                "parameters": len(group),
-                "statistic": statistic,
-                "p_value": p,
-                "changed": bool(is_changed),
-            }
-            for name, group, (statistic, p), is_changed in zip(
-                names, members, tests, changed, strict=True
+        kinds, known = np.array(self.kinds), self.uncertainty
+        groups = []
+        for name in dict.fromkeys(kinds.tolist()):
+            k = np.flatnonzero(self.determined & (kinds == name))
+            dof = float(np.min(np.asarray(known.dof)[k], initial=np.inf))
+            covariance = np.asarray(known.covariance)[np.ix_(k, k)]
+            statistic, p = joint_test(np.asarray(self.difference)[k], covariance, dof)
+            groups.append(
+                {"name": name, "parameters": len(k), "statistic": statistic, "p_value": p}
             )
-        ]
-
-    def _test(self, group: np.ndarray) -> tuple[float, float]:
-        if not len(group):
-            return 0.0, 1.0
-        return joint_test(
-            np.asarray(self.difference)[group],
-            np.asarray(self.uncertainty.covariance)[np.ix_(group, group)],
-            float(np.min(np.asarray(self.uncertainty.dof)[group])),
-        )
+        adjusted = _holm(np.array([group["p_value"] for group in groups]))
+        for group, p in zip(groups, adjusted.tolist(), strict=True):
+            group["changed"] = p <= 1.0 - self.level
+        return groups
 
     def summary(self) -> Table:
         """Return a table of both estimates, their differences with intervals, and verdicts."""
         verdicts, kinds, half = self.verdicts, self.kinds, self.half_widths
         a, b = (np.asarray(f.parameters)[list(self.indices)] for f in (self.first, self.second))
         change, width = with_deviations(self.difference, half)
+        signed = [x if x.startswith("-") else f"+{x}" for x in change]
         tested, chance = len(verdicts) - verdicts.count(Verdict.UNKNOWN), 1.0 - self.level
         return Table(
             f"{self.first.name} and {self.second.name}: {len(kinds)} base parameters",
@@ -162,9 +150,7 @@ class Comparison(eqx.Module):
             Column("unit", self.units),
             Column(self.first.name, with_deviations(a, half)[0], kind="number"),
             Column(self.second.name, with_deviations(b, half)[0], kind="number"),
-            Column(
-                "difference", [x if x.startswith("-") else f"+{x}" for x in change], kind="number"
-            ),
+            Column("difference", signed, kind="number"),
             Column(f"± ({100 * self.level:g} %)", width, kind="number"),
             Column("verdict", [verdict.value for verdict in verdicts]),
             status=[Status.DOUBTFUL if v is Verdict.CHANGED else Status.NEUTRAL for v in verdicts],
@@ -260,8 +246,10 @@ def joint_test(
     r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
 
     It is chi-squared where the covariance is exact, else Hotelling's $T^2$. All variances must be
-    finite and above zero.
+    finite and above zero; without differences nothing has changed.
     """
+    if not len(difference):
+        return 0.0, 1.0
     deviations = np.sqrt(np.diag(covariance))
     correlation = covariance / deviations / deviations[:, None]
     values, directions = np.linalg.eigh(0.5 * (correlation + correlation.T))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from scipy import special
+from scipy import linalg, special
 from scipy.interpolate import CubicSpline
 
 from jaxid.arrays import AnyArray, Float
@@ -78,9 +78,7 @@ def estimate_delay(
     single = isinstance(observations, Observations)
     recordings = (observations,) if single else tuple(observations)
     n, size = base.model.robot.joints, base.size
-    common = np.zeros((size + n, size + 1))
-    common[:size, :size] = np.eye(size)
-    common[size:, size] = 1.0
+    common = linalg.block_diag(np.eye(size), np.ones((n, 1)))
     total = _add_delays(base, recordings, np.zeros(size)).total
     w = (MaximumForces() if weights is None else weights)(base.model.robot, total)
     p, seconds, step = Decomposition.of(*total.weighted(w)).solve()[:size], 0.0, np.inf
@@ -108,7 +106,7 @@ def estimate_delay(
     covariance, _ = block_covariance([(rows, f - rows @ x) for rows, f in parts], B)
     contrast = np.eye(n)[1:] - np.eye(n)[:1]
     differences = contrast @ covariance[size:, size:] @ contrast.T
-    p_value = joint_test(contrast @ x[size:], differences, dof)[1] if n > 1 else 1.0
+    p_value = joint_test(contrast @ x[size:], differences, dof)[1]
     return Delay(seconds, deviation, dof, seconds - step + x[size:], p_value)
 
 
@@ -139,13 +137,12 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
     lost = math.ceil(abs(seconds) / dt - 1e-9)
     edge = observations.filter.edge(dt)
     mask, instants = np.array(observations.mask), observations.instants
-    shifted: dict[str, list[np.ndarray]] = {"q": [], "qd": [], "qdd": []}
+    motion = Motion(*(np.array(x, np.float64) for x in vars(observations.motion).values()))
     for (a, b), (r0, r1) in zip(observations.segments, observations.row_segments, strict=True):
         # Beyond the ends the nearest motion is used, in rows that do not count.
         at = np.clip(time[a:b] - seconds, time[a], time[b - 1])
-        for key, parts in shifted.items():
-            x = np.asarray(getattr(observations.motion, key), np.float64)
-            parts.append(CubicSpline(time[a:b], x[a:b])(at))
+        for x in (motion.q, motion.qd, motion.qdd):
+            x[a:b] = CubicSpline(time[a:b], x[a:b])(at)
         first, last = (a + edge + lost, b) if seconds > 0 else (a, b - edge - lost)
         rows = instants[r0:r1]
         mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
@@ -154,5 +151,4 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
             f"the delay is {seconds:g} s, but `{observations.name}` lasts "
             f"{time[-1] - time[0]:g} s: no rows of some joint are left."
         )
-    motion = Motion(**{key: np.concatenate(parts) for key, parts in shifted.items()})
     return observations.replace(motion=motion, mask=mask)

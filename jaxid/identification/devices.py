@@ -27,24 +27,22 @@ MOST = 64
 _calls = itertools.count()
 
 
-def shards(folder: str | Path, pattern: str = "*.parquet") -> tuple[Path, ...]:
-    """Return the files of a data set that this process reads; all of them in a single process.
+def shards(folder: str | Path) -> tuple[Path, ...]:
+    """Return the Parquet files of a folder that this process reads; all in a single process.
 
     Large files are assigned first, each to the process with the fewest bytes so far: all processes
     come to the same assignment without exchange. Open each file with `scan_log`.
 
     Args:
         folder: Folder of the data set, which all processes see.
-        pattern: Pattern of the file names.
 
     Raises:
         InputError: If there is no such file.
     """
-    files = sorted(p for p in Path(folder).glob(pattern) if p.is_file())
+    files = list(Path(folder).glob("*.parquet"))
     if not files:
-        raise InputError(f"`{folder}` holds no file `{pattern}`: check the folder of the data set.")
-    sizes = [0] * jax.process_count()
-    own = []
+        raise InputError(f"`{folder}` holds no file `*.parquet`: check the folder of the data set.")
+    sizes, own = [0] * jax.process_count(), []
     for path in sorted(files, key=lambda p: (-p.stat().st_size, p)):
         process = sizes.index(min(sizes))
         sizes[process] += path.stat().st_size
@@ -56,7 +54,6 @@ def shards(folder: str | Path, pattern: str = "*.parquet") -> tuple[Path, ...]:
 def factorise_across_processes(
     base: BaseParameters,
     recordings: Sequence[Observations],
-    divisions: int = 10,
     patience: float | int = 600.0,
     progress: Progress | None = None,
 ) -> RegressionProblem:
@@ -69,7 +66,6 @@ def factorise_across_processes(
     Args:
         base: The base parameters, the same in all processes.
         recordings: Recordings of this process alone, or none. `shards` distributes files.
-        divisions: Number of blocks of time of each recording.
         patience: Time to wait for the other processes [s].
         progress: Callback, called with the completed fraction (0 to 1) of a pass over long logs.
 
@@ -81,7 +77,7 @@ def factorise_across_processes(
     require_float64("factors across processes")
     own, processes = Blocks(()), jax.process_count()
     if recordings:
-        own = RegressionProblem(base, recordings, progress, divisions=divisions).blocks
+        own = RegressionProblem(base, recordings, progress).blocks
     if processes == 1:
         return RegressionProblem(base, blocks=own, names=[o.name for o in recordings])
     # What must be the same in all processes for their factors to fit together.

@@ -12,11 +12,7 @@ from scipy import optimize
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.identification.combination import (
-    as_least_squares,
-    combine,
-    require_same_base,
-)
+from jaxid.identification.combination import as_least_squares, combine, require_same_base
 from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
 from jaxid.identification.factors import Factors
 from jaxid.identification.fit import Fit, interval_table
@@ -100,15 +96,13 @@ def identify_drive_gains(
         parts = [_linearise(f.time_blocks.total, f.weights, E, k, u) for f, E, k in runs]
         return np.concatenate([r for r, _ in parts]), np.vstack([J for _, J in parts])
 
+    start = np.append(combine(fits, maps, offsets)[0], np.ones(robot.joints))
+    settings = {"method": "lm", "x_scale": "jac", "xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14}
     solution = optimize.least_squares(
         lambda u: linearise(u)[0],
-        np.append(combine(fits, maps, offsets)[0], np.ones(robot.joints)),
+        start,
         lambda u: linearise(u)[1],  # pyright: ignore[reportArgumentType]
-        method="lm",
-        x_scale="jac",
-        xtol=1e-14,
-        ftol=1e-14,
-        gtol=1e-14,
+        **settings,
     )
     c = solution.x[size:]
     residuals, J = linearise(solution.x)
@@ -120,11 +114,11 @@ def identify_drive_gains(
             "the load does not tell all gains: mount a heavier one, farther from the flange, and "
             "let every joint move it in both runs."
         )
-    blocks = []
-    for fit, E, k in runs:
-        for part in fit.time_blocks.parts:
-            r, rows = _linearise(part, fit.weights, E, k, solution.x)
-            blocks.append((rows, -r))
+    blocks = [
+        _linearise(part, fit.weights, E, k, solution.x)[::-1]
+        for fit, E, k in runs
+        for part in fit.time_blocks.parts
+    ]
     covariance, dof = block_covariance(blocks, B)
     covariance = covariance[size:, size:] / c**2 / c[:, None] ** 2
     uncertainty = Uncertainty(covariance, np.full(robot.joints, dof), covariance)

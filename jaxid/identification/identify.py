@@ -119,8 +119,6 @@ def fit_problem(
 
 
 def _check(base: Any, recordings: Sequence[Any]) -> None:
-    if not recordings:
-        raise InputError("`observations` must hold at least one recording, but is empty.")
     if not isinstance(base, BaseParameters):
         raise TypeError(
             f"`base` must be base parameters, but is a `{type(base).__name__}`: pass the result of "
@@ -152,8 +150,7 @@ def _naive_covariance(
     B, weights = np.asarray(estimate.inverse), np.asarray(estimate.weights)
     squares = factors.residual_squares(estimate.parameters)
     taken = estimate.effective_parameters
-    if taken is None:
-        taken = float(np.sum((R @ B) * R))
+    taken = float(np.sum((R @ B) * R)) if taken is None else taken
     free = 1.0 - taken / float(factors.rows.sum())
     covariance = np.zeros_like(B)
     for joint, w, square in zip(factors.joints, weights, squares, strict=True):

@@ -17,10 +17,10 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.regressor import JointRegressor
-from jaxid.identification.uncertainty.spectral import LineSums, line_sums, variances
+from jaxid.identification.uncertainty.spectral import line_sums, variances
 
 AT_ONCE = 2048
-"""Samples whose columns are held at once."""
+"""Samples up to which several data sets evaluate their columns together."""
 WELL_CONDITIONED = 1e4
 """Condition number, with columns of length one, up to which products of rows are accurate enough;
 beyond it a data set is solved again by orthogonal factors."""
@@ -61,7 +61,7 @@ class BatchFit(eqx.Module):
 
 
 class DataSets(NamedTuple):
-    """Data sets of a batch; their samples may be divided by a second axis, of chunks.
+    """Data sets of a batch, or one of them.
 
     Forces have an axis of draws before the samples. The mask is one for rows that count, and None
     if all count; `numbers` are those of the geometry [datasets, numbers], if robots differ.
@@ -97,60 +97,22 @@ def _solved(rows: JointRegressor, batch: DataSets, row_time: float | None) -> Ba
     datasets, samples, _ = batch.motion.q.shape
     calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
     group = -(-datasets // calls)
-    batch = _in_chunks(batch, -(-samples // AT_ONCE))
     whole = calls * group
     more = jax.tree.map(lambda x: x[np.arange(whole - datasets)], batch)
     groups = jax.tree.map(
         lambda x, y: jnp.concatenate([x, y]).reshape((-1, group, *x.shape[1:])), batch, more
     )
-    fits = jax.lax.map(lambda one: _solve_group(rows, one, row_time), groups)
-    return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
 
+    def one(pair: tuple[DataSets, list[Array]]) -> BatchFit:
+        return _solve_one(rows, *pair, row_time)
 
-def _in_chunks(batch: DataSets, chunks: int) -> DataSets:
-    """Divide the samples, filled up with some that do not count; the chunks are a second axis."""
-    missing = -batch.motion.q.shape[1] % chunks
-
-    def divide(x):
-        x = jnp.pad(x, (*((0, 0),) * (x.ndim - 2), (0, missing), (0, 0)))
-        return jnp.moveaxis(x.reshape((*x.shape[:-2], chunks, -1, x.shape[-1])), -3, 1)
-
-    def repeat(x):
-        return jnp.broadcast_to(x[:, None], (len(x), chunks, *x.shape[1:]))
-
-    mask = jnp.ones_like(batch.motion.q) if missing and batch.mask is None else batch.mask
-    motion, forces, mask = jax.tree.map(divide, (batch.motion, batch.forces, mask))
-    weights, numbers = jax.tree.map(repeat, (batch.weights, batch.numbers))
-    return DataSets(motion, forces, weights, mask, numbers)
-
-
-def _solve_group(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
-    """Solve a few data sets; those of one chunk evaluate their columns together, once."""
-    chunks = batch.motion.q.shape[1]
-    if chunks == 1:
-        batch = jax.tree.map(lambda x: x[:, 0], batch)
-        pairs = batch, _columns(rows, batch)
-
-        def one(x):
-            return _solve_one(rows, x[0], lambda f: f(*x), row_time)
-
+    def solve_group(sets: DataSets) -> BatchFit:
+        pairs = sets, _columns(rows, sets)
         # A CPU multiplies the matrices of one data set faster than those of several together.
         return jax.vmap(one)(pairs) if jax.default_backend() != "cpu" else jax.lax.map(one, pairs)
 
-    def by_chunks(parts):
-        def part(f, k):
-            chunk = jax.tree.map(lambda x: x[k], parts)
-            return f(chunk, [A[0] for A in _columns(rows, jax.tree.map(lambda x: x[None], chunk))])
-
-        def total(f):
-            def add(sums, k):
-                return jax.tree.map(jnp.add, sums, part(f, k)), None
-
-            return jax.lax.scan(add, part(f, 0), np.arange(1, chunks))[0]
-
-        return _solve_one(rows, jax.tree.map(lambda x: x[0], parts), total, row_time)
-
-    return jax.lax.map(by_chunks, batch)
+    fits = jax.lax.map(solve_group, groups)
+    return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
 
 
 def _columns(rows: JointRegressor, batch: DataSets) -> list[Array]:
@@ -163,14 +125,12 @@ def _columns(rows: JointRegressor, batch: DataSets) -> list[Array]:
 
 
 def _solve_one(
-    rows: JointRegressor, one: DataSets, total: Callable, row_time: float | None
+    rows: JointRegressor, one: DataSets, columns: list[Array], row_time: float | None
 ) -> BatchFit:
-    """Solve one data set by the products of its rows; `one` is the set, or its first chunk.
-
-    The sum of a function of data and columns over the data set's chunks is `total(function)`.
-    """
+    """Solve one data set by the products of its rows."""
     weights, places = one.weights, [np.array(own, int) for own in rows.columns]
     length, size = len(one.motion.q), rows.size
+    A, Q = _counted(one, columns)
 
     def weighted_sum(products: list[Array]) -> Array:
         """Add the weighted products of columns with forces [draws, base]."""
@@ -184,12 +144,8 @@ def _solve_one(
         pairs = zip(places, products, strict=True)
         return jnp.stack([jnp.sum(p[:, k] * y, axis=-1) for k, y in pairs], axis=-1)
 
-    def sums(x: DataSets, A: list[Array]) -> tuple[list[Array], list[Array], Array, Array]:
-        A, Q = _counted(x, A)
-        count = jnp.full(weights.shape, 1.0 * length) if x.mask is None else x.mask.sum(axis=0)
-        return [theta @ theta.T for theta in A], *_products(A, Q), count
-
-    grams, products, forces, count = total(sums)
+    count = jnp.full(weights.shape, 1.0 * length) if one.mask is None else one.mask.sum(axis=0)
+    grams, (products, forces) = [theta @ theta.T for theta in A], _products(A, Q)
     whole = jnp.zeros((size, size), weights.dtype)
     for k, gram, w in zip(places, grams, weights, strict=True):
         whole = whole.at[k[:, None], k].add(w**2 * gram)
@@ -199,12 +155,9 @@ def _solve_one(
     squares = forces - 2 * along(p, products) + felt
 
     def refine() -> tuple[Array, Array]:
-        def residuals(x: DataSets, A: list[Array]) -> tuple[list[Array], Array]:
-            A, Q = _counted(x, A)
-            joints = zip(Q, A, places, strict=True)
-            return _products(A, [forces - p[:, k] @ theta for forces, theta, k in joints])
-
-        products, squares = total(residuals)
+        joints = zip(Q, A, places, strict=True)
+        residuals = [measured - p[:, k] @ theta for measured, theta, k in joints]
+        products, squares = _products(A, residuals)
         step = weighted_sum(products) @ inverse
         # The squares at the refined parameters: what is of second order in the step is rounding.
         return p + step, squares - 2 * along(step, products)
@@ -221,12 +174,8 @@ def _solve_one(
     naive = jnp.sqrt(jnp.maximum(naive, 0.0))
     deviations, dof = naive, jnp.broadcast_to(count.sum() - size, naive.shape)
     if row_time is not None:
-
-        def lines(x: DataSets, A: list[Array]) -> LineSums:
-            share = jnp.ones(weights.shape) if x.mask is None else x.mask.mean(axis=0)
-            return line_sums(rows.columns, weights, inverse, p, *_counted(x, A), share)
-
-        variance, dof = variances(total(lines), length, row_time)
+        lines = line_sums(rows.columns, weights, inverse, p, A, Q, count / length)
+        variance, dof = variances(lines, length, row_time)
         deviations = jnp.sqrt(jnp.maximum(variance, 0.0))
     return BatchFit(
         p,

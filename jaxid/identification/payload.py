@@ -71,31 +71,29 @@ class Payload(eqx.Module):
         """Mass, centre of mass, and moments about it, with their uncertainty (`CENTRAL_NAMES`)."""
         values, J = _about_centre(np.asarray(self.parameters))
         C = np.asarray(self.uncertainty.covariance)
-        unknown = ~np.isfinite(np.diag(C))
         covariance = J @ np.where(np.isfinite(C), C, 0.0) @ J.T
-        lost = np.any(J[:, unknown] != 0.0, axis=1)
+        lost = np.any(J[:, ~np.isfinite(np.diag(C))] != 0.0, axis=1)
         covariance[lost, lost] = np.inf
-        dof = np.asarray(self.uncertainty.dof)
-        return values, Uncertainty(covariance, dof, covariance)
+        return values, Uncertainty(covariance, self.uncertainty.dof, covariance)
 
     def summary(self) -> Table:
         """Return a table of mass, centre of mass and moments about it, and of their consistency."""
+        text, status = "the payload is a body that could exist.", Status.GOOD
         if not np.isfinite(self.distance):
+            status = Status.BAD
             text = (
                 "the logs do not determine all ten parameters of the payload: move the joints that "
                 "carry it in more poses, faster, and alike in both runs."
             )
-            remark = Remark(text, Status.BAD)
-        elif self.distance == 0:
-            remark = Remark("the payload is a body that could exist.", Status.GOOD)
-        else:
+        elif self.distance > 0:
+            status = Status.NEUTRAL if self.distance < 4.0 else Status.DOUBTFUL
             text = (
                 "the estimate itself belongs to no body: these are the parameters of the nearest "
                 f"one that could exist, {self.distance:.2g} standard deviations away."
             )
-            remark = Remark(text, Status.NEUTRAL if self.distance < 4.0 else Status.DOUBTFUL)
+        remarks = [Remark(text, status)]
         title = "payload in the frame of its body; moments about the centre of mass"
-        return interval_table(title, CENTRAL_NAMES, CENTRAL_UNITS, *self.central, [remark])
+        return interval_table(title, CENTRAL_NAMES, CENTRAL_UNITS, *self.central, remarks)
 
     def __str__(self) -> str:
         return str(self.summary())
@@ -173,14 +171,13 @@ def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"
     if not 0 <= body < robot.joints:
         raise InputError(f"`body` must be from 0 to {robot.joints - 1}, but is {body}.")
     ten = [f"{name}{body + 1}" for name in INERTIAL_NAMES]
-    missing = [name for name in ten if name not in names]
-    if missing:
-        raise InputError(
-            f"a load on body {body} has ten parameters, but the model lacks `{missing[0]}`: use "
-            "`RigidBodies()` with all ten."
-        )
-    unit = np.zeros((len(ten), base.model.size))
-    unit[range(len(ten)), [names.index(name) for name in ten]] = 1.0
+    for name in ten:
+        if name not in names:
+            raise InputError(
+                f"a load on body {body} has ten parameters, but the model lacks `{name}`: use "
+                "`RigidBodies()` with all ten."
+            )
+    unit = np.eye(base.model.size)[[names.index(name) for name in ten]]
     return np.asarray(base.from_standard(unit)).T
 
 

@@ -81,12 +81,8 @@ class RegressionProblem:
                 report = functools.partial(self._report, number)
                 parts += stream_blocks(self.base, recording, edges, report)
             else:
-                folded = self._fold(
-                    self._chunks(number),
-                    RowChunk.equations,
-                    self.base.acting_columns,
-                    self.base.size,
-                )
+                chunks, acting = self._chunks(number), self.base.acting_columns
+                folded = self._fold(chunks, RowChunk.equations, acting, self.base.size)
                 parts += folded[first : first + len(edges) - 1]
         return Blocks(tuple(parts))
 
@@ -95,18 +91,13 @@ class RegressionProblem:
         """The factors of all rows together."""
         return self.blocks.total
 
-    @property
-    def has_samples(self) -> bool:
-        """Whether the rows themselves are known, and not only their factors."""
-        return bool(self.recordings)
-
     def require_samples(self, task: str) -> None:
         """Check that the rows themselves are known, for a task at the beginning of a sentence.
 
         Raises:
             InputError: If only factors are known.
         """
-        if not self.has_samples:
+        if not self.recordings:
             raise InputError(
                 f"{task} needs the rows themselves, but only their factors are known: use "
                 "`identify` with the recordings."

@@ -16,17 +16,13 @@ from jaxid.export.simulators import joint_dynamics
 URDF = """<?xml version="1.0"?>
 <!-- kept -->
 <robot name="small" xmlns:xacro="http://example.org">
-  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
   <link name="world"/>
   <link name="cart">
-    <visual><geometry><mesh filename="package://a/cart.dae"/></geometry></visual>
-    <inertial><origin xyz="1 2 3" rpy="0.1 0.2 0.3"/><mass value="3"/>
-      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-  </link>
+    <visual><geometry><mesh filename="package://a/cart.dae"/></geometry></visual></link>
   <link name="plate"><inertial><mass value="9"/>
       <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
   <link name="upper"/>
-  <link name="lower"><inertial><mass value="2"/>
+  <link name="lower"><inertial><origin xyz="1 2 3" rpy="0.1 0.2 0.3"/><mass value="2"/>
       <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
   <joint name="rail" type="prismatic"><parent link="world"/><child link="cart"/>
     <origin xyz="0 0 0.5" rpy="0.3 0.2 0.1"/><axis xyz="1 0 0"/>
@@ -72,6 +68,10 @@ def held(fit, m, *, drives):
     return forces
 
 
+def close(found, wanted, tolerance):
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=tolerance * np.abs(wanted).max())
+
+
 def pinocchio_torques(pin, model, m):
     data, order = model.createData(), []
     for v in zip(m.q, m.qd, m.qdd, strict=True):
@@ -91,15 +91,10 @@ def test_the_urdf_gives_the_same_torques_in_pinocchio(fit, source, tmp_path):
     model = pin.buildModelFromUrdf(str(path))
     assert list(model.names)[1:] == ["rail", "shoulder", "elbow"]
     m, joints = motion(3, 40), joint_dynamics(fit)[0]
-    wanted = held(fit, m, drives=False)
-    np.testing.assert_allclose(
-        pinocchio_torques(pin, model, m), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max()
-    )
+    close(pinocchio_torques(pin, model, m), held(fit, m, drives=False), 1e-12)
     np.testing.assert_array_equal(model.damping, joints["damping"])
     np.testing.assert_array_equal(model.friction, joints["friction"])
     np.testing.assert_array_equal(model.effortLimit[[0, 2]], [120.0, 25.0])
-    claimed = jid.urdf_parameters(path)
-    np.testing.assert_allclose(claimed, fit.standard_parameters[:30], rtol=1e-12, atol=1e-12)
 
 
 def test_everything_else_in_the_urdf_is_untouched(fit, source, tmp_path):
@@ -107,14 +102,10 @@ def test_everything_else_in_the_urdf_is_untouched(fit, source, tmp_path):
 
     def rest(file):
         root = etree.parse(str(file), etree.XMLParser(remove_blank_text=True)).getroot()
-        for tag in ("inertial", "dynamics"):
-            for element in list(root.iter(tag)):
-                element.getparent().remove(element)
+        for element in root.xpath("//inertial | //dynamics | //comment()[contains(., 'friction')]"):
+            element.getparent().remove(element)
         for limit in root.iter("limit"):
             limit.attrib.pop("effort")
-        for comment in root.xpath("//comment()"):
-            if "Inertias and friction" in comment.text:
-                root.remove(comment)
         return etree.tostring(root, method="c14n")
 
     assert rest(path) == rest(source)
@@ -153,16 +144,11 @@ def test_the_mjcf_gives_the_same_torques_in_mujoco(fit, tmp_path, name):
         fit = fit_of(model, possible(model), full=True)
     path = jid.export_mjcf(fit, tmp_path / "arm.xml")
     model = mujoco.MjModel.from_xml_path(str(path))
-    n, joints = fit.base.model.robot.joints, joint_dynamics(fit)[0]
-    m = motion(n, 40)
-    wanted = held(fit, m, drives=True)
-    np.testing.assert_allclose(
-        mujoco_torques(mujoco, model, m), wanted, rtol=0, atol=1e-11 * np.abs(wanted).max()
-    )
+    m, joints = motion(model.nu, 40), joint_dynamics(fit)[0]
+    close(mujoco_torques(mujoco, model, m), held(fit, m, drives=True), 1e-11)
     np.testing.assert_array_equal(model.dof_armature, joints["armature"])
     np.testing.assert_array_equal(model.dof_damping, joints["damping"])
     np.testing.assert_array_equal(model.dof_frictionloss, joints["friction"])
-    assert model.nu == n
     assert fit.checksum in path.read_text("utf-8")
 
 
@@ -173,25 +159,19 @@ def test_pinocchio_parameters_are_those_of_its_inertias_and_regressor(fit, sourc
     for i, row in enumerate(rows):
         model.inertias[i + 1] = pin.Inertia.FromDynamicParameters(row)
         np.testing.assert_allclose(model.inertias[i + 1].toDynamicParameters(), row, atol=1e-12)
-    wanted = held(fit, m, drives=False)
-    np.testing.assert_allclose(
-        pinocchio_torques(pin, model, m), wanted, rtol=0, atol=1e-12 * np.abs(wanted).max()
-    )
+    close(pinocchio_torques(pin, model, m), held(fit, m, drives=False), 1e-12)
 
 
 def test_the_exported_function_takes_any_number_of_samples_and_needs_no_jaxid(fit, tmp_path):
     exported, m = jid.export.exported_function(fit), motion(3, 30)
-    np.testing.assert_allclose(
-        exported.call(m.q, m.qd, m.qdd), fit.predict(m), rtol=1e-11, atol=1e-11
-    )
+    close(exported.call(m.q, m.qd, m.qdd), fit.predict(m), 1e-13)
     if importlib.util.find_spec("flatbuffers") is None:
         with pytest.raises(RuntimeError, match="pip install flatbuffers"):
             jid.export.export_jax(fit, tmp_path / "arm.bin")
         return
     path, m = jid.export.export_jax(fit, tmp_path / "arm.bin"), motion(3, 1)
     read = jax.export.deserialize(bytearray(path.read_bytes()))
-    found = read.call(m.q, m.qd, m.qdd)
-    np.testing.assert_allclose(found, fit.predict(m), rtol=1e-11, atol=1e-11)
+    close(read.call(m.q, m.qd, m.qdd), fit.predict(m), 1e-13)
 
 
 class Drag(jid.terms.AbstractTerm):
@@ -232,8 +212,6 @@ def test_what_could_not_exist_is_refused_with_the_way_out(fit, tmp_path, write, 
         p[30] = -0.1
     fit = dataclasses.replace(fit, full_parameters=None if case == "base" else p)
     said = {"base": "only base parameters", "body": "body 2 cannot", "friction": "`damping`"}
-    with pytest.raises(ValueError, match=said[case]) as error:
+    with pytest.raises(ValueError, match=f"{said[case]}.*`jid.PhysicallyConsistent"):
         write(fit, tmp_path / "out")
-    assert "`jid.PhysicallyConsistent()`" in str(error.value)
-    assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()

@@ -6,7 +6,7 @@ from scipy import stats
 from virtual import fit_of, planar_base, uncertainty
 
 import jaxid as jid
-from jaxid.identification.comparison import Verdict, compare_some, parameter_kinds
+from jaxid.identification.comparison import Verdict, compare_some
 
 BASE = planar_base()
 SIZE, DRAWS = BASE.size, 1500
@@ -93,24 +93,11 @@ def test_covariance_and_degrees_of_freedom_of_a_difference():
     assert shared.names == ("fv1", "fv2")
 
 
-def test_kinds_are_the_terms_in_words():
-    kinds = dict(zip(BASE.names, parameter_kinds(BASE), strict=True))
-    assert (kinds["mx1"], kinds["fv1"], kinds["fo2"]) == (
-        "rigid bodies",
-        "viscous friction",
-        "constant offset",
-    )
-
-
-def test_refusals():
-    (a, _), _, _ = covariances(5)
-    one = fit(np.zeros(SIZE), a)
+@pytest.mark.parametrize(("terms", "length"), [(3, 0.4), (4, 0.5)])
+def test_refusals(terms, length):
+    one, robot = fit(np.zeros(SIZE), np.eye(SIZE)), jid.robots.planar_arm(2, length)
+    other = jid.base_parameters(jid.Model(robot, BASE.model.terms[:terms]))
+    with pytest.raises(ValueError, match="have different base parameters"):
+        jid.compare(one, fit_of(other, np.zeros(other.size)))
     with pytest.raises(ValueError, match="`level`"):
         jid.compare(one, one, 95.0)
-    model = jid.Model(BASE.model.robot, (*BASE.model.terms[:3], jid.RotorInertia()))
-    base = jid.base_parameters(model)
-    with pytest.raises(ValueError, match=r"in number|in the place of"):
-        jid.compare(one, fit_of(base, np.zeros(base.size)))
-    longer = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.5), BASE.model.terms))
-    with pytest.raises(ValueError, match="the lengths in them differ"):
-        jid.compare(one, fit_of(longer, np.zeros(SIZE)))

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from virtual import dense, observations, planar_base, standard_parameters
+from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.combination import combine
@@ -12,11 +12,6 @@ from jaxid.identification.comparison import Verdict
 from jaxid.identification.states import stores_energy
 
 NOISE = np.array([0.5, 0.1])
-
-
-@pytest.fixture(scope="module")
-def base():
-    return planar_base()
 
 
 def observe(base, truths, seed=0, **options):
@@ -162,14 +157,6 @@ def test_a_fit_that_leaves_something_open_still_helps(base, truths):
     assert 0.0 < jid.identify_states(named).sharing[1] <= 1.0
 
 
-def test_a_fit_from_a_file_goes_on_exactly(fits, tmp_path):
-    again = jid.load(fits[0].save(tmp_path / "cold.json"))
-    for a, b in zip(again.factor, fits[0].factor, strict=True):
-        np.testing.assert_array_equal(a, b)
-    updated = [jid.update(one, fits[1]).parameters for one in (again, fits[0])]
-    np.testing.assert_array_equal(*updated)
-
-
 def test_other_estimates_are_solved_again_from_their_factors(base, logs, fits):
     robust = jid.identify(base, logs[0], jid.estimators.IterativelyReweighted())
     assert not robust.is_least_squares
@@ -178,20 +165,15 @@ def test_other_estimates_are_solved_again_from_their_factors(base, logs, fits):
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("chosen", "message"),
     [
-        (lambda one, other: jid.identify_states([one, one]), "different names"),
-        (lambda one, other: jid.identify_states([one, other], ["fv9"]), "`fv9` is no base"),
-        (lambda one, other: jid.identify_states([one, other], ["fv1"], ["fv2"]), "`varying`"),
-        (lambda one, other: jid.identify_states([one, other]).fit("hot"), "`state`"),
+        ((0, 0), "different names"),
+        ((0, 1, ["fv9"]), "`fv9` is no base"),
+        ((0, 1, ["fv1"], ["fv2"]), "`varying`"),
     ],
 )
-def test_refusals(fits, call, message):
+def test_refusals(fits, found, chosen, message):
     with pytest.raises(ValueError, match=message):
-        call(*fits)
-
-
-def test_fits_of_other_models_are_refused(base, logs, fits):
-    bare = jid.base_parameters(jid.Model(base.model.robot, base.model.terms[:3]))
-    with pytest.raises(ValueError, match="`cold` and `bare` have different base parameters"):
-        jid.update(fits[0], jid.identify(bare, logs[1], name="bare"))
+        jid.identify_states([fits[k] for k in chosen[:2]], *chosen[2:])
+    with pytest.raises(ValueError, match="`state`"):
+        found.fit("hot")

@@ -1,6 +1,5 @@
 """The compiled pass over long logs gives what NumPy's QR gives, and chunks change only rounding."""
 
-import itertools
 import math
 
 import equinox as eqx
@@ -16,20 +15,9 @@ from jaxid.identification.identify import fit_problem
 SMOOTH = jid.ZeroPhaseButterworth(100.0, margin=0.01)
 
 
-def based(robot) -> jid.BaseParameters:
-    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
-    return jid.base_parameters(jid.Model(robot, terms))
-
-
-@pytest.fixture(scope="module")
-def base():
-    return based(jid.robots.planar_arm(2, 0.4))
-
-
 def observed(base, samples=6000, noise=0.3, **options) -> jid.Observations:
-    return observations(
-        base.model, standard_parameters(base.model), samples=samples, noise=noise, **options
-    )
+    p = standard_parameters(base.model)
+    return observations(base.model, p, samples=samples, noise=noise, **options)
 
 
 def changed(o: jid.Observations, **fields) -> jid.Observations:
@@ -59,10 +47,8 @@ def agree(base, o, blocks=4) -> None:
     np.testing.assert_array_equal(got.total.rows, expected.total.rows)
     for a, b in zip((got.total, *got.parts), (expected.total, *expected.parts), strict=True):
         assert distance(a, b) < 1e-12
-    p, q = (
-        fit_problem(jid.RegressionProblem(base, blocks=x), jid.estimators.LeastSquares()).parameters
-        for x in (got, expected)
-    )
+    problems = (jid.RegressionProblem(base, blocks=x) for x in (got, expected))
+    p, q = (fit_problem(x, jid.estimators.LeastSquares()).parameters for x in problems)
     norms = np.linalg.norm(expected.total.weighted(np.ones(2))[0], axis=0)
     assert np.linalg.norm(norms * (p - q)) <= 1e-12 * np.linalg.norm(norms * q)
 
@@ -76,7 +62,6 @@ def agree(base, o, blocks=4) -> None:
         {"still": (0,)},
         {"still": (1,)},
     ],
-    ids=["every sample a row", "masked rows", "subsampled", "first joint still", "second still"],
 )
 def test_unfiltered(base, options):
     agree(base, observed(base, **options))
@@ -93,15 +78,10 @@ def test_a_joint_that_moves_late(base):
 def test_a_known_tool(base):
     robot = base.model.robot
     tool = jid.Tool(1, mass=2.5, centre_of_mass=(0.1, 0.0, 0.05))
-    loaded = based(robot.replace(tool=tool))
+    loaded = jid.base_parameters(jid.Model(robot.replace(tool=tool), base.model.terms))
     o = observed(loaded)
     agree(loaded, o)
     assert distance(fast(loaded, o).total, fast(base, o).total) > 1e-3
-
-
-def test_forces_without_noise_are_explained_to_rounding(base):
-    problem = jid.RegressionProblem(base, blocks=fast(base, observed(base, noise=0.0)))
-    assert fit_problem(problem, jid.estimators.LeastSquares()).residual < 1e-13
 
 
 @pytest.mark.parametrize(
@@ -110,7 +90,6 @@ def test_forces_without_noise_are_explained_to_rounding(base):
         {"segments": ((0, 900), (900, 25000), (25000, 26500), (26500, 60000))},
         {"decimation": jid.Decimation((5, 4))},
     ],
-    ids=["several segments", "stages of decimation"],
 )
 def test_filtered_and_decimated(base, fields):
     agree(base, changed(observed(base, samples=60000, filter=SMOOTH, every=7), **fields))
@@ -127,20 +106,16 @@ def test_a_response_is_what_filtering_an_impulse_gives():
     low_pass = jid.ZeroPhaseButterworth(30.0).low_pass(1e-3)
     h = streaming.impulse_response(low_pass)
     half = len(h) // 2
-    impulse = np.zeros(6 * half + 1)
-    impulse[3 * half] = 1.0
-    expected = low_pass(impulse)
-    np.testing.assert_allclose(h, expected[2 * half : 4 * half + 1], atol=1e-15)
+    expected = low_pass(np.eye(1, 6 * half + 1, 3 * half)[0])
+    np.testing.assert_allclose(np.pad(h, 2 * half), expected, atol=1e-15)
     assert math.isclose(h.sum(), 1.0, rel_tol=1e-12)
-    assert np.abs(expected[: 2 * half]).max() < 1e-14 * h.max()
 
 
 def test_a_prismatic_arm_against_a_dense_matrix():
     robot = jid.robots.planar_arm(3, 0.4)
     base = jid.base_parameters(jid.Model(robot.replace(revolute=(False, True, True))))
-    o = observations(base.model, standard_parameters(base.model), samples=5000, noise=1.0)
+    o, weights = observed(base, samples=5000, noise=1.0), np.linspace(0.5, 2.0, 3)
     theta, forces, joint = dense(base, o)
-    weights = np.linspace(0.5, 2.0, 3)
     W = weights[joint]
     R, z = fast(base, o).total.weighted(weights)
     norms = np.linalg.norm(R, axis=0)
@@ -154,10 +129,8 @@ def test_long_logs_take_the_compiled_pass_by_themselves(base, monkeypatch):
     slow = jid.RegressionProblem(base, [o, o], divisions=5).blocks
     monkeypatch.setattr(streaming, "LONG", 5000)
     quick = jid.RegressionProblem(base, [o, o], divisions=5).blocks
-    assert len(quick.parts) == 10
-    assert distance(slow.total, quick.total) < 1e-12
-    firsts = [p.joints[0].R for p in quick.parts]
-    assert not any(np.array_equal(a, b) for a, b in itertools.pairwise(firsts))
+    distances = [distance(a, b) for a, b in zip(slow.parts, quick.parts, strict=True)]
+    assert 0.0 < max(distances) < 1e-12
 
 
 def test_filters_with_a_long_memory_stay_in_numpy(base):

@@ -49,7 +49,7 @@ class SpectralSandwich(AbstractUncertainty):
 
     def __call__(self, problem, estimate, naive):
         """Return the sandwich, with the jackknife as a cross-check."""
-        if not problem.has_samples:
+        if not problem.recordings:
             found, _ = BlockJackknife()(problem, estimate, naive)
             note = (
                 "standard deviations come from the block jackknife: only factors of the rows were "
