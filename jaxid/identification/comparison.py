@@ -121,10 +121,10 @@ class Comparison(eqx.Module):
         Each has `name`, the number of determined `parameters`, the `statistic` (about that number
         where nothing has changed), its `p_value`, and whether the group has `changed`.
         """
-        kinds, known = np.array(self.kinds), self.uncertainty
+        kinds, determined, known = np.array(self.kinds), self.determined, self.uncertainty
         groups = []
         for name in dict.fromkeys(kinds.tolist()):
-            k = np.flatnonzero(self.determined & (kinds == name))
+            k = np.flatnonzero(determined & (kinds == name))
             dof = float(np.min(np.asarray(known.dof)[k], initial=np.inf))
             covariance = np.asarray(known.covariance)[np.ix_(k, k)]
             statistic, p = joint_test(np.asarray(self.difference)[k], covariance, dof)

@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -160,7 +160,10 @@ class _Stream:
         edges: Sequence[int],
         progress: Progress | None,
     ):
-        stages = _stages(observations)
+        stages, self._stride = _stages(observations), 1
+        if all(len(response) == 1 for response, _ in stages):
+            # Without filters the samples between the rows are not needed.
+            self._stride, stages = math.prod(factor for _, factor in stages), ()
         self._observations, self._edges, self._progress = observations, list(edges), progress
         self._widths = [len(columns) + 1 for columns in base.acting_columns]
         self._mask = np.asarray(observations.mask)
@@ -195,11 +198,12 @@ class _Stream:
             for r in range(rows.start, rows.stop, most):
                 end = min(r + most, rows.stop)
                 begin = a + edge + (r - r0) * factor - reach
-                yield block, (r, end), slice(begin, min(begin + self._samples_of(end - r), b))
+                samples = slice(begin, min(begin + self._samples_of(end - r), b), self._stride)
+                yield block, (r, end), samples
 
     def _samples_of(self, rows: int) -> int:
         shape = self._shape
-        return -(-(rows + shape.delay) // shape.rows) * shape.samples
+        return -(-(rows + shape.delay) // shape.rows) * shape.samples * self._stride
 
     def _reduce_ends(self, base: BaseParameters) -> Iterator[tuple[int, list[np.ndarray]]]:
         """Yield block and equations of the rows that no piece covers, reduced in NumPy."""
@@ -220,7 +224,7 @@ class _Stream:
         R, blocks, similar = self._pass(first)
         if not similar:
             # The first look has missed what the pass has seen: now it is known.
-            total = _sums(blocks)
+            total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
             R, blocks, _ = self._pass([r.T @ G @ r for r, G in zip(R, total, strict=True)])
         return [[_root(G) @ r for G, r in zip(grams, R, strict=True)] for grams in blocks]
 
@@ -231,23 +235,28 @@ class _Stream:
             # As many rows of a piece as an iteration has.
             b = min(b, a + self._shape.rows)
             stop = min(samples.stop, samples.start + self._samples_of(b - a))
-            pieces.append((block, (a, b), slice(samples.start, stop)))
-        grams = self._grams(pieces, [np.eye(w) for w in self._widths])
-        return _sums(grams)
+            pieces.append((block, (a, b), slice(samples.start, stop, samples.step)))
+        total = [np.zeros((width, width)) for width in self._widths]
+        self._add([total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths])
+        return total
 
     def _pass(self, first: Grams) -> tuple[Grams, list[Grams], bool]:
         """Return the first triangles, Gram matrices of every block, and whether they agree."""
         R = [_triangle(G) for G in first]
         mixing = [np.linalg.inv(r) for r in R]
-        blocks = self._grams(self._pieces, mixing, self._progress)
-        similar = all(_similar(*x) for x in zip(_sums(blocks), first, mixing, strict=True))
-        return R, blocks, similar
-
-    def _grams(
-        self, pieces: Sequence[Piece], mixing: Grams, progress: Progress | None = None
-    ) -> list[Grams]:
-        """Return the Gram matrices of every block: those of some pieces, and of the ends."""
         blocks = [[np.zeros((w, w)) for w in self._widths] for _ in self._edges[1:]]
+        self._add(blocks, self._pieces, mixing, self._progress)
+        total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
+        return R, blocks, all(_similar(*x) for x in zip(total, first, mixing, strict=True))
+
+    def _add(
+        self,
+        blocks: list[Grams],
+        pieces: Sequence[Piece],
+        mixing: Grams,
+        progress: Progress | None = None,
+    ) -> None:
+        """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
         for done, ((block, _, _), grams) in enumerate(self._run(pieces, mixing), 1):
             for total, G in zip(blocks[block], grams, strict=True):
                 total += G
@@ -257,7 +266,6 @@ class _Stream:
             for total, rows, mix in zip(blocks[block], equations, mixing, strict=True):
                 mixed = rows @ mix
                 total += mixed.T @ mixed
-        return blocks
 
     def _run(self, pieces: Sequence[Piece], mixing: Grams) -> Iterator[tuple[Piece, Grams]]:
         """Call the loop for some pieces, one on each device, and read the next ones meanwhile."""
@@ -280,14 +288,15 @@ class _Stream:
     def _fill(self, piece: Piece, read: tuple) -> list[np.ndarray]:
         """Return the arrays of one piece, filled up to the shape of the loop."""
         (motion, forces), shape = read, self._shape
-        samples = [np.asarray(x, np.float64) for x in (motion.q, motion.qd, motion.qdd, forces)]
-        missing = shape.iterations * shape.samples - len(forces)
-        arrays = [np.pad(x, ((0, missing), (0, 0))) for x in samples]
         # The first rows come late, and do not count.
-        mask = self._mask[slice(*piece[1])]
-        rows = shape.delay + len(mask)
-        mask = np.pad(mask, ((shape.delay, shape.iterations * shape.rows - rows), (0, 0)))
-        return [*arrays, mask, np.asarray(-(-rows // shape.rows), np.int32)]
+        mask = np.pad(self._mask[slice(*piece[1])], ((shape.delay, 0), (0, 0)))
+        length = shape.iterations * shape.samples
+        arrays = [
+            _filled_up(np.asarray(x, np.float64), length)
+            for x in (motion.q, motion.qd, motion.qdd, forces)
+        ]
+        arrays.append(_filled_up(mask, shape.iterations * shape.rows))
+        return [*arrays, np.asarray(-(-len(mask) // shape.rows), np.int32)]
 
     def _call(self, pieces: list[list[np.ndarray]], mixing: Grams) -> list[Grams]:
         """Return the Gram matrices of some pieces, at most one for each device."""
@@ -303,9 +312,12 @@ class _Stream:
         return [[G[k] for G in grams] for k in range(count)]
 
 
-def _sums(blocks: list[Grams]) -> Grams:
-    """Return the Gram matrices of all blocks together."""
-    return [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
+def _filled_up(x: np.ndarray, length: int) -> np.ndarray:
+    if len(x) >= length:
+        return np.ascontiguousarray(x[:length])
+    out = np.zeros((length, *x.shape[1:]), x.dtype)
+    out[: len(x)] = x
+    return out
 
 
 def _triangle(G: np.ndarray) -> np.ndarray:
@@ -333,9 +345,12 @@ def _root(G: np.ndarray) -> np.ndarray:
     root = np.zeros_like(G)
     live = np.flatnonzero(np.diag(G) > 0)
     own = np.ix_(live, live)
-    values, directions = np.linalg.eigh(G[own])
-    rows = np.sqrt(np.maximum(values, 0.0))[:, None] * directions.T
-    root[own] = np.linalg.qr(rows, mode="r")
+    try:
+        root[own] = np.linalg.cholesky(G[own]).T
+    except np.linalg.LinAlgError:
+        values, directions = np.linalg.eigh(G[own])
+        rows = np.sqrt(np.maximum(values, 0.0))[:, None] * directions.T
+        root[own] = np.linalg.qr(rows, mode="r")
     return root
 
 
@@ -369,15 +384,22 @@ def _compiled(
         known = [0.0] * joints if tool_forces is None else tool_forces(q, qd, qdd)
         return columns + [f - k for f, k in zip(forces, known, strict=True)]
 
-    def nothing(*parts: Array) -> list[Array]:
-        return [jnp.zeros(parts[0].shape[1:])] * height
+    def nothing(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
+        return [jnp.zeros(q.shape[1:])] * height
 
-    def run(*arrays: Any) -> list[Array]:
-        *samples, mask, count, mixing, matrices = arrays
-
+    def run(
+        q: AnyArray,
+        qd: AnyArray,
+        qdd: AnyArray,
+        forces: AnyArray,
+        mask: AnyArray,
+        count: AnyArray,
+        mixing: list,
+        matrices: list,
+    ) -> list[Array]:
         def iteration(k: Array, state: tuple) -> tuple:
             carried, grams = state
-            parts = [_part(x, k, shape.samples) for x in samples]
+            parts = [_part(x, k, shape.samples) for x in (q, qd, qdd, forces)]
             # Results of a branch are stored: no consumer computes them again.
             columns = jax.lax.cond(count > 0, evaluate, nothing, *parts)
             new = jnp.stack(columns)
