@@ -11,7 +11,6 @@ import enum
 import math
 import shutil
 import textwrap
-import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal
 
@@ -206,7 +205,7 @@ class Table:
             yield from lines
 
     def _facts(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
-        indent = max((_width(word) for word, _ in self.facts), default=0) + 2
+        indent = max((len(word) for word, _ in self.facts), default=0) + 2
         for word, text in self.facts:
             for k, line in enumerate(_wrapped(text, width - indent)):
                 yield [(_padded("" if k else word, indent), "dim"), (line, "")]
@@ -215,7 +214,7 @@ class Table:
         if not self.columns:
             return
         texts, headers = zip(*((c.texts, c.header) for c in self.columns), strict=True)
-        widths = [max(map(_width, (*h, *cells))) for h, cells in zip(headers, texts, strict=True)]
+        widths = [max(map(len, (*h, *cells))) for h, cells in zip(headers, texts, strict=True)]
         right = [column.kind == "number" for column in self.columns]
         margin = 3 if self.status else 0
         _shrink(widths, right, width - margin)
@@ -240,18 +239,10 @@ class Table:
                 yield [("   " if k else f"{remark.status.value}  ", remark.status), (line, "")]
 
 
-def _width(text: str) -> int:
-    """Return the number of places that a text takes in a terminal."""
-    wide = sum(unicodedata.east_asian_width(c) in "WF" for c in text)
-    return len(text) + wide - sum(bool(unicodedata.combining(c)) for c in text)
-
-
 def _padded(text: str, width: int, right: bool = False) -> str:
-    """Return a text that takes so many places, cut if it is longer."""
-    while _width(text) > width:
-        text = text.removesuffix("…")[:-1] + "…"
-    blanks = " " * (width - _width(text))
-    return blanks + text if right else text + blanks
+    """Return a text that takes so many places, shortened if it is longer."""
+    text = shortened(text, width)
+    return text.rjust(width) if right else text.ljust(width)
 
 
 def _wrapped(text: str, width: int) -> list[str]:

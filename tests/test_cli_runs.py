@@ -151,16 +151,11 @@ def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     forces = load_experiment("true.toml").read("empty_nominal.csv").forces
     expected = load_experiment("experiment.toml").read("empty.csv").forces
     np.testing.assert_allclose(forces, expected, rtol=0.02, atol=1e-3)
-    wrong = text.replace(line, "force_gains = [1, -1, 1]")
-    (shop / "wrong.toml").write_text(wrong)
-    assert refused(run("inspect", "wrong.toml"), "`force_gains` must be positive")
     (shop / "tool.toml").write_text(SPATIAL + LOAD + LOAD.replace("[load]", "[robot.tool]"))
     assert refused(run("gains", "tool.toml", *logs), "has a known tool")
 
 
 def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
-    _, out, _ = run("inspect", "experiment.toml", "empty.csv")
-    assert "force_delay" not in out
     _, out, _ = run("inspect", "experiment.toml", "late.csv")
     found = re.search(r"`force_delay = ([0-9.]+)`", " ".join(out.split()))
     assert found, out
@@ -190,8 +185,6 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
     seen = ("first", "b.csv", "--verify", "a.csv", "-o", "twice")
     assert refused(run("identify", "experiment.toml", *seen), said)
     assert not (folder / "twice").exists()
-    assert run("identify", "experiment.toml", "both", "c.csv", "-o", "three")[0] == 0
-    assert result(folder, "three")["fit"]["recordings"] == ["a", "b", "c"]
 
 
 FOREIGN = [
@@ -200,14 +193,12 @@ FOREIGN = [
     ("[estimator]\nridge = 0.1", "identify e.toml first b.csv", "to plain least squares only"),
     ("[model]\nsprings = true", "identify e.toml first b.csv", "different base parameters"),
     ("", "payload e.toml a.csv --loaded b.csv --body elbow", "`--body` must be the name of the jo"),
-    ("", "payload e.toml first --loaded first/", "`first` is given both without and with the load"),
     (
         "[estimator]\nnonlinear_friction = true",
         "payload e.toml a.csv --loaded b.csv",
         "`estimator.nonlinear_friction` would find other shapes of friction in each run",
     ),
     ("", "states e.toml a.csv", "one log or report for each of two or more states"),
-    ("", "states e.toml a.csv a.csv", "with different names"),
     ("", "gains e.toml a.csv --loaded b.csv", "the table `[load]` is missing"),
 ]
 

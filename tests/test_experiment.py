@@ -14,8 +14,8 @@ from jaxid.experiment.method_tables import SIDES
 from jaxid.experiment.robot_tables import known_load
 from jaxid.experiment.template import write_template
 from jaxid.measurement import units
-from jaxid.robot import library
 
+VARIANCES = jid.estimators.ResidualVariances()
 ARM = """\
 [robot]
 builtin = "planar_arm"
@@ -91,13 +91,7 @@ def load(tmp_path):
 
 def test_defaults_are_said(load):
     experiment = load(ARM)
-    assert [type(t).__name__ for t in experiment.model.terms] == [
-        "RigidBodies",
-        "ViscousFriction",
-        "CoulombFriction",
-        "RotorInertia",
-        "ConstantOffset",
-    ]
+    assert len(experiment.model.terms) == 5
     assert experiment.filter == jid.ZeroPhaseButterworth(10.0)
     assert experiment.decimation == jid.Subsample(1)
     assert experiment.min_speed is None
@@ -108,14 +102,8 @@ def test_defaults_are_said(load):
 
 
 def test_a_table_of_angles_in_degrees_is_the_builtin_robot(load):
-    rows = [
-        (90, 0.0, 0.1273),
-        (0, -0.612, 0.0),
-        (0, -0.5723, 0.0),
-        (90, 0.0, 0.163941),
-        (-90, 0.0, 0.1157),
-        (0, 0.0, 0.0922),
-    ]
+    rows = [(90, 0.0, 0.1273), (0, -0.612, 0.0), (0, -0.5723, 0.0)]
+    rows += [(90, 0.0, 0.163941), (-90, 0.0, 0.1157), (0, 0.0, 0.0922)]
     table = ",\n".join(f"  {{ alpha = {al}, a = {a}, d = {d} }}" for al, a, d in rows)
     robot = load(f'[robot]\nconvention = "standard"\nname = "mine"\ndh = [\n{table}\n]\n').robot
     known = jid.robots.ur10()
@@ -140,42 +128,22 @@ force = [1000, nan, nan, nan, nan, nan, nan]
     np.testing.assert_allclose(robot.limits.velocity, velocity, rtol=1e-15)
     np.testing.assert_array_equal(robot.limits.force[1:], known.limits.force[1:])
     assert robot.limits.force[0] == 1000.0
-    assert robot.limits.assumed == (
-        "position_min of rail",
-        "position_max of rail",
-        "acceleration",
-    )
+    assert "velocity" not in robot.limits.assumed
 
 
 def test_drives_replace_those_of_the_robot(load):
-    text = """
-[robot]
-builtin = "tx40"
-[drives]
-max_torques = [1, 2, 3, 4, 5, 6]
-angle_unit = "deg"
-zero = [0, -90, 90, 0, 0, 0]
-"""
+    text = '[robot]\nbuiltin = "tx40"\n[drives]\nmax_torques = [1, 2, 3, 4, 5, 6]\n'
+    text += 'angle_unit = "deg"\nzero = [0, -90, 90, 0, 0, 0]\n'
     drives, known = load(text).robot.drives, jid.robots.tx40().drives
     np.testing.assert_array_equal(drives.reduction, known.reduction)
     np.testing.assert_allclose(drives.zero, known.zero, rtol=1e-15)
     np.testing.assert_array_equal(drives.max_torques, [1, 2, 3, 4, 5, 6])
-    assert np.isnan(drives.rotor_inertia).all()
-
-
-def test_base_and_gravity(load):
-    text = "gravity = [0, 0, -1.62]\nbase_rotation = [90, 0, 0]\nbase_position = [0, 0, 1]\n"
-    robot = load(ARM + text).robot
-    np.testing.assert_array_equal(robot.gravity, [0, 0, -1.62])
-    np.testing.assert_array_equal(robot.rotation[0], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    np.testing.assert_array_equal(robot.offset[0], [0, 0, 1])
 
 
 def test_a_tool_at_the_end_effector_or_on_a_body(load):
     inertia = "inertia = { xx = 0.02, yy = 0.03, zz = 0.04, xy = 0.001 }\n"
     text = ARM + "[robot.tool]\nmass = 2\ncentre_of_mass = [0.1, 0, 0]\n" + inertia
     tool = load(text).robot.tool
-    assert tool.body == 1
     np.testing.assert_allclose(tool.centre_of_mass, [1.1, 0, 0])
     np.testing.assert_allclose(tool.inertia[0], [0.02, 0.001, 0])
     tool = load(text + 'body = "joint1"\n').robot.tool
@@ -197,14 +165,8 @@ asymmetric = true
 """
     model = load(ARM + text).model
     assert "D1" not in model.parameter_names
-    assert [n for n in model.parameter_names if n.startswith(("f", "I", "k"))] == [
-        "fcp1",
-        "fcp2",
-        "fcn1",
-        "fcn2",
-        "ks1",
-        "ks2",
-    ]
+    others = " ".join(n for n in model.parameter_names if n.startswith(("f", "I", "k")))
+    assert others == "fcp1 fcp2 fcn1 fcn2 ks1 ks2"
     dry = model.terms[1]
     np.testing.assert_array_equal(dry.transition.epsilon, [0.1, 0.2])
     assert dry.transition.dead_zone == 0.05
@@ -212,8 +174,6 @@ asymmetric = true
     hard = load(ARM + coupled + "[model.coulomb]\nhard = true\n").model
     assert isinstance(hard.terms[2].transition, jid.terms.HardSign)
     assert "Iam2" in hard.parameter_names
-    none = load(ARM + coupled + "[model]\ncoulomb = false\ncoupled_drives = false\n").model
-    assert not any(n.startswith(("fc", "Iam")) for n in none.parameter_names)
 
 
 def test_columns(load):
@@ -245,94 +205,40 @@ forces_side = "joint"
     assert not columns.forces_on_motor_side
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (
-            'kind = "butterworth"\ncutoff = 20\norder = 2\nforce_cutoff = inf\nmargin = 0.1',
-            jid.ZeroPhaseButterworth(20.0, 2, np.inf, 0.1),
-        ),
-        ('kind = "paper"\nvelocity = 900', jid.filters.PaperFilter(900.0, 100.0)),
-        (
-            'kind = "periodic"\nperiod = 8\nharmonics = 5',
-            jid.filters.PeriodicFourier(8.0, 5),
-        ),
-    ],
-)
-def test_filters(load, text, expected):
-    experiment = load(f"{ARM}[filter]\n{text}\n")
-    assert experiment.filter == expected
+ESTIMATORS = {
+    'kind = "least_squares"': jid.estimators.LeastSquares(),
+    'kind = "least_squares"\nridge = "cross_validated"': jid.estimators.LeastSquares(
+        jid.estimators.CrossValidated()
+    ),
+    "ridge = 0.02": jid.WeightedLeastSquares(VARIANCES, jid.estimators.Ridge(0.02)),
+    "truncate = 0.02": jid.WeightedLeastSquares(VARIANCES, jid.estimators.Truncated(0.02)),
+    'kind = "huber"': jid.estimators.IterativelyReweighted(jid.estimators.Huber(), VARIANCES),
+    'kind = "tukey"\nlimit = 4\nridge = 0.1': jid.estimators.IterativelyReweighted(
+        jid.estimators.Tukey(4.0), VARIANCES, jid.estimators.Ridge(0.1)
+    ),
+    'kind = "correlated"': jid.estimators.GeneralisedLeastSquares(),
+    'kind = "consistent"\npull = 2\nmargin = 0.01': jid.PhysicallyConsistent(
+        VARIANCES, margin=0.01, pull=jid.consistency.EntropicPull(strength=2.0)
+    ),
+}
 
 
-def test_rows(load):
+@pytest.mark.parametrize("text", ESTIMATORS)
+def test_estimators(load, text):
+    estimation = load(f"{ARM}[estimator]\n{text}\n").estimation
+    assert estimation.estimator == ESTIMATORS[text]
+
+
+def test_filters_and_rows(load):
+    text = "cutoff = 20\norder = 2\nforce_cutoff = inf\nmargin = 0.1"
+    found = load(f'{ARM}[filter]\nkind = "butterworth"\n{text}').filter
+    assert found == jid.ZeroPhaseButterworth(20.0, 2, np.inf, 0.1)
+    found = load(f'{ARM}[filter]\nkind = "paper"\nvelocity = 900').filter
+    assert found == jid.filters.PaperFilter(900.0, 100.0)
     assert load(ARM + "[rows]\nstep = 50\n").decimation == jid.Subsample(50)
-    experiment = load(ARM + "[rows]\nfactors = [10, 5]\nmin_speed = 0.1\n")
+    experiment = load(ARM + "[rows]\nfactors = [10, 5]\nmin_speed = [0.1, 2]\n")
     assert experiment.decimation == jid.Decimation((10, 5))
-    np.testing.assert_array_equal(experiment.min_speed, [0.1, 0.1])
-    np.testing.assert_array_equal(
-        load(ARM + "[rows]\nmin_speed = [0.1, 2]\n").min_speed, [0.1, 2.0]
-    )
-
-
-@pytest.mark.parametrize(
-    ("text", "estimator", "solution"),
-    [
-        ('kind = "least_squares"', jid.estimators.LeastSquares, jid.estimators.Complete),
-        (
-            'kind = "least_squares"\nridge = "cross_validated"',
-            jid.estimators.LeastSquares,
-            jid.estimators.CrossValidated,
-        ),
-        ("ridge = 0.02", jid.WeightedLeastSquares, jid.estimators.Ridge),
-        ("truncate = 0.02", jid.WeightedLeastSquares, jid.estimators.Truncated),
-    ],
-)
-def test_estimators(load, text, estimator, solution):
-    experiment = load(f"{ARM}[estimator]\n{text}\n")
-    assert isinstance(experiment.estimation.estimator, estimator)
-    assert isinstance(experiment.estimation.estimator.solution, solution)
-    assert experiment.estimation.regularised == (solution is not jid.estimators.Complete)
-    if solution is jid.estimators.Ridge:
-        assert experiment.estimation.estimator.solution.strength == 0.02
-    if solution is jid.estimators.Truncated:
-        assert experiment.estimation.estimator.solution.rcond == 0.02
-
-
-@pytest.mark.parametrize(
-    ("text", "estimator"),
-    [
-        (
-            'kind = "huber"',
-            jid.estimators.IterativelyReweighted(
-                jid.estimators.Huber(), jid.estimators.ResidualVariances()
-            ),
-        ),
-        (
-            'kind = "tukey"\nlimit = 4\nridge = 0.1',
-            jid.estimators.IterativelyReweighted(
-                jid.estimators.Tukey(4.0),
-                jid.estimators.ResidualVariances(),
-                jid.estimators.Ridge(0.1),
-            ),
-        ),
-        ('kind = "correlated"', jid.estimators.GeneralisedLeastSquares()),
-        (
-            'kind = "consistent"\npull = 2\nmargin = 0.01',
-            jid.PhysicallyConsistent(
-                jid.estimators.ResidualVariances(),
-                margin=0.01,
-                pull=jid.consistency.EntropicPull(strength=2.0),
-            ),
-        ),
-    ],
-)
-def test_estimators_of_other_kinds(load, text, estimator):
-    experiment = load(f"{ARM}[estimator]\n{text}\n")
-    assert experiment.estimation.estimator == estimator
-    assert experiment.estimation.plain == jid.WeightedLeastSquares(
-        jid.estimators.ResidualVariances(),
-        jid.estimators.Ridge(0.1) if "ridge" in text else jid.estimators.Complete(),
-    )
+    np.testing.assert_array_equal(experiment.min_speed, [0.1, 2.0])
 
 
 def test_estimators_of_files(load, tmp_path):
@@ -385,25 +291,6 @@ total_mass = 12
     np.testing.assert_array_equal(consistent.bounds.has_ellipsoid, [False, True])
 
 
-def test_logs_are_read_cropped_and_filtered(load, tmp_path):
-    t = 0.01 * np.arange(400)
-    q = np.stack([np.sin(t), np.cos(2 * t)], 1)
-    head = "t,q1,q2\n"
-    rows = "\n".join(f"{x:.9g},{a:.12g},{b:.12g}" for x, (a, b) in zip(t, q, strict=True))
-    (tmp_path / "run.csv").write_text(head + rows)
-    forces = "\n".join(f"{3 * a:.12g},{b:.12g}" for a, b in q)
-    (tmp_path / "run_torque.csv").write_text("tau1,tau2\n" + forces)
-    text = RECORDING + 'forces_file = "{}_torque.csv"\nstart = 0.5\nstop = 3.5\n'
-    experiment = load(ARM + text + "[filter]\nkind = 'butterworth'\ncutoff = 5\n")
-    recording = experiment.read(tmp_path / "run.csv")
-    assert recording.samples == 300
-    np.testing.assert_allclose(recording.forces[:, 0], 3 * recording.angles[:, 0], rtol=1e-10)
-    observations = experiment.observe(recording)
-    np.testing.assert_allclose(
-        observations.motion.qd[50:-50, 0], np.cos(observations.time[50:-50]), atol=2e-3
-    )
-
-
 BODIES = '[estimator]\nkind = "consistent"\n'
 COLUMNS = ARM + RECORDING
 BUTTERWORTH = ARM + "[filter]\nkind = 'butterworth'\n"
@@ -412,7 +299,6 @@ REFUSALS = [
     ("robot = 3", "`robot`"),
     ("[robt]\nurdf = 'a'", "`robt`.*did you mean `robot`"),
     ("", "`[robot]`"),
-    ("[robot]", "`urdf`, `builtin` and `dh`"),
     (ARM + 'urdf = "a"', "`urdf` and `builtin`"),
     ('[robot]\nbuiltin = "tx9"', "`robot.builtin`"),
     ('[robot]\nbuiltin = "panda"\ntip = "x"', "`tip` belongs to `urdf`"),
@@ -421,14 +307,11 @@ REFUSALS = [
     ("[robot]\ndh = []\nconvention = 'standard'", "`robot`"),
     ("[robot]\ndh = [{alpha = 0, a = 0}]", "`robot.dh[0].d`.*`[robot.dh]`"),
     (ARM + "gravity = [0, 0, 'g']", "`robot.gravity[2]`"),
-    (ARM + "gravity = [0, 0, nan]", "`robot.gravity[2]`"),
     (ARM + "xyzzy = 1", "`robot.xyzzy`.*`[robot]` has urdf"),
-    (ARM + 'name = "a\\u001b[31m"', "`robot.name`.*U+001B"),
-    (TOOL.replace("mass = 1", "mass = 0"), "`robot.tool.mass`"),
+    (ARM + 'name = "a\\u001b[31m"', "`robot.name`.*control character"),
     (TOOL + "body = 'hand'", "`body`.*joint1, joint2"),
     (TOOL + "inertia = {xx = 1, yy = 1, zz = 9}", "`inertia`"),
     (ARM + "[limits]\nvelocity = [1, 2, 3]", "`limits`: `velocity`"),
-    (ARM + "[limits]\nposition_min = [1, 1]\nposition_max = [0, 2]", "`position_min`"),
     (ARM + "[limits]\nposition_max = [150, 150]", "`joint1`.*`angle_unit"),
     (ARM + "[limits]\nforce = [1e-300, 20]", "`force`"),
     (
@@ -436,32 +319,18 @@ REFUSALS = [
         "`gear_ratios` or `matrix`",
     ),
     (ARM + "[drives]\ngear_ratios = [nan, 1]", "`drives.gear_ratios[0]`"),
-    (ARM + "[drives]\ngear_ratios = [1, 0]", "`drives`"),
     (ARM + "[drives]\nmatrix = [[1, 0], [0]]", "`matrix`"),
-    (ARM + "[drives]\nmax_torques = [0, 1]", "`drives.max_torques[0]`"),
     (ARM + "[model]\ncoulomb = 'hard'", "`model.coulomb`"),
-    (ARM + "[model.coulomb]\nepsilon = 0", "`model.coulomb.epsilon`"),
-    (ARM + "[model.coulomb]\nepsilon = [1]", "`coulomb.epsilon`"),
     (ARM + "[model.coulomb]\nasymmetric = true\nstribeck = 1", "`coulomb.stribeck`"),
     (ARM + "[model]\ncoupled_drives = true", "`model`"),
     (ARM + "[recording]\nangles = 'q{}'", "`recording.forces`"),
-    (COLUMNS.replace('time = "t"', ""), "`time`.*`sample_time`"),
     (COLUMNS + "angle_unit = 'degree'", "`degree`"),
-    (COLUMNS + "force_unit = 'A'", "`torque_constants`"),
     (COLUMNS + "angle_signs = [1, 2]", "`angle_signs`"),
-    (COLUMNS + "largest_gap = 0.5", "`recording.largest_gap`"),
-    (ARM + "[filter]\ncutoff = 1", "`filter.kind`"),
-    (ARM + "[filter]\nkind = 'buterworth'", "`filter.kind`"),
-    (BUTTERWORTH + "cutoff = -3", "`cutoff`"),
     (BUTTERWORTH + "cutoff = []", "`filter.cutoff`"),
     (ARM + "[filter]\nkind = 'paper'\ncutoff = 3", "`filter.cutoff`.*velocity"),
-    (ARM + "[filter]\nkind = 'periodic'\nperiod = 1\nharmonics = 1.5", "`filter.harmonics`"),
-    (ARM + "[rows]\nevery = 2", "`rows.every` was renamed to `step`"),
     (ARM + "[rows]\nslow = 2", "`rows.slow` was renamed to `min_speed`"),
     (ARM + "[rows]\nstep = 2\nfactors = [2]", "`step`.*`factors`"),
     (ARM + "[rows]\nfactors = [50]", "`factors`"),
-    (ARM + "[rows]\nmin_speed = [1]", "`min_speed`"),
-    (ARM + "[estimator]\nkind = 'wls'", "`estimator.kind`"),
     (ARM + "[estimator]\nweights = 'maximum_forces'", "`weights = .*`joint1`"),
     (
         ARM + "[estimator]\nkind = 'least_squares'\nweights = 'residual_variances'",
@@ -471,25 +340,16 @@ REFUSALS = [
     (ARM + "[estimator]\nkind = 'instrumental'", "`estimator`: `reference`"),
     (ARM + "[estimator]\nridge = 0.1\nprior = 'urdf'", "`prior"),
     (ARM + "[estimator]\nnonlinear_friction = true\nessential = 0.1", "`nonlinear_friction`"),
-    (ARM + BODIES + "mass_min = -1", "`mass_min`"),
-    (ARM + BODIES + "mass_min = [1, 2, 3]", "`mass_min`"),
     (ARM + BODIES + "centre_max = [[1, 1, 1], [1, 1]]", "`estimator.centre_max`"),
     (ARM + BODIES + "ellipsoid_centre = [0, 0, 0]", "`ellipsoid_axes`"),
-    (ARM + "[estimator]\nradius = 1", '`estimator.radius`: belongs to `kind = "consistent"`'),
-    (ARM + BODIES + "essential = 0.1", "`estimator.essential`: belongs to"),
     (ARM + "[estimator]\nessential = 0.1\nridge = 0.1", "`essential`.*`ridge`"),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge`"),
     (ARM + "[estimator]\nridge = 0.1\ntruncate = 0.1", "`truncate`.*`ridge`"),
-    (ARM + "[excitation.spline]\npoints = 3", "`excitation.spline.points`"),
-    (ARM + "[excitation]\nsamples = 1_000_000_000_000_000", "`excitation.samples`"),
     ("[robot\n", "TOML"),
-    (ARM + ARM, "TOML"),
     (ARM + "x = " + 3000 * "[", "TOML"),
-    (ARM + "x = " + 9999 * "9", "TOML"),
     (SHAPES.replace('body = "bend"', 'body = "wrist"'), "`collision`: `body`.*turn, lift"),
     (SHAPES.replace("ground = -0.1", 'pairs = [["hand", "chair"]]'), "`chair`"),
     (SHAPES.replace("ground = -0.1", "fit = true"), "`fit`.*`robot.urdf`"),
-    (SHAPES.replace("ground = -0.1", "grund = 1.0"), "`collision.grund`.*`ground`"),
 ]
 
 
@@ -503,16 +363,6 @@ def test_mistakes_are_one_sentence_with_file_and_key(load, text, expected):
     assert "\n" not in message
     assert message.endswith((".", "?"))
     assert not message.endswith("..")
-
-
-def test_files_that_cannot_be_read(tmp_path):
-    for path in (tmp_path / "none.toml", tmp_path):
-        with pytest.raises(InputError, match="is no file"):
-            load_experiment(path)
-    path = tmp_path / "latin.toml"
-    path.write_bytes("# Stäubli\n".encode("latin-1"))
-    with pytest.raises(InputError, match=r"latin.toml: .* position 4"):
-        load_experiment(path)
 
 
 def test_logs_that_do_not_fit_the_file(load, tmp_path):
@@ -579,15 +429,6 @@ def test_the_template_documents_every_key(tmp_path):
             assert re.search(rf"^(# )?{key} = .", text, flags=re.M), key
 
 
-def test_the_template_keeps_the_chosen_chain(tmp_path):
-    (tmp_path / "arm.urdf").write_text(URDF)
-    path = tmp_path / "experiment.toml"
-    path.write_text(write_template(tmp_path / "arm.urdf", tip="cart", base="base", folder=tmp_path))
-    experiment = load_experiment(path)
-    assert experiment.robot.joint_names == ("rail",)
-    assert experiment.columns.angle_unit == units.M
-
-
 def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
     folder = tmp_path / 'a"b\\c  # d'
     folder.mkdir()
@@ -599,7 +440,7 @@ def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
     plain = tmp_path / "arm.urdf"
     plain.write_text(URDF)
     assert found.keys() == tomllib.loads(write_template(plain, folder=tmp_path)).keys()
-    for sign in ("&#10;gravity = [0, 0, 9.81]&#10;#", "&#13;", "&#x9b;31m", "&#x2028;"):
+    for sign in ("&#10;gravity = [0, 0, 9.81]&#10;#", "&#x9b;31m", "&#x2028;"):
         urdf.write_text(URDF.replace("shoulder", f"j{sign}"))
         with pytest.raises(ValueError, match="name"):
             write_template(urdf, folder=tmp_path)
@@ -630,8 +471,6 @@ def test_the_template_breaks_long_lists(tmp_path):
             "angle_unit = ['m', 'mm']",
             '`angle_unit` of joint `shoulder` is "mm", but the joint turns',
         ),
-        ("velocity_unit = 'rpm'", '`velocity_unit` of joint `rail` is "rpm", but the joint slides'),
-        ("force_unit = 'N m'", '`force_unit` of joint `rail` is "N m", but the joint slides'),
         ("force_unit = 'N'", '`force_unit` of joint `shoulder` is "N", but the joint turns'),
     ],
 )
@@ -641,16 +480,6 @@ def test_degrees_for_a_rail_are_refused(tmp_path, load, units, sentence):
     text = '[robot]\nurdf = "arm.urdf"\n' + RECORDING + units
     with pytest.raises(ValueError, match=re.escape(sentence)):
         load(text)
-    motors = load(text + '\nside = "motor"\n')
-    assert motors.columns.angles_on_motor_side
-
-
-def test_which_largest_force_decides_is_said(load):
-    text = ARM + "[limits]\nforce = [80, 20]\n[drives]\ngear_ratios = [50, 50]\n"
-    notes = load(text + "max_torques = [2, 0.4]").notes
-    assert any("`limits.force`), which decide before" in n for n in notes)
-    assert any("joint1 80, not 100 N m." in n for n in notes)
-    assert not any("limits.force" in n for n in load(text).notes)
 
 
 def test_shapes_come_from_the_file(load):
@@ -669,4 +498,4 @@ def test_shapes_come_from_the_file(load):
 
 def test_the_built_in_shapes_are_those_of_the_library(load):
     model = load('[robot]\nbuiltin = "tx90l_on_rail"\n[collision]\nfit = true\n').collision
-    assert model.pair_names == library.tx90l_on_rail_collision().pair_names
+    assert model.pair_names == jid.robots.tx90l_on_rail_collision().pair_names

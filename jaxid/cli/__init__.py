@@ -3,7 +3,6 @@
 Their work is imported when they run, so that `jaxid --help` answers at once.
 """
 
-import importlib.metadata
 import io
 import sys
 from pathlib import Path
@@ -17,14 +16,13 @@ from jaxid.cli.options import (
     ExperimentFile,
     Force,
     Loaded,
+    Logs,
     OutputFolder,
     Seed,
     Tip,
     Unloaded,
     describe_error,
     open_console,
-    output_folder,
-    refuse_foreign_folder,
     refuse_foreign_table,
     require_one_log_per_option,
     start,
@@ -69,11 +67,9 @@ def _options(
     version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
 ) -> None:
     if version:
-        try:
-            shown = importlib.metadata.version("jaxid-robotics")
-        except importlib.metadata.PackageNotFoundError:
-            shown = "(not installed)"
-        typer.echo(f"jaxid {shown}")
+        from jaxid.report.page import versions
+
+        typer.echo(f"jaxid {versions()['jaxid']}")
         raise typer.Exit
 
 
@@ -93,18 +89,13 @@ def demo(
     from jaxid.experiment.session import stages
     from jaxid.report.page import show, show_remarks
 
-    console = start()
-    refuse_foreign_folder(output, force)
-    with stages(open_console(stderr=True), 15) as stage:
-        part = stage.through()
+    console = start(output, force)
+    with stages(open_console(stderr=True)) as stage:
 
         def progress(name: str, fraction: float) -> None:
-            nonlocal part
             if fraction == 0.0:
                 stage(name)
-                part = stage.through()
-            else:
-                part(fraction)
+            stage.through(fraction)
 
         study = run_study(seed, progress)
         stage("writing the report")
@@ -147,7 +138,7 @@ def init(
     from jaxid.experiment.template import write_template
 
     start()
-    text = write_template(urdf, tip=tip, base=base, folder=output_folder())
+    text = write_template(urdf, tip=tip, base=base)
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 
@@ -197,14 +188,7 @@ def inspect(
 @app.command()
 def identify(
     experiment: ExperimentFile,
-    logs: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Logs to identify with, fitted together; the folder of an earlier report stands "
-            "for the logs it was made of.",
-            metavar="LOG",
-        ),
-    ],
+    logs: Logs,
     verify: Annotated[
         list[Path] | None,
         typer.Option(
@@ -234,9 +218,8 @@ def identify(
     """
     from jaxid.cli import commands
 
-    console, unseen = start(), verify or []
+    console, unseen = start(output, force), verify or []
     commands.check_logs(logs, unseen, split)
-    refuse_foreign_folder(output, force)
     commands.identify(console, experiment, logs, unseen, split, output, pdf)
 
 
@@ -313,10 +296,9 @@ def compare(
     """
     from jaxid.cli import commands
 
-    console = start()
+    console = start(output, force)
     if first.resolve() == second.resolve():
         raise InputError(f"`{first}` is given twice: compare two different runs.")
-    refuse_foreign_folder(output, force)
     commands.compare(console, (first, second), level, output)
 
 
@@ -340,8 +322,7 @@ def payload(
     """
     from jaxid.cli import commands
 
-    console = start()
-    refuse_foreign_folder(output, force)
+    console = start(output, force)
     commands.payload(console, experiment, logs, loaded, body, output)
 
 
@@ -359,30 +340,23 @@ def gains(
     """
     from jaxid.cli import commands
 
-    console = start()
-    refuse_foreign_folder(output, force)
+    console = start(output, force)
     commands.gains(console, experiment, logs, loaded, output)
 
 
 @app.command()
 def states(
     experiment: ExperimentFile,
-    logs: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Logs, or folders of reports: one for each state, like cold and warm.",
-            metavar="LOG",
-        ),
-    ],
+    logs: Logs,
     output: OutputFolder = Path("states"),
     force: Force = False,
 ) -> None:
     """Fit several states of a robot at once: one inertia, friction for each.
 
-    Like cold and warm. Friction and offsets are each state's own, all else is shared.
+    One log or report for each, like cold and warm. Friction and offsets are each state's own,
+    all else is shared.
     """
     from jaxid.cli import commands
 
-    console = start()
-    refuse_foreign_folder(output, force)
+    console = start(output, force)
     commands.states(console, experiment, logs, output)

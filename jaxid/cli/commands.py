@@ -1,5 +1,6 @@
 """Work of the commands for an experiment and its logs, and what they print."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from jaxid.export.feed_forward import export_jax
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
 from jaxid.identification.comparison import compare as compare_fits
 from jaxid.identification.drive_gains import identify_drive_gains
-from jaxid.identification.fit import Fit, load
+from jaxid.identification.fit import Fit
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.payload import (
     CENTRAL_NAMES,
@@ -39,15 +40,12 @@ from jaxid.identification.states import identify_states
 from jaxid.io import require_writable
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import (
-    alternative_table,
     body_table,
     motor_tables,
     residual_table,
 )
 from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import (
-    MODEL,
-    estimate_rows,
     read_fit,
     write_comparison,
     write_estimates,
@@ -65,16 +63,15 @@ UNLIKELY = 0.01
 def inspect(console: Console, path: Path, logs: list[Path]) -> None:
     """Show what can be identified, and if logs are sane."""
     experiment, examined = load_experiment(path), []
-    choices = len(logs) + 1 if experiment.candidates else 0
-    with stages(open_console(stderr=True), 1 + choices + 4 * len(logs)) as stage:
+    with stages(open_console(stderr=True)) as stage:
         stage("finding base parameters")
         _ = experiment.base.expressions
         experiment, _ = select_filter(experiment, logs, stage)
         for log in logs:
-            recording, observations, diagnosis = load_log(experiment, log, stage)
+            _, observations, diagnosis = load_log(experiment, log, stage)
             stage(f"factorising {log.name}")
-            through = stage.through(recording.samples)
-            fit = estimate(experiment.base, observations, experiment.estimation.plain, through)
+            estimator = experiment.estimation.plain
+            fit = estimate(experiment.base, observations, estimator, stage.through)
             stage(f"looking for mistakes in {log.name}")
             examined.append((diagnosis.with_fit(fit), fit))
     robot = experiment.robot
@@ -112,15 +109,12 @@ def identify(
 ) -> None:
     """Estimate the parameters and write a report."""
     experiment = load_experiment(path)
-    files = [p for p in logs if not p.is_dir()]
-    if not files:
+    if all(p.is_dir() for p in logs):
         raise InputError(
             "folders of earlier reports stand for their logs, but at least one log must be given "
             "as a file, for torque errors and figures."
         )
-    choices = len(files) + 1 if experiment.candidates else 0
-    total = 4 + choices + 2 * (len(files) + len(verify))
-    with stages(open_console(stderr=True), total) as stage:
+    with stages(open_console(stderr=True)) as stage:
         result = identify_logs(experiment, logs, verify, split, stage)
         stage("writing the report")
         settings = {
@@ -143,7 +137,6 @@ def identify(
             result.validation.definiteness,
             settings,
             (*result.experiment.notes, *result.notes, *result.findings),
-            result.alternative,
             result.choice,
             (*result.findings, *result.mistakes),
             pdf,
@@ -166,8 +159,6 @@ def _show_identification(console: Console, result: Identification) -> None:
     if fit.consistency is not None:
         show(console, body_table(fit.consistency, robot.joint_names))
     show(console, result.validation.summary())
-    if other := result.alternative:
-        show(console, alternative_table(result.validation.errors, other.errors, other.names))
 
 
 def _doubts(texts: Any) -> list[Remark]:
@@ -183,9 +174,6 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
             "to begin anew, remove the file, or choose another -o."
         )
     experiment, errors = load_experiment(path), open_console(stderr=True)
-    if resume and not state.exists():
-        text = f"`{state}` is not there to go on with: the design begins anew"
-        show_remarks(console, _doubts([text]))
     try:
         with stages(errors) as stage:
             design = design_motion(experiment, stage.design, state, resume)
@@ -219,13 +207,7 @@ def export(
 ) -> None:
     """Write the model of a report in a format."""
     require_writable(path.parent)
-    model = report / MODEL if report.is_dir() else report
-    if not model.is_file():
-        what = f"holds no `{MODEL}`" if report.is_dir() else "is not there"
-        raise InputError(
-            f"`{report}` {what}: give a folder that `jaxid identify` has written, or a model file."
-        )
-    fit = load(model)
+    fit = read_fit(report)
     if to == "c":
         export_c(fit, path.parent, name=path.stem, double=double)
     elif to == "urdf":
@@ -240,9 +222,7 @@ def export(
 
 def compare(console: Console, paths: tuple[Path, Path], level: float, output: Path) -> None:
     """Decide which parameters have changed between two runs."""
-    names = {path.resolve().name for path in paths}
-    labels = [str(path) if len(names) == 1 else None for path in paths]
-    cold, warm = (read_fit(p, label) for p, label in zip(paths, labels, strict=True))
+    cold, warm = (dataclasses.replace(read_fit(p), name=str(p)) for p in paths)
     found = compare_fits(cold, warm, level)
     files = write_comparison(output, found, paths)
     show(console, found.summary(), found.group_summary())
@@ -266,12 +246,9 @@ def payload(
     keys = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
     content = {"body": name, **{key: getattr(found, key) for key in keys}}
     sources = {"unloaded": logs, "loaded": loaded}
-    rows = [
-        *estimate_rows(INERTIAL_NAMES, INERTIAL_UNITS, found.parameters, found.uncertainty),
-        *estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *found.central),
-    ]
-    covariance = found.uncertainty.covariance
-    files = write_estimates(output, "payload", rows, covariance, content, sources)
+    rows = (INERTIAL_NAMES, INERTIAL_UNITS, found.parameters, found.uncertainty)
+    central = (CENTRAL_NAMES, CENTRAL_UNITS, *found.central)
+    files = write_estimates(output, "payload", [rows, central], content, sources)
     show(console, found.summary())
     show_remarks(console, _doubts(doubts))
     _show_lines(
@@ -292,9 +269,9 @@ def gains(console: Console, path: Path, logs: list[Path], loaded: list[Path], ou
     found = identify_drive_gains(empty, full, experiment.load)
     key, values = _corrected(experiment, np.asarray(found.gains))
     sources = {"unloaded": logs, "loaded": loaded}
-    names, covariance = found.joint_names, found.uncertainty.covariance
-    rows = estimate_rows(names, ("1",) * len(names), found.gains, found.uncertainty)
-    files = write_estimates(output, "gains", rows, covariance, {key: values}, sources)
+    names = found.joint_names
+    rows = (names, ("1",) * len(names), found.gains, found.uncertainty)
+    files = write_estimates(output, "gains", [rows], {key: values}, sources)
     show(console, found.summary())
     show_remarks(console, _doubts(doubts))
     shown = ", ".join(significant(v, 5) for v in values)
@@ -312,7 +289,8 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
             f"give one log or report for each of two or more states, with different names: they "
             f"name the states, but are {', '.join(names)}."
         )
-    runs, doubts = _runs(experiment, [[log] for log in logs], names)
+    with stages(open_console(stderr=True)) as stage:
+        runs, doubts = read_runs(experiment, [[log] for log in logs], names, stage)
     found = identify_states(runs)
     chance = found.sharing[1]
     content = {
@@ -321,9 +299,8 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
         "varying": [found.base.names[k] for k in found.varying],
         "sharing_chance": chance,
     }
-    rows = estimate_rows(found.names, found.units, found.parameters, found.uncertainty)
-    covariance = found.uncertainty.covariance
-    files = write_estimates(output, "states", rows, covariance, content, {"states": logs})
+    rows = (found.names, found.units, found.parameters, found.uncertainty)
+    files = write_estimates(output, "states", [rows], content, {"states": logs})
     if chance < UNLIKELY:
         doubts.append(
             "the states do not agree on what they share (chance "
@@ -345,25 +322,13 @@ def _pair(
         raise InputError(
             f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
         )
-    return _runs(experiment, [logs, loaded], ["unloaded", "loaded"])
-
-
-def _runs(
-    experiment: Experiment, groups: list[list[Path]], names: list[str]
-) -> tuple[list[Fit], list[str]]:
-    """Return a run of the logs and reports of each group, and doubts about the logs."""
-    files = [p for paths in groups for p in paths if not p.is_dir()]
-    choices = len(files) + 1 if experiment.candidates else 0
-    total = 1 + len(groups) + choices + 2 * len(files)
-    with stages(open_console(stderr=True), total) as stage:
-        return read_runs(experiment, groups, names, stage)
+    with stages(open_console(stderr=True)) as stage:
+        return read_runs(experiment, [logs, loaded], ["unloaded", "loaded"], stage)
 
 
 def _tool(found: Payload, joint: str) -> list[str]:
-    J = found.inertia
-    keys = ("xx", "yy", "zz", "xy", "xz", "yz")
-    entries = (J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2])
-    inertia = ", ".join(f"{k} = {v:.6g}" for k, v in zip(keys, entries, strict=True))
+    upper = [(k, i) for k in range(3) for i in range(k, 3)]
+    inertia = ", ".join(f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper)
     return [
         "[robot.tool]",
         f'body = "{joint}"',
@@ -383,7 +348,4 @@ def _corrected(experiment: Experiment, gains: np.ndarray) -> tuple[str, list[flo
 
 
 def _show_lines(console: Console, text: str, lines: list[str]) -> None:
-    console.print()
-    console.print(Text(text, style="dim"))
-    for line in lines:
-        console.print(Text(line), soft_wrap=True)
+    console.print(Text("\n".join(["", text, *lines])), soft_wrap=True)

@@ -1,9 +1,7 @@
 """Options that commands share, the terminal, errors as sentences, and folders of results."""
 
 import errno
-import os
 import shlex
-import stat
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -35,6 +33,13 @@ Tip = Annotated[
 Base = Annotated[
     str | None, typer.Option(metavar="LINK", help="The link on the ground; by default the root.")
 ]
+Logs = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Logs; the folder of an earlier report stands for those it was made of.",
+        metavar="LOG",
+    ),
+]
 Unloaded = Annotated[
     list[Path],
     typer.Argument(
@@ -65,14 +70,21 @@ def require_one_log_per_option() -> None:
             )
 
 
-def start() -> Console:
-    """Turn on double precision and the cache of compiled code; return the terminal."""
+def start(output: Path | None = None, force: bool = False) -> Console:
+    """Turn on double precision and the cache of compiled code; return the terminal.
+
+    Raises:
+        OSError: If nothing can be written into the folder `output`.
+        InputError: If there is something else than an earlier report in its place.
+    """
     import jax
 
     from jaxid.program.cache import keep_compiled
 
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
+    if output is not None:
+        refuse_foreign_folder(output, force)
     return open_console()
 
 
@@ -111,27 +123,17 @@ def refuse_foreign_folder(target: Path, force: bool) -> None:
         InputError: If there is something else in its place.
     """
     from jaxid.io import require_writable
-    from jaxid.report.result_files import SCHEMAS
+    from jaxid.report.result_files import SCHEMAS, schema_of
 
     if target.exists() and not target.is_dir():
         raise InputError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
-    kinds = {file: schema.split("/")[0] for file, schema in SCHEMAS.items()}
     empty = not target.is_dir() or not any(target.iterdir())
-    if not (force or empty or any(_has_schema(target / f, kind) for f, kind in kinds.items())):
+    if not (force or empty or any(schema_of(target / file) for file in SCHEMAS)):
         raise InputError(
             f"`{target}` holds files but no report: choose another folder with -o, or add --force "
             "to put the report beside them."
         )
     require_writable(target)
-
-
-def _has_schema(path: Path, kind: str) -> bool:
-    from jaxid.io import read_json
-
-    try:
-        return str(read_json(path)["schema"]).startswith(kind)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
 
 
 def refuse_foreign_table(target: Path) -> None:
@@ -162,15 +164,3 @@ def refuse_foreign_table(target: Path) -> None:
                 f"`{foreign}` is there already, and no motion of `jaxid excite`: choose another -o."
             ) from None
         require_writable(target.parent)
-
-
-def output_folder() -> Path | None:
-    """Return this folder, or None if the output is redirected into a file of another one."""
-    try:
-        status = os.fstat(sys.stdout.fileno())
-    except (OSError, ValueError):
-        return Path()
-    if not stat.S_ISREG(status.st_mode):
-        return Path()
-    here = (entry.stat(follow_symlinks=False) for entry in os.scandir())
-    return Path() if any(os.path.samestat(status, one) for one in here) else None

@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.demo import study as settings
-from jaxid.demo.study import Model, Study
+from jaxid.demo.study import Study
 from jaxid.io import atomic_folder
 from jaxid.report.excitation import side_by_side_table
 from jaxid.report.identification import parameter_table
@@ -56,7 +56,7 @@ def remarks(study: Study) -> list[Remark]:
     worst, true = ([max(m.mean_errors(k)) for k in (0, 1)] for m in (study.weighted, study.true))
     plain, weighted = (m.mean_errors(0)[-1] for m in (study.unweighted, study.weighted))
     none, cad, identified = (1e3 * run.rms for run in study.followed)
-    found = [
+    return [
         Remark(
             f"The identified model predicts the torques of every axis to {worst[0]:.2g} % of the "
             f"largest torque, and to {worst[1]:.2g} % on an unseen path.",
@@ -77,22 +77,14 @@ def remarks(study: Study) -> list[Remark]:
             Status.GOOD if identified < cad < none else Status.DOUBTFUL,
         ),
     ]
-    for filter, inside, total in study.coverage:
-        text = f"{inside} of {total} estimates ({100 * inside / total:.1f} %)"
-        found.append(
-            Remark(
-                f"With noise and encoders as the only disturbance, {text} lie within their 95 % "
-                f"intervals with {filter}."
-            )
-        )
-    return [*found, *([Remark(study.timing)] if isinstance(study.timing, str) else [])]
 
 
 def paper_table(study: Study) -> Table:
     """Return the statements of the paper beside the results of the demo."""
-    base, timed = study.base, study.timing
+    base = study.base
     speed, acceleration = study.tip_maxima
     worst = [significant(max(study.weighted.mean_errors(k)), 2) for k in (0, 1)]
+    definite = [str(m.validation.definiteness) for m in study.models]
     moving = significant(max(study.moving_errors(study.weighted, 1)), 2)
     true = significant(max(study.true.mean_errors(1)), 2)
     lengths = ", ".join(f"{name} = {base.lengths[name]:g}" for name in ("l2x", "l3z"))
@@ -108,34 +100,18 @@ def paper_table(study: Study) -> Table:
         ("mean error, worst axis, verification [%]", "below 1", worst[1]),
         ("the same while the axis moves [%]", MISSING, moving),
         ("verification, by the true parameters [%]", MISSING, true),
-        ("mass matrix without weights", "not positive definite", _definite(study.unweighted)),
-        ("mass matrix with weights", "positive definite", _definite(study.weighted)),
-        ("mass matrix, consistent bodies", "not done", _definite(study.consistent)),
+        ("mass matrix without weights", "not positive definite", definite[0]),
+        ("mass matrix with weights", "positive definite", definite[1]),
+        ("mass matrix, consistent bodies", "not done", definite[2]),
     ]
     for number, (cold, warm, unit) in PUBLISHED.items():
         for state, value, fit in (("cold", cold, study.weighted.fit), ("warm", warm, study.warm)):
             k = number - 1
             pair = with_deviation(float(fit.parameters[k]), float(fit.standard_deviations[k]))
             rows.append((f"p_B({number}), {state} [{unit}]", f"{value:.2f}", " ± ".join(pair)))
-    if not isinstance(timed, str):
-        literal, factored, full = (1e6 * timed[key] for key in ("literal", "factored", "full"))
-        rows += [
-            ("feed-forward, Eq. 39 as printed [µs]", "11.928", significant(literal)),
-            ("feed-forward, Eq. 38 [µs]", "15.243", significant(full)),
-            ("Eq. 39 as printed over Eq. 38", "0.78", significant(literal / full, 2)),
-            ("feed-forward, Eq. 39 factored [µs]", MISSING, significant(factored)),
-            ("computed by", "PC, 2.16 GHz", timed["where"]),
-        ]
     title = f"the paper, and the results on the virtual {base.model.robot.name}"
     names = ("quantity", "paper", "here")
     return Table(title, *map(Column, names, zip(*rows, strict=True)))
-
-
-def _definite(model: Model) -> str:
-    found = model.validation.definiteness
-    if found.positive_definite:
-        return "positive definite"
-    return f"not positive definite in {100 * found.indefinite:.0f} % of the poses"
 
 
 def error_table(study: Study, recording: int) -> Table:
@@ -329,7 +305,6 @@ def _record(study: Study) -> dict[str, Any]:
             }
             for k, (cold, warm, _) in PUBLISHED.items()
         ],
-        "coverage": [dict(zip(("filter", "inside", "of"), c, strict=True)) for c in study.coverage],
         "following": [
             {
                 "fed_forward": run.name,
@@ -338,5 +313,4 @@ def _record(study: Study) -> dict[str, Any]:
             }
             for run in study.followed
         ],
-        "feed_forward": study.timing,
     }

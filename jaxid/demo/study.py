@@ -1,15 +1,8 @@
 """The paper's experiments, one after the other, on the virtual TX90L on its rail."""
 
-import ctypes
 import dataclasses
-import os
-import statistics
-import subprocess
-import tempfile
-import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -77,11 +70,7 @@ class Study(NamedTuple):
         true: Parameters of the robot itself: their errors are all due to disturbances.
         warm: Fit of the warm robot.
         temperature: Comparison of the cold with the warm robot.
-        coverage: Where nothing but noise disturbs: a filter in words, the number of 95 % intervals
-            that hold the true parameter, and the number of all.
         followed: Runs along the path with no model, CAD values, and the identified model.
-        timing: Compiler, and cost of a feed-forward torque [s]; a sentence where it was not
-            measured.
     """
 
     seed: int
@@ -97,9 +86,7 @@ class Study(NamedTuple):
     true: Model
     warm: jid.Fit
     temperature: Comparison
-    coverage: tuple[tuple[str, int, int], ...]
     followed: tuple[PathRun, ...]
-    timing: dict[str, Any] | str
 
     @property
     def models(self) -> tuple[Model, ...]:
@@ -128,7 +115,6 @@ def run_study(
     seed: int,
     progress: Callable[[str, float], None],
     *,
-    draws: int = 4,
     periods: int = 2,
     motion: jid.trajectories.AbstractTrajectory | None = None,
 ) -> Study:
@@ -137,7 +123,6 @@ def run_study(
     Args:
         seed: Seed of all random numbers.
         progress: Callback, called with the name of a stage and its completed fraction (0 to 1).
-        draws: Number of recordings with which intervals are checked.
         periods: Number of periods of the excitation that are measured.
         motion: Motion to identify with; designed if None.
     """
@@ -168,7 +153,9 @@ def run_study(
         progress(f"measuring: {name}", 0.0)
         number = 10 * seed + len(observations)
         run = virtual.track(trajectory, sample_time=SAMPLE_TIME, seed=number, name=name)
-        observations.append(_observe(run.recording, robot, jid.filters.PaperFilter()))
+        rows = jid.Subsample(STEP)
+        log = jid.observe(run.recording, robot, jid.filters.PaperFilter(), rows)
+        observations.append(log)
     progress("identifying", 0.0)
     rows = jid.RegressionProblem(base, [observations[0]])
     truth = np.asarray(base.from_standard(cold.parameters))
@@ -183,11 +170,8 @@ def run_study(
     models = [Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()]
     progress("comparing cold and warm", 0.0)
     warm = jid.identify(base, observations[1], jid.WeightedLeastSquares())
-    progress("checking intervals", 0.0)
-    coverage = _check_coverage(base, played, seed, draws)
     progress("following the path with three controllers", 0.0)
     followed = _follow(cold, path, joints, fits["consistent"], seed)
-    progress("timing the feed-forward", 0.0)
     return Study(
         seed,
         base,
@@ -199,16 +183,8 @@ def run_study(
         *models,
         warm=warm,
         temperature=jid.compare(fits["weighted"], warm),
-        coverage=coverage,
         followed=followed,
-        timing=time_feed_forward(fits["consistent"], joints),
     )
-
-
-def _observe(
-    log: jid.Recording, robot: jid.Robot, filter: jid.filters.AbstractFilter
-) -> jid.Observations:
-    return jid.observe(log, robot, filter, jid.Subsample(STEP))
 
 
 def _design(
@@ -244,34 +220,6 @@ def _design(
     return design(jid.criteria.ConditionNumber()), design(jid.criteria.DOptimal())
 
 
-def _check_coverage(
-    base: jid.BaseParameters, excitation: jid.trajectories.WithLeads, seed: int, draws: int
-) -> tuple[tuple[str, int, int], ...]:
-    """Count the intervals that hold the truth, for a robot with noise and encoders only."""
-    quiet = jid.simulation.virtual_tx90l_on_rail(disturbed=False)
-    truth = np.asarray(base.from_standard(quiet.parameters))
-    seeds = range(1000 * (seed + 1), 1000 * (seed + 1) + draws)
-    logs = [
-        quiet.measure(
-            excitation, duration=float(excitation.duration), sample_time=SAMPLE_TIME, seed=k
-        )
-        for k in seeds
-    ]
-    filters = {
-        "the paper's filter, which lags and smooths accelerations twice": jid.filters.PaperFilter(),
-        "a zero-phase Butterworth filter of 15 Hz": jid.ZeroPhaseButterworth(15.0),
-    }
-    counts = []
-    for name, filter in filters.items():
-        inside = 0
-        for log in logs:
-            fit = jid.identify(base, _observe(log, quiet.robot, filter))
-            low, high = fit.intervals(0.95).T
-            inside += int(np.count_nonzero((low <= truth) & (truth <= high)))
-        counts.append((name, inside, draws * base.size))
-    return tuple(counts)
-
-
 def _follow(
     virtual: jid.VirtualRobot,
     path: jid.trajectories.TipPath,
@@ -294,66 +242,3 @@ def _follow(
         distance = np.linalg.norm(tip - path.positions(np.asarray(run.time)), axis=1)
         runs.append(PathRun(name, run, distance))
     return tuple(runs)
-
-
-_LOOPS = """#include "arm.c"
-#define LOOP(form) \\
-void loop_##form(long calls, long states, const double *q, const double *qd, const double *qdd, \\
-                 double *tau) \\
-{ \\
-    long k; \\
-    for (k = 0; k < calls; ++k) { \\
-        const long row = k % states * ARM_JOINTS; \\
-        arm_##form(q + row, qd + row, qdd + row, MORE_##form tau + row); \\
-    } \\
-}
-#define MORE_torque
-#define MORE_torque_of_masses
-#define MORE_torque_of_parameters arm_parameters,
-LOOP(torque)
-LOOP(torque_of_parameters)
-LOOP(torque_of_masses)
-"""
-
-
-def time_feed_forward(
-    fit: jid.Fit, trajectory: jid.trajectories.AbstractTrajectory
-) -> dict[str, Any] | str:
-    """Return the cost of a feed-forward torque in C on states of a motion [s] (Sec. 7).
-
-    `literal` is the base regressor times the base parameters, as printed (Eq. 39), `factored` the
-    same as a recursion on base parameters, `full` mass matrix and bias forces (Eq. 38). A sentence
-    is returned where they cannot be measured.
-
-    Args:
-        fit: Model with a complete set of standard parameters.
-        trajectory: Trajectory whose torques are computed.
-    """
-    compiler = os.environ.get("CC", "cc")
-    motion = trajectory.motion(np.linspace(0.0, float(trajectory.duration), 256))
-    states = [np.ascontiguousarray(x, np.float64) for x in (motion.q, motion.qd, motion.qdd)]
-    forms = {"literal": "torque_of_parameters", "factored": "torque", "full": "torque_of_masses"}
-    with tempfile.TemporaryDirectory(prefix="jaxid-") as folder:
-        jid.export_c(fit, folder, name="arm")
-        (Path(folder) / "loops.c").write_text(_LOOPS, encoding="ascii")
-        words = [compiler, "-O2", "-shared", "-fPIC", "loops.c", "-o", "loops.so", "-lm"]
-        try:
-            subprocess.run(words, cwd=folder, check=True, capture_output=True)
-        except (OSError, subprocess.CalledProcessError) as failure:
-            return f"feed-forward torques were not timed: {failure}"
-        library = ctypes.CDLL(str(Path(folder) / "loops.so"))
-    # All forms in turn, so that other work on the machine disturbs them alike.
-    turns = [[_cost(library, form, states) for form in forms.values()] for _ in range(21)]
-    medians = (statistics.median(column) for column in zip(*turns, strict=True))
-    return {"where": f"C, {compiler} -O2", **dict(zip(forms, medians, strict=True))}
-
-
-def _cost(library: ctypes.CDLL, form: str, states: list[np.ndarray], calls: int = 4096) -> float:
-    """Return the time of one call [s]."""
-    loop = getattr(library, f"loop_{form}")
-    loop.restype = None
-    arrays = (*states, np.empty_like(states[0]))
-    places = [ctypes.c_void_p(x.ctypes.data) for x in arrays]
-    begin = time.perf_counter()
-    loop(ctypes.c_long(calls), ctypes.c_long(len(states[0])), *places)
-    return (time.perf_counter() - begin) / calls

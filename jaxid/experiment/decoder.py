@@ -8,6 +8,7 @@ elsewhere and are no keys.
 
 import difflib
 import inspect
+import json
 import math
 import re
 import typing
@@ -199,7 +200,7 @@ _SCALARS: dict[Any, tuple[Any, str]] = {
 def _convert(value: Any, option: Any, place: str) -> Any:
     """Return a value as an annotation asks for it, or `_OTHER` if it is of another kind."""
     origin, arguments = typing.get_origin(option), typing.get_args(option)
-    if origin is Annotated and (function := table_of(option)):
+    if function := table_of(option):
         return call(function, value, place) if isinstance(value, dict) else _OTHER
     if origin is Annotated:
         made = _convert(value, arguments[0], place)
@@ -211,21 +212,18 @@ def _convert(value: Any, option: Any, place: str) -> Any:
     if origin in (list, tuple):
         return _elements(value, origin, arguments, place) if isinstance(value, list) else _OTHER
     if option in _SCALARS:
-        fits = isinstance(value, _SCALARS[option][0])
+        fits = isinstance(value, _SCALARS[option][0]) and isinstance(value, bool) == (
+            option is bool
+        )
         return _scalar(value, option, place) if fits else _OTHER
-    if _is_array(option):
-        return _array(value, place) if isinstance(value, float | int | list) else _OTHER
-    return call(option, value, place) if isinstance(value, dict) else _OTHER
+    return _array(value, place) if isinstance(value, float | int | list) else _OTHER
 
 
 def _scalar(value: Any, option: Any, place: str) -> Any:
-    if isinstance(value, bool) != (option is bool):
-        return _OTHER
     if option is Unit:
         return unit(value)
-    signs = [c for c in value if not c.isprintable()] if option is str else []
-    if signs:
-        raise InputError(f"`{place}` holds the control character U+{ord(signs[0]):04X}: remove it.")
+    if isinstance(value, str) and not value.isprintable():
+        raise InputError(f"`{place}` holds a control character, {value!a}: remove it.")
     return option(value)
 
 
@@ -239,14 +237,10 @@ def _elements(value: list, kind: Any, hints: tuple[Any, ...], place: str) -> Any
 
 
 def _array(value: Any, place: str) -> np.ndarray:
-    def leaf(x: Any) -> Any:
-        return [leaf(y) for y in x] if isinstance(x, list) else decode_value(x, float, place)
-
-    entries = leaf(value)
     try:
-        return np.array(entries, np.float64)
-    except ValueError as error:
-        raise InputError(f"`{place}` must have rows of equal length.") from error
+        return np.array(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"`{place}` must hold numbers, in rows of equal length.") from error
 
 
 def table_of(option: Any) -> Callable | None:
@@ -283,8 +277,4 @@ def quoted(values: Iterable[Any]) -> str:
 def _came(value: Any) -> str:
     if isinstance(value, dict):
         return "is a table"
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        return "is a list of tables (`[[…]]`)"
-    if isinstance(value, bool):
-        return f"is {str(value).lower()}"
-    return f'is "{value}"' if isinstance(value, str) else f"is {value}"
+    return f"is {json.dumps(value, ensure_ascii=False, default=str)}"

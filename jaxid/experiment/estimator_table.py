@@ -5,11 +5,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import Bounds, Fraction, Positive, decode, keys_of, quoted
-from jaxid.experiment.robot_tables import RobotSource
+from jaxid.experiment.robot_tables import RobotSource, named
 from jaxid.identification.consistency import BodyBounds, EntropicPull, PhysicallyConsistent
 from jaxid.identification.estimators import (
     AbstractEstimator,
@@ -81,11 +80,6 @@ class Estimation(NamedTuple):
     essential: float | None
     nonlinear: bool
     notes: list[str]
-
-    @property
-    def regularised(self) -> bool:
-        """Whether the estimator keeps small what the logs do not decide."""
-        return not isinstance(self.plain.solution, Complete)
 
 
 def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -174,9 +168,15 @@ def build_estimation(
     joint_weights, notes = ResidualVariances(), []
     if kind not in ("least_squares", "correlated"):
         joint_weights, notes = _weights(robot, weights)
-    solution = _solution(ridge, truncate)
+    solution: AbstractSolution = Complete()
+    if truncate is not None:
+        solution = Truncated(truncate)
+    elif ridge is not None:
+        solution = CrossValidated() if isinstance(ridge, str) else Ridge(ridge)
     plain = WeightedLeastSquares(joint_weights, solution)
-    bodies = None if prior is None else _prior(source, folder)
+    bodies = None if prior is None else source.parameters(folder)
+    if prior is not None and bodies is None:
+        raise InputError('`prior = "urdf"` needs a robot with `robot.urdf`.')
     match kind:
         case "weighted":
             estimator = plain
@@ -189,19 +189,27 @@ def build_estimation(
         case "correlated":
             estimator = GeneralisedLeastSquares(solution)
         case "instrumental":
-            references, starts = _references(folder, reference, reference_start)
+            if reference is None:
+                raise InputError('`reference` is missing: `kind = "instrumental"` needs it.')
+            names = [reference] if isinstance(reference, str) else reference
+            references = tuple(load_trajectory(folder / name) for name in names)
+            begin = reference_start
+            starts = tuple(begin) if isinstance(begin, list) else (begin or 0.0,)
             estimator = InstrumentalVariables(references, joint_weights, starts)
         case "consistent":
             entropic = EntropicPull(bodies, pull or 1.0) if pull or bodies is not None else None
-            estimator = PhysicallyConsistent(
-                joint_weights, _bounds(robot, bounds), margin or 0.0, entropic
-            )
+            if "ellipsoid_centre" in bounds and "ellipsoid_axes" not in bounds:
+                raise InputError("`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m].")
+            limits = BodyBounds.from_geometry(robot).replace(**bounds) if bounds else None
+            estimator = PhysicallyConsistent(joint_weights, limits, margin or 0.0, entropic)
     if bodies is not None and kind != "consistent":
         if isinstance(solution, Complete):
             raise InputError(
                 "`prior` needs `ridge` or `truncate`: without them the logs decide everything."
             )
-        estimator = RelativeTo(_standard_parameters(model, bodies), estimator)
+        known = named(bodies)
+        p = np.array([known.get(name, 0.0) for name in model.parameter_names])
+        estimator = RelativeTo(p, estimator)
     method = UNCERTAINTIES[uncertainty]()
     return Estimation(estimator, plain, method, essential, nonlinear_friction, notes)
 
@@ -221,48 +229,3 @@ def _weights(robot: Robot, weights: str | None) -> tuple[AbstractWeights, list[s
         )
         return ResidualVariances(), [note]
     return MaximumForces(), []
-
-
-def _solution(ridge: float | str | None, truncate: float | None) -> AbstractSolution:
-    if truncate is not None:
-        return Truncated(truncate)
-    if ridge is None:
-        return Complete()
-    return CrossValidated() if isinstance(ridge, str) else Ridge(ridge)
-
-
-def _prior(source: RobotSource, folder: Path) -> Float[np.ndarray, "bodies 10"]:
-    bodies = source.parameters(folder)
-    if bodies is None:
-        raise InputError('`prior = "urdf"` needs a robot with `robot.urdf`.')
-    return bodies
-
-
-def _references(
-    folder: Path, reference: str | list[str] | None, start: float | list[float] | None
-) -> tuple[tuple[Any, ...], tuple[float, ...]]:
-    """Return commanded motions, and when they began."""
-    if reference is None:
-        raise InputError('`reference` is missing: `kind = "instrumental"` needs it.')
-    names = [reference] if isinstance(reference, str) else reference
-    starts = start if isinstance(start, list) else [start or 0.0]
-    return tuple(load_trajectory(folder / name) for name in names), tuple(starts)
-
-
-def _bounds(robot: Robot, given: dict[str, Any]) -> BodyBounds | None:
-    """Return the bounds from the robot's geometry, with those of the file in their places."""
-    if "ellipsoid_centre" in given and "ellipsoid_axes" not in given:
-        raise InputError("`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m].")
-    return BodyBounds.from_geometry(robot).replace(**given) if given else None
-
-
-def _standard_parameters(
-    model: Model, bodies: Float[np.ndarray, "bodies 10"]
-) -> Float[np.ndarray, " standard"]:
-    """Return standard parameters with these bodies, and zero for all else."""
-    p = np.zeros(model.size)
-    rigid = next(term for term in model.terms if term.body_parameters)
-    first = sum(len(t.parameters(model.robot)) for t in model.terms[: model.terms.index(rigid)])
-    values = bodies[:, : rigid.body_parameters].ravel()
-    p[first : first + len(values)] = values
-    return p

@@ -1,6 +1,5 @@
 """Design of the motion that an experiment file asks for, and the files that a robot can play."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -22,11 +21,10 @@ from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.problem import assumed_noise
 from jaxid.experiment.decoder import within
 from jaxid.experiment.experiment import Experiment
-from jaxid.identification.comparison import parameter_kinds
+from jaxid.experiment.robot_tables import named
 from jaxid.io import atomic_folder
-from jaxid.report.excitation import list_joints, write_excitation
+from jaxid.report.excitation import write_excitation
 from jaxid.report.result_files import read_fit
-from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.table import Remark, Status
 from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
 from jaxid.trajectory.leads import with_leads
@@ -108,13 +106,7 @@ def compare_criteria(
 ) -> list[ExcitationPlan]:
     """Design by every criterion, from few starts and without polishing, until Ctrl-C."""
     plans, table = [], experiment.excitation
-    for number, criterion in enumerate(CRITERIA):
-
-        def tell(now: DesignProgress, number: int = number) -> None:
-            share = (number + now.fraction) / len(CRITERIA)
-            doing = f"criterion {number + 1} of {len(CRITERIA)}, {now.task}"
-            progress(now._replace(fraction=share, task=doing))
-
+    for criterion in CRITERIA:
         try:
             with within("excitation", experiment.path.name):
                 plan = design_excitation(
@@ -123,7 +115,7 @@ def compare_criteria(
                     starts=min(8, table.starts),
                     generations=min(4, table.generations),
                     polish=0,
-                    progress=tell,
+                    progress=progress,
                     throw=False,
                     **_settings(experiment, find_nominal(experiment), bool(criterion.weighted)),
                 )
@@ -140,10 +132,10 @@ def write_design(
 ) -> list[Path]:
     """Write table, trajectory, ROS message and pictures; return the files."""
     plan, step, table = design.plan, design.sample_time, experiment.excitation
-    robot = plan.base.model.robot
+    robot = experiment.robot
     names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{table.ros}"]
-    settings = {"facts": (("seed", str(table.seed)),), "experiment_text": experiment.text}
-    settings["command"] = command
+    seed = (("seed", str(table.seed)),)
+    settings = {"facts": seed, "experiment_text": experiment.text, "command": command}
     with double_precision(), atomic_folder(output.parent) as folder:
         write_csv(design.sampled, robot, folder / names[0], sample_time=step)
         save_trajectory(jax.tree.map(np.asarray, design.played), folder / names[1])
@@ -250,9 +242,7 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
         return None  # nothing depends on it, and the robot's notes name the body that cannot exist
     if bodies is None or not np.any(bodies):
         return None
-    base, standard = experiment.base, experiment.model.parameter_names
-    names = [f"{n}{i + 1}" for i in range(experiment.robot.joints) for n in INERTIAL_NAMES]
-    known = dict(zip(names, bodies.ravel().tolist(), strict=True))
+    base, standard, known = experiment.base, experiment.model.parameter_names, named(bodies)
     values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
     leads = [standard[k] in known for k in base.indices]
     return Nominal(base.names, np.where(leads, values, np.nan), None)
@@ -286,19 +276,14 @@ def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | 
             motion = with_leads(motion, robot, periods=leads.periods)
             begin, end = (float(t) for t in motion.window)
         except InputError as error:
-            text = f"the motion is without leads, and starts and ends at full speed: {error} "
-            text += "`rest = true` designs one that is at rest there."
-            remarks.append(Remark(text, Status.BAD))
+            text = f"the motion is without leads, and starts and ends at full speed: {error}"
+            remarks.append(Remark(f"{text} `rest = true` designs one at rest there.", Status.BAD))
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
     rests = not remarks and (leads is not None or table.rest or table.spline is not None)
     if begin > 0:
-        remarks.append(
-            Remark(
-                f"the robot starts at rest and is in the designed motion from {begin:.3f} to "
-                f"{end:.3f} s of {float(motion.duration):.3f} s"
-            )
-        )
+        text = f"from {begin:.3f} to {end:.3f} s of {float(motion.duration):.3f} s"
+        remarks.append(Remark(f"the robot starts at rest and is in the designed motion {text}"))
     remarks += _remarks(experiment, plan)
     remarks += force_remarks(experiment, nominal, motion)
     sampled = motion
@@ -309,21 +294,19 @@ def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | 
 
 
 def _remarks(experiment: Experiment, plan: ExcitationPlan) -> list[Remark]:
-    table, notes = experiment.excitation, []
-    if table.noise is None:
-        notes.append(
-            "the noise is assumed as 1 % of the largest forces: give `noise` if it is known"
-        )
-    if table.earlier:
-        notes.append(f"deviations are those together with {', '.join(table.earlier)}")
-    if table.chosen_leads is not None and table.chosen_leads.periods > 1:
-        count = table.chosen_leads.periods
-        notes.append(f"the motion runs through {count} periods; the deviations are of one")
-    if plan.nominal is None:
-        notes.append(
-            "for relative deviations, say in `excitation.nominal` where an earlier result is"
-        )
-    return [Remark(text) for text in notes]
+    table = experiment.excitation
+    count = 1 if table.chosen_leads is None else table.chosen_leads.periods
+    notes = {
+        "the noise is assumed as 1 % of the largest forces: give `noise` if it is known": (
+            table.noise is None
+        ),
+        f"deviations are those together with {', '.join(table.earlier)}": table.earlier,
+        f"the motion runs through {count} periods; the deviations are of one": count > 1,
+        "for relative deviations, say in `excitation.nominal` where an earlier result is": (
+            plan.nominal is None
+        ),
+    }
+    return [Remark(text) for text, holds in notes.items() if holds]
 
 
 def force_remarks(
@@ -342,8 +325,9 @@ def force_remarks(
     remarks = []
     if experiment.excitation.force_margin is None:
         remarks.append(_force_use(experiment, nominal, played))
-    if unknown := _unknown_parameters(experiment, nominal):
-        text = f"not known, and counted as zero in the forces: {unknown}"
+    unknown = [n for n, p in zip(nominal.names, nominal.parameters, strict=True) if np.isnan(p)]
+    if unknown:
+        text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"
         remarks.append(Remark(text, Status.DOUBTFUL))
     if nominal.undetermined:
         text = (
@@ -361,34 +345,15 @@ def _force_use(experiment: Experiment, nominal: Nominal, played: AbstractTraject
         motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
         limits = _force_limits(experiment, nominal, 0.0)
         findings = limits.describe(robot, np.asarray(limits(robot, motion)))
-    shown = {
-        f"{x.name} with {100 * x.used:.1f} % of {x.limit:.4g} {x.unit}": x.value for x in findings
-    }
-    exceeded = [text for text, value in shown.items() if value > 0]
-    if exceeded:
+    worst = max(findings, key=lambda finding: finding.value)
+    nearest = f"{worst.name} with {100 * worst.used:.1f} % of {worst.limit:.4g} {worst.unit}"
+    if worst.value > 0:
         return Remark(
             "by the nominal parameters this motion needs more than robot and motors can give: "
-            f"{'; '.join(exceeded)}; give `force_margin`, and the design keeps these limits",
+            f"{nearest}; give `force_margin`, and the design keeps these limits",
             Status.BAD,
         )
-    nearest = max(shown, key=lambda text: shown[text])
     return Remark(
         "forces were not part of the design; by the nominal parameters they stay within their "
-        f"limits, the nearest being {nearest} (`force_margin` keeps them with room)",
-        Status.NEUTRAL,
+        f"limits, the nearest being {nearest} (`force_margin` keeps them with room)"
     )
-
-
-def _unknown_parameters(experiment: Experiment, nominal: Nominal) -> str:
-    """Name the unknown parameters by effect and joint; empty if all are known."""
-    base, kinds = experiment.base, parameter_kinds(experiment.base)
-    joints: dict[str, list[int]] = {}
-    for k in np.flatnonzero(np.isnan(nominal.parameters)):
-        number = re.search(r"\d+$", base.model.parameter_names[base.indices[k]])
-        if number is not None:
-            joints.setdefault(kinds[k], []).append(int(number[0]) - 1)
-    effects: dict[str, list[str]] = {}
-    for effect, indices in joints.items():
-        where = list_joints(experiment.robot, sorted(set(indices)))
-        effects.setdefault(where, []).append(effect)
-    return "; ".join(f"{', '.join(words)} of {where}" for where, words in effects.items())

@@ -29,11 +29,7 @@ from jaxid.experiment.robot_tables import RobotSource, known_load, replace_drive
 from jaxid.identification.choices import FilterCandidate, essential_parameters
 from jaxid.identification.consistency import BodyBounds
 from jaxid.identification.estimators import (
-    Complete,
-    CrossValidated,
-    LeastSquares,
     NonlinearFriction,
-    WeightedLeastSquares,
 )
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
@@ -115,30 +111,21 @@ class Experiment:
         """Base parameters of the model, found when they are first asked for."""
         return base_parameters(self.model)
 
-    @property
-    def other_estimator(self) -> LeastSquares | WeightedLeastSquares:
-        """Estimator to compare with where logs do not determine everything.
-
-        Plain least squares beside an estimator that keeps undetermined parameters small, and the
-        other way round.
-        """
-        other = Complete() if self.estimation.regularised else CrossValidated()
-        return dataclasses.replace(self.estimation.plain, solution=other)
-
     def fit(self, rows: RegressionProblem, progress: Progress | None = None) -> Fit:
         """Estimate parameters as the table `[estimator]` says."""
-        uncertainty = self.estimation.uncertainty
+        chosen, logs = self.estimation, rows.recordings
         if self.linear is not None:
             linear = base_parameters(Model(self.robot, self.linear))
-            estimator = NonlinearFriction(self.estimation.plain)
-            return identify_nonlinear(
-                self.base, rows.recordings, estimator, linear=linear, progress=progress
-            ).better
-        fit = fit_problem(rows, self.estimation.estimator, uncertainty=uncertainty)
-        if self.estimation.essential is None:
+            estimator = NonlinearFriction(chosen.plain)
+            choice = identify_nonlinear(
+                self.base, logs, estimator, linear=linear, progress=progress
+            )
+            return choice.better
+        fit = fit_problem(rows, chosen.estimator, uncertainty=chosen.uncertainty)
+        if chosen.essential is None:
             return fit
         choice = essential_parameters(
-            fit, rows.recordings, cost=self.estimation.essential, uncertainty=uncertainty
+            fit, logs, cost=chosen.essential, uncertainty=chosen.uncertainty
         )
         return dataclasses.replace(choice.fit, notes=(*choice.fit.notes, *choice.notes))
 
@@ -281,21 +268,5 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         "estimation": estimation,
         "linear": effects.linear_terms(robot) if estimation.nonlinear else None,
         "excitation": call(Excitation, content.get("excitation", {}), "excitation"),
-        "notes": (*_two_forces(robot), *filter_notes, *estimation.notes),
+        "notes": (*filter_notes, *estimation.notes),
     }
-
-
-def _two_forces(robot: Robot) -> list[str]:
-    """Say which of two known largest forces decides."""
-    joints, motors = np.asarray(robot.limits.force), np.asarray(robot.drives.max_forces)
-    both = np.isfinite(joints) & np.isfinite(motors) & ~np.isclose(joints, motors, rtol=1e-6)
-    if not both.any():
-        return []
-    shown = (
-        f"{robot.joint_names[j]} {joints[j]:.4g}, not {motors[j]:.4g} {robot.force_unit(j)}"
-        for j in np.flatnonzero(both).tolist()
-    )
-    return [
-        "the largest forces are those of the joints (`limits.force`), which decide before what the "
-        f"motors give through the gears (`drives.max_torques`): {'; '.join(shown)}."
-    ]

@@ -138,20 +138,16 @@ class Effects:
         coupled = self.coupled_drives
         if coupled is None:
             coupled = bool(CoupledDrives().couplings(robot))
-        terms: list[AbstractTerm] = [RigidBodies(principal_axes=self.principal_axes)]
-        if self.viscous:
-            terms.append(ViscousFriction())
-        if self.coulomb is not False:
-            terms.append(dry.term(robot))
-        if self.rotor_inertia:
-            terms.append(RotorInertia())
-        if offset:
-            terms.append(ConstantOffset())
-        if coupled:
-            terms.append(CoupledDrives(dry.transition(robot)))
-        if self.springs:
-            terms.append(LinearSpring())
-        return tuple(terms)
+        terms = (
+            RigidBodies(principal_axes=self.principal_axes),
+            self.viscous and ViscousFriction(),
+            self.coulomb is not False and dry.term(robot),
+            self.rotor_inertia and RotorInertia(),
+            offset and ConstantOffset(),
+            coupled and CoupledDrives(dry.transition(robot)),
+            self.springs and LinearSpring(),
+        )
+        return tuple(term for term in terms if not isinstance(term, bool))
 
     def linear_terms(self, robot: Robot) -> tuple[AbstractTerm, ...]:
         """Return the terms with Coulomb's law in place of Stribeck's."""

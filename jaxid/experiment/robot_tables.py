@@ -11,6 +11,7 @@ from jaxid.arrays import Float
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import Finite, Magnitude, PerJoint, Positive, Vector
 from jaxid.robot import library
+from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.joints import Limits, far_notes, fast_notes, per_joint, range_fault
 from jaxid.robot.library import from_dh
 from jaxid.robot.robot import GRAVITY, Robot, Tool
@@ -89,11 +90,7 @@ def known_load(
     """
 
     def on(robot: Robot) -> Tool:
-        content: dict[str, Any] = {
-            "mass": mass,
-            "centre_of_mass": centre_of_mass,
-            "inertia": inertia,
-        }
+        content: Any = {"mass": mass, "centre_of_mass": centre_of_mass, "inertia": inertia}
         if body is None:
             return cast(Tool, robot.with_tool(**content).tool)
         return Tool(joint_number(robot, body), **content)
@@ -227,6 +224,12 @@ class RobotSource:
         return np.asarray(urdf_parameters(folder / self.urdf, **self.chain)).reshape(-1, 10)
 
 
+def named(bodies: Float[np.ndarray, "bodies 10"]) -> dict[str, float]:
+    """Return the parameters of bodies by their names in a model."""
+    names = (f"{name}{k + 1}" for k in range(len(bodies)) for name in INERTIAL_NAMES)
+    return dict(zip(names, bodies.ravel().tolist(), strict=True))
+
+
 def replace_limits(
     robot: Robot,
     *,
@@ -266,8 +269,8 @@ def replace_limits(
     _check_limits(robot, fields)
     assumed = tuple(name for name in robot.limits.assumed if name not in told)
     limits = Limits(robot.joints, **fields, assumed=assumed)
-    notes = _doubts(robot, limits, position_min or position_max, velocity and angle_unit == "rad")
-    return robot.replace(limits=limits, notes=(*robot.notes, *notes))
+    notes = dict.fromkeys((*robot.notes, *_doubts(robot, limits)))
+    return robot.replace(limits=limits, notes=tuple(notes))
 
 
 def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
@@ -288,14 +291,13 @@ def _check_limits(robot: Robot, fields: dict[str, np.ndarray]) -> None:
             raise InputError(f"joint `{name}` {why}: {cure}.")
 
 
-def _doubts(robot: Robot, limits: Limits, ranges: Any, speeds: Any) -> Iterator[str]:
+def _doubts(robot: Robot, limits: Limits) -> Iterator[str]:
     """Name limits of the file that look as if they were in other units."""
     for j, name in enumerate(robot.joint_names):
-        ends = (float(limits.position_min[j]), float(limits.position_max[j]))
-        if ranges and not robot.revolute[j]:
+        if not robot.revolute[j]:
+            ends = (float(limits.position_min[j]), float(limits.position_max[j]))
             yield from far_notes(f"joint `{name}`: an end of its range", ends)
-        if speeds:
-            yield from fast_notes(name, float(limits.velocity[j]), robot.revolute[j])
+        yield from fast_notes(name, float(limits.velocity[j]), robot.revolute[j])
 
 
 def replace_drives(

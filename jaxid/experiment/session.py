@@ -5,13 +5,12 @@ import functools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, TimeElapsedColumn
 
 from jaxid.diagnosis import Diagnosis, diagnose
-from jaxid.diagnosis.diagnosis import BAD, mistakes_in_logs
+from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
@@ -19,15 +18,14 @@ from jaxid.experiment.decoder import within
 from jaxid.experiment.experiment import Experiment
 from jaxid.identification.choices import FilterChoice, choose_filter
 from jaxid.identification.combination import require_same_base, share_rows, update
-from jaxid.identification.fit import Fit, load
+from jaxid.identification.estimators import Complete
+from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
-from jaxid.measurement.observations import Progress as Callback
 from jaxid.measurement.recording import NeedsMemory, Recording
-from jaxid.report.identification import solution_name
-from jaxid.report.result_files import MODEL, Alternative
-from jaxid.validation import Validation, comparison_step, torque_errors, validate
+from jaxid.report.result_files import read_fit
+from jaxid.validation import Validation, comparison_step, validate
 
 LoadedLog = tuple[Recording | Observations, Observations, Diagnosis]
 """Log as it was read (of a log on disk its observations), filtered log, and diagnosis."""
@@ -36,34 +34,17 @@ LoadedLog = tuple[Recording | Observations, Observations, Diagnosis]
 class Stages:
     """Progress bar of a command, called with the name of each stage as it begins."""
 
-    def __init__(self, bar: Progress, total: int):
+    def __init__(self, bar: Progress):
         self._bar = bar
-        self._task = bar.add_task("starting", total=total + 1, detail="")
-        self._part = bar.add_task("", total=1.0, detail="", visible=False)
+        self._task = bar.add_task("starting", total=1.0)
 
     def __call__(self, name: str) -> None:
         """Begin a stage."""
-        self._bar.update(self._task, description=name, advance=1)
-        self._bar.update(self._part, visible=False)
+        self._bar.reset(self._task, description=name)
 
-    def through(self, rows: int = 0) -> Callback:
-        """Return a callback for the completed fraction of a stage, which shows its speed."""
-        self._bar.reset(self._part, visible=False)
-        start = monotonic()
-
-        def progress(fraction: float) -> None:
-            seconds = monotonic() - start
-            detail = f"{100 * fraction:3.0f} %"
-            if rows and seconds > 0:
-                speed = fraction * rows / seconds
-                detail += f", {speed / 1e6:.1f} million" if speed >= 1e6 else f", {speed:,.0f}"
-                detail += " rows/s"
-            if fraction > 0:
-                left = int(seconds / fraction - seconds)
-                detail += f", {left // 60}:{left % 60:02d} left"
-            self._bar.update(self._part, completed=fraction, visible=True, detail=detail)
-
-        return progress
+    def through(self, fraction: float) -> None:
+        """Show the completed fraction (0 to 1) of the stage."""
+        self._bar.update(self._task, completed=fraction)
 
     def design(self, now: DesignProgress) -> None:
         """Show the progress of a design, and the best value so far."""
@@ -73,13 +54,12 @@ class Stages:
 
 
 @contextmanager
-def stages(console: Console, total: int = 0) -> Iterator[Stages]:
-    """Show a progress bar of so many stages in a terminal, and nothing elsewhere."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    detail = TextColumn("{task.fields[detail]}")
+def stages(console: Console) -> Iterator[Stages]:
+    """Show a progress bar in a terminal, and nothing elsewhere."""
+    columns = (*Progress.get_default_columns(), TimeElapsedColumn())
     quiet = not console.is_terminal
-    with Progress(*columns, detail, console=console, transient=True, disable=quiet) as progress:
-        yield Stages(progress, total)
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+        yield Stages(progress)
 
 
 def load_log(
@@ -107,9 +87,8 @@ def _scan_log(experiment: Experiment, path: Path, stage: Stages, name: str | Non
     log = experiment.open(path)
     log = log if name is None else log.replace(name=name)
     stage(f"looking through {path.name}")
-    through = stage.through(log.samples)
     robot, min_speed = experiment.robot, experiment.min_speed
-    diagnosis = diagnose(log, robot, min_speed=min_speed, progress=through)
+    diagnosis = diagnose(log, robot, min_speed=min_speed, progress=stage.through)
     notes, step = [*log.notes, *diagnosis.notes], comparison_step(log)
     if step > 1:
         what = f"one of every {step} of its {log.rows} rows"
@@ -155,7 +134,6 @@ def select_filter(
         recording = experiment.read(log)
         recordings.append(recording if split is None else recording.split(split)[0])
     stage("choosing the filter")
-    samples = len(experiment.candidates) * sum(r.samples for r in recordings)
     with within("filter` and `rows", experiment.path.name):
         choice = choose_filter(
             experiment.base,
@@ -163,7 +141,7 @@ def select_filter(
             experiment.candidates,
             estimator=experiment.estimation.estimator,
             min_speed=experiment.min_speed,
-            progress=stage.through(samples),
+            progress=stage.through,
         )
     notes = (*experiment.notes, str(choice))
     return dataclasses.replace(experiment, filter=choice.filter, candidates=(), notes=notes), choice
@@ -175,17 +153,11 @@ def earlier_run(experiment: Experiment, folder: Path) -> Fit:
     Raises:
         InputError: If it keeps nothing, or of another robot or model.
     """
-    path = folder / MODEL
-    if not path.is_file():
-        raise InputError(
-            f"`{folder}` is a folder, but holds no `{MODEL}`: name a log, or the folder of a "
-            "report that `jaxid identify` has written."
-        )
-    fit = load(path)
+    fit = read_fit(folder)
     try:
         require_same_base((fit, dataclasses.replace(fit, base=experiment.base, name="these logs")))
     except InputError as error:
-        raise InputError(f"`{path}` does not fit `{experiment.path.name}`: {error}") from error
+        raise InputError(f"`{folder}` does not fit `{experiment.path.name}`: {error}") from error
     return fit
 
 
@@ -205,7 +177,8 @@ def read_runs(
             "identify` finds, as `epsilon` and `stribeck` of `model.coulomb`."
         )
     estimation, doubts = experiment.estimation, []
-    plain = estimation.estimator is estimation.plain and not estimation.regularised
+    complete = isinstance(estimation.plain.solution, Complete)
+    plain = estimation.estimator is estimation.plain and complete
     if not plain or estimation.essential is not None:
         rest = "the rest of `[estimator]` does not count"
         doubts.append(f"all runs are weighted least squares here: {rest}")
@@ -218,10 +191,9 @@ def read_runs(
         logs = [load_log(experiment, path, stage) for path in paths if not path.is_dir()]
         doubts += _findings(logs)
         if logs:
-            observations = [log for _, log, _ in logs]
             stage(f"factorising the rows, {name}")
-            through = stage.through(sum(o.samples for o in observations))
-            rows = RegressionProblem(experiment.base, observations, through)
+            observations = [log for _, log, _ in logs]
+            rows = RegressionProblem(experiment.base, observations, stage.through)
             fits.append(fit_problem(rows, estimation.plain))
             doubts += mistakes_in_logs([diagnosis for *_, diagnosis in logs], fits[-1])
         runs.append(dataclasses.replace(functools.reduce(update, fits), name=name))
@@ -238,7 +210,6 @@ class Identification:
         fit: Identified parameters.
         validation: Torque errors of all logs, those of the fit first.
         fitted: Number of logs, or of parts of logs, of the fit.
-        alternative: Another solution of the same equations, where logs do not determine everything.
         notes: Notes on the logs, as sentences.
         findings: Findings on the logs.
         mistakes: Likely mistakes in the columns of the logs, by the fit.
@@ -249,7 +220,6 @@ class Identification:
     fit: Fit
     validation: Validation
     fitted: int
-    alternative: Alternative | None
     notes: list[str]
     findings: list[str]
     mistakes: tuple[str, ...]
@@ -281,32 +251,18 @@ def identify_logs(
     stage("finding base parameters")
     base = experiment.base
     stage("factorising the rows")
-    samples = sum(o.samples for o in fitted)
-    rows = RegressionProblem(base, fitted, stage.through(samples))
-    fit = experiment.fit(rows, stage.through(samples))
+    rows = RegressionProblem(base, fitted, stage.through)
+    fit = experiment.fit(rows, stage.through)
     if reports:
         fit = _add_reports(experiment, reports, fit)
         _refuse_seen(fit, base, unseen)
     stage("predicting torques")
     every = [*fitted, *unseen]
-    through = stage.through(max(o.samples for o in every))
-    validation = validate(fit, every, progress=through)
-    alternative = None
-    if (experiment.estimation.regularised or fit.undetermined) and not reports:
-        same = rows if fit.base is base else RegressionProblem(fit.base, fitted)
-        other = fit_problem(same, experiment.other_estimator)
-        names = (solution_name(fit.solution), solution_name(other.solution))
-        alternative = Alternative(other, [torque_errors(other, log) for log in every], names)
-    notes = [note for o in every for note in o.notes]
+    validation = validate(fit, every, progress=stage.through)
     mistakes = mistakes_in_logs([diagnosis for *_, diagnosis in loaded[: len(logs)]], fit)
-    if fit.residual > BAD and not mistakes:
-        notes.append(
-            "whether the forces stand later in the logs than the angles takes longer to tell: "
-            "`jaxid inspect` says so for each log."
-        )
-    notes, findings = list(dict.fromkeys(notes)), _findings(loaded)
+    notes = list(dict.fromkeys(note for o in every for note in o.notes))
     return Identification(
-        experiment, choice, fit, validation, len(fitted), alternative, notes, findings, mistakes
+        experiment, choice, fit, validation, len(fitted), notes, _findings(loaded), mistakes
     )
 
 

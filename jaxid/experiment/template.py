@@ -54,7 +54,7 @@ def write_template(
     *,
     tip: str | None = None,
     base: str | None = None,
-    folder: str | Path | None = ".",
+    folder: str | Path = ".",
 ) -> str:
     """Return a complete commented experiment file for a robot; it loads as it is.
 
@@ -62,17 +62,14 @@ def write_template(
         urdf: Path of the robot's URDF file.
         tip: Link of the end-effector; the end of the longest chain if None.
         base: Link that stands on the ground; the root if None.
-        folder: Folder of the experiment file, to which the URDF's path is relative. If None, it is
-            not known, and the path is absolute.
+        folder: Folder of the experiment file, to which the URDF's path is relative.
 
     Raises:
         FileNotFoundError: If the URDF file does not exist.
         InputError: If it cannot be loaded.
     """
     robot = load_urdf(urdf, tip=tip, base=base)
-    path = Path(urdf).resolve()
-    if folder is not None:
-        path = Path(os.path.relpath(path, Path(folder).resolve()))
+    path = Path(os.path.relpath(Path(urdf).resolve(), Path(folder).resolve()))
     source = {"urdf": path.as_posix(), "tip": tip, "base": base}
     limits = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
     values = {
@@ -206,7 +203,9 @@ def _entry(name: str, value: str, text: str, active: bool) -> Iterator[str]:
     assignment = f"{mark}{name} = {value}"
     if len(assignment) >= COLUMN:
         yield from _comment(f"{text.rstrip('.')}:")
-        yield from _broken(assignment, mark)
+        # A list may go on in the next line.
+        lines = textwrap.wrap(assignment, WIDTH, subsequent_indent=f"{mark}  ")
+        yield from lines if " = [" in assignment else [assignment]
         return
     lines = textwrap.wrap(text.rstrip("."), WIDTH - COLUMN - 2) or [""]
     yield f"{assignment:<{COLUMN}}# {lines[0]}" if text else assignment
@@ -220,20 +219,6 @@ def _comment(text: str) -> list[str]:
     )
 
 
-def _broken(assignment: str, mark: str) -> Iterator[str]:
-    """Break a list that is too long for its line into several."""
-    opening, bracket, content = assignment.partition(" = [")
-    if len(assignment) <= WIDTH or not bracket:
-        yield assignment
-        return
-    indent = f"{mark}  "
-    yield opening + bracket
-    yield from textwrap.wrap(
-        f"{content[:-1]},", WIDTH, initial_indent=indent, subsequent_indent=indent
-    )
-    yield f"{mark}]"
-
-
 def _summary(function: Callable) -> str:
     """Return the first sentence of a docstring, without formulas."""
     text = (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ")
@@ -241,22 +226,21 @@ def _summary(function: Callable) -> str:
 
 
 def _recording(robot: Robot) -> dict[str, Any]:
-    angles = ["rad" if turns else "m" for turns in robot.revolute]
-    forces = ["N m" if turns else "N" for turns in robot.revolute]
+    joints = range(robot.joints)
+    angles, forces = [*map(robot.joint_unit, joints)], [*map(robot.force_unit, joints)]
     return {
         "angles": "q{}",
         "forces": "tau{}",
         "time": "time",
         "angle_unit": angles[0] if len(set(angles)) == 1 else angles,
-        "force_unit": forces[0] if len(set(forces)) == 1 else forces,
+        "force_unit": forces[0] if len(set(angles)) == 1 else forces,
     }
 
 
 def _joints(robot: Robot) -> str:
     """Return a comment with numbers, names and kinds of the joints."""
-    mixed = not all(robot.revolute)
     names = (
-        f"{i + 1} {name}" + (f" ({'turns' if turns else 'slides'})" if mixed else "")
-        for i, (name, turns) in enumerate(zip(robot.joint_names, robot.revolute, strict=True))
+        f"{i} {name} ({'turns' if turns else 'slides'})"
+        for i, (name, turns) in enumerate(zip(robot.joint_names, robot.revolute, strict=True), 1)
     )
     return "\n".join(_comment(f"The joints: {', '.join(names)}")) + "\n"

@@ -13,7 +13,6 @@ from jaxid.io import atomic_folder
 from jaxid.report.motion import joint_figure, path_figure, pose_figure, tip_figure
 from jaxid.report.page import picture, provenance, render_page
 from jaxid.report.style import save
-from jaxid.robot.robot import Robot
 from jaxid.table import Column, Remark, Status, Table, significant
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
@@ -46,8 +45,14 @@ def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
 
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     """Return what must be known of a design, what it assumes, and what it leaves vague."""
-    published = ", ".join(plan.limits.limits.assumed)
-    assumed, vague = ", ".join(_assumed_limits(plan)), ", ".join(plan.vague)
+    robot, limits = plan.base.model.robot, plan.limits.limits
+    rates = {"velocity": "/s", "acceleration": "/s²"}
+    assumed = ", ".join(
+        f"{name} of `{robot.joint_names[j]}` "
+        f"({float(getattr(limits, name)[j]):.4g} {robot.joint_unit(j)}{rates.get(name, '')})"
+        for name, j in plan.limits.assumed
+    )
+    published, vague = ", ".join(limits.assumed), ", ".join(plan.vague)
     doubts = (
         published and f"Limits that nobody published, assumed: {published}",
         assumed and f"Assumed, because not given: {assumed}",
@@ -55,17 +60,16 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         "The design was stopped: `--resume` goes on where it was" if plan.interrupted else "",
     )
     found = [Remark(text, Status.DOUBTFUL) for text in doubts if text]
-    robot = plan.base.model.robot
     start, then = plan.limits.basis.times(plan.samples)[:2]
     step = float(then - start)
-    noise = {
-        j: f"{significant(float(s))} {robot.force_unit(j)}"
-        for j, s in enumerate(np.asarray(plan.noise))
-    }
+    noise = ", ".join(
+        f"{significant(s)} {robot.force_unit(j)}"
+        for j, s in enumerate(np.asarray(plan.noise).tolist())
+    )
     text = (
         f"Expected deviations are those of {plan.samples} samples in {plan.samples * step:.4g} s "
         f"({1 / step:.4g} Hz), of one run, with white noise of the forces: standard deviation "
-        f"{', '.join(_grouped(robot, noise))}; of n runs they are √n times smaller."
+        f"{noise}; of n runs they are √n times smaller."
     )
     return [*plan.remarks, Remark(text), *found]
 
@@ -74,38 +78,6 @@ def ordered(remarks: Iterable[Remark]) -> list[Remark]:
     """Return remarks sorted by status: neutral ones first, bad ones last."""
     order = (Status.NEUTRAL, Status.GOOD, Status.DOUBTFUL, Status.BAD)
     return sorted(remarks, key=lambda remark: order.index(remark.status))
-
-
-def _assumed_limits(plan: ExcitationPlan) -> list[str]:
-    """Return the limits that were assumed because nobody gave them, with their values."""
-    robot, texts = plan.base.model.robot, []
-    for field, words, per in (
-        ("position_min", "lower end of the range", ""),
-        ("position_max", "upper end of the range", ""),
-        ("velocity", "speed", "/s"),
-        ("acceleration", "acceleration", "/s²"),
-    ):
-        limits = np.asarray(getattr(plan.limits.limits, field))
-        joints = [joint for name, joint in plan.limits.assumed if name == field]
-        values = {j: f"{float(limits[j]):.4g} {robot.joint_unit(j)}{per}" for j in joints}
-        texts += [f"{words} of {text}" for text in _grouped(robot, values)]
-    return texts
-
-
-def _grouped(robot: Robot, texts: Mapping[int, str]) -> list[str]:
-    """Return joints with the same text together, like `all joints (8 rad/s²)`."""
-    return [
-        f"{list_joints(robot, [j for j, other in texts.items() if other == text])} ({text})"
-        for text in dict.fromkeys(texts.values())
-    ]
-
-
-def list_joints(robot: Robot, joints: Iterable[int]) -> str:
-    """Return the names of joints (from 0) in a sentence, or `all joints`."""
-    names = [robot.joint_names[j] for j in joints]
-    if len(names) == robot.joints > 1:
-        return "all joints"
-    return ", ".join(f"`{name}`" for name in names)
 
 
 def write_excitation(
@@ -173,10 +145,7 @@ def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         text = "A motion that can be recorded, but its design was stopped."
         return Remark(text, Status.DOUBTFUL)
     if any(remark.status is Status.BAD for remark in remarks):
-        text = (
-            "A motion that determines all base parameters, but read the remarks below before it "
-            "is recorded."
-        )
+        text = "This motion determines all base parameters, but read the remarks below first."
         return Remark(text, Status.DOUBTFUL)
     text = "A motion that keeps all given limits, and determines all base parameters."
     return Remark(text, Status.GOOD)

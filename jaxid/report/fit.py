@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from scipy.signal import fftconvolve
 
 from jaxid.arrays import Float
 from jaxid.errors import InputError
@@ -215,16 +216,8 @@ def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
     Args:
         spectra: Spectra of the residuals of a fit.
         robot: Robot of the fit.
-
-    Raises:
-        InputError: If the numbers of joints differ.
     """
     n = robot.joints
-    if len(spectra.density) != n:
-        raise InputError(
-            f"`spectra` must be those of the {n} joints of `{robot.name}`, but are of "
-            f"{len(spectra.density)}."
-        )
     title = f"{robot.name}: residuals of {sum(spectra.white)} of {n} joints are white"
     with drawing(title) as figure:
         for j, axes in enumerate(_joint_panels(figure, n, 1.9)):
@@ -326,11 +319,9 @@ def autocorrelation(errors: TorqueErrors, lags: int) -> Float[np.ndarray, "lags 
     e = errors.errors
     e = e - np.nanmean(e, axis=0)
     counted, e = np.isfinite(e).astype(float), np.nan_to_num(e)
-    length = 2 ** math.ceil(math.log2(len(e) + lags))
 
     def correlate(x: np.ndarray) -> np.ndarray:
-        power = np.abs(np.fft.rfft(x, length, axis=0)) ** 2
-        return np.fft.irfft(power, length, axis=0)[:lags]
+        return fftconvolve(x, x[::-1], axes=0)[len(x) - 1 :][:lags]
 
     pairs = np.round(correlate(counted))
     with np.errstate(invalid="ignore", divide="ignore"):

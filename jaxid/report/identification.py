@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.identification.consistency.estimator import Consistency
-from jaxid.identification.estimators import AbstractSpectralSolution
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
@@ -112,8 +111,8 @@ def _task_table(fit: Fit, settings: Mapping[str, Any]) -> Table:
 def _robot_table(robot: Robot) -> Table:
     table, assumed = robot.summary(), ", ".join(robot.limits.assumed)
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
-    facts = [*table.facts, ("gravity [m/s²]", gravity)]
-    return Table("", *table.columns, facts=[*facts, *([("assumed", assumed)] if assumed else [])])
+    more = [("gravity [m/s²]", gravity), ("assumed", assumed or "nothing")]
+    return Table("", *table.columns, facts=[*table.facts, *more])
 
 
 def _torque_blocks(figures: Mapping[str, Figure], joints: int) -> list[Figure | str]:
@@ -220,27 +219,6 @@ def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
             ("active bounds", "; ".join(consistency.active) or "none"),
         ],
     )
-
-
-def alternative_table(
-    errors: Sequence[TorqueErrors], others: Sequence[TorqueErrors], names: tuple[str, str]
-) -> Table:
-    """Return the errors of a fit beside those of another solution of the same equations."""
-    means = [[float(np.mean(e.rms_relative)) for e in group] for group in (errors, others)]
-    return Table(
-        "solved otherwise: RMS error in percent of the RMS force, mean of the joints",
-        Column("recording", [e.name for e in errors]),
-        Column(f"this fit ({names[0]})", means[0], "%", percent),
-        Column(names[1], means[1], "%", percent),
-    )
-
-
-def solution_name(solution: AbstractSpectralSolution) -> str:
-    """Return a solution in words, such as `ridge 0.01`."""
-    strength = getattr(solution, "strength", getattr(solution, "rcond", None))
-    if strength is None:
-        return "plain least squares"
-    return f"{type(solution).__name__.lower()} {strength:.2g}"
 
 
 def verdict(
@@ -350,13 +328,11 @@ def _judge_residuals(fit: Fit) -> list[Remark]:
         f"line by less than {percent(spectra.limit)} % in 95 % of cases. The intervals account "
         "for correlated residuals."
     )
+    nearly = float(np.max(np.asarray(spectra.departure))) <= 2.0 * spectra.limit
+    status, doubt = Status.NEUTRAL if nearly else Status.DOUBTFUL, ""
     if white == joints:
-        return [Remark("The residuals are white noise.", Status.GOOD, rule)]
-    if float(np.max(np.asarray(spectra.departure))) <= 2.0 * spectra.limit:
-        text = f"The residuals are nearly white noise (white: {white} of {joints} joints)."
-        return [Remark(text, Status.NEUTRAL, rule)]
-    text = (
-        f"The residuals are not white noise for {joints - white} of {joints} joints: some effect "
-        "is not in the model, or the noise itself is coloured."
-    )
-    return [Remark(text, Status.DOUBTFUL, rule)]
+        status = Status.GOOD
+    elif not nearly:
+        doubt = ": some effect is not in the model, or the noise itself is coloured"
+    text = f"The residuals are white noise for {white} of {joints} joints{doubt}"
+    return [Remark(text, status, rule)]

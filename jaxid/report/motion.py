@@ -228,17 +228,9 @@ def animation(
         time: Instants of the samples [s].
         q: Joint coordinates [rad or m].
         collision: Collision model, whose capsules are drawn.
-        frames: Number of pictures.
-
-    Raises:
-        InputError: If there are fewer than two samples or pictures.
+        frames: Number of pictures, two at least.
     """
     t, q = np.asarray(time, np.float64), np.asarray(q, np.float64)
-    if len(t) < 2 or frames < 2:
-        raise InputError(
-            f"`time` and `frames` must give at least two pictures, but are {len(t)} samples and "
-            f"{frames} pictures."
-        )
     instants = np.linspace(t[0], t[-1], frames)
     shown = np.stack([np.interp(instants, t, column) for column in q.T], axis=1)
     view = _project(robot, shown, collision)

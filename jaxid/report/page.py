@@ -127,11 +127,8 @@ def _macros() -> Any:
 
 def _align(number: str) -> str:
     """Replace blanks behind a number by blanks as wide as the digits and the point left out."""
-    bare = number.rstrip(" ")
-    blanks = len(number) - len(bare)
-    if not blanks or "." in bare:
-        return bare + "\N{FIGURE SPACE}" * blanks
-    return bare + "\N{PUNCTUATION SPACE}" + "\N{FIGURE SPACE}" * (blanks - 1)
+    pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
+    return pointed.replace(" ", "\N{FIGURE SPACE}")
 
 
 def show(console: Console, *tables: Table) -> None:

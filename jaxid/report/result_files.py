@@ -1,14 +1,13 @@
 """Results on disk: pages and figures for people, numbers for programs, written atomically."""
 
 import csv
-import dataclasses
 import datetime
 import math
 import re
 import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -43,14 +42,8 @@ SCHEMAS = {
     for kind in ("result", "comparison", "payload", "gains", "states", "demo")
 }
 """Files that hold results, and the schemas in them."""
-
-
-class Alternative(NamedTuple):
-    """Another solution of the same equations, its errors, and the names of both solutions."""
-
-    fit: Fit
-    errors: Sequence[TorqueErrors]
-    names: tuple[str, str]
+Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
+"""Names, units, values and uncertainty of some estimates."""
 
 
 def write_report(
@@ -61,7 +54,6 @@ def write_report(
     definiteness: Definiteness,
     settings: Mapping[str, Any],
     notes: Sequence[str] = (),
-    alternative: Alternative | None = None,
     choice: FilterChoice | None = None,
     doubts: Sequence[str] = (),
     pdf: bool = False,
@@ -71,7 +63,7 @@ def write_report(
     A folder that exists keeps its other files; files of an earlier report in it are replaced.
     `settings` tell the origin of the result, `notes` and `doubts` about the logs are sentences.
     """
-    record = _record(fit, identification, verification, definiteness, settings, notes, alternative)
+    record = _record(fit, identification, verification, definiteness, settings, notes)
     figures = _draw(fit, identification, verification, choice)
     page = identification_page(
         fit, identification, verification, definiteness, settings, figures, notes, doubts
@@ -130,25 +122,30 @@ def safe_name(name: str) -> str:
 
 def _earlier_files(folder: Path) -> set[str]:
     """Return the figures that an earlier report in this folder has written."""
-    try:
-        content = read_json(folder / "result.json")
-        if content["schema"] != SCHEMAS["result.json"]:
-            return set()
-        return {f for f in content["files"] if re.fullmatch(r"[\w.-]+\.(png|pdf)", f)}
-    except (OSError, ValueError, KeyError, TypeError):
+    if schema_of(folder / "result.json") != SCHEMAS["result.json"]:
         return set()
+    files = read_json(folder / "result.json").get("files", ())
+    return {f for f in files if re.fullmatch(r"[\w.-]+\.(png|pdf)", f)}
 
 
-def read_fit(folder: Path, name: str | None = None) -> Fit:
-    """Read the fit of a report; its name is the folder's by default."""
-    folder = folder.parent if folder.is_file() else folder
-    if not (folder / MODEL).is_file():
+def schema_of(path: Path) -> str:
+    """Return the schema that a result file names; nothing for other files."""
+    try:
+        schema = str(read_json(path)["schema"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+    return schema if schema.startswith("jaxid-") else ""
+
+
+def read_fit(report: Path) -> Fit:
+    """Read the fit of a report, or a model file."""
+    path = report if report.is_file() else report / MODEL
+    if not path.is_file():
         raise InputError(
-            f"`{folder}` must be a folder that `jaxid identify` has written, but holds no "
+            f"`{report}` must be a folder that `jaxid identify` has written, but holds no "
             f"`{MODEL}`."
         )
-    name = folder.resolve().name if name is None else name
-    return dataclasses.replace(load(folder / MODEL), name=name)
+    return load(path)
 
 
 def write_comparison(
@@ -183,33 +180,29 @@ def write_comparison(
     return _write_table(folder, "comparison", content, rows, comparison_figure(comparison))
 
 
-def estimate_rows(
-    names: Sequence[str], units: Sequence[str], values: AnyArray, uncertainty: Uncertainty
-) -> list[dict[str, Any]]:
-    """Return estimates of a payload, of gains or of states, one row for each."""
-    return _rows(
-        name=names,
-        unit=units,
-        estimate=values,
-        standard_deviation=uncertainty.standard_deviations,
-        half_width=uncertainty.half_widths(),
-    )
-
-
 def write_estimates(
     folder: Path,
     kind: str,
-    rows: list[dict[str, Any]],
-    covariance: AnyArray,
+    estimates: Sequence[Estimates],
     content: Mapping[str, Any],
     sources: Mapping[str, Sequence[Path]],
 ) -> list[Path]:
     """Write a payload, gains or states as `{kind}.json` and `{kind}.csv`; return the files."""
+    rows = []
+    for names, units, values, uncertainty in estimates:
+        deviations, halves = uncertainty.standard_deviations, uncertainty.half_widths()
+        rows += _rows(
+            name=names,
+            unit=units,
+            estimate=values,
+            standard_deviation=deviations,
+            half_width=halves,
+        )
     everything = {
         "sources": {key: [str(p) for p in paths] for key, paths in sources.items()},
         "level": LEVEL,
         "parameters": rows,
-        "covariance": covariance,
+        "covariance": estimates[0][-1].covariance,
         **content,
     }
     return _write_table(folder, kind, everything, rows)
@@ -282,7 +275,6 @@ def _record(
     definiteness: Definiteness,
     settings: Mapping[str, Any],
     notes: Sequence[str],
-    alternative: Alternative | None,
 ) -> dict[str, Any]:
     """Return the content of `result.json`."""
     base, model, robot = fit.base, fit.base.model, fit.base.model.robot
@@ -312,12 +304,6 @@ def _record(
                 smallest_eigenvalue="smallest",
                 indefinite_share="indefinite",
             ),
-            "beside": alternative
-            and {
-                "way": alternative.names[1],
-                "solution": str(alternative.fit.solution),
-                "errors": [_error_record(e, robot) for e in alternative.errors],
-            },
             "settings": settings,
             "notes": tuple(dict.fromkeys((*robot.notes, *fit.notes, *notes))),
         }

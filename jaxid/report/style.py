@@ -27,7 +27,6 @@ WIDTH = 11.0
 """Width of a figure [inch]."""
 
 _SETTINGS = {
-    "figure.facecolor": "white",
     "font.size": 9,
     "text.color": INK,
     # Names of joints and files are no formulas, whatever characters they contain.
@@ -42,7 +41,6 @@ _SETTINGS = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.unicode_minus": True,
     "grid.color": PALE,
     "grid.linewidth": 0.5,
     **{f"{axis}tick.labelsize": 8 for axis in "xy"},
@@ -52,7 +50,6 @@ _SETTINGS = {
     "legend.frameon": False,
     "legend.fontsize": 9,
     "legend.handlelength": 1.6,
-    "lines.solid_joinstyle": "round",
     "agg.path.chunksize": 20000,
     "pdf.fonttype": 42,
     "svg.hashsalt": "jaxid",

@@ -167,8 +167,6 @@ def error_figure(
     Raises:
         InputError: If there is no recording at all, or the numbers of joints differ.
     """
-    if not (*identification, *verification):
-        raise InputError("`identification` or `verification` must hold errors, but both are empty.")
     groups = (("identification", identification), ("verification", verification))
     return bar_figure(groups, robot)
 
