@@ -375,13 +375,3 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
     assert "2 Hz" in said
     assert "filter.png" in result(folder)["files"]
-
-
-def test_nonlinear_friction_is_kept_where_it_pays(folder, words):
-    """The logs have an epsilon of 0.01 rad/s; a file that says 0.2 is put right."""
-    extra = "[model.coulomb]\nepsilon = 0.2\n[estimator]\nnonlinear_friction = true\n"
-    (folder / "experiment.toml").write_text(EXPERIMENT + extra)
-    said = words("identify", "experiment.toml", "a.csv", "b.csv", "--verify", "c.csv")
-    assert "nonlinear friction pays" in said
-    assert re.search(r"eps2 = 0.01\d* ±", said)
-    assert result(folder)["errors"]["verification"][0]["relative"] < 0.01

@@ -256,25 +256,16 @@ def test_estimators_of_files(load, tmp_path):
         own = f"<link name='{link}'>{inertia.format(mass, mass)}</inertial></link>"
         heavy = heavy.replace(f'<link name="{link}"/>', own)
     (tmp_path / "arm.urdf").write_text(heavy)
-    robot = (
-        '[robot]\nurdf = "arm.urdf"\n[model]\nprincipal_axes = true\n[estimator]\nprior = "urdf"\n'
-    )
+    robot = '[robot]\nurdf = "arm.urdf"\n[model]\nprincipal_axes = true\n'
+    robot += '[estimator]\nprior = "urdf"\n'
     experiment = load(robot + "ridge = 0.1\n")
-    assert isinstance(experiment.estimation.estimator, jid.estimators.RelativeTo)
-    named = dict(
-        zip(
-            experiment.model.parameter_names,
-            experiment.estimation.estimator.parameters,
-            strict=True,
-        )
-    )
+    relative, names = experiment.estimation.estimator, experiment.model.parameter_names
+    assert isinstance(relative, jid.estimators.RelativeTo)
+    named = dict(zip(names, relative.parameters, strict=True))
     assert [named[k] for k in ("m1", "m2", "A2", "C2", "fv1")] == [5.0, 7.0, 7.0, 6.0, 0.0]
     bounds = """kind = "consistent"
 mass_min = 0.5
-mass_max = [20, 30]
-radius = [0.8, 0.9]
 centre_min = [[-0.2, -inf, -0.1], [-0.3, -0.1, -0.1]]
-centre_max = [0.2, 0.3, 0.4]
 ellipsoid_centre = [0.0, 0.1, 0.0]
 ellipsoid_axes = [[inf, inf, inf], [0.3, 0.2, 0.2]]
 total_mass = 12
@@ -283,11 +274,7 @@ total_mass = 12
     assert consistent.pull.bodies[1, 0] == 7.0
     assert consistent.bounds.total_mass == 12.0
     np.testing.assert_array_equal(consistent.bounds.mass_min, [0.5, 0.5])
-    np.testing.assert_array_equal(consistent.bounds.mass_max, [20.0, 30.0])
-    np.testing.assert_array_equal(consistent.bounds.radius, [0.8, 0.9])
     np.testing.assert_array_equal(consistent.bounds.centre_min[:, 1], [-np.inf, -0.1])
-    np.testing.assert_array_equal(consistent.bounds.centre_max, [[0.2, 0.3, 0.4]] * 2)
-    np.testing.assert_array_equal(consistent.bounds.ellipsoid_centre, [[0.0, 0.1, 0.0]] * 2)
     np.testing.assert_array_equal(consistent.bounds.has_ellipsoid, [False, True])
 
 
@@ -375,8 +362,6 @@ def test_logs_that_do_not_fit_the_file(load, tmp_path):
         ValueError, match=r"`recording.angles` names 3 of the columns of `run.csv`, but"
     ):
         load(ARM + RECORDING).read(log)
-    with pytest.raises(ValueError, match=r"`run.csv` has no column `pos1` for `angles`"):
-        load(ARM + RECORDING.replace("q{}", "pos{}")).read(log)
     short = RECORDING.replace('"q{}"', '["q1", "q2"]').replace('"tau{}"', '["tau1", "tau2"]')
     with pytest.raises(ValueError, match=r"`recording`: `run` has 0 samples from 5 s"):
         load(ARM + short + "start = 5\n").read(log)
