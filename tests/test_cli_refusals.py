@@ -15,7 +15,7 @@ KEYS = [
     ('"t"', '"t"\nforce_delay = 100', "but the longest segment of `a` lasts 6 s"),
     ("cutoff = 10", "cutoff = 99", "take one of 1 samples at most"),
     ('"q{}"', '["q1"]', "for each joint"),
-    ('"q{}"', '["q1", "tau1"]', "`tau1` of `a.csv` is used twi"),
+    ('"q{}"', '["q1", "tau1"]', "`tau1` of `a.csv` is used"),
     ('builtin = "planar_arm"', 'urdf = "lost.urdf"', "`lost.urdf` is no file: paths in an experim"),
 ]
 
