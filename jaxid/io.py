@@ -166,7 +166,8 @@ def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
         if name not in _DTYPES:
             raise InputError(f"a document cannot hold an array of {name}.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            entries = _name_infinities(entries)
+            shown = np.where(np.isfinite(array), array.astype(object), array.astype(str))
+            entries = shown.tolist()
         return {name: entries} if array.size else {name: [], "shape": list(array.shape)}
     if isinstance(value, float):
         return value if math.isfinite(value) else {"float": repr(value)}
@@ -177,12 +178,6 @@ def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
         entries = {f.name: to_json(getattr(value, f.name), refused) for f in fields}
         return {"kind": type(value).__name__, **entries}
     raise InputError(f"a document cannot hold {value!r:.60}.")
-
-
-def _name_infinities(entries: Any) -> Any:
-    if isinstance(entries, list):
-        return [_name_infinities(x) for x in entries]
-    return entries if math.isfinite(entries) else repr(entries)
 
 
 def from_json(value: Any, hint: Any, place: str = "") -> Any:
@@ -205,12 +200,14 @@ def from_json(value: Any, hint: Any, place: str = "") -> Any:
         result = tuple(from_json(x, h, f"{place}[{k}]") for k, (x, h) in pairs)
     else:
         result = value
-    if not any(_fits(result, o) for o in options) and isinstance(result, float | np.ndarray):
+    forms = [result]
+    if isinstance(result, float | np.ndarray):
         # A number and an array without axes are the same.
-        result = np.array(result) if isinstance(result, float) else result[()]
-    if not any(_fits(result, option) for option in options):
-        raise InputError(f"`{place}` holds {value!r:.60}, which does not belong there")
-    return result
+        forms.append(np.array(result) if isinstance(result, float) else result[()])
+    for form in forms:
+        if any(_fits(form, option) for option in options):
+            return form
+    raise InputError(f"`{place}` holds {value!r:.60}, which does not belong there")
 
 
 def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:
@@ -224,18 +221,15 @@ def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
     if name == "float":
         return _number_from_json(entries, float, place)
     if name == "member":
-        enums = [o for o in options if isinstance(o, type) and issubclass(o, enum.Enum)]
-        for member in (member for option in enums for member in option):
-            if entries == f"{type(member).__name__}.{member.name}":
-                return member
-        raise InputError(f"`{place}` names `{entries}`, which is not known")
+        enums = (o for o in options if isinstance(o, type) and issubclass(o, enum.Enum))
+        members = {f"{o.__name__}.{member.name}": member for o in enums for member in o}
+        if str(entries) not in members:
+            raise InputError(f"`{place}` names `{entries}`, which is not known")
+        return members[entries]
     exact = {"f": float, "i": int, "b": bool}[np.dtype(name).kind]
+    numbers = _number_from_json(entries, exact, place)
     try:
-        if shape is not None:
-            return np.zeros(tuple(shape), name)
-        return np.array(_number_from_json(entries, exact, place), name)
-    except InputError:
-        raise
+        return np.array(numbers, name).reshape(np.shape(numbers) if shape is None else shape)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"`{place}` is no array of {name}") from error
 
@@ -263,15 +257,15 @@ def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
             "defines it, or use a newer version of jaxid"
         )
     fields = {f.name: f for f in dataclasses.fields(named[-1]) if f.init}
-    for name in value:
-        if name != "kind" and name not in fields:
+    entries = {}
+    for name, entry in value.items():
+        if name in fields:
+            entries[name] = from_json(entry, fields[name].type, f"{place}.{name}".strip("."))
+        elif name != "kind":
             raise InputError(f"`{place or kind}` ({kind}) has an unknown key `{name}`")
     absent = dataclasses.MISSING
-    entries = {}
     for name, field in fields.items():
-        if name in value:
-            entries[name] = from_json(value[name], field.type, f"{place}.{name}".strip("."))
-        elif field.default is absent and field.default_factory is absent:
+        if name not in value and field.default is field.default_factory is absent:
             raise InputError(f"`{place or kind}` ({kind}) lacks `{name}`")
     return named[-1](**entries)
 
@@ -293,8 +287,8 @@ def _element_hints(options: Sequence[Any], length: int) -> tuple[Any, ...]:
     for option in options:
         if typing.get_origin(option) is tuple:
             arguments = typing.get_args(option)
-            if len(arguments) == 2 and arguments[1] is Ellipsis:
-                return (arguments[0],) * length
+            if arguments[1:] == (Ellipsis,):
+                return arguments[:1] * length
             if len(arguments) == length:
                 return arguments
     return (None,) * length

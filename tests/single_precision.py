@@ -68,10 +68,8 @@ def dynamics():
 
 def rounded():
     """Of arrays in float32, which are the same numbers in float64."""
-    single = [np.asarray(x, np.float32) for x in (*jax.tree.leaves(cold.motion), cold.forces)]
-    if DOUBLE:
-        single = [x.astype(np.float64) for x in single]
-    *motion, forces = single
+    single = [np.float32(x) for x in (*jax.tree.leaves(cold.motion), cold.forces)]
+    *motion, forces = [x.astype(float) for x in single] if DOUBLE else single
     o = cold.replace(motion=jid.Motion(*motion), forces=forces)
     return jid.identify(base, o).parameters
 
@@ -99,11 +97,8 @@ def written_motion():
     a = np.array([[0.1, 0.2], [0.3, -0.1]])
     series = fourier_series(np.array([0.3, 0.1]), a, a[::-1], 1.1)
     jid.trajectories.save_trajectory(series, FOLDER / "motion.json")
-    return (
-        jid.trajectories.load_trajectory(FOLDER / "motion.json")
-        .motion(np.linspace(0.0, 1.0, 5))
-        .qdd
-    )
+    found = jid.trajectories.load_trajectory(FOLDER / "motion.json")
+    return found.motion(np.linspace(0.0, 1.0, 5)).qdd
 
 
 def batch():
@@ -156,12 +151,7 @@ CASES = {
     "pinocchio_parameters": lambda: jid.export.pinocchio_parameters(consistent()),
     "inverse_kinematics": lambda: jid.inverse_kinematics(jid.robots.tx40(), [0.3, 0.1, 0.4]),
 }
-REFUSED = (
-    "identify_batch",
-    "bootstrap",
-    "factorise_across_processes",
-    "design_excitation",
-)
+REFUSED = ("identify_batch", "bootstrap", "factorise_across_processes", "design_excitation")
 """Cases that compute in JAX, which must not do so in float32."""
 if __name__ == "__main__":
     found = {}

@@ -61,13 +61,6 @@ def test_other_files_stay_and_those_of_an_earlier_result_go(tmp_path):
     assert contents(tmp_path) == {"b": "new", "c": "new", "mine": "mine", "result.json": index}
 
 
-def test_a_folder_in_a_files_place_is_not_touched(tmp_path):
-    (tmp_path / "b").mkdir()
-    with pytest.raises(InputError, match=r"`.*b`"):
-        write(tmp_path, "a", "b")
-    assert [p.name for p in tmp_path.iterdir()] == ["b"]
-
-
 @pytest.mark.parametrize("calls", range(4))
 def test_a_stop_before_any_of_the_moves_leaves_no_mixture(tmp_path, monkeypatch, calls):
     """A process that is killed between two calls leaves no JSON file beside others' files."""
@@ -100,32 +93,29 @@ def test_a_single_file_is_there_at_every_moment(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", watched)
     write_text(place, "new ü")
-    assert seen == ["old"]
-    assert place.read_text(encoding="utf-8") == "new ü"
-
-
-def test_a_place_where_nothing_can_be_is_named_before_the_work(tmp_path):
-    link = tmp_path / "report"
-    link.symlink_to(tmp_path / "gone")
-    for refuse in (
-        lambda: refuse_foreign_folder(link, force=False),
-        lambda: require_writable(link / "deep"),
-    ):
-        with pytest.raises(InputError, match=r"`.*report`"):
-            refuse()
-    require_writable(tmp_path / "new" / "deep")
-    assert [p.name for p in tmp_path.iterdir()] == ["report"]
+    assert (*seen, place.read_text(encoding="utf-8")) == ("old", "new ü")
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc")
 def test_what_cannot_be_written_has_the_name_that_was_given():
+    with pytest.raises(OSError) as caught:
+        refuse_foreign_table(Path("/proc/report/table.csv"))
+    assert caught.value.filename == "/proc/report"
+
+
+def test_a_place_where_nothing_can_be_is_named_before_the_work(tmp_path):
+    link, place = tmp_path / "report", tmp_path / "place"
+    link.symlink_to(tmp_path / "gone")
+    (place / "report").mkdir(parents=True)
     for refuse in (
-        lambda: refuse_foreign_folder(Path("/proc/self/report"), force=False),
-        lambda: refuse_foreign_table(Path("/proc/report/table.csv")),
+        lambda: refuse_foreign_folder(link, force=False),
+        lambda: require_writable(link / "deep"),
+        lambda: write(place, "a", "report"),
     ):
-        with pytest.raises(OSError) as caught:
+        with pytest.raises(InputError, match=r"`.*report`"):
             refuse()
-        assert caught.value.filename in ("/proc/self/report", "/proc/report")
+    require_writable(place / "new" / "deep")
+    assert [p.name for p in place.iterdir()] == ["report"]
 
 
 def test_no_file_exhausts_a_reader(tmp_path):

@@ -8,6 +8,7 @@ coupled.
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -29,7 +30,7 @@ from jaxid.identification.fit import Fit
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import AT_ONCE, SamplesOnDisk
-from jaxid.measurement.recording import Recording, consecutive
+from jaxid.measurement.recording import FEWEST, Recording, consecutive
 from jaxid.robot.robot import Robot
 from jaxid.table import MISSING, Column, Remark, Status, Table, significant
 
@@ -69,13 +70,32 @@ class Diagnosis:
     def mistakes(self, fit: Fit) -> tuple[str, ...]:
         """Return the likely mistakes in signs, order, units and sides of the log's columns.
 
+        That is a single one whose correction makes the model fit the log, as a sentence; nothing if
+        the model fits, or no single mistake explains why it does not.
+
         Args:
             fit: Fit of the robot's model, to this log or to several.
         """
+        o = self.observations
         # Faults of channels explain the rest.
-        if self.faulty or self.observations is None:
+        if self.faulty or o is None:
             return ()
-        return likely_mistakes(fit.base, self.observations, *self.motor_sides)
+        step = -(-o.rows // 300)
+        motion, forces = o.motion[o.instants[::step]], o.reduced_forces[::step]
+        left = _unexplained(fit.base, motion, forces)
+        if left < BAD:
+            return ()
+        corrected = _corrected(self.robot, motion, forces, self.motor_sides)
+        tried = sorted((_unexplained(fit.base, m, f), text) for text, m, f in corrected)
+        best = tried[0][0]
+        likely = [text for rest, text in tried if rest <= 1.05 * best]
+        # With more than three candidates nothing is known.
+        if best > 0.9 * left or len(likely) > 3:
+            return ()
+        return (
+            f"{', or '.join(likely)}: the model then misses {100 * best:.2g} % of the forces "
+            f"instead of {100 * left:.2g} %.",
+        )
 
     def with_fit(self, fit: Fit) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
@@ -87,7 +107,7 @@ class Diagnosis:
         if not found and not self.faulty:
             found = negative_friction(fit)
             if self.observations is not None:
-                found += delay_finding(fit.base, self.observations, fit)
+                found += delay_finding(self.observations, fit)
         return dataclasses.replace(self, findings=(*found, *self.findings))
 
     def summary(self) -> Table:
@@ -101,7 +121,7 @@ class Diagnosis:
             _beside("to", s.highest, limits.position_max),
             _beside("speed", s.speed, limits.velocity, "unit/s"),
             _beside("force", s.force, robot.known_max_forces),
-            Column("at rest", s.standing, "%", lambda x: f"{100 * x:.0f}"),
+            Column("at rest", s.stands.mean(axis=0), "%", lambda x: f"{100 * x:.0f}"),
             Column("unit", [robot.joint_unit(j) for j in joints]),
             Column("force\nunit", [robot.force_unit(j) for j in joints]),
             facts=[
@@ -161,8 +181,14 @@ def diagnose(
             observations = observe(log, robot, ZeroPhaseButterworth(cutoff), min_speed=min_speed)
         whole = observations
     elif isinstance(log.source, SamplesOnDisk):
-        part, whole = _excerpt(log, log.source), log
-        observations, notes = _observe_excerpt(log, part, robot, min_speed)
+        part, whole, why = _excerpt(log, log.source), log, ""
+        try:
+            observations = observe(part, robot, log.filter, log.decimation, min_speed)
+        except InputError as error:
+            observations, why = None, f" of single channels only: {error}"
+        if why or part.samples < log.samples:
+            examined = f"{part.samples} of the {log.samples} samples"
+            notes = (f"{examined} were examined for mistakes{why}",)
     else:
         whole = observations = log
         part = Recording(
@@ -208,31 +234,20 @@ def _statistics(observations: Observations, progress: Progress | None) -> LogSta
     return statistics
 
 
-def _observe_excerpt(
-    log: Observations, part: Recording, robot: Robot, min_speed: ArrayLike | None
-) -> tuple[Observations | None, tuple[str, ...]]:
-    """Return observations of a part of a log, if it is long enough, and a remark."""
-    try:
-        observations = observe(part, robot, log.filter, log.decimation, min_speed)
-        reason = ""
-    except InputError as error:
-        observations, reason = None, f" of single channels only: {error}"
-    if part.samples == log.samples and observations is not None:
-        return observations, ()
-    note = f"{part.samples} of the {log.samples} samples were examined for mistakes{reason}"
-    return observations, (note,)
-
-
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
     """Return stretches of a log as they were recorded: from its beginning, middle and end."""
-    stretches = _stretches(log)
-    angles, velocities, forces = zip(
-        *(source.read_rows(slice(a, b)) for a, b in stretches), strict=True
-    )
-    times = []
-    for a, b in stretches:
-        k = next(k for k, (_, end) in enumerate(log.segments) if end > a)
-        times.append(log.start_times[k] + log.sample_time * (np.arange(a, b) - log.segments[k][0]))
+    dt = log.sample_time
+    # With a filter of a long memory, one long stretch tells more than several short ones.
+    count = 4 if log.samples > EXAMINED >= 80 * log.filter.edge(dt) else 1
+    length = min(log.samples, EXAMINED) // count
+    parts, times = [], []
+    for start in np.linspace(0, log.samples - length, count).astype(int).tolist():
+        for (first, last), time in zip(log.segments, log.start_times, strict=True):
+            a, b = max(first, start), min(last, start + length)
+            if b - a >= FEWEST:
+                parts.append(source.read_rows(slice(a, b)))
+                times.append(time + dt * (np.arange(a, b) - first))
+    angles, velocities, forces = zip(*parts, strict=True)
     return Recording(
         time=np.concatenate(times),
         angles=np.concatenate(angles),
@@ -240,115 +255,60 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
         velocities=None if velocities[0] is None else np.concatenate(velocities),
         angles_on_motor_side=source.log.columns.angles_on_motor_side,
         forces_on_motor_side=source.log.columns.forces_on_motor_side,
-        segments=consecutive(b - a for a, b in stretches),
-        sample_time=log.sample_time,
+        segments=consecutive(map(len, times)),
+        sample_time=dt,
         name=log.name,
     )
 
 
-def _stretches(log: Observations) -> list[tuple[int, int]]:
-    """Return half-open ranges of samples, none of which goes over a gap."""
-    if log.samples <= EXAMINED:
-        return list(log.segments)
-    count = 4
-    length = EXAMINED // count
-    stretches: list[tuple[int, int]] = []
-    for start in np.linspace(0, log.samples - length, count).astype(int):
-        a = max(int(start), stretches[-1][1] if stretches else 0)
-        b = min(a + length, next(end for _, end in log.segments if end > a))
-        stretches.append((a, b))
-    if min(b - a for a, b in stretches) >= 20 * log.filter.edge(log.sample_time):
-        return stretches
-    # Gaps, or a filter with a long memory: one long stretch tells more than several short ones.
-    a, b = max(log.segments, key=lambda ends: ends[1] - ends[0])
-    return [(a, min(b, a + EXAMINED))]
-
-
-def likely_mistakes(
-    base: BaseParameters,
-    observations: Observations,
-    angles_on_motor_side: bool = False,
-    forces_on_motor_side: bool = False,
-) -> tuple[str, ...]:
-    """Look for a single sign, exchange, unit or side whose correction makes the model fit the log.
-
-    Returns:
-        A sentence; nothing if the model fits, or no single mistake explains why it does not.
-    """
-    step = -(-observations.rows // 300)
-    forces = observations.reduced_forces[::step]
-    motion = observations.motion[observations.instants[::step]]
-    left = _unexplained(base, motion, forces)
-    if left < BAD:
-        return ()
-    sides = angles_on_motor_side, forces_on_motor_side
-    corrected = _corrected(base.model.robot, motion, forces, *sides)
-    tried = sorted((_unexplained(base, m, f), text) for text, m, f in corrected)
-    best = tried[0][0]
-    likely = [text for rest, text in tried if rest <= 1.05 * best]
-    # With more than three candidates nothing is known.
-    if best > 0.9 * left or len(likely) > 3:
-        return ()
-    return (
-        f"{', or '.join(likely)}: the model then misses {100 * best:.2g} % of the forces instead "
-        f"of {100 * left:.2g} %.",
-    )
-
-
 def _corrected(
-    robot: Robot,
-    motion: Motion,
-    forces: Float[np.ndarray, "rows joints"],
-    angles_on_motor_side: bool,
-    forces_on_motor_side: bool,
+    robot: Robot, motion: Motion, forces: np.ndarray, sides: tuple[bool, bool]
 ) -> Iterator[tuple[str, Motion, np.ndarray]]:
     """Yield possible mistakes, as clauses, each with the motion and forces without it."""
     drives, names, n = robot.drives, robot.joint_names, robot.joints
-    still = np.asarray(drives.joint_angles(np.zeros(n)))
-    to_joint = np.asarray(drives.joint_angles(np.eye(n))) - still
-    to_motor = np.linalg.inv(to_joint)
+    eye = np.eye(n)
+    columns, torques = [motion.q, motion.qd, motion.qdd], forces
+    if sides[0]:
+        columns = [drives.motor_angles(motion.q), *map(drives.motor_velocities, columns[1:])]
+    if sides[1]:
+        torques = drives.motor_torques(forces)
 
-    def moved(by: np.ndarray, q: AnyArray | None = None) -> Motion:
-        q = motion.q @ by if q is None else np.asarray(q)
-        return Motion(q, motion.qd @ by, motion.qdd @ by)
-
-    def change_angles(change: np.ndarray) -> Motion:
-        """Return the motion with other combinations of the log's columns."""
-        if not angles_on_motor_side:
-            return moved(change)
-        q = drives.joint_angles(np.asarray(drives.motor_angles(motion.q)) @ change)
-        return moved(to_motor @ change @ to_joint, q)
-
-    def change_forces(change: np.ndarray) -> np.ndarray:
-        return forces @ (to_joint.T @ change @ to_motor.T if forces_on_motor_side else change)
+    def without(text: str, angles: np.ndarray = eye, forces: np.ndarray = eye, sides=sides):
+        """Return a clause, with motion and forces of other combinations of the log's columns."""
+        q, qd, qdd = (x @ angles for x in columns)
+        f = torques @ forces
+        if sides[0]:
+            q, qd, qdd = drives.joint_angles(q), *map(drives.joint_velocities, (qd, qdd))
+        return text, Motion(q, qd, qdd), drives.joint_forces(f) if sides[1] else f
 
     for j, name in enumerate(names):
         change = np.diag(np.where(np.arange(n) == j, -1.0, 1.0))
         key = f"of joint `{name}` seems to be wrong (`recording."
-        yield f"the sign of the force {key}force_signs`)", motion, change_forces(change)
-        yield f"the sign of the angle {key}angle_signs`)", change_angles(change), forces
+        yield without(f"the sign of the force {key}force_signs`)", forces=change)
+        yield without(f"the sign of the angle {key}angle_signs`)", change)
     # The number of pairs grows with the square.
     for i, j in itertools.combinations(range(n), 2) if n <= 12 else ():
         change = np.eye(n)
         change[[i, j]] = change[[j, i]]
         key = f"of joints `{names[i]}` and `{names[j]}` seem to be exchanged (`recording."
-        yield f"the forces {key}forces`)", motion, change_forces(change)
-        yield f"the angles {key}angles`)", change_angles(change), forces
+        yield without(f"the forces {key}forces`)", forces=change)
+        yield without(f"the angles {key}angles`)", change)
     for unit, factor in (("deg", np.pi / 180), ("rev", 2 * np.pi)):
-        for said, by in ((f"{unit}", factor), (f"rad, not in {unit}", 1 / factor)):
-            scaled = moved(np.diag(np.where(robot.revolute, by, 1.0)))
+        for said, by in ((unit, factor), (f"rad, not in {unit}", 1 / factor)):
             text = f"the angles of the log seem to be in {said} (`recording.angle_unit`)"
-            yield text, scaled, forces
+            yield without(text, np.diag(np.where(robot.revolute, by, 1.0)))
     if drives.is_direct:
         return
-    for side, owner, by, angles, changed in (
-        ("motor", "motors'", to_joint, drives.joint_angles, forces @ to_motor.T),
-        ("joint", "joints'", to_motor, drives.motor_angles, forces @ to_joint.T),
-    ):
-        other, text = moved(by, angles(motion.q)), f"of the log seem to be the {owner} (`recording."
-        yield f'the angles and forces {text}side = "{side}"`)', other, changed
-        yield f'the forces {text}forces_side = "{side}"`)', motion, changed
-        yield f"the angles {text}side`, with `forces_side` as it is)", other, forces
+    angles, forces_too = (not side for side in sides)
+    cases = (
+        ("angles and forces", angles, 'side = "{}"`)', (angles, angles)),
+        ("angles", angles, "side`, with `forces_side` as it is)", (angles, sides[1])),
+        ("forces", forces_too, 'forces_side = "{}"`)', (sides[0], forces_too)),
+    )
+    for what, motors, key, other in cases[sides[0] != sides[1] :]:
+        owner = "motor" if motors else "joint"
+        text = f"the {what} of the log seem to be the {owner}s' (`recording.{key.format(owner)}"
+        yield without(text, sides=other)
 
 
 def _unexplained(
@@ -373,9 +333,8 @@ def _unexplained(
     R = np.asarray(np.linalg.qr(theta, mode="r"))
     length = np.linalg.norm(R, axis=0)
     R, target = R[:, :-1] / np.where(length[:-1] > 0, length[:-1], 1.0), R[:, -1]
-    named = {f"{kind}{j + 1}" for kind in ("fv", "fc") for j in range(joints)}
+    braking = np.array([re.fullmatch(r"f[vc]\d+", name) is not None for name in base.names])
     used = np.ones(base.size, bool)
-    braking = np.array([name in named for name in base.names])
     while True:
         found = np.zeros(base.size)
         found[used] = np.linalg.lstsq(R[:, used], target, rcond=1e-9)[0]
@@ -399,13 +358,13 @@ def negative_friction(fit: Fit) -> tuple[str, ...]:
     )
 
 
-def delay_finding(base: BaseParameters, observations: Observations, fit: Fit) -> tuple[str, ...]:
+def delay_finding(observations: Observations, fit: Fit) -> tuple[str, ...]:
     """Return a sentence about a delay of the forces that the model sees, or nothing."""
     # A model that explains too little sees no delay.
     if not fit.residual < 0.3:
         return ()
     try:
-        delay = estimate_delay(base, observations, GivenWeights(np.asarray(fit.weights)))
+        delay = estimate_delay(fit.base, observations, GivenWeights(np.asarray(fit.weights)))
     except ValueError:
         return ()
     half = delay.interval()[1] - delay.seconds

@@ -54,11 +54,6 @@ class LogStatistics:
         return np.concatenate(self._speeds) < STANDING * np.maximum(self.speed, 1e-12)
 
     @property
-    def standing(self) -> Float[np.ndarray, " joints"]:
-        """Fraction (0 to 1) of the samples in which each joint stands."""
-        return self.stands.mean(axis=0)
-
-    @property
     def power(self) -> float:
         """Mean power over the product of the RMS forces and velocities."""
         power, forces, velocities = self._energies
@@ -81,14 +76,12 @@ def limit_findings(
 
     Joints in `faulty` have faults of single channels, which explain more.
     """
-    findings, common = [], []
-    if not faulty:
-        findings = unit_findings(robot, statistics.lowest, statistics.highest, on_motor_side)
-        common = _force_findings(robot, statistics)
-    units_are_wrong, ratio = bool(findings), statistics.velocity_ratio
-    findings += common
+    s, ratio = statistics, statistics.velocity_ratio
+    angles = [] if faulty else unit_findings(robot, s.lowest, s.highest, on_motor_side)
+    forces = [] if faulty else _force_findings(robot, s)
+    findings = angles + forces
     for j in (j for j in range(robot.joints) if j not in faulty):
-        findings += _joint_findings(robot, j, statistics, not units_are_wrong, not common)
+        findings += _joint_findings(robot, j, s, not angles, not forces)
         if measured_velocities and abs(ratio[j] - 1.0) > 0.2:
             findings.append(
                 f"the measured velocities of joint `{robot.joint_names[j]}` are {ratio[j]:.3g} "
@@ -96,12 +89,12 @@ def limit_findings(
                 "order of the columns."
             )
     # Over a whole log, friction makes a robot consume energy.
-    if not faulty and statistics.power < -0.05:
+    if not faulty and s.power < -0.05:
         findings.append(
             "the robot gives off energy over the whole log: check the signs of its angles and "
             "forces (`recording.angle_signs`, `force_signs`)."
         )
-    standing = float(statistics.stands.all(axis=1).mean())
+    standing = float(s.stands.all(axis=1).mean())
     if standing > 0.5:
         findings.append(
             f"the robot stands still for {100 * standing:.0f} % of the log: crop it with "
@@ -151,13 +144,14 @@ def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
     ratio = statistics.force / np.where(np.isfinite(known), known, np.nan)
     ratio = ratio[np.isfinite(ratio)]
     cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
-    if ratio.size > 1 and ratio.min() > 1.2:
-        return [
-            f"all joints need more than their largest forces, {ratio.min():.2g} to "
-            f"{ratio.max():.2g} times as much: {cure}"
-        ]
-    if ratio.size > 1 and 0 < ratio.max() < 0.02:
-        return [f"no joint needs more than {100 * ratio.max():.2g} % of its largest force: {cure}"]
+    if ratio.size < 2:
+        return []
+    low, high = ratio.min(), ratio.max()
+    if low > 1.2:
+        text = f"all joints need more than their largest forces, {low:.2g} to {high:.2g} times"
+        return [f"{text} as much: {cure}"]
+    if 0 < high < 0.02:
+        return [f"no joint needs more than {100 * high:.2g} % of its largest force: {cure}"]
     return []
 
 
@@ -168,11 +162,12 @@ def unit_findings(
     on_motor_side: bool,
 ) -> list[str]:
     """Look for a unit or side that brings the angles of all joints back into their ranges."""
-    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
-    known = np.array(robot.revolute) & np.isfinite(high - low)
+    low = np.asarray(robot.limits.position_min)
+    width = np.asarray(robot.limits.position_max) - low
+    known = np.array(robot.revolute) & np.isfinite(width)
     if not known.any():
         return []
-    low, width = low[known], (high - low)[known]
+    low, width = low[known], width[known]
 
     def used_fraction(ends: np.ndarray) -> float:
         """Return the largest used fraction of a range; zero if some range is left."""
@@ -181,28 +176,20 @@ def unit_findings(
         return float(((b - a) / width).max()) if inside.all() else 0.0
 
     ends = np.stack([lowest, highest])
-    moved = float(((highest - lowest)[known] / width).max())
-    if moved <= 0.02 and used_fraction(np.where(known, np.rad2deg(ends), ends)) > 0.1:
-        return [
-            f"no joint moves through more than {100 * moved:.2g} % of its range: are the angles of "
-            'the log in radians, though `recording.angle_unit` is "deg"?'
-        ]
-    if used_fraction(ends):
+    if used_fraction(ends) > 0.02:
         return []
+    degrees, radians = 'degrees (`recording.angle_unit = "deg"`)', "radians (`recording.angle_unit`"
     corrected = {
-        'degrees (`recording.angle_unit = "deg"`)': np.where(known, np.deg2rad(ends), ends),
-        'radians (`recording.angle_unit` is "rev")': np.where(known, ends / (2 * np.pi), ends),
+        degrees: np.where(known, np.deg2rad(ends), ends),
+        f'{radians} is "deg")': np.where(known, np.rad2deg(ends), ends),
+        f'{radians} is "rev")': np.where(known, ends / (2 * np.pi), ends),
     }
     if not on_motor_side and not robot.drives.is_direct:
         joints = np.asarray(robot.drives.joint_angles(ends))
         corrected['the motors\' (`recording.side = "motor"`)'] = joints
-    cures = [cure for cure, angles in corrected.items() if used_fraction(angles) > 0.1]
-    if not cures:
-        return []
-    return [
-        "the angles leave the ranges of the joints, but would not if those in the log were "
-        f"{', or '.join(cures)}."
-    ]
+    cures = " or ".join(cure for cure, angles in corrected.items() if used_fraction(angles) > 0.1)
+    text = "the angles do not suit the ranges of the joints, but would if those in the log were "
+    return [f"{text}{cures}."] if cures else []
 
 
 def channel_findings(robot: Robot, recording: Recording) -> list[tuple[int, str]]:
@@ -215,9 +202,8 @@ def channel_findings(robot: Robot, recording: Recording) -> list[tuple[int, str]
         text = _wrapped(x, time) if robot.revolute[j] else ""
         text = text or _spikes(x, time, r.segments) or _held_angles(x, others, time, r.segments)
         held = _held_forces(forces[:, j], x, time, r.segments)
-        found += [(j, f"{angle} {text}")] if text else []
-        found += [(j, f"the forces of joint `{name}` {held}")] if held else []
-    return found
+        found += [(j, angle, text), (j, f"the forces of joint `{name}`", held)]
+    return [(j, f"{channel} {text}") for j, channel, text in found if text]
 
 
 def _wrapped(x: Float[np.ndarray, " samples"], time: np.ndarray) -> str:

@@ -1,7 +1,6 @@
 """Meaning and units of the columns of a log, and logs in SI units."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,9 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.measurement import units
+from jaxid.measurement.filters import optional
 from jaxid.measurement.log_files import LogTable, Selection, open_table
+from jaxid.measurement.recording import positive_time
 from jaxid.measurement.units import Quantity, Unit
 from jaxid.robot.joints import per_joint
 
@@ -21,20 +22,12 @@ PerJoint = tuple[float, ...] | None
 """One number for each joint, or the default for all."""
 
 
-def _selection(value: Selection | range | list | None) -> Any:
-    return value if value is None or isinstance(value, str | int) else tuple(value)
+def _listed(value: Any) -> Any:
+    return value if value is None or isinstance(value, str | int | Unit) else tuple(value)
 
 
 def _numbers(value: Iterable[float | int] | np.ndarray | None) -> tuple[float, ...] | None:
     return None if value is None else tuple(float(v) for v in value)
-
-
-def _number(value: float | int | None) -> float | None:
-    return None if value is None else float(value)
-
-
-def _units(value: Unit | Iterable[Unit] | None) -> Any:
-    return value if value is None or isinstance(value, Unit) else tuple(value)
 
 
 class Columns(eqx.Module):
@@ -69,15 +62,15 @@ class Columns(eqx.Module):
         forces_on_motor_side: Whether forces are the motors', before the gears.
     """
 
-    angles: Selection = eqx.field(static=True, converter=_selection)
-    forces: Selection = eqx.field(static=True, converter=_selection)
-    velocities: Selection | None = eqx.field(static=True, converter=_selection, default=None)
+    angles: Selection = eqx.field(static=True, converter=_listed)
+    forces: Selection = eqx.field(static=True, converter=_listed)
+    velocities: Selection | None = eqx.field(static=True, converter=_listed, default=None)
     time: str | int | None = eqx.field(static=True, default=None)
-    sample_time: float | None = eqx.field(static=True, converter=_number, default=None)
+    sample_time: float | None = eqx.field(static=True, converter=optional, default=None)
     time_unit: Unit = eqx.field(static=True, default=units.S)
-    angle_unit: Units = eqx.field(static=True, converter=_units, default=units.RAD)
-    velocity_unit: Units | None = eqx.field(static=True, converter=_units, default=None)
-    force_unit: Units = eqx.field(static=True, converter=_units, default=units.NM)
+    angle_unit: Units = eqx.field(static=True, converter=_listed, default=units.RAD)
+    velocity_unit: Units | None = eqx.field(static=True, converter=_listed, default=None)
+    force_unit: Units = eqx.field(static=True, converter=_listed, default=units.NM)
     torque_constants: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
     angle_signs: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
     force_signs: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
@@ -91,11 +84,10 @@ class Columns(eqx.Module):
         if (self.time is None) == (self.sample_time is None):
             raise InputError(
                 "`Columns` needs either `time` (the column of the time stamps) or `sample_time` "
-                "[s] (rows are equally far apart), but has "
-                + ("neither." if self.time is None else "both: leave out the one not to trust.")
+                "[s] (rows are equally far apart), but has neither or both."
             )
-        if self.sample_time is not None and not 0 < self.sample_time < np.inf:
-            raise InputError(f"`sample_time` must be positive [s], but is {self.sample_time:g}.")
+        if self.sample_time is not None:
+            positive_time(self.sample_time)
         self._require_unit("time_unit", Quantity.TIME)
         self._require_unit("angle_unit", Quantity.COORDINATE)
         self._require_unit("velocity_unit", Quantity.VELOCITY)
@@ -108,7 +100,7 @@ class Columns(eqx.Module):
         if current != (self.torque_constants is not None):
             raise InputError(
                 "`torque_constants` [N m/A] are needed when `force_unit` is a current, and only "
-                "then: " + ("add them." if current else "leave them out or set `force_unit`.")
+                "then: set both, or neither."
             )
 
     def _require_unit(self, name: str, *allowed: Quantity) -> None:
@@ -158,16 +150,6 @@ class Log:
 
     tables: tuple[LogTable, ...]
     columns: Columns
-
-    @property
-    def rows(self) -> int:
-        """Number of rows."""
-        return self.tables[0].rows
-
-    @functools.cached_property
-    def joints(self) -> int:
-        """Number of joints."""
-        return self.read(0, 1)[0].shape[1]
 
     def read(
         self, start: int = 0, stop: int | None = None

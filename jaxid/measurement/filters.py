@@ -22,6 +22,11 @@ SETTLED = 1e-4
 """Fraction of the impulse response's peak below which the start of a log no longer matters."""
 
 
+def optional(value: float | int | None) -> float | None:
+    """Convert a number, unless it is None."""
+    return None if value is None else float(value)
+
+
 def integer(name: str) -> Callable[[float | int], int]:
     """Return a converter that accepts integers only, as `int` or `float`."""
 
@@ -66,12 +71,8 @@ class LowPass(eqx.Module):
         """Return the gain for sinusoids of some frequencies [Hz]."""
         if not self.sections:
             return np.ones_like(frequency)
-        sos = np.array(self.sections)
-        points = np.exp(-2j * math.pi * np.asarray(frequency) * sample_time)
-        one_way = np.prod(
-            [np.polyval(s[2::-1], points) / np.polyval(s[:2:-1], points) for s in sos], axis=0
-        )
-        return np.abs(one_way) ** 2
+        angular = 2 * math.pi * np.asarray(frequency) * sample_time
+        return np.abs(signal.sosfreqz(np.array(self.sections), angular)[1]) ** 2
 
     def memory(self, tolerance: float = 1e-14) -> int:
         """Return after how many samples the impulse response stays below a fraction of its peak."""
@@ -117,17 +118,11 @@ def unit_gain_sections(sos: np.ndarray) -> tuple[tuple[float, ...], ...]:
 def _require_cutoff(name: str, cutoff: float, sample_time: float) -> None:
     """Refuse a cut-off [Hz] that does not suit the sampling rate."""
     rate = 1 / sample_time
-    if cutoff >= 0.5 * rate:
+    if not 1e-5 * rate <= cutoff < 0.5 * rate:
         raise InputError(
-            f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of "
-            f"{rate:.6g} Hz: take a lower one, log faster than {2 * cutoff:.6g} Hz, or check "
-            "`time_unit`."
-        )
-    if cutoff < 1e-5 * rate:
-        raise InputError(
-            f"`{name}` of {cutoff:.6g} Hz is too low for a sampling rate of {rate:.6g} Hz, since "
-            f"no log is long enough for such a filter to settle: take one above {1e-5 * rate:.2g} "
-            "Hz (about five times the highest frequency of the motion), or check `time_unit`."
+            f"`{name}` of {cutoff:.6g} Hz must be at least {1e-5 * rate:.2g} Hz and below half of "
+            f"the sampling rate of {rate:.6g} Hz: take another one (about five times the highest "
+            f"frequency of the motion), log faster than {2 * cutoff:.6g} Hz, or check `time_unit`."
         )
 
 
@@ -163,27 +158,17 @@ class AbstractFilter(eqx.Module):
         """Filter forces or columns of one segment: linear, without phase, constants unchanged."""
         return self.low_pass(sample_time)(x)
 
-    def memory(self, sample_time: float) -> int:
-        """Return the memory of `smooth` in samples: the overlap of chunks."""
-        return self.low_pass(sample_time).memory()
 
-
-def _optional(value: float | int | None) -> float | None:
-    return None if value is None else float(value)
-
-
-def _check(filter: AbstractFilter, order: int = 1, **positive: float | int | None) -> None:
-    """Check the settings that filters share."""
-    owner, margin = type(filter).__name__, getattr(filter, "margin", None)
-    for name, value in positive.items():
-        if value is not None and not value > 0:
-            raise InputError(f"`{name}` of `{owner}` must be positive, but is {value:g}.")
-    if not 0 < order <= 20:
-        raise InputError(
-            f"`order` of `{owner}` must be between 1 and 20, but is {order}: 2 to 8 are usual."
-        )
-    if margin is not None and not 0 <= margin < math.inf:
-        raise InputError(f"`margin` must be a time [s] of zero or more, but is {margin:g}.")
+def _check(filter: AbstractFilter, *positive: str) -> None:
+    """Check the settings that filters share, and that others are positive."""
+    owner = type(filter).__name__
+    rules = dict.fromkeys(positive, (lambda x: x > 0, "positive"))
+    rules["order"] = lambda x: 0 < x <= 20, "between 1 and 20 (2 to 8 are usual)"
+    rules["margin"] = lambda x: 0 <= x < math.inf, "a time [s] of zero or more"
+    for name, (rule, words) in rules.items():
+        value = getattr(filter, name, None)
+        if value is not None and not rule(value):
+            raise InputError(f"`{name}` of `{owner}` must be {words}, but is {value:g}.")
 
 
 def _edge(margin: float | None, sample_time: float, *filters: LowPass) -> int:
@@ -209,11 +194,11 @@ class ZeroPhaseButterworth(AbstractFilter):
 
     cutoff: float = eqx.field(static=True, converter=float)
     order: int = eqx.field(static=True, converter=integer("order"), default=4)
-    force_cutoff: float | None = eqx.field(static=True, converter=_optional, default=None)
-    margin: float | None = eqx.field(static=True, converter=_optional, default=None)
+    force_cutoff: float | None = eqx.field(static=True, converter=optional, default=None)
+    margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
-        _check(self, self.order, cutoff=self.cutoff, force_cutoff=self.force_cutoff)
+        _check(self, "cutoff", "force_cutoff")
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         smooth = butterworth(self.cutoff, self.order, sample_time)
@@ -260,16 +245,16 @@ class PaperFilter(AbstractFilter):
     uses_velocities: ClassVar[bool] = False
     velocity: float = eqx.field(static=True, converter=float, default=1200.0)
     acceleration: float = eqx.field(static=True, converter=float, default=100.0)
-    margin: float | None = eqx.field(static=True, converter=_optional, default=None)
+    margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
-        _check(self, velocity=self.velocity, acceleration=self.acceleration)
+        _check(self, "velocity", "acceleration")
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
         way = angles - angles[0]
-        b, a = _differentiator("velocity", self.velocity, sample_time)
+        b, a = _bilinear("velocity", [1.0, 0.0], self.velocity, sample_time)
         qd = np.asarray(signal.lfilter(b, a, way, axis=0))
-        b, a = _differentiator("acceleration", self.acceleration, sample_time)
+        b, a = _bilinear("acceleration", [1.0, 0.0], self.acceleration, sample_time)
         padding = min(len(angles) - 1, self.low_pass(sample_time).memory(SETTLED))
         minus = signal.filtfilt(b, a, way, axis=0, padtype="odd", padlen=padding)
         return Motion(angles, qd, -minus)
@@ -303,31 +288,24 @@ class PeriodicFourier(AbstractFilter):
     uses_velocities: ClassVar[bool] = False
     period: float = eqx.field(static=True, converter=float)
     harmonics: int = eqx.field(static=True, converter=integer("harmonics"))
-    force_harmonics: float | None = eqx.field(static=True, converter=_optional, default=None)
+    force_harmonics: float | None = eqx.field(static=True, converter=optional, default=None)
     order: int = eqx.field(static=True, converter=integer("order"), default=4)
-    margin: float | None = eqx.field(static=True, converter=_optional, default=None)
+    margin: float | None = eqx.field(static=True, converter=optional, default=None)
 
     def __check_init__(self) -> None:
-        _check(
-            self,
-            self.order,
-            period=self.period,
-            harmonics=self.harmonics,
-            force_harmonics=self.force_harmonics,
-        )
+        _check(self, "period", "harmonics", "force_harmonics")
 
     def motion(self, angles, velocities, sample_time) -> Motion:  # noqa: D102
-        samples = len(angles)
-        if samples * sample_time < (1 - 1e-9) * self.period:
+        t = sample_time * np.arange(len(angles))
+        if len(t) * sample_time < (1 - 1e-9) * self.period:
             raise InputError(
                 f"`period` of `PeriodicFourier` is {self.period:g} s, but a segment of the log "
-                f"lasts {samples * sample_time:g} s: record whole periods, or use another filter."
+                f"lasts {len(t) * sample_time:g} s: record whole periods, or use another filter."
             )
         _require_cutoff("harmonics / period", self.harmonics / self.period, sample_time)
-        t = sample_time * np.arange(samples)
         w = 2 * math.pi / self.period * np.arange(1, self.harmonics + 1)
         s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
-        basis = np.hstack([np.ones((samples, 1)), s, c])
+        basis = np.hstack([np.ones((len(t), 1)), s, c])
         series = np.linalg.lstsq(basis, angles - angles[0], rcond=None)[0]
         q = angles[0] + basis @ series
         moved, left = angles.std(axis=0), np.sqrt(np.mean((angles - q) ** 2, axis=0))
@@ -352,23 +330,18 @@ class PeriodicFourier(AbstractFilter):
         return _edge(self.margin, sample_time, self.low_pass(sample_time))
 
 
-def _lag(name: str, omega: float, sample_time: float) -> tuple[np.ndarray, np.ndarray]:
-    r"""Return $1 / (s / \omega + 1)$ by the bilinear transform: numerator and denominator."""
+def _bilinear(
+    name: str, numerator: list[float], omega: float, sample_time: float
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Return $(b s + c) / (s / \omega + 1)$ by the bilinear transform, as coefficients."""
     _require_cutoff(name, omega / (2 * math.pi), sample_time)
-    half = 0.5 * omega * sample_time
-    return np.array([half, half]) / (1 + half), np.array([1.0, (half - 1) / (half + 1)])
+    return signal.bilinear(numerator, [1 / omega, 1.0], 1 / sample_time)
 
 
 def _first_order(name: str, omega: float, sample_time: float) -> LowPass:
     r"""Return $1 / (s / \omega + 1)$, forward and backward."""
-    sos = signal.tf2sos(*_lag(name, omega, sample_time))
+    sos = signal.tf2sos(*_bilinear(name, [1.0], omega, sample_time))
     return LowPass(unit_gain_sections(sos), omega / (2 * math.pi))
-
-
-def _differentiator(name: str, omega: float, sample_time: float) -> tuple[np.ndarray, np.ndarray]:
-    r"""Return $s / (s / \omega + 1)$ by the bilinear transform (Eq. 25)."""
-    _, a = _lag(name, omega, sample_time)
-    return omega / (1 + 0.5 * omega * sample_time) * np.array([1.0, -1.0]), a
 
 
 def first_difference(
@@ -405,9 +378,8 @@ class AbstractDecimation(eqx.Module):
     def low_pass(self, stage: int) -> LowPass:
         """Return the filter before a stage, at that stage's own rate."""
 
-    @abc.abstractmethod
     def check(self, cutoff: float, sample_time: float) -> None:
-        """Refuse a signal of band `cutoff` [Hz] that would be aliased."""
+        """Refuse a signal of band `cutoff` [Hz] that would be aliased; none is unless told."""
 
     @property
     def factor(self) -> int:
@@ -494,6 +466,3 @@ class Decimation(AbstractDecimation):
             return LowPass((), math.inf)
         sos = np.asarray(signal.cheby1(8, 0.05, 0.8 / factor, output="sos"), np.float64)
         return LowPass(unit_gain_sections(sos), 0.4 / factor)
-
-    def check(self, cutoff: float, sample_time: float) -> None:
-        """Accept every signal, since each stage has a filter."""

@@ -60,11 +60,10 @@ class LogTable:
             first, *others = itertools.chain(*self.channels.values())
             rows = len(self.columns[first])
             for name in others:
-                if len(self.columns[name]) != rows:
+                if (own := len(self.columns[name])) != rows:
                     raise InputError(
-                        f"`{name}` of `{self.source}` has {len(self.columns[name])} samples, but "
-                        f"`{first}` has {rows}: arrays must have one row for each sample "
-                        "(transpose them)."
+                        f"`{name}` of `{self.source}` has {own} samples, but `{first}` has {rows}: "
+                        "transpose arrays, so that there is one row for each sample."
                     )
         if rows == 0:
             raise InputError(f"`{self.source}` has no rows: is the log cut?")
@@ -73,7 +72,7 @@ class LogTable:
     def read(self, channels: Iterable[str], start: int = 0, stop: int | None = None) -> "LogTable":
         """Return some rows of some channels, in memory."""
         kept = {channel: self.channels[channel] for channel in channels}
-        names = list(dict.fromkeys(itertools.chain(*kept.values())))
+        names = list(itertools.chain(*kept.values()))
         columns = self.columns
         if isinstance(columns, pl.LazyFrame):
             with _readable_parquet(self.source):
@@ -82,9 +81,8 @@ class LogTable:
                 columns = part.to_dict(as_series=True)
         else:
             columns = {name: columns[name][start:stop] for name in names}
-        return dataclasses.replace(
-            self, columns=columns, channels=kept, first_row=self.first_row + start
-        )
+        row = self.first_row + start
+        return dataclasses.replace(self, columns=columns, channels=kept, first_row=row)
 
     def array(self, channel: str) -> np.ndarray:
         """Return the finite numbers of a channel (samples x columns)."""
@@ -125,12 +123,12 @@ class LogTable:
             with np.errstate(invalid="ignore"):  # signalling NaN
                 array = np.asarray(column, np.float64)
         else:
+            array = np.zeros(0)
+        if array.size == 0:
             raise InputError(
                 f"`{name}` of `{self.source}` must be an array of real numbers of one or two "
-                f"axes, but holds {column.dtype} with {column.ndim} axes."
+                f"axes, but holds {column.dtype} of shape {column.shape}."
             )
-        if array.size == 0:
-            raise InputError(f"`{name}` of `{self.source}` has rows, but no columns.")
         array = np.array(array.reshape(len(array), -1), np.float64)
         size = np.abs(array).max(axis=1)
         complaint = "is not finite, or larger than any sensor tells ({} in size)"
@@ -187,18 +185,16 @@ def open_table(path: Path, selections: Mapping[str, Selection], on_disk: bool) -
 
 def estimated_rows(path: Path) -> int:
     """Estimate the number of rows of a file; 0 if it cannot be read in parts."""
-    if path.suffix.lower() in SUFFIXES and path.is_file():
-        with path.open("rb") as file:
-            head = file.read(HEAD)
-        return path.stat().st_size * head.count(b"\n") // max(len(head), 1)
-    try:
-        if path.suffix.lower() == ".parquet":
-            with _readable_parquet(path.name):
-                return int(pl.scan_parquet(path).select(pl.len()).collect().item())
-        if path.suffix.lower() == ".npz":
+    suffix = path.suffix.lower()
+    with contextlib.suppress(InputError, OSError):
+        if suffix in SUFFIXES:
+            with path.open("rb") as file:
+                head = file.read(HEAD)
+            return path.stat().st_size * head.count(b"\n") // max(len(head), 1)
+        if suffix == ".parquet":
+            return LogTable(path.name, pl.scan_parquet(path), {}).rows
+        if suffix == ".npz":
             return max(map(len, (_map_arrays(path) or {}).values()), default=0)
-    except InputError:
-        pass
     return 0
 
 
@@ -215,17 +211,13 @@ class _Layout(NamedTuple):
     def channels(self, selections: Mapping[str, Selection]) -> dict[str, tuple[str, ...]]:
         """Return the names of the columns of each channel, each of which has its own."""
         channels = {c: self._expand(c, selection) for c, selection in selections.items()}
-        used: dict[str, str] = {}
-        for channel, names in channels.items():
-            for name in names:
-                if name in used:
-                    other = used[name]
-                    both = "twice" if other == channel else f"for `{other}` and `{channel}`"
-                    raise InputError(
-                        f"the column `{name}` of `{self.source}` is used {both}: one column holds "
-                        "one channel of one joint; name the right one."
-                    )
-                used[name] = channel
+        names = [*itertools.chain(*channels.values())]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            owners = [f"`{channel}`" for channel in channels if repeated[0] in channels[channel]]
+            raise InputError(
+                f"the column `{repeated[0]}` of `{self.source}` is used twice, for "
+                f"{' and '.join(owners)}: name the right one for each joint."
+            )
         return channels
 
     def _expand(self, channel: str, selection: Selection) -> tuple[str, ...]:
@@ -235,51 +227,37 @@ class _Layout(NamedTuple):
         if isinstance(selection, int) or "{}" not in selection:
             return (self._name(channel, selection),)
         pattern = re.escape(selection).replace(re.escape("{}"), r"(\d{1,18})")
-        matches: dict[int, str] = {}
-        for column in self.names:
-            if not (match := re.fullmatch(pattern, column)):
-                continue
-            number = int(match[1])
-            if number in matches:
-                raise InputError(
-                    f"`{self.source}` has `{matches[number]}` and `{column}`, which both are "
-                    f"number {number} of `{channel}`: name the columns one by one."
-                )
-            matches[number] = column
-        if not matches:
+        found = sorted(
+            (int(m[1]), m[0]) for name in self.names if (m := re.fullmatch(pattern, name))
+        )
+        if not found:
             return (self._name(channel, selection.replace("{}", "1")),)
-        numbers = range(min(*matches, 1), max(matches) + 1)
-        missing = next((number for number in numbers if number not in matches), None)
-        if missing is not None:
+        numbers, columns = [number for number, _ in found], [column for _, column in found]
+        first = min(numbers[0], 1)
+        if numbers != list(range(first, first + len(numbers))):
             raise InputError(
-                f"`{self.source}` has no column `{selection.replace('{}', str(missing))}` for "
-                f"`{channel}`, though it has `{matches[max(matches)]}`: name the columns one by "
-                "one."
+                f"the columns of `{self.source}` for `{channel}`, `{'`, `'.join(columns[:20])}`, "
+                f"must have the numbers from {first} to {first + len(numbers) - 1}: name the "
+                "columns one by one."
             )
-        return tuple(matches[number] for number in numbers)
+        return tuple(columns)
 
     def _name(self, channel: str, column: str | int) -> str:
         names = self.names
-        if isinstance(column, int):
-            if not 0 <= column < len(names):
-                raise InputError(
-                    f"`{channel}` asks for column {column} of `{self.source}`, but its columns are "
-                    f"numbered from 0 to {len(names) - 1}."
-                )
+        if isinstance(column, int) and 0 <= column < len(names):
             return names[column]
-        if not self.named:
+        if self.named and column in names:
+            return str(column)
+        if isinstance(column, int) or not self.named:
+            has = "columns" if self.named else "no header, and columns"
             raise InputError(
-                f"`{self.source}` has no header, so `{channel}` cannot name the column `{column}`: "
-                f"give positions from 0 to {len(names) - 1}."
+                f"`{channel}` asks for column {column} of `{self.source}`, which has {has} from 0 "
+                f"to {len(names) - 1}: give another position."
             )
-        if column in names:
-            return column
-        near = difflib.get_close_matches(column, names, n=1, cutoff=0.5)
-        hint = f" (did you mean `{near[0]}`?)" if near else ""
-        shown = ", ".join(f"`{name}`" for name in names[:40])
-        more = f" and {len(names) - 40} more" if len(names) > 40 else ""
+        near = difflib.get_close_matches(column, names, n=40, cutoff=0)
         raise InputError(
-            f"`{self.source}` has no column `{column}` for `{channel}`{hint}: it has {shown}{more}."
+            f"`{self.source}` has no column `{column}` for `{channel}`: it has, "
+            f"the closest first, `{'`, `'.join(near)}`."
         )
 
     def read_lines(self, rows: bytes, line: int) -> dict[str, pl.Series]:
@@ -325,8 +303,7 @@ def _open_text(path: Path, selections: Mapping[str, Selection], on_disk: bool) -
         frames = _read_frames(file, text, table)
         if not on_disk:
             return dataclasses.replace(table, columns=pl.concat(frames).lazy())
-        state = path.stat()
-        key = (path.resolve(), state.st_size, state.st_mtime_ns, *channels.values())
+        key = (path.resolve(), path.stat().st_mtime_ns, *channels.values())
         if key not in _conversions:
             folder = Path(tempfile.mkdtemp(prefix="jaxid-"))
             atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -338,7 +315,7 @@ def _open_text(path: Path, selections: Mapping[str, Selection], on_disk: bool) -
 
 def _read_frames(file: BinaryIO, text: _Layout, table: LogTable) -> Iterator[pl.DataFrame]:
     """Yield the numbers of consecutive blocks of lines."""
-    names = list(dict.fromkeys(itertools.chain(*table.channels.values())))
+    names = list(itertools.chain(*table.channels.values()))
     stamps, exact, line, rest = table.channels.get("time", ()), None, table.first_row, b""
     while data := file.read(BLOCK) + file.readline():
         data = rest + data
@@ -366,11 +343,6 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
     first, _, _ = head.partition(b"\n")
-    if b"\r" in first.rstrip(b"\r"):
-        raise InputError(
-            f"`{source}` ends its lines with carriage returns alone: save it again with line ends "
-            "of Unix or Windows (LF or CRLF)."
-        )
     line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
     if not line.strip():
         raise InputError(f"`{source}` must start with a header or with numbers, but is empty.")
@@ -464,10 +436,8 @@ def _map_arrays(path: Path) -> dict[str, np.ndarray] | None:
                 file.seek(entry.header_offset + 26)
                 lengths = np.frombuffer(file.read(4), "<u2")
                 file.seek(entry.header_offset + 30 + int(lengths.sum()))
-                first = np.lib.format.read_magic(file) == (1, 0)
-                form = np.lib.format
-                read = form.read_array_header_1_0 if first else form.read_array_header_2_0
-                shape, fortran, dtype = read(file)
+                np.lib.format.read_magic(file)
+                shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
                 order = "F" if fortran else "C"
                 array = np.memmap(path, dtype, "r", file.tell(), shape, order)
                 arrays[entry.filename.removesuffix(".npy")] = array

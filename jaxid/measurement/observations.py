@@ -2,11 +2,13 @@
 
 import abc
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -19,7 +21,7 @@ from jaxid.measurement.filters import (
     Subsample,
     ZeroPhaseButterworth,
 )
-from jaxid.measurement.recording import Recording, consecutive
+from jaxid.measurement.recording import Recording, consecutive, finite_channel, positive_time
 from jaxid.robot.joints import per_joint
 from jaxid.robot.robot import Robot
 
@@ -55,28 +57,18 @@ class SamplesInMemory(AbstractSamples):
         return self.motion, self.forces
 
 
-class Chunk(eqx.Module):
+class Chunk(NamedTuple):
     """Part of the observations whose columns fit into memory.
 
     Attributes:
         samples: Half-open range of samples whose columns are needed (rows and overlap).
         rows: Half-open range of the resulting rows.
-        smoothed: Range of smoothed samples that decimation needs, from the chunk's first.
-        wanted: Range of decimated samples that are the rows.
+        reduce: Function that turns columns at these samples into these rows.
     """
 
-    samples: tuple[int, int] = eqx.field(static=True)
-    rows: tuple[int, int] = eqx.field(static=True)
-    smoothed: tuple[int, int] = eqx.field(static=True)
-    wanted: tuple[int, int] = eqx.field(static=True)
-    filter: AbstractFilter
-    decimation: AbstractDecimation
-    sample_time: float = eqx.field(static=True)
-
-    def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Float[np.ndarray, "rows *columns"]:
-        """Reduce columns at the chunk's samples to its rows."""
-        x = self.filter.smooth(x, self.sample_time)[slice(*self.smoothed)]
-        return self.decimation(x)[slice(*self.wanted)]
+    samples: tuple[int, int]
+    rows: tuple[int, int]
+    reduce: Callable[[AnyArray], np.ndarray]
 
 
 class Observations(eqx.Module):
@@ -139,17 +131,9 @@ class Observations(eqx.Module):
             InputError: If shapes differ, values are not finite, or `sample_time` is not positive.
         """
         arrays = {"q": q, "qd": qd, "qdd": qdd, "forces": forces}
-        data = {key: np.asarray(x, np.float64) for key, x in arrays.items()}
-        shape = data["q"].shape
-        for key, x in data.items():
-            if x.ndim != 2 or x.shape != shape or not np.isfinite(x).all():
-                raise InputError(
-                    f"`{key}` must hold a finite number for each sample and joint, like `q` with "
-                    f"shape {shape}, but has shape {x.shape}."
-                )
-        dt = float(sample_time)
-        if not 0 < dt < np.inf:
-            raise InputError(f"`sample_time` must be positive [s], but is {dt:g}.")
+        shape = np.shape(q)
+        data = {key: finite_channel(name, key, x, shape, 1) for key, x in arrays.items()}
+        dt = positive_time(sample_time)
         filter = ZeroPhaseButterworth(math.inf) if filter is None else filter
         decimation = Subsample(1) if decimation is None else decimation
         segments = ((0, len(data["q"])),) if segments is None else tuple(segments)
@@ -250,11 +234,12 @@ class Observations(eqx.Module):
         holds between the rows.
         """
         edge = self.filter.edge(self.sample_time)
-        parts = []
-        for a, b in self.segments:
-            smoothed = self.filter.smooth(x[a:b], self.sample_time)
-            parts.append(self.decimation(smoothed[edge : b - a - edge]))
+        every = slice(None)
+        parts = [self._reduce(slice(edge, b - a - edge), every, x[a:b]) for a, b in self.segments]
         return np.concatenate(parts)
+
+    def _reduce(self, kept: slice, wanted: slice, x: AnyArray) -> np.ndarray:
+        return self.decimation(self.filter.smooth(x, self.sample_time)[kept])[wanted]
 
     def chunks(self, samples: int = 16384) -> tuple[Chunk, ...]:
         """Divide into parts of about so many samples, each with the overlap that its filters need.
@@ -269,7 +254,8 @@ class Observations(eqx.Module):
         if samples < 1:
             raise InputError(f"`samples` must be positive, but is {samples}.")
         factor, edge = self.decimation.factor, self.filter.edge(self.sample_time)
-        before, after = self.decimation.memory(), self.filter.memory(self.sample_time)
+        low_pass = self.filter.low_pass(self.sample_time)
+        before, after = self.decimation.memory(), low_pass.memory()
         chunks, step = [], max(1, samples // factor)
         for (a, b), (r0, r1) in zip(self.segments, self.row_segments, strict=True):
             first, last = a + edge, b - edge
@@ -280,17 +266,10 @@ class Observations(eqx.Module):
                 low = first + skipped * factor
                 high = min(last, first + (stop - 1 - r0) * factor + before + 1)
                 begin, end = max(a, low - after), min(b, high + after)
-                chunks.append(
-                    Chunk(
-                        samples=(begin, end),
-                        rows=(start, stop),
-                        smoothed=(low - begin, high - begin),
-                        wanted=(start - r0 - skipped, stop - r0 - skipped),
-                        filter=self.filter,
-                        decimation=self.decimation,
-                        sample_time=self.sample_time,
-                    )
-                )
+                kept = slice(low - begin, high - begin)
+                wanted = slice(start - r0 - skipped, stop - r0 - skipped)
+                reduce = functools.partial(self._reduce, kept, wanted)
+                chunks.append(Chunk((begin, end), (start, stop), reduce))
         return tuple(chunks)
 
     def between(self, start: float, stop: float) -> "Observations":
@@ -342,6 +321,11 @@ class Observations(eqx.Module):
         return self.motion[self.instants]
 
 
+def joined(parts: Iterable[Any]) -> Any:
+    """Return trees of arrays, such as motions and forces, one behind the other."""
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
 def _row_samples(segments: Sequence[tuple[int, int]], edge: int, factor: int) -> list[range]:
     """Return the samples of each segment at which rows lie."""
     return [range(a + edge, b - edge, factor) for a, b in segments]
@@ -385,14 +369,16 @@ def observe(
         recording.angles_on_motor_side,
         recording.forces_on_motor_side,
     )
-    motions = [
-        filter.motion(angles[a:b], None if velocities is None else velocities[a:b], dt)
+    parts = [
+        (
+            filter.motion(angles[a:b], None if velocities is None else velocities[a:b], dt),
+            forces[a:b],
+        )
         for a, b in used
     ]
-    motion = Motion(*(np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "qd", "qdd")))
     segments = consecutive(b - a for a, b in used)
     observations = Observations(
-        source=SamplesInMemory(motion, np.concatenate([forces[a:b] for a, b in used])),
+        source=SamplesInMemory(*joined(parts)),
         filter=filter,
         decimation=decimation,
         segments=segments,
@@ -402,7 +388,7 @@ def observe(
         name=recording.name if name is None else name,
         notes=(*recording.notes, *omitted),
     )
-    return with_fast_rows(observations, robot, min_speed, [motion.qd[observations.instants]])
+    return with_fast_rows(observations, robot, min_speed, [observations.reduced_motion.qd])
 
 
 def require_joints(name: str, joints: int, robot: Robot) -> None:
@@ -439,9 +425,8 @@ def usable_segments(
             "smaller `margin`, or check `time_unit`."
         )
     short = len(segments) - len(used)
-    if not short:
-        return used, []
-    return used, [f"{short} segment(s), shorter than the filter's edges, were left out"]
+    text = f"{short} segment(s), shorter than the filter's edges, were left out"
+    return used, [text] if short else []
 
 
 def with_fast_rows(

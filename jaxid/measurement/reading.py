@@ -15,6 +15,7 @@ from jaxid.measurement.observations import (
     AbstractSamples,
     Observations,
     Progress,
+    joined,
     joint_side,
     require_joints,
     usable_segments,
@@ -100,9 +101,7 @@ class SamplesOnDisk(AbstractSamples):
 
     def read_all(self) -> tuple[Motion, np.ndarray]:
         """Return motion and forces of all segments; they must fit into memory."""
-        motions, forces = zip(*(self.read(slice(a, b)) for a, b in self.segments), strict=True)
-        parts = [np.concatenate([getattr(m, x) for m in motions]) for x in ("q", "qd", "qdd")]
-        return Motion(*parts), np.concatenate(forces)
+        return joined(self.read(slice(a, b)) for a, b in self.segments)
 
     def read_rows(self, samples: slice) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """Return angles, velocities and forces of a segment's samples as they were recorded."""
@@ -161,16 +160,14 @@ def scan_log(
     log = open_log(path, columns, forces_path, velocities_path, on_disk=True)
     source = Path(path)
     name = source.stem if name is None else name
-    require_joints(name, log.joints, robot)
+    require_joints(name, log.read(0, 1)[0].shape[1], robot)
     decimation = Subsample(1) if decimation is None else decimation
     if columns.sample_time is not None:
-        grid = TimeGrid(columns.sample_time, ((0, log.rows),))
+        grid = TimeGrid(columns.sample_time, ((0, log.tables[0].rows),))
     else:
         first_row = log.tables[0].first_row
         grid = find_grid(lambda: _stamps(log), source.name, largest_gap, first_row, in_parts=True)
-    if start > -np.inf or stop < np.inf:
-        grid = grid.cropped(start, stop, name)
-    dt = grid.sample_time
+    grid, dt = grid.cropped(start, stop, name), grid.sample_time
     used, omitted = usable_segments(grid.ranges, filter, decimation, dt, name)
     segments = consecutive(b - a for a, b in used)
     starts = dict(zip(grid.ranges, grid.start_times, strict=True))
@@ -187,19 +184,19 @@ def scan_log(
         name=name,
         notes=(*grid.notes, *omitted),
     )
-    if min_speed is not None:
-        velocities = _row_velocities(observations, progress)
-        return with_fast_rows(observations, robot, min_speed, velocities)
-    rows = observations.row_segments[-1][1]
-    return observations.replace(mask=np.broadcast_to(np.ones(1, bool), (rows, robot.joints)))
+    if min_speed is None:
+        rows = observations.row_segments[-1][1]
+        return observations.replace(mask=np.broadcast_to(True, (rows, robot.joints)))
+    velocities = _row_velocities(observations, progress)
+    return with_fast_rows(observations, robot, min_speed, velocities)
 
 
 def _stamps(log: Log) -> Iterator[np.ndarray]:
     """Yield the time stamps in parts [s]."""
     last = 0.0
-    for start in range(0, log.rows, AT_ONCE):
+    for start in range(0, log.tables[0].rows, AT_ONCE):
         # Integers and dates count from a part's first row: the row before links parts.
-        part = log.stamps(max(0, start - 1), min(start + AT_ONCE, log.rows))
+        part = log.stamps(max(0, start - 1), min(start + AT_ONCE, log.tables[0].rows))
         if start:
             part = (part - part[0] + last)[1:]
         last = float(part[-1])
@@ -236,17 +233,14 @@ def filter_memory(filter: AbstractFilter, sample_time: float, measured: bool) ->
     )
     half = 4096
     while half <= 2**20:
-        impulse = np.zeros((2 * half + 1, 1))
-        impulse[half] = 1e-3
+        impulse = 1e-3 * (np.arange(2 * half + 1) == half)[:, None]
         try:
             motion = filter.motion(impulse, impulse if measured else None, sample_time)
         except ValueError as error:
             raise NeedsMemory(refusal) from error
-        reach = 0
-        for x in (motion.q, motion.qd, motion.qdd):
-            size = np.abs(np.asarray(x)[:, 0])
-            last = np.flatnonzero(size > 1e-13 * size.max())
-            reach = max(reach, int(np.abs(last - half).max(initial=0)))
+        size = np.abs(np.hstack([motion.q, motion.qd, motion.qdd]))
+        last, _ = np.nonzero(size > 1e-13 * size.max(axis=0))
+        reach = int(np.abs(last - half).max(initial=0))
         if reach < half // 2:
             # The part below rounding decays at the same rate.
             return int(1.3 * reach) + 4

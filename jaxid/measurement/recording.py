@@ -94,10 +94,11 @@ class Recording(eqx.Module):
         if not largest_gap > 1.0:
             raise InputError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
         channels = {"angles": angles, "forces": forces, "velocities": velocities}
-        data: dict[str, Any] = dict.fromkeys(channels)
-        for key, x in channels.items():
-            if x is not None:
-                data[key] = _finite(name, key, x, np.shape(angles), first_row)
+        shape = np.shape(angles)
+        data: dict[str, Any] = {
+            key: None if x is None else finite_channel(name, key, x, shape, first_row)
+            for key, x in channels.items()
+        }
         samples = len(data["angles"])
         if samples < FEWEST:
             raise InputError(
@@ -115,9 +116,7 @@ class Recording(eqx.Module):
             dt, times, added, resample = _resampling(stamps, name, largest_gap, first_row)
             data = {key: None if x is None else resample(x) for key, x in data.items()}
         else:
-            dt, added = float(sample_time or 0.0), []
-            if not 0 < dt < np.inf:
-                raise InputError(f"`sample_time` must be positive [s], but is {dt:g}.")
+            dt, added = positive_time(sample_time or 0.0), []
             times = [dt * np.arange(samples)]
         return cls(
             time=np.concatenate(times),
@@ -181,7 +180,7 @@ class Recording(eqx.Module):
         )
 
 
-def _finite(
+def finite_channel(
     name: str, key: str, value: ArrayLike, shape: tuple[int, ...], first_row: int
 ) -> np.ndarray:
     """Return a channel as finite real numbers."""
@@ -191,7 +190,7 @@ def _finite(
     if array.ndim != 2 or array.shape != shape:
         raise InputError(
             f"`{key}` of `{name}` must have one row for each sample and one column for each "
-            f"joint, like `angles` with shape {shape}, but has shape {array.shape}."
+            f"joint, like the angles with shape {shape}, but has shape {array.shape}."
         )
     bad = np.argwhere(~(np.abs(array) <= LARGEST))
     if bad.size:
@@ -202,6 +201,13 @@ def _finite(
             "unit, or repair or remove the row."
         )
     return array
+
+
+def positive_time(sample_time: float) -> float:
+    """Check and return the time between two samples [s]."""
+    if not 0 < sample_time < np.inf:
+        raise InputError(f"`sample_time` must be positive [s], but is {sample_time:g}.")
+    return float(sample_time)
 
 
 def consecutive(lengths: Iterable[int]) -> tuple[tuple[int, int], ...]:
@@ -263,7 +269,7 @@ def require_finite_delay(seconds: float) -> None:
 class TimeGrid(NamedTuple):
     """Uniform stretches of a log: half-open ranges of rows, and the times at which they start [s].
 
-    The `deviation` of the stamps from the grid is the largest, the `jitter` of the steps RMS [s].
+    The `deviation` is the largest one of the stamps from the grid [s].
     """
 
     sample_time: float
@@ -271,7 +277,6 @@ class TimeGrid(NamedTuple):
     start_times: tuple[float, ...] = (0.0,)
     notes: tuple[str, ...] = ()
     deviation: float = 0.0
-    jitter: float = 0.0
 
     @property
     def is_exact(self) -> bool:
@@ -329,7 +334,7 @@ def find_grid(
     spread = 1.4826 * float(np.median(np.abs(steps - typical)))
     # A gap is a pause that neither the limit nor the usual jitter explains.
     limit = max(largest_gap * typical, typical + 8.0 * spread)
-    starts, start_times, before_gaps, pauses = [0], [0.0], [], []
+    starts, start_times, pauses = [0], [0.0], []
     rows, total, count = 0, 0.0, 0
     for t, row in _linked(read(), origin):
         steps = np.diff(t)
@@ -344,7 +349,6 @@ def find_grid(
         gaps = np.flatnonzero(steps > limit)
         starts += (row + gaps + 1).tolist()
         start_times += t[gaps + 1].tolist()
-        before_gaps += t[gaps].tolist()
         pauses += steps[gaps].tolist()
         regular = steps[steps < 1.5 * typical + 8.0 * spread]
         total, count = total + float(regular.sum()), count + len(regular)
@@ -366,7 +370,7 @@ def find_grid(
     if pauses:
         notes.append(
             f"{len(pauses)} gap{'s' if len(pauses) > 1 else ''} in time, the first after "
-            f"{before_gaps[0]:.6g} s, the longest of {max(pauses):.6g} s (sample time "
+            f"{start_times[1] - pauses[0]:.6g} s, the longest of {max(pauses):.6g} s (sample time "
             f"{sample_time:.6g} s), split the log into segments; a `largest_gap` above "
             f"{max(pauses) / sample_time:.3g} would bridge them"
         )
@@ -377,7 +381,7 @@ def find_grid(
         tuple((a, a + int(n)) for a, n, keep in zip(starts, lengths, kept, strict=True) if keep),
         tuple(t for t, keep in zip(start_times, kept, strict=True) if keep),
         tuple(notes),
-        *_deviation(_linked(read(), origin), starts, start_times, kept, sample_time),
+        _deviation(_linked(read(), origin), starts, start_times, kept, sample_time),
     )
     if in_parts and not grid.is_exact:
         raise NeedsMemory(
@@ -413,19 +417,15 @@ def _deviation(
     start_times: Sequence[float],
     kept: np.ndarray,
     sample_time: float,
-) -> tuple[float, float]:
-    """Return the largest deviation from the grid, and the RMS deviation of the steps."""
-    first_rows, first_times = np.array(starts), np.array(start_times)
-    largest, square, count = 0.0, 0.0, 0
+) -> float:
+    """Return the largest deviation from the grid [s]."""
+    first_rows, first_times, largest = np.array(starts), np.array(start_times), 0.0
     for t, row in parts:
         rows = row + np.arange(len(t))
         number = np.searchsorted(first_rows, rows, "right") - 1
         off = t - first_times[number] - sample_time * (rows - first_rows[number])
         largest = max(largest, float(np.abs(off[kept[number]]).max(initial=0.0)))
-        inside = (number[1:] == number[:-1]) & kept[number[1:]]
-        steps = np.diff(t)[inside] - sample_time
-        square, count = square + float(np.sum(steps**2)), count + len(steps)
-    return largest, float(np.sqrt(square / max(count, 1)))
+    return largest
 
 
 def _resampling(
@@ -458,7 +458,7 @@ def _resampling(
     if not grid.is_exact:
         counts = [int(np.floor((t[b - 1] - t[a]) / dt + 1e-3)) + 1 for a, b in grid.ranges]
         notes.append(
-            f"time stamps jitter by {100 * grid.jitter / dt:.1f} % of the sample time (RMS): "
+            f"time stamps jitter by up to {100 * grid.deviation / dt:.1f} % of the sample time: "
             f"resampled to a uniform grid of {dt:.6g} s by cubic splines; if the robot "
             "samples uniformly and only the stamps are late, give `sample_time` instead"
         )

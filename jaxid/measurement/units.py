@@ -1,7 +1,6 @@
 """Units of the columns of a log, with their factors to SI units."""
 
 import dataclasses
-import difflib
 import enum
 
 import numpy as np
@@ -76,9 +75,5 @@ def unit(symbol: str) -> Unit:
     """
     units = {known.symbol: known for known in ALL}
     if symbol not in units:
-        begun = [known for known in units if len(known) > 1 and symbol.startswith(known)]
-        near = difflib.get_close_matches(symbol, units, n=1, cutoff=0.9)
-        near = near or sorted(begun, key=len)[-1:] or difflib.get_close_matches(symbol, units, n=1)
-        hint = f" (did you mean `{near[0]}`?)" if near else ""
-        raise InputError(f"`{symbol}` is no known unit{hint}: write one of {', '.join(units)}.")
+        raise InputError(f"`{symbol}` is no known unit: write one of {', '.join(units)}.")
     return units[symbol]

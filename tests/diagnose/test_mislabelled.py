@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from jaxid.diagnosis import diagnose
-from jaxid.diagnosis.diagnosis import likely_mistakes
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction
@@ -54,74 +53,72 @@ def motors():
     return np.asarray(drives.motor_angles(motion.q)), np.asarray(drives.motor_torques(forces))
 
 
-def said(angles, forces, angles_on_motor_side=True, forces_on_motor_side=True):
-    log = Recording.of(
-        angles,
-        forces,
-        sample_time=DT,
-        angles_on_motor_side=angles_on_motor_side,
-        forces_on_motor_side=forces_on_motor_side,
-    )
-    o = observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5))
-    diagnosis = diagnose(log, ROBOT, observations=o)
-    mistakes = likely_mistakes(BASE, diagnosis.observations, *diagnosis.motor_sides)
-    return mistakes, diagnosis.findings
+def log_of(angles, forces, angles_on_motor_side=True, forces_on_motor_side=True):
+    sides = {
+        "angles_on_motor_side": angles_on_motor_side,
+        "forces_on_motor_side": forces_on_motor_side,
+    }
+    log = Recording.of(angles, forces, sample_time=DT, **sides)
+    return log, observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5))
+
+
+@pytest.fixture(scope="module")
+def said(motors):
+    fit = identify(BASE, log_of(*motors)[1])
+
+    def mistakes(*arguments, **sides):
+        log, o = log_of(*arguments, **sides)
+        return diagnose(log, ROBOT, observations=o).mistakes(fit)
+
+    return mistakes
 
 
 def test_a_good_log_has_no_findings_and_prints_its_limits(motors):
-    assert said(*motors)[0] == ()
-    log = Recording.of(
-        *motors, sample_time=DT, angles_on_motor_side=True, forces_on_motor_side=True
-    )
-    fit = identify(BASE, observe(log, ROBOT, ZeroPhaseButterworth(8.0), Subsample(5)))
+    log, o = log_of(*motors)
+    fit = identify(BASE, o)
     diagnosis = diagnose(log, ROBOT, fit)
     assert diagnosis.mistakes(fit) == ()
-    assert set(diagnose(log, ROBOT).findings) <= set(diagnosis.findings)
+    findings = set(diagnose(log, ROBOT, observations=o).findings)
+    assert findings <= set(diagnosis.findings)
+    # Observations are examined without their recording.
+    assert set(diagnose(o, ROBOT).findings) == findings
     text = str(diagnosis)
     assert all(name in text for name in ROBOT.joint_names)
     assert text.count("!") >= len(diagnosis.findings)
 
 
-def test_observations_are_examined_without_their_recording(motors):
-    angles, forces = motors
-    log = Recording.of(angles, forces, sample_time=DT, angles_on_motor_side=True)
-    o = observe(log, ROBOT, ZeroPhaseButterworth(8.0))
-    findings = diagnose(o, ROBOT).findings
-    recorded = diagnose(log, ROBOT, observations=o).findings
-    assert set(findings) == set(recorded)
-    assert str(diagnose(o, ROBOT)).count("!") >= len(findings)
-
-
 @pytest.mark.parametrize(("joint", "channel"), [(0, "angle"), (3, "force"), (3, "angle")])
-def test_a_sign_is_found_in_the_motors_columns_by_friction_that_must_brake(motors, joint, channel):
+def test_a_sign_is_found_in_the_motors_columns_by_friction_that_must_brake(
+    motors, said, joint, channel
+):
     angles, forces = motors
     name, signs = ROBOT.joint_names[joint], np.where(np.arange(4) == joint, -1.0, 1.0)
     wrong = (angles, forces * signs) if channel == "force" else (angles * signs, forces)
-    (sentence,) = said(*wrong)[0]
+    (sentence,) = said(*wrong)
     assert f"the sign of the {channel} of joint `{name}` seems to be wrong" in sentence
 
 
-def test_motors_columns_that_are_exchanged_are_found(motors):
+def test_motors_columns_that_are_exchanged_are_found(motors, said):
     angles, forces = motors
-    (sentence,) = said(angles, forces[:, [0, 1, 3, 2]])[0]
+    (sentence,) = said(angles, forces[:, [0, 1, 3, 2]])
     names = f"`{ROBOT.joint_names[2]}` and `{ROBOT.joint_names[3]}`"
     assert sentence.startswith(f"the forces of joints {names} seem to be exchanged")
 
 
-def test_units_and_sides_are_found(motors):
+def test_units_and_sides_are_found(motors, said):
     angles, forces = motors
-    (sentence,) = said(np.rad2deg(angles), forces)[0]
+    (sentence,) = said(np.rad2deg(angles), forces)
     assert "the angles of the log seem to be in deg (`recording.angle_unit`)" in sentence
-    (sentence,) = said(angles, forces, angles_on_motor_side=False)[0]
+    (sentence,) = said(angles, forces, angles_on_motor_side=False)
     assert "the angles of the log seem to be the motors' (`recording.side`" in sentence
-    (sentence,) = said(angles, forces, forces_on_motor_side=False)[0]
+    (sentence,) = said(angles, forces, forces_on_motor_side=False)
     assert "the forces of the log seem to be the motors' (`recording.forces_side = \"mo" in sentence
 
 
 @pytest.mark.parametrize(("factor", "words"), [(1e3, "all joints need"), (1e-3, "no joint needs")])
 def test_forces_in_another_unit_are_one_doubt_and_not_four(motors, factor, words):
-    angles, forces = motors
-    doubts = [w for w in said(angles, factor * forces)[1] if "force" in w]
+    log, o = log_of(motors[0], factor * motors[1])
+    doubts = [w for w in diagnose(log, ROBOT, observations=o).findings if "force" in w]
     assert len(doubts) == 1
     assert doubts[0].startswith(words)
     assert "check `recording.force_unit`, `forces_side` and `torque_constants`" in doubts[0]
