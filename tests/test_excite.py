@@ -152,7 +152,7 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "use of the limits",
         "is in the designed motion from",
         "of 100 samples in 7.854 s (12.73 Hz), of one run",
-        "standard deviation `hinge` (0.120 N m)",
+        "standard deviation 0.120 N m",
         "give `noise` if it is known",
         "by the nominal parameters they stay within their limits",
     ):
@@ -212,7 +212,7 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
     assert re.search(
         r"force of joint `hinge` +5\.\d+ N m +≤ 6 N m +9\d\.\d +12 less a margin of", out
     )
-    assert "counted as zero in the forces: viscous friction" in " ".join(out.split())
+    assert "counted as zero in the forces: fv1" in " ".join(out.split())
     assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
 
 
