@@ -128,17 +128,6 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     assert not any("rigid bodies" in line for line in changed)
 
 
-def test_reports_stand_for_their_logs(shop, run):  # noqa: F811
-    for name in ("empty", "loaded"):
-        assert run("identify", "experiment.toml", f"{name}.csv", "-o", name)[0] == 0
-    assert run("payload", "experiment.toml", "empty", "--loaded", "loaded", "-o", "p")[0] == 0
-    assert run("payload", "experiment.toml", "empty.csv", "--loaded=loaded.csv", "-o", "q")[0] == 0
-    one, other = (
-        json.loads((shop / place / "payload.json").read_text(encoding="utf-8")) for place in "pq"
-    )
-    np.testing.assert_allclose(one["estimate"], other["estimate"], rtol=1e-9, atol=1e-12)
-
-
 def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
     logs = ("empty_nominal.csv", "--loaded", "loaded_nominal.csv")
     code, out, err = run("gains", "load.toml", *logs)

@@ -190,9 +190,7 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
     show(console, *design.plan.tables())
     show_remarks(console, ordered((*plan_remarks(design.plan), *design.remarks)))
     show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in written])
-    if all_criteria and design.plan.interrupted:
-        show_remarks(console, _doubts(["the design was stopped, and no other criterion was tried"]))
-    elif all_criteria:
+    if all_criteria and not design.plan.interrupted:
         with stages(errors) as stage:
             plans = compare_criteria(experiment, stage.design)
         if plans:

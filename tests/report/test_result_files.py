@@ -122,22 +122,6 @@ def test_the_model_can_be_used_again(written, fit):
     np.testing.assert_allclose(again, fit.base.from_standard(p), rtol=1e-14)
 
 
-def test_a_failure_in_the_middle_leaves_nothing(tmp_path, fit, validation, monkeypatch, quick):
-    def fail(figure, path):
-        path.write_bytes(b"half")
-        raise RuntimeError("no ink")
-
-    monkeypatch.setattr(result_files, "save", fail)
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "result.json").write_text("old")
-    for folder in (tmp_path / "old", tmp_path / "new" / "report"):
-        with pytest.raises(RuntimeError, match="no ink"):
-            report(folder, fit, validation)
-    assert names(tmp_path) == ["old"]
-    assert names(tmp_path / "old") == ["result.json"]
-    assert (tmp_path / "old" / "result.json").read_text() == "old"
-
-
 def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, quick):
     for name in ("log.csv", "torque_mine.png"):
         (tmp_path / name).write_text("mine")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxid.report.identification import body_table, error_table
+from jaxid.report.identification import body_table
 from jaxid.report.page import show
 from jaxid.table import (
     MISSING,
@@ -109,16 +109,6 @@ def test_a_fit_shows_estimates_with_both_deviations(fit):
     naive = fit.uncertainty.naive_covariance
     known = dataclasses.replace(fit.uncertainty, covariance=naive)
     assert "naive" not in dataclasses.replace(fit, uncertainty=known).summary().text()
-
-
-def test_errors_have_joints_and_units(fit, validation):
-    errors, robot = validation.errors[1], fit.base.model.robot
-    errors = dataclasses.replace(errors, max_forces=np.array([200.0, np.nan]))
-    table = error_table(errors, robot)
-    assert "second" in table.title
-    assert [row[:2] for row in table.rows] == [("rail", "N"), ("swing_$1_$", "N m")]
-    assert table.rows[0][4].strip() == f"{errors.mean_percent[0]:.3g}"
-    assert table.rows[1][4].strip() == MISSING
 
 
 def test_bodies_show_their_margins_and_the_active_bounds(consistent):
