@@ -138,7 +138,7 @@ class BodyBounds(eqx.Module):
     @property
     def has_ellipsoid(self) -> Bool[np.ndarray, " bodies"]:
         """Whether bodies have an ellipsoid for their centre of mass."""
-        return np.isfinite(self.ellipsoid_axes).all(axis=1)
+        return np.asarray(np.isfinite(self.ellipsoid_axes).all(axis=1))
 
     @property
     def inner_centres(self) -> Float[np.ndarray, "bodies 3"]:

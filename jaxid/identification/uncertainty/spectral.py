@@ -293,7 +293,7 @@ class SpectralTable:
         arrays = [[getattr(x, name) for x in lines] for name in names]
         arrays.append([x.exposure[:, None] + 0 * x.leverage for x in lines])
         longest = max(x.length * x.row_time for x in lines)
-        return cls(np, *(np.concatenate(parts, -1) for parts in arrays), longest)
+        return cls(np, *(np.concatenate(parts, -1) for parts in arrays), longest=longest)
 
     def density(self, power: np.ndarray) -> np.ndarray:
         """Return the spectrum of the errors at each line, from the periodogram of residuals."""
