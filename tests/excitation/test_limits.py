@@ -45,14 +45,6 @@ def test_random_and_restored_motions_keep_limits_and_use_them(limits):
             assert (limits.use(x).max(axis=0) > 0.9).all()
 
 
-def test_what_is_within_is_not_touched(limits):
-    fine = limits.grid(512)
-    y = jnp.asarray(0.01 * np.random.default_rng(0).standard_normal(limits.scale.size))
-    middle = fine.scale_into_limits(y)
-    again = fine.scale_into_limits(middle)
-    np.testing.assert_allclose(again, middle, atol=1e-12)
-
-
 def test_unknown_limits_are_assumed_and_known_jerks_are_kept(arm):
     free = JointLimits(arm, BASES[0], Limits(2))
     assert np.isfinite(free.limits.acceleration).all()

@@ -3,7 +3,6 @@
 import jax
 import numpy as np
 
-from jaxid.excitation.constraints import TipLimits
 from jaxid.excitation.criteria import ConditionNumber, DOptimal
 from jaxid.excitation.problem import (
     PENALTY,
@@ -46,17 +45,6 @@ def test_each_joint_of_a_child_moves_as_in_a_parent(free, parents):
     np.testing.assert_array_equal(crossover(free, parents, jax.random.key(2)), children)
     # Limits hold for each joint alone: children keep them like their parents.
     assert (limits.use(limits.coefficients(np.asarray(children[0])))[:3] < 1.01).all()
-
-
-def test_constraints_count_among_children(base, free, parents):
-    limited = ExcitationProblem(
-        base, BASIS, constraints=(TipLimits(1.5),), noise=np.ones(2), samples=200
-    )
-    slow, fast = (
-        np.asarray(limited.watched_excess(crossover(p, parents, jax.random.key(6))))
-        for p in (limited, free)
-    )
-    assert slow.mean() < fast.mean() - 0.05
 
 
 def test_a_small_excess_does_not_outweigh_a_better_value():

@@ -137,22 +137,6 @@ def test_a_rounded_quarter_turn_costs_no_base_parameter(write):
     )
 
 
-def test_axes_and_sums_of_turns_snap(write):
-    half = np.pi / 4 + 1e-6
-    text = robot(
-        *(link(name) for name in ("base", "mid", "a")),
-        joint("first", "base", "mid", "fixed", rpy=f"{half} 0 0"),
-        joint("j1", "mid", "a", rpy=f"{half} 0 0", axis="0 2 0.00002"),
-    )
-    loaded = load_urdf(write(text))
-    assert set(np.abs(loaded.rotation[0]).ravel()) == {0.0, 1.0}
-    assert loaded.axis[0].tolist() == [0.0, 1.0, 0.0]
-    assert [note.split(" snapped")[0] for note in loaded.notes[:2]] == [
-        "joint `j1`: attitude",
-        "joint `j1`: axis",
-    ]
-
-
 # What the options mean.
 
 

@@ -1,7 +1,5 @@
 """Contract of every basis: derivatives that belong together, envelopes that hold, retimings."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -103,18 +101,6 @@ def test_a_fourier_series_is_the_papers_sum():
         offset + a @ (np.sin(0.8 * k * t) / (0.8 * k)) - b @ (np.cos(0.8 * k * t) / (0.8 * k))
     )
     np.testing.assert_allclose(fourier_series(offset, a, b, 0.8).motion(t).q, expected, atol=1e-14)
-
-
-def test_the_gradient_by_the_frequency():
-    random = np.random.default_rng(3)
-    offset, (a, b) = random.standard_normal(3), random.standard_normal((2, 3, 4))
-
-    def total(omega):
-        return jnp.sum(fourier_series(offset, a, b, omega).motion(2.1).q)
-
-    h = 1e-6
-    slope = (total(0.8 + h) - total(0.8 - h)) / (2 * h)
-    assert float(jax.grad(total)(jnp.asarray(0.8))) == pytest.approx(float(slope), rel=1e-6)
 
 
 def test_leads_are_checked_and_one_period_between_them_is_measured():
