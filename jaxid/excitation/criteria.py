@@ -66,7 +66,7 @@ def information(
 def informations(
     base: BaseParameters,
     basis: AbstractBasis,
-    x: Float[Array, "starts joints variables"],
+    x: Float[AnyArray, "starts joints variables"],
     *,
     samples: int,
     measured: int,

@@ -21,12 +21,13 @@ from jaxid.trajectory.trajectory import (
 )
 
 
-def _lead(q: Any, qd: Any, qdd: Any, duration: Any, x: Any, sign: int = 1) -> tuple:
+def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> tuple:
     r"""Return position, velocity, acceleration and jerk of a lead at times x from standstill [s].
 
-    The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in q, qd and qdd. A lead-out
-    (`sign` -1) is a lead-in (1) that is run backwards.
+    The velocity is $\alpha x^2 + \beta x^3$. The lead meets a motion in a state (q, qd, qdd). A
+    lead-out (`sign` -1) is a lead-in (1) that is run backwards.
     """
+    q, qd, qdd = state
     alpha, beta = _cubic(sign * qd, qdd, duration)
     return (
         q + alpha * (x**3 - duration**3) / 3 + beta * (x**4 - duration**4) / 4,
@@ -81,8 +82,8 @@ class LeadsBasis(PeriodsBasis):
 
     def _lead_rows(self, x: AnyArray, sign: int) -> AnyArray:
         """Return the rows of the lead-in (1) or lead-out (-1) at times from standstill."""
-        q, qd, qdd, _ = self.series.rows(np.zeros(1))
-        return namespace(x, self.omega).stack(_lead(q, qd, qdd, self.lead, x[:, None], sign))
+        state = self.series.rows(np.zeros(1))[:3]
+        return namespace(x, self.omega).stack(_lead(state, self.lead, x[:, None], sign))
 
     def envelope(self, points: int) -> Envelope:
         """Return samples of a period, as for any series, and control points of the leads.
@@ -154,7 +155,7 @@ class WithLeads(AbstractTrajectory):
         last = self.inner.states(jnp.reshape(self.start + self.length, 1))
         since = jnp.clip(time - begin + lead_in, 0.0, lead_in)
         left = jnp.clip(end + lead_out - time, 0.0, lead_out)
-        early, late = _lead(*first, lead_in, since), _lead(*last, lead_out, left, -1)
+        early, late = _lead(first, lead_in, since), _lead(last, lead_out, left, -1)
         inner = self.inner.states(self.start + t - begin)
         parts = zip(early, inner, late, strict=False)
         return tuple(jnp.where(time < begin, x, jnp.where(time > end, z, y)) for x, y, z in parts)
@@ -220,7 +221,7 @@ def _shortest_leads(
     with np.errstate(divide="ignore", invalid="ignore"):
         instants = [-alpha / beta, -2 * alpha / (3 * beta), -alpha / (3 * beta)]
     inner = [np.where(np.isfinite(x) & (x > 0) & (x < T), x, T) for x in instants]
-    found = [_lead(q, qd, qdd, T, x) for x in (0 * T, *inner, T)]
+    found = [_lead((q, qd, qdd), T, x) for x in (0 * T, *inner, T)]
     place, speed, rate, jerk = (np.stack(values) for values in zip(*found, strict=True))
     low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
