@@ -15,6 +15,12 @@ from jaxid.identification.identify import fit_problem
 SMOOTH = jid.ZeroPhaseButterworth(100.0, margin=0.01)
 
 
+@pytest.fixture(scope="module")
+def base():
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
+    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+
+
 def observed(base, samples=6000, noise=0.3, **options) -> jid.Observations:
     p = standard_parameters(base.model)
     return observations(base.model, p, samples=samples, noise=noise, **options)
