@@ -124,7 +124,7 @@ def test_splines_pass_their_points_and_keep_to_the_range_of_their_handles():
 def test_random_series_keep_and_use_limits_on_a_finer_grid(harmonics, seed, reach):
     robot = library.tx90l_on_rail()
     s = random_fourier_series(robot, omega=0.8, harmonics=harmonics, reach=reach, seed=seed)
-    m = s.motion(np.arange(5_000) * s.duration / 5_000)
+    m = jax.tree.map(np.asarray, s.motion(np.arange(5_000) * s.duration / 5_000))
     lim = robot.limits
     middle = 0.5 * (lim.position_min + lim.position_max)
     half = lim.position_max - middle
