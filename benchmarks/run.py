@@ -210,9 +210,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     known = {script.name: script for script in SCRIPTS}
     parser.add_argument("scripts", nargs="*", help=f"only these: {', '.join(known)}")
-    parser.add_argument(
-        "--check", action="store_true", help="everything small; the tests"
-    )
+    parser.add_argument("--check", action="store_true", help="everything small; the tests")
     parser.add_argument("--resume", action="store_true", help="skip what was measured today")
     parser.add_argument("--methods", action="store_true", help="also the quality of the methods")
     parser.add_argument("--tables", action="store_true", help="only write the tables again")

@@ -14,11 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array as Array
-from jaxtyping import Bool as Bool
-from jaxtyping import Float as Float
-from jaxtyping import Int as Int
-from jaxtyping import PRNGKeyArray as PRNGKeyArray
+from jaxtyping import (
+    Array as Array,
+    Bool as Bool,
+    Float as Float,
+    Int as Int,
+    PRNGKeyArray as PRNGKeyArray,
+)
 
 from jaxid.errors import InputError
 

@@ -1,4 +1,3 @@
 """Diagnosis: signs of wrong units, signs, channels and sensors in a log."""
 
-from jaxid.diagnosis.diagnosis import Diagnosis as Diagnosis
-from jaxid.diagnosis.diagnosis import diagnose as diagnose
+from jaxid.diagnosis.diagnosis import Diagnosis as Diagnosis, diagnose as diagnose

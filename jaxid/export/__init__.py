@@ -1,9 +1,13 @@
 """Export of an identified model: C for controllers, files for simulators, vectors for tools."""
 
 from jaxid.export.c_code import export_c as export_c
-from jaxid.export.feed_forward import export_jax as export_jax
-from jaxid.export.feed_forward import exported_function as exported_function
-from jaxid.export.simulators import export_mjcf as export_mjcf
-from jaxid.export.simulators import export_pinocchio as export_pinocchio
-from jaxid.export.simulators import export_urdf as export_urdf
-from jaxid.export.simulators import pinocchio_parameters as pinocchio_parameters
+from jaxid.export.feed_forward import (
+    export_jax as export_jax,
+    exported_function as exported_function,
+)
+from jaxid.export.simulators import (
+    export_mjcf as export_mjcf,
+    export_pinocchio as export_pinocchio,
+    export_urdf as export_urdf,
+    pinocchio_parameters as pinocchio_parameters,
+)

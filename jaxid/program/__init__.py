@@ -5,17 +5,22 @@ and merge equal expressions; the remaining sequence of operations is a `Program`
 JAX, `evaluate` in NumPy, `to_python` on single floats; `c.CWriter` writes it in C.
 """
 
-from jaxid.program.evaluation import evaluate as evaluate
-from jaxid.program.evaluation import evaluate_packed as evaluate_packed
-from jaxid.program.evaluation import to_python as to_python
-from jaxid.program.program import OperationCounts as OperationCounts
-from jaxid.program.program import Program as Program
-from jaxid.program.program import select_outputs as select_outputs
+from jaxid.program.evaluation import (
+    evaluate as evaluate,
+    evaluate_packed as evaluate_packed,
+    to_python as to_python,
+)
+from jaxid.program.program import (
+    OperationCounts as OperationCounts,
+    Program as Program,
+    select_outputs as select_outputs,
+)
 from jaxid.program.sincos import sine_cosine as sine_cosine
-from jaxid.program.trace import FREE as FREE
-from jaxid.program.trace import trace as trace
-from jaxid.program.xla import Fence as Fence
-from jaxid.program.xla import Lowered as Lowered
-from jaxid.program.xla import Reversible as Reversible
-from jaxid.program.xla import default_fence as default_fence
-from jaxid.program.xla import lower as lower
+from jaxid.program.trace import FREE as FREE, trace as trace
+from jaxid.program.xla import (
+    Fence as Fence,
+    Lowered as Lowered,
+    Reversible as Reversible,
+    default_fence as default_fence,
+    lower as lower,
+)

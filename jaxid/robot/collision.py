@@ -17,11 +17,13 @@ from jaxid.errors import InputError
 from jaxid.robot.kinematics import placements
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
-from jaxid.robot.shapes import GROUND as GROUND
-from jaxid.robot.shapes import Box as Box
-from jaxid.robot.shapes import Capsule as Capsule
-from jaxid.robot.shapes import HalfSpace as HalfSpace
-from jaxid.robot.shapes import segment_distance
+from jaxid.robot.shapes import (
+    GROUND as GROUND,
+    Box as Box,
+    Capsule as Capsule,
+    HalfSpace as HalfSpace,
+    segment_distance,
+)
 from jaxid.robot.urdf import UrdfTree
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])

@@ -7,8 +7,7 @@ from forward_kinematics import (
     random_configuration,
     tip_transform,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from jaxid.robot.library import from_dh
 

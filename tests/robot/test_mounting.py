@@ -1,7 +1,6 @@
 import numpy as np
 from forward_kinematics import body_transforms, from_rpy, random_configuration, tip_transform
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from jaxid.robot.library import panda
 from jaxid.robot.robot import Robot

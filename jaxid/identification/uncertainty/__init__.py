@@ -1,8 +1,10 @@
 """Uncertainty of estimates: spectral sandwich, block jackknife, residual spectra."""
 
 from .blocks import BlockJackknife as BlockJackknife
-from .result import AbstractUncertainty as AbstractUncertainty
-from .result import IndependentRows as IndependentRows
-from .result import ResidualSpectra as ResidualSpectra
-from .result import Uncertainty as Uncertainty
+from .result import (
+    AbstractUncertainty as AbstractUncertainty,
+    IndependentRows as IndependentRows,
+    ResidualSpectra as ResidualSpectra,
+    Uncertainty as Uncertainty,
+)
 from .spectral import SpectralSandwich as SpectralSandwich
