@@ -114,11 +114,11 @@ def identify_drive_gains(
             "the load does not tell all gains: mount a heavier one, farther from the flange, and "
             "let every joint move it in both runs."
         )
-    blocks = [
-        _linearise(part, fit.weights, E, k, solution.x)[::-1]
-        for fit, E, k in runs
-        for part in fit.time_blocks.parts
-    ]
+    blocks = []
+    for fit, E, k in runs:
+        for part in fit.time_blocks.parts:
+            r, rows = _linearise(part, fit.weights, E, k, solution.x)
+            blocks.append((rows, r))
     covariance, dof = block_covariance(blocks, B)
     covariance = covariance[size:, size:] / c**2 / c[:, None] ** 2
     uncertainty = Uncertainty(covariance, np.full(robot.joints, dof), covariance)
