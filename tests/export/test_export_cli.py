@@ -80,8 +80,8 @@ def test_files_hold_the_model(report, run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("nowhere", "--to", "c"), "`nowhere` is not there: give a folder"),
-        (("empty", "--to", "c"), "`empty` holds no `model.json`"),
+        (("nowhere", "--to", "c"), "`nowhere` must be a folder"),
+        (("empty", "--to", "c"), "`empty` must be a folder"),
         (("report", "--to", "c", "-o", "arm.h"), "must be a C file like arm.c"),
         (("report", "--to", "c", "-o", "7arm.c"), "names in C code"),
         (("report", "--to", "json", "-o", "empty"), "`empty` is a folder"),
