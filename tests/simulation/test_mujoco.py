@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import jaxid as jid
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
 from jaxid.robot import library
@@ -65,6 +66,27 @@ def test_the_same_experiment_gives_the_same_torques(dry, tolerance):
     assert difference.max() < tolerance
     apart = np.abs(np.asarray(ours.actual.q) - np.asarray(theirs.actual.q)).max(axis=0)
     assert apart.max() < 2e-3
+
+
+def test_mujocos_data_lead_to_the_true_parameters():
+    virtual = ur10()
+    trajectory = random_fourier_series(virtual.robot, omega=1.0, reach=0.8, seed=3)
+    run = MujocoRobot(virtual).track(
+        trajectory, feed_forward=virtual.forces, duration=6.0, substeps=2, seed=0
+    )
+    base = jid.base_parameters(virtual.model)
+    rows = jid.Subsample(20)
+    fit = jid.identify(
+        base, jid.observe(run.recording, virtual.robot, jid.ZeroPhaseButterworth(20.0), rows)
+    )
+    truth = np.asarray(base.from_standard(virtual.parameters))
+    wanted = np.asarray(base.inverse_dynamics(truth, run.actual))
+    error = np.sqrt(np.mean((fit.predict(run.actual) - wanted) ** 2, axis=0))
+    assert (error < 2e-3 * np.asarray(virtual.robot.max_forces)).all()
+    masses = np.array([n.startswith(("m", "Ia")) for n in base.names])
+    np.testing.assert_allclose(
+        np.asarray(fit.parameters)[masses], truth[masses], atol=0.02 * np.abs(truth[masses]).max()
+    )
 
 
 def test_what_mujoco_does_not_know_is_refused():
