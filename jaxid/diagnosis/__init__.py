@@ -1,3 +1,3 @@
 """Diagnosis: signs of wrong units, signs, channels and sensors in a log."""
 
-from jaxid.diagnosis.diagnosis import Diagnosis as Diagnosis, diagnose as diagnose
+from .diagnosis import Diagnosis as Diagnosis, diagnose as diagnose

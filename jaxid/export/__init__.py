@@ -1,11 +1,11 @@
 """Export of an identified model: C for controllers, files for simulators, vectors for tools."""
 
-from jaxid.export.c_code import export_c as export_c
-from jaxid.export.feed_forward import (
+from .c_code import export_c as export_c
+from .feed_forward import (
     export_jax as export_jax,
     exported_function as exported_function,
 )
-from jaxid.export.simulators import (
+from .simulators import (
     export_mjcf as export_mjcf,
     export_pinocchio as export_pinocchio,
     export_urdf as export_urdf,

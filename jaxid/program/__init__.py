@@ -5,19 +5,19 @@ and merge equal expressions; the remaining sequence of operations is a `Program`
 JAX, `evaluate` in NumPy, `to_python` on single floats; `c.CWriter` writes it in C.
 """
 
-from jaxid.program.evaluation import (
+from .evaluation import (
     evaluate as evaluate,
     evaluate_packed as evaluate_packed,
     to_python as to_python,
 )
-from jaxid.program.program import (
+from .program import (
     OperationCounts as OperationCounts,
     Program as Program,
     select_outputs as select_outputs,
 )
-from jaxid.program.sincos import sine_cosine as sine_cosine
-from jaxid.program.trace import FREE as FREE, trace as trace
-from jaxid.program.xla import (
+from .sincos import sine_cosine as sine_cosine
+from .trace import FREE as FREE, trace as trace
+from .xla import (
     Fence as Fence,
     Lowered as Lowered,
     Reversible as Reversible,

@@ -1,7 +1,7 @@
 """Virtual robots: experiments whose truth is known, on our own physics or on MuJoCo."""
 
-from jaxid.simulation.example import virtual_panda as virtual_panda, write_example as write_example
-from jaxid.simulation.friction import (
+from .example import virtual_panda as virtual_panda, write_example as write_example
+from .friction import (
     AbstractDisturbance as AbstractDisturbance,
     AbstractGearFriction as AbstractGearFriction,
     CableForce as CableForce,
@@ -10,17 +10,17 @@ from jaxid.simulation.friction import (
     SmoothFriction as SmoothFriction,
     TorqueRipple as TorqueRipple,
 )
-from jaxid.simulation.mechanics import (
+from .mechanics import (
     FlexibleGear as FlexibleGear,
     RigidGear as RigidGear,
     Servo as Servo,
 )
-from jaxid.simulation.mujoco import MujocoRobot as MujocoRobot
-from jaxid.simulation.tx90l import (
+from .mujoco import MujocoRobot as MujocoRobot
+from .tx90l import (
     cad_tx90l_on_rail as cad_tx90l_on_rail,
     virtual_tx90l_on_rail as virtual_tx90l_on_rail,
 )
-from jaxid.simulation.virtual import (
+from .virtual import (
     Sensors as Sensors,
     Tracking as Tracking,
     VirtualRobot as VirtualRobot,

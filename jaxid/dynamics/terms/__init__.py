@@ -1,6 +1,6 @@
 """Terms of a model: effects in the equations of motion that are linear in unknown parameters."""
 
-from jaxid.dynamics.terms.friction import (
+from .friction import (
     AbstractTransition as AbstractTransition,
     AsymmetricCoulombFriction as AsymmetricCoulombFriction,
     AsymmetricViscousFriction as AsymmetricViscousFriction,
@@ -14,7 +14,7 @@ from jaxid.dynamics.terms.friction import (
     TemperatureScaled as TemperatureScaled,
     ViscousFriction as ViscousFriction,
 )
-from jaxid.dynamics.terms.term import (
+from .term import (
     AbstractTerm as AbstractTerm,
     ConstantOffset as ConstantOffset,
     LinearSpring as LinearSpring,
