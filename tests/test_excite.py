@@ -71,6 +71,7 @@ def written(tmp_path_factory, compiled):
     folder = tmp_path_factory.mktemp("excite")
     (folder / "pendulum.urdf").write_text(PENDULUM)
     (folder / "experiment.toml").write_text(EXPERIMENT)
+    (folder / "fast.toml").write_text(FAST)
     return folder
 
 
@@ -101,7 +102,6 @@ def designed(written, run):
 @pytest.fixture(scope="module")
 def excited(written):
     """A motion as fast as it can be had, for what is said of it."""
-    (written / "fast.toml").write_text(FAST)
     experiment = load_experiment(written / "fast.toml")
     return design_motion(experiment, lambda _: None, written / "fast.npz", False)
 
@@ -362,7 +362,7 @@ def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
     arguments = ["excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria", "--resume"]
     code, out, err = run(*arguments)
     assert code == 0, err
-    assert "`some/motion.state.npz` is not there to go on with: the design begins" in out
+    assert "`some/motion.state.npz` is not there: the design begins anew" in out
     assert asked == [c.name for c in CRITERIA[:2]]
     assert "motions that minimise one of the criteria each" in out
     assert "stopped after 1 of 6 criteria" in out

@@ -174,6 +174,8 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
             "to begin anew, remove the file, or choose another -o."
         )
     experiment, errors = load_experiment(path), open_console(stderr=True)
+    if resume and not state.exists():
+        show_remarks(console, _doubts([f"`{state}` is not there: the design begins anew"]))
     try:
         with stages(errors) as stage:
             design = design_motion(experiment, stage.design, state, resume)

@@ -106,7 +106,12 @@ def compare_criteria(
 ) -> list[ExcitationPlan]:
     """Design by every criterion, from few starts and without polishing, until Ctrl-C."""
     plans, table = [], experiment.excitation
-    for criterion in CRITERIA:
+    for number, criterion in enumerate(CRITERIA, 1):
+
+        def tell(step: DesignProgress, number: int = number) -> None:
+            task = f"criterion {number} of {len(CRITERIA)}: {step.task}"
+            progress(step._replace(task=task))
+
         try:
             with within("excitation", experiment.path.name):
                 plan = design_excitation(
@@ -115,7 +120,7 @@ def compare_criteria(
                     starts=min(8, table.starts),
                     generations=min(4, table.generations),
                     polish=0,
-                    progress=progress,
+                    progress=tell,
                     throw=False,
                     **_settings(experiment, find_nominal(experiment), bool(criterion.weighted)),
                 )

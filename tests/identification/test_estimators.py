@@ -2,6 +2,8 @@
 
 import inspect
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import optimize
@@ -27,9 +29,9 @@ class Known(AbstractTrajectory):
     def duration(self):
         return self.dt * (len(self.motion_.q) - 1)
 
-    def motion(self, t):
-        places = np.round(np.asarray(t) / self.dt).astype(int)
-        return self.motion_[places]
+    def states(self, t):
+        places = jnp.round(t / self.dt).astype(int)
+        return tuple(jnp.asarray(x)[places] for x in jax.tree.leaves(self.motion_))
 
 
 @pytest.fixture(scope="module")
