@@ -279,7 +279,8 @@ def _corrected(
         f = torques @ forces
         if sides[0]:
             q, qd, qdd = drives.joint_angles(q), *map(drives.joint_velocities, (qd, qdd))
-        return text, Motion(q, qd, qdd), drives.joint_forces(f) if sides[1] else f
+        f = drives.joint_forces(f) if sides[1] else f
+        return text, Motion(q, qd, qdd), np.asarray(f)
 
     for j, name in enumerate(names):
         change = np.diag(np.where(np.arange(n) == j, -1.0, 1.0))

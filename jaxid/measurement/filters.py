@@ -162,6 +162,7 @@ class AbstractFilter(eqx.Module):
 def _check(filter: AbstractFilter, *positive: str) -> None:
     """Check the settings that filters share, and that others are positive."""
     owner = type(filter).__name__
+    rules: dict[str, tuple[Callable[[float], bool], str]]
     rules = dict.fromkeys(positive, (lambda x: x > 0, "positive"))
     rules["order"] = lambda x: 0 < x <= 20, "between 1 and 20 (2 to 8 are usual)"
     rules["margin"] = lambda x: 0 <= x < math.inf, "a time [s] of zero or more"
@@ -335,7 +336,8 @@ def _bilinear(
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""Return $(b s + c) / (s / \omega + 1)$ by the bilinear transform, as coefficients."""
     _require_cutoff(name, omega / (2 * math.pi), sample_time)
-    return signal.bilinear(numerator, [1 / omega, 1.0], 1 / sample_time)
+    b, a = signal.bilinear(numerator, [1 / omega, 1.0], 1 / sample_time)
+    return np.asarray(b), np.asarray(a)
 
 
 def _first_order(name: str, omega: float, sample_time: float) -> LowPass:
