@@ -13,17 +13,9 @@ from jaxid.report.excitation import side_by_side_table
 from jaxid.report.identification import parameter_table
 from jaxid.report.page import Section, folded, picture, render_page, versions
 from jaxid.report.result_files import SCHEMAS, plain, write_json
+from jaxid.simulation.tx90l import COLD, WARM
 from jaxid.table import MISSING, Column, Remark, Status, Table, significant, with_deviation
 
-PUBLISHED = {
-    1: (273.40, 273.62, "kg"),
-    2: (1.68, 1.65, "kg m"),
-    27: (248.41, 90.19, "N s/m"),
-    28: (41.26, 25.65, "N m s"),
-    34: (312.50, 233.00, "N"),
-    35: (18.24, 15.07, "N m"),
-}
-"""Base parameters of the paper (Sec. 6): number from 1; value cold and warm, and their unit."""
 SHOWN = (0, 2, 4, 6)
 """Axes 1, 5 and 7 of the paper's Figs. 6, 7 and 9, and the shoulder, which holds the arm."""
 POINTS = 800
@@ -104,11 +96,11 @@ def paper_table(study: Study) -> Table:
         ("mass matrix with weights", "positive definite", definite[1]),
         ("mass matrix, consistent bodies", "not done", definite[2]),
     ]
-    for number, (cold, warm, unit) in PUBLISHED.items():
-        for state, value, fit in (("cold", cold, study.weighted.fit), ("warm", warm, study.warm)):
-            k = number - 1
-            pair = with_deviation(float(fit.parameters[k]), float(fit.standard_deviations[k]))
-            rows.append((f"p_B({number}), {state} [{unit}]", f"{value:.2f}", " ± ".join(pair)))
+    for k in COLD:
+        for state, paper, fit in (("cold", COLD, study.weighted.fit), ("warm", WARM, study.warm)):
+            pair = with_deviation(fit.parameters[k - 1], fit.standard_deviations[k - 1])
+            name = f"p_B({k}), {state} [{base.units[k - 1]}]"
+            rows.append((name, f"{paper[k]:.2f}", " ± ".join(pair)))
     title = f"the paper, and the results on the virtual {base.model.robot.name}"
     names = ("quantity", "paper", "here")
     return Table(title, *map(Column, names, zip(*rows, strict=True)))
@@ -181,24 +173,17 @@ def _excitation(study: Study) -> Section:
         "Seven bodies with seven parameters each, viscous and Coulomb friction and rotors make "
         f"{base.model.size} columns. The QR decomposition without pivoting leaves {base.size} of "
         "them; the first two are those that the paper prints in Eq. 24.",
-        folded(
-            f"All {base.size} base parameters, as estimated with weights, cold",
-            parameter_table(study.weighted.fit),
-        ),
+        folded(f"All {base.size} base parameters, weighted", parameter_table(study.weighted.fit)),
         f"The motion is a Fourier series of {settings.HARMONICS} harmonics at {settings.OMEGA:g} "
-        "rad/s within all limits and clear of collisions. The paper minimises the condition number "
-        "of the unweighted information matrix; that motion is run here. The D-optimal one beside "
-        "it makes the parameters most certain.",
+        "rad/s within all limits and clear of collisions. As in the paper, it has the least "
+        "condition number; the D-optimal one beside it makes the parameters most certain.",
         *([side_by_side_table(study.plans)] if study.plans else []),
         picture(
             jid.plot.path(robot, motion, times),
             "Fig. 3: path of the end-effector along the designed motion. The paper states up to "
             f"2.7 m/s and 11.3 m/s²; here {speed:.3g} m/s and {acceleration:.3g} m/s².",
         ),
-        picture(
-            jid.plot.joints(robot, robot.limits, times, motion),
-            "Fig. 4: one period of the designed motion.",
-        ),
+        picture(jid.plot.joints(robot, robot.limits, times, motion), "Fig. 4: one period of it."),
     ]
 
 
@@ -210,9 +195,9 @@ def _identification(study: Study) -> Section:
     desired, filtered = study.played.motion(time[shown]), observations.motion[shown]
     plain, weighted = (m.validation.errors[0] for m in (study.unweighted, study.weighted))
     return "Identification with and without weights", [
-        "The virtual robot follows the motion by its servo at 1000 Hz: cold, and once more when "
-        "it is warm. Logs hold the angles of 17-bit motor encoders and motor torques with 1 % of "
-        "noise, disturbed by ripple, stiction and Stribeck friction that the model does not have. "
+        "The virtual robot follows the motion by its servo at 1000 Hz, cold and warm. Logs hold "
+        "angles of 17-bit encoders and motor torques with 1 % of noise, disturbed by ripple, "
+        "stiction and Stribeck friction, which the model does not have. "
         f"Filter (Eq. 25): {observations.filter}; {observations.rows} rows of each joint.",
         picture(
             jid.plot.filtered(robot, time[shown], desired, filtered, 2),
@@ -237,31 +222,22 @@ def _verification(study: Study) -> Section:
     motion, capsules = path.motion(times), jid.robots.tx90l_on_rail_collision()
     first, second = study.weighted.validation.errors
     return "Verification and application on another path", [
-        "The path after ISO 9283: straight lines, a rectangle and two circles on the plane through "
-        f"two opposite edges of a cube of {settings.EDGE:g} m. Where pieces meet the end-effector "
-        f"is at rest; speed up to {settings.SPEED:g} m/s, acceleration up to "
-        f"{settings.ACCELERATION:g} m/s². The seven joints are redundant: of all solutions the "
-        "nearest to a posture are taken.",
+        f"The path after ISO 9283 in a cube of {settings.EDGE:g} m: lines, a rectangle and two "
+        f"circles. Where pieces meet the end-effector rests; up to {settings.SPEED:g} m/s and "
+        f"{settings.ACCELERATION:g} m/s². Of the redundant joint angles the nearest to a posture "
+        "are taken.",
         picture(jid.plot.path(robot, motion, times), "Fig. 8: path of the end-effector."),
-        picture(
-            jid.plot.poses(robot, motion.q[::5], capsules),
-            "The robot with its capsules along the path.",
-        ),
+        picture(jid.plot.poses(robot, motion.q[::5], capsules), "The robot with its capsules."),
         picture(
             jid.plot.torques(second, robot, "verification", SHOWN),
             "Fig. 9: torques of the axes 1, 3, 5 and 7 on the verification path.",
         ),
-        picture(
-            jid.plot.errors([first], [second], robot),
-            "Fig. 10: mean errors on identification and verification.",
-        ),
+        picture(jid.plot.errors([first], [second], robot), "Fig. 10: mean errors on both paths."),
         (error_table(study, 0), error_table(study, 1)),
         f"“Moving”: rows of each axis above {settings.AT_REST:g} rad/s or m/s. The torque of an "
-        "axis at rest may be anything up to stiction, which no model of speeds predicts, and this "
-        "path rests at every corner.",
-        "The same path once more, with the same servo, and three torques fed forward: none, those "
-        "of a CAD model whose bodies are 10 to 18 % off and that has no friction, and those of the "
-        "identified model.",
+        "axis at rest may be anything up to stiction, which no model of speeds predicts.",
+        "The same path with three torques fed forward: none, those of a CAD model without friction "
+        "whose bodies are 10 to 18 % off, and those of the identified model.",
         following_table(study),
     ]
 
@@ -270,6 +246,7 @@ def _record(study: Study) -> dict[str, Any]:
     """Return the results of the demo for `demo.json`, in rad, m, s, N and N m."""
     base, fits = study.base, (study.weighted.fit, study.warm)
     speed, acceleration = study.tip_maxima
+    criteria = [{c.name: c.after for c in plan.criteria} for plan in study.plans]
     return {
         "schema": SCHEMAS["demo.json"],
         "versions": versions(),
@@ -277,11 +254,8 @@ def _record(study: Study) -> dict[str, Any]:
         "base_parameters": {"count": base.size, "names": base.names, "truth": study.truth},
         "excitation": {
             "designs": [
-                {
-                    "criterion": plan.criterion.name,
-                    "criteria": {c.name: c.after for c in plan.criteria},
-                }
-                for plan in study.plans
+                {"criterion": plan.criterion.name, "criteria": own}
+                for plan, own in zip(study.plans, criteria, strict=True)
             ],
             "tip_speed": speed,
             "tip_acceleration": acceleration,
@@ -300,17 +274,13 @@ def _record(study: Study) -> dict[str, Any]:
         "temperature": [
             {
                 "number": k,
-                "paper": [cold, warm],
-                "estimates": [float(fit.parameters[k - 1]) for fit in fits],
+                "paper": [COLD[k], WARM[k]],
+                "estimates": [fit.parameters[k - 1] for fit in fits],
             }
-            for k, (cold, warm, _) in PUBLISHED.items()
+            for k in COLD
         ],
         "following": [
-            {
-                "fed_forward": run.name,
-                "tip_rms": run.rms,
-                "tip_largest": run.distance.max(),
-            }
+            {"fed_forward": run.name, "tip_rms": run.rms, "tip_largest": run.distance.max()}
             for run in study.followed
         ],
     }

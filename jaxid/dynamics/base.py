@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Numbers, as_array
 from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
-from jaxid.dynamics.dispatch import compiled_method, in_numpy, on_samples, program_of
+from jaxid.dynamics.dispatch import in_numpy, on_samples, program_of
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.rank import (
@@ -22,7 +22,7 @@ from jaxid.dynamics.rank import (
     regrouping,
     singular_values,
 )
-from jaxid.dynamics.regressor import JointRegressor, PackedRegressor, rows_in_numpy
+from jaxid.dynamics.regressor import JointRegressor, PackedRegressor
 from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
 from jaxid.table import MISSING, Column, Remark, Status, Table
@@ -114,18 +114,15 @@ class BaseParameters(Hashable):
         return select_outputs(program, entries[:, np.array(self.indices, int)])
 
     @property
-    def _shapes(self) -> tuple[tuple[int], ...]:
-        return ((self.model.robot.joints,),) * 3
-
-    @property
     def joint_regressor(self) -> JointRegressor:
         """Base regressor for many samples, joint by joint, for programs in JAX (Eq. 23)."""
-        return JointRegressor(self, self.columns, *self._shapes)
+        n = (self.model.robot.joints,)
+        return JointRegressor(self, self.columns, n, n, n)
 
     @property
-    def acting_columns(self) -> list[tuple[int, ...]]:
+    def acting_columns(self) -> tuple[tuple[int, ...], ...]:
         """For each joint the base parameters that can act on it."""
-        return list(compiled_method(self, self.columns, *self._shapes).acting)
+        return self.joint_regressor.columns
 
     def regressor_rows(self, motion: Motion) -> list[Float[np.ndarray, "samples columns"]]:
         """Return each joint's row of the base regressor in its `acting_columns`, in NumPy (Eq. 23).
@@ -133,9 +130,8 @@ class BaseParameters(Hashable):
         Args:
             motion: Joint motion [samples, joints].
         """
-        method = compiled_method(self, self.columns, *self._shapes)
         arrays = [np.asarray(x, np.float64).T for x in (motion.q, motion.qd, motion.qdd)]
-        return [rows.T for rows in rows_in_numpy(method.program, method.acting, *arrays)]
+        return [rows.T for rows in self.joint_regressor.in_numpy(*arrays)]
 
     def forces_in_numpy(
         self, p: Float[AnyArray, " base"], motion: Motion
@@ -273,14 +269,10 @@ def base_parameters(
     found = methods.pop(method)(W)
     ((_, check),) = methods.items()
     other = check(W)
-    kappa, left = regrouping(W, found)
+    kappa, left, new = regrouping(W, found.independent, found.dependent)
     first, second = np.array(found.independent, int), np.array(found.dependent, int)
     kappa = kappa * scale[first][:, None] / scale[second]
-    weakest = ""
-    if found.independent:
-        chosen = W[:, found.independent]
-        R = np.linalg.qr(chosen / np.linalg.norm(chosen, axis=0), mode="r")
-        weakest = model.parameter_names[found.independent[int(np.argmin(np.abs(np.diag(R))))]]
+    weakest = model.parameter_names[first[np.argmin(new)]] if len(new) else ""
     notes = _doubts(found, other, left, weakest)
     return BaseParameters(
         model,

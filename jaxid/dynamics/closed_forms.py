@@ -25,8 +25,8 @@ from jaxid.dynamics.rank import (
     characteristic_length,
     column_units,
     random_motion,
+    regrouping,
     row_units,
-    solve_from_earlier,
 )
 from jaxid.program import FREE, evaluate, trace
 from jaxid.robot.inertia import AXES
@@ -38,6 +38,8 @@ _SCALES = np.array([0.55, 0.75, 1.3, 1.7])
 """Factors of a length that is varied alone."""
 _FITTED, _CHECKED = 40, 8
 """Numbers of random geometries for fits and for checks."""
+_AT_ONCE = 32
+"""Number of geometries that are evaluated together."""
 _FITS = 1e-9
 """Relative error up to which a closed form fits."""
 _SMALL = 1e-7
@@ -81,9 +83,8 @@ def closed_forms(
         terms = [(first, Coefficient((Monomial(Fraction(1)),)))]
         for column, second in enumerate(dependent):
             own, other = units[first], units[second]
-            difference = None
-            if own is not None and other is not None:
-                difference = tuple(a - b for a, b in zip(own, other, strict=True))
+            known = own is not None and other is not None
+            difference = np.subtract(own, other) if known else None
             coefficient = finder.coefficient(row, column, difference, kappa[row, column])
             if coefficient is not None:
                 terms.append((second, coefficient))
@@ -98,21 +99,19 @@ class _Finder:
     """Values of the matrix at all geometries, from which one coefficient is found at a time."""
 
     def __init__(self, model: Model, independent: tuple[int, ...], dependent: tuple[int, ...]):
-        regrouping = Regrouping(model, independent, dependent)
-        lengths = changing_lengths(model.robot, regrouping) if dependent else ()
+        matrix = Regrouping(model, independent, dependent)
+        lengths = changing_lengths(model.robot, matrix) if dependent else ()
         rng = np.random.default_rng(3)
-        base = draws(regrouping, lengths, 1, rng)
+        base = draws(matrix, lengths, 1, rng)
         alone = np.repeat(base, len(lengths) * len(_SCALES), axis=0)
         for k in range(len(lengths)):
             alone[k * len(_SCALES) : (k + 1) * len(_SCALES), k] *= _SCALES
-        values = np.concatenate([base, alone, draws(regrouping, lengths, _FITTED + _CHECKED, rng)])
-        found, self.right = regrouping(regrouping.place(lengths, values))
+        values = np.concatenate([base, alone, draws(matrix, lengths, _FITTED + _CHECKED, rng)])
+        found, self.right = matrix(lengths, values)
         found = np.where(np.isfinite(found), found, 0.0)
         self.lengths: tuple[Length, ...] = lengths
-        self._units = np.array([regrouping.unit(x) for x in lengths])
-        self._entry_units = (
-            regrouping.units[regrouping.independent, None] / regrouping.units[regrouping.dependent]
-        )
+        self._units = np.array([matrix.unit(x) for x in lengths])
+        self._entry_units = matrix.units[matrix.independent, None] / matrix.units[matrix.dependent]
         self._values = np.array([x.value for x in lengths]) / self._units
         scaled = values / self._units
         fitted, checked = slice(1 + len(alone), -_CHECKED), slice(-_CHECKED, None)
@@ -127,7 +126,7 @@ class _Finder:
         self._shares = np.array(shares).reshape(len(lengths), len(_POWERS), *found.shape[1:])
 
     def coefficient(
-        self, row: int, column: int, difference: tuple[int, ...] | None, value: float
+        self, row: int, column: int, difference: np.ndarray | None, value: float
     ) -> Coefficient | None:
         """Return the coefficient of a dependent column in a base parameter, or None if it is zero.
 
@@ -164,32 +163,29 @@ class _Finder:
             return number
         return self._written(numbers, powers, unit)
 
-    def _candidates(self, row: int, column: int, difference: tuple[int, ...] | None) -> np.ndarray:
+    def _candidates(self, row: int, column: int, difference: np.ndarray | None) -> np.ndarray:
         possible = self._shares[:, :, row, column] > _SMALL
         choices = [_POWERS[p] for p in possible]
         if np.prod([len(c) for c in choices], dtype=float) > 20_000:
             return np.zeros((0, len(self.lengths)), int)
-        found = []
-        for powers in itertools.product(*choices):
-            total = np.zeros(3, int)
-            for length, exponent in zip(self.lengths, powers, strict=True):
-                total += int(exponent) * np.array(length.dimension)
-            if difference is None or tuple(total) == tuple(difference):
-                found.append(powers)
-        return np.array(found, int).reshape(len(found), len(self.lengths))
+        found = list(itertools.product(*choices))
+        powers = np.array(found, int).reshape(len(found), len(self.lengths))
+        if difference is None:
+            return powers
+        dimensions = np.array([x.dimension for x in self.lengths], int).reshape(-1, 3)
+        return powers[(powers @ dimensions == difference).all(axis=1)]
 
     def _written(self, numbers: np.ndarray, powers: np.ndarray, unit: float) -> Coefficient:
         """Return numbers in the robot's own units in SI units, as simple fractions if they are."""
         monomials = []
-        for number, exponents in zip(numbers, powers, strict=True):
+        for number, exponents in zip(numbers[::-1], powers[::-1], strict=True):
             symbols = tuple(
                 (x.name, int(e)) for x, e in zip(self.lengths, exponents, strict=True) if e
             )
             # With the right dimension the units of lengths and of the entry cancel.
             factor = unit / float(np.prod(self._units ** exponents.astype(float)))
             monomials.append(Monomial(_simple(float(number) * factor), symbols))
-        order = sorted(range(len(monomials)), key=lambda k: tuple(-powers[k]))
-        return Coefficient(tuple(monomials[k] for k in order))
+        return Coefficient(tuple(monomials))
 
 
 def _products(x: np.ndarray, powers: np.ndarray) -> np.ndarray:
@@ -253,69 +249,41 @@ class Regrouping:
         """Return a value of typical size: the robot's size, or gravity."""
         return self.gravity if length.dimension.second else self.size
 
-    def place(
-        self, lengths: tuple[Length, ...], values: Float[np.ndarray, "cases lengths"]
-    ) -> Float[np.ndarray, "cases geometry"]:
-        """Return geometries in which some lengths have other values and all else is the same."""
-        geometry = np.repeat(self.geometry[None], len(values), axis=0)
-        for column, length in enumerate(lengths):
-            for entry, factor in length.entries:
-                geometry[:, entry] = factor * values[:, column]
-        return geometry
-
     def __call__(
-        self, geometries: Float[np.ndarray, "cases geometry"]
+        self, lengths: tuple[Length, ...], values: Float[np.ndarray, "cases lengths"]
     ) -> tuple[Float[np.ndarray, "cases base dependent"], bool]:
-        """Return the matrix at each geometry, and whether the choice of columns is right at all.
+        """Return the matrix for other lengths, and whether the choice of columns is right at all.
 
         It is if the dependent columns follow from earlier independent ones, and those are
         independent.
         """
+        geometries = np.repeat(self.geometry[None], len(values), axis=0)
+        for column, length in enumerate(lengths):
+            for entry, factor in length.entries:
+                geometries[:, entry] = factor * values[:, column]
         found, right = [], True
         joints, samples = self._motion[0].shape
-        columns = len(self.units)
-        at_once = max(1, 20_000_000 // (joints * samples * columns))
-        for start in range(0, len(geometries), at_once):
-            block = geometries[start : start + at_once]
-            kappa, good = self._solve(self._matrices(block))
-            found.append(kappa)
-            right = right and good
-        return np.concatenate(found), right
-
-    def _matrices(self, geometries):
-        cases, samples = len(geometries), self._motion[0].shape[1]
-        motion = [np.tile(x, cases) for x in self._motion]
-        theta = evaluate(self._program, *motion, np.repeat(geometries.T, samples, axis=1))
-        theta = theta * self._rows[:, None, None] * self.units[:, None]
-        theta = theta.reshape(*theta.shape[:2], cases, samples)
-        return theta.transpose(2, 0, 3, 1).reshape(cases, -1, len(self.units))
-
-    def _solve(self, W):
-        norms = np.linalg.norm(W, axis=1)
-        live = norms > _NOTHING * norms.max(axis=1, keepdims=True)
-        scale = np.where(live, norms, 1.0)
-        W = np.where(live[:, None], W / scale[:, None], 0.0)
-        W1, W2 = W[..., self.independent], W[..., self.dependent]
-        diagonal = np.diagonal(np.linalg.qr(W1, mode="r"), axis1=1, axis2=2)
-        if np.abs(diagonal).min(initial=1.0) < _FITS:
-            return np.zeros((len(W), len(self.independent), len(self.dependent))), False
-        columns = (self.independent, self.dependent)
-        kappa = np.array([solve_from_earlier(*x, *columns) for x in zip(W1, W2, strict=True)])
-        left = np.linalg.norm(W2 - W1 @ kappa, axis=1).max(initial=0.0)
-        kappa = np.where(np.abs(kappa) > _FITS, kappa, 0.0)
-        kappa = kappa * scale[:, None, self.dependent] / scale[:, self.independent, None]
-        return kappa, bool(left < _FITS)
+        for block in np.split(geometries, range(_AT_ONCE, len(geometries), _AT_ONCE)):
+            motion = [np.tile(x, len(block)) for x in self._motion]
+            theta = evaluate(self._program, *motion, np.repeat(block.T, samples, axis=1))
+            theta = theta * self._rows[:, None, None] * self.units[:, None]
+            theta = theta.reshape(joints, -1, len(block), samples).transpose(2, 0, 3, 1)
+            for W in theta.reshape(len(block), joints * samples, -1):
+                kappa, left, new = regrouping(W, self.independent, self.dependent)
+                found.append(kappa)
+                right = right and left < _FITS and new.min(initial=1.0) >= _FITS
+        return np.array(found), bool(right)
 
 
 def draws(
-    regrouping: Regrouping, lengths: tuple[Length, ...], cases: int, rng: np.random.Generator
+    matrix: Regrouping, lengths: tuple[Length, ...], cases: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "cases lengths"]:
     """Return random values of lengths, all of the robot's size, so that small ones have effect."""
-    units = np.array([math.copysign(regrouping.unit(x), x.value) for x in lengths])
+    units = np.array([math.copysign(matrix.unit(x), x.value) for x in lengths])
     return rng.uniform(0.5, 1.5, (cases, len(lengths))) * units
 
 
-def changing_lengths(robot: Robot, regrouping: Regrouping) -> tuple[Length, ...]:
+def changing_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
     """Return the lengths that can vary without changing which columns are independent.
 
     Where single ones cannot, the geometry has a coincidence, such as two equal lengths that make
@@ -323,10 +291,10 @@ def changing_lengths(robot: Robot, regrouping: Regrouping) -> tuple[Length, ...]
     cannot vary at all get no name.
     """
     rng = np.random.default_rng(2)
-    single = named_lengths(robot, regrouping)
+    single = named_lengths(robot, matrix)
 
     def possible(lengths: tuple[Length, ...]) -> bool:
-        return regrouping(regrouping.place(lengths, draws(regrouping, lengths, 2, rng)))[1]
+        return matrix(lengths, draws(matrix, lengths, 2, rng))[1]
 
     if possible(single):
         return single
@@ -351,19 +319,19 @@ def changing_lengths(robot: Robot, regrouping: Regrouping) -> tuple[Length, ...]
     return tuple(sorted(free, key=lambda x: x.entries))
 
 
-def named_lengths(robot: Robot, regrouping: Regrouping) -> tuple[Length, ...]:
+def named_lengths(robot: Robot, matrix: Regrouping) -> tuple[Length, ...]:
     """Return every component of an offset that is not zero, and gravity."""
     n = robot.joints
     lengths = []
-    for entry in np.flatnonzero(regrouping.geometry[: 3 * n]):
+    for entry in np.flatnonzero(matrix.geometry[: 3 * n]):
         body, axis = divmod(int(entry), 3)
-        value = float(regrouping.geometry[entry])
+        value = float(matrix.geometry[entry])
         name = offset_name(robot, body) + AXES[axis]
         lengths.append(Length(name, value, ((int(entry), 1.0),), Dimension(0, 1, 0)))
-    if regrouping.gravity > 0.0:
-        direction = regrouping.geometry[3 * n :] / regrouping.gravity
+    if matrix.gravity > 0.0:
+        direction = matrix.geometry[3 * n :] / matrix.gravity
         entries = tuple((3 * n + k, float(x)) for k, x in enumerate(direction) if x)
-        lengths.append(Length("g", regrouping.gravity, entries, Dimension(0, 1, -2)))
+        lengths.append(Length("g", matrix.gravity, entries, Dimension(0, 1, -2)))
     return tuple(lengths)
 
 

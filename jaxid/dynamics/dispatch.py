@@ -10,7 +10,6 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,72 +18,20 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, Numbers, as_array, content, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Lowered, Program, evaluate, evaluate_packed, lower, trace
+from jaxid.program import Program, evaluate, lower, trace
 
 FEW = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
-_KEPT = 64
+KEPT = 64
+"""Number of programs that are kept, of the models that were used last."""
 
 
-class CompiledMethod:
-    """Scalar program of a method, and its compiled forms, which are made when first needed.
-
-    Attributes:
-        program: The program.
-        distinct: Places of the outputs that vary, each value once.
-        entries: For each output the number of its value among `distinct`, or its constant.
-    """
-
-    def __init__(self, program: Program):
-        self.program = program
-        first: dict[int, int] = {}
-        for k, x in enumerate(program.outputs):
-            if isinstance(x, int):
-                first.setdefault(x, k)
-        numbers = {x: k for k, x in enumerate(first)}
-        self.distinct = list(first.values())
-        self.entries = tuple(numbers[x] if isinstance(x, int) else x for x in program.outputs)
-
-    @functools.cached_property
-    def lowered(self) -> Lowered:
-        """Program as a function of JAX arrays."""
-        return lower(self.program)
-
-    @functools.cached_property
-    def dense(self) -> Callable:
-        """Compiled function that returns whole arrays."""
-        return jax.jit(lambda *arrays: self.lowered.dense(*arrays))
-
-    @functools.cached_property
-    def _packed(self) -> Callable:
-        def run(*arrays: AnyArray) -> list:
-            outputs = self.lowered(*arrays)
-            return [outputs[k] for k in self.distinct]
-
-        return jax.jit(run)
-
-    def packed(self, compiled: bool, *arrays: AnyArray) -> tuple[Any, ...]:
-        """Return the values that vary, each once, by NumPy or compiled; the batch comes last."""
-        if compiled:
-            return tuple(self._packed(*arrays))
-        outputs = evaluate_packed(self.program, *arrays)
-        return tuple(outputs[k] for k in self.distinct)
-
-    @functools.cached_property
-    def acting(self) -> tuple[tuple[int, ...], ...]:
-        """For each row of the output the columns that are not always zero."""
-        nonzeros = np.asarray(self.program.nonzeros)
-        return tuple(tuple(int(k) for k in np.flatnonzero(row)) for row in nonzeros)
-
-
-_methods: OrderedDict[tuple, CompiledMethod] = OrderedDict()
+_programs: OrderedDict[tuple, Program] = OrderedDict()
 _lock = threading.Lock()
 
 
-def compiled_method(
-    owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
-) -> CompiledMethod:
-    """Return the program of a method of a model; it is traced when first needed.
+def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:
+    """Return the scalar program of a method of a model; it is traced when first needed.
 
     An owner may have a method `derived_program(name, *shapes)`, which returns the program of its
     method of that name if it follows from the program of another model, or None.
@@ -95,23 +42,23 @@ def compiled_method(
         shapes: Shapes of the method's arguments.
     """
     key = (definition.__name__, shapes, *content(owner))
+    program = _programs.get(key)
+    if program is None:
+        derive = getattr(owner, "derived_program", None)
+        program = None if derive is None else derive(definition.__name__, *shapes)
+        program = trace(definition, *shapes) if program is None else program
     with _lock:
-        if key in _methods:
-            _methods.move_to_end(key)
-            return _methods[key]
-    derive = getattr(owner, "derived_program", None)
-    program = None if derive is None else derive(definition.__name__, *shapes)
-    method = CompiledMethod(trace(definition, *shapes) if program is None else program)
-    with _lock:
-        _methods[key] = method
-        while len(_methods) > _KEPT:
-            _methods.popitem(last=False)
-    return method
+        _programs[key] = program
+        _programs.move_to_end(key)
+        while len(_programs) > KEPT:
+            _programs.popitem(last=False)
+    return program
 
 
-def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:
-    """Return the scalar program of a method of a model."""
-    return compiled_method(owner, definition, *shapes).program
+@functools.lru_cache(maxsize=KEPT)
+def _compiled(program: Program) -> Callable:
+    lowered = lower(program)
+    return jax.jit(lambda *arrays: lowered.dense(*arrays))
 
 
 def on_samples(
@@ -144,12 +91,13 @@ def on_samples(
         out = jax.vmap(lambda *x: definition(*shared, *x))(*map(jnp.asarray, flat))
         return jnp.reshape(out, (*batch, *out.shape[1:]))
     shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in flat))
-    method = compiled_method(owner, definition, *shapes)
+    program = program_of(owner, definition, *shapes)
     arguments = (*shared, *(x.T for x in flat))
     if count <= FEW and not is_traced(arguments):
-        out = jnp.asarray(evaluate(method.program, *arguments), _precision(arguments))
+        precision = jnp.result_type(*(x.dtype for x in arguments), float)
+        out = jnp.asarray(evaluate(program, *arguments), precision)
     else:
-        out = method.dense(*arguments)
+        out = _compiled(program)(*arguments)
     out = jnp.moveaxis(jnp.broadcast_to(out, (*out.shape[:-1], count)), -1, 0)
     return jnp.reshape(out, (*batch, *out.shape[1:]))
 
@@ -166,10 +114,6 @@ def in_numpy(
     shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in samples))
     out = evaluate(program_of(owner, definition, *shapes), *arguments)
     return np.moveaxis(np.broadcast_to(out, (*out.shape[:-1], len(samples[0]))), -1, 0)
-
-
-def _precision(arguments: tuple[AnyArray, ...]) -> Any:
-    return jnp.result_type(*(x.dtype for x in arguments), float)
 
 
 def solve_symmetric(

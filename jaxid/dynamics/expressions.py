@@ -5,7 +5,6 @@ lengths, or a number where there is no short form.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple
@@ -28,20 +27,12 @@ class Monomial:
     number: Number
     powers: Powers = ()
 
-    def evaluate(self, lengths: Mapping[str, float]) -> float:
-        """Return the value for given lengths [m]."""
-        return float(self.number) * math.prod(lengths[name] ** e for name, e in self.powers)
-
 
 @dataclass(frozen=True)
 class Coefficient:
     """A sum of monomials: the factor of one standard parameter."""
 
     monomials: tuple[Monomial, ...]
-
-    def evaluate(self, lengths: Mapping[str, float]) -> float:
-        """Return the value for given lengths [m]."""
-        return sum(m.evaluate(lengths) for m in self.monomials)
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -88,10 +79,6 @@ class Expression:
     def symbols(self) -> tuple[str, ...]:
         """Names of the lengths that occur."""
         return tuple(dict.fromkeys(s for _, c in self.terms for s in c.symbols))
-
-    def evaluate(self, lengths: Mapping[str, float]) -> dict[str, float]:
-        """Return the coefficient of each standard parameter for given lengths [m]."""
-        return {name: c.evaluate(lengths) for name, c in self.terms}
 
     def __str__(self):
         # Parameters that share a factor are put in one bracket, at the place of the first of them.

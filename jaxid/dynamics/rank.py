@@ -6,12 +6,13 @@ order decides which columns are independent, so that the choice is the same for 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
-from jaxid.arrays import AnyArray, Float, Int
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.expressions import length_power
 from jaxid.dynamics.model import Model
@@ -104,10 +105,7 @@ def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6)
     drops = floored[:-1] / floored[1:]
     possible = np.arange(1, columns) >= certain
     rank = certain if not possible.any() else 1 + int(np.argmax(np.where(possible, drops, 0.0)))
-    if columns and s[-1] > tolerance:
-        rank = columns
-    if not live.any():
-        rank = 0
+    rank = min(rank, np.count_nonzero(live))
     null = Vt[rank:]
     dependent: list[int] = []
     # Eliminate from the last column backwards: a pivot found there is where a vector ends.
@@ -131,48 +129,34 @@ def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6)
 
 
 def regrouping(
-    W: Float[AnyArray, "rows columns"], dependence: Dependence
-) -> tuple[Float[AnyArray, "base dependent"], float]:
-    r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and its error (Eq. 22).
+    W: Float[AnyArray, "rows columns"], independent: Sequence[int], dependent: Sequence[int]
+) -> tuple[Float[np.ndarray, "base dependent"], float, Float[np.ndarray, " base"]]:
+    r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and how exact it is (Eq. 22).
+
+    A dependent column is a combination of independent columns before it.
 
     Returns:
-        $\kappa$, and the largest fraction of a dependent column that it does not explain.
+        $\kappa$; the largest fraction of a dependent column that it does not explain; and the
+        fraction of each independent column that those before it do not explain.
     """
     W = np.asarray(W, np.float64)
     norms = np.linalg.norm(W, axis=0)
-    floor = ROUNDING * norms.max(initial=0.0)
-    scale = np.where(norms > floor, norms, 1.0)
-    first, second = list(dependence.independent), list(dependence.dependent)
-    W1, W2 = W[:, first] / scale[first], W[:, second] / scale[second]
-    W2 = np.where(norms[second] > floor, W2, 0.0)
-    kappa = solve_from_earlier(W1, W2, np.array(first, int), np.array(second, int))
-    left = float(np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0))
-    kappa = np.where(np.abs(kappa) > 1e-9, kappa, 0.0)
-    return kappa * scale[second] / scale[first][:, None], left
-
-
-def solve_from_earlier(
-    W1: Float[np.ndarray, "rows base"],
-    W2: Float[np.ndarray, "rows dependent"],
-    first: Int[np.ndarray, " base"],
-    second: Int[np.ndarray, " dependent"],
-) -> Float[np.ndarray, "base dependent"]:
-    """Return the combinations of earlier independent columns that are closest to dependent ones.
-
-    Args:
-        W1: Independent columns.
-        W2: Dependent columns.
-        first: Places of the independent columns, in ascending order.
-        second: Places of the dependent columns.
-    """
-    if not first.size:
-        return np.zeros((0, len(second)))
+    live = norms > ROUNDING * norms.max(initial=0.0)
+    scale = np.where(live, norms, 1.0)
+    W = np.where(live, W / scale, 0.0)
+    first, second = np.array(independent, int), np.array(dependent, int)
+    W1, W2 = W[:, first], W[:, second]
     Q, R = np.linalg.qr(W1)
-    earlier = first[:, None] < second
-    kappa = scipy.linalg.solve_triangular(R, np.where(earlier, Q.T @ W2, 0.0))
-    # One step of refinement takes out most of the rounding that poor conditioning amplifies.
-    left = np.where(earlier, Q.T @ (W2 - W1 @ kappa), 0.0)
-    return kappa + scipy.linalg.solve_triangular(R, left)
+    new = np.abs(np.diag(R))
+    kappa = np.zeros((len(first), len(second)))
+    if len(first) and new.min() > ROUNDING:
+        # The second step takes out most of the rounding that poor conditioning amplifies.
+        for _ in range(2):
+            left = np.where(first[:, None] < second, Q.T @ (W2 - W1 @ kappa), 0.0)
+            kappa = kappa + scipy.linalg.solve_triangular(R, left)
+    unexplained = float(np.linalg.norm(W2 - W1 @ kappa, axis=0).max(initial=0.0))
+    kappa = np.where(np.abs(kappa) > 1e-9, kappa, 0.0)
+    return kappa * scale[second] / scale[first][:, None], unexplained, new
 
 
 def random_regressor(

@@ -52,7 +52,7 @@ def information(
     """
     plain = np.zeros((base.size, base.size))
     weighted = plain.copy() if prior is None else np.array(prior, np.float64)
-    columns = base.joint_regressor.columns
+    columns = base.acting_columns
     for own, theta, w in zip(
         columns, base.regressor_rows(motion), np.asarray(weights), strict=True
     ):
@@ -77,7 +77,7 @@ def informations(
 
     Motions are evaluated at `samples`, which stand for those that are `measured`.
     """
-    rows = base.joint_regressor.for_gradients
+    rows = base.joint_regressor
     motion = np.asarray(basis.rows(basis.times(samples))[:3])
     arrays = [jnp.einsum("sk,bjk->jbs", part, x) for part in motion]
     plain = jnp.zeros((x.shape[0], rows.size, rows.size), x.dtype)

@@ -27,7 +27,7 @@ from jaxid.dynamics.dispatch import program_of
 from jaxid.identification.factors import Factors, JointFactor, divide_rows, row_chunks
 from jaxid.measurement.filters import LowPass
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.program import Program, default_fence, lower
+from jaxid.program import Program, lower
 
 LONG = 100_000
 """Samples from which compiling pays."""
@@ -361,9 +361,8 @@ def _compiled(
     """Return the loop, which is compiled when it is first called."""
     joints = len(acting)
     size = len(program.outputs) // joints
-    fence = default_fence("cpu", jax.__version_info__)
-    base_columns = lower(program, fence)
-    tool_forces = None if tool is None else lower(tool, fence)
+    base_columns = lower(program, fence=True)
+    tool_forces = None if tool is None else lower(tool, fence=True)
 
     def entry(j: int, k: int) -> tuple[bool, int | float]:
         x = program.outputs[j * size + k]

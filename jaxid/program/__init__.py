@@ -18,9 +18,6 @@ from .program import (
 from .sincos import sine_cosine as sine_cosine
 from .trace import FREE as FREE, trace as trace
 from .xla import (
-    Fence as Fence,
     Lowered as Lowered,
-    Reversible as Reversible,
-    default_fence as default_fence,
     lower as lower,
 )

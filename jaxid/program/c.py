@@ -16,7 +16,7 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.program.program import Program, Reference
 from jaxid.program.scalar import Operation
-from jaxid.program.sincos import DOUBLE, SINGLE, Precision
+from jaxid.program.sincos import DOUBLE, SINGLE, half_pi
 
 _LIBRARY = {
     "sine_cosine": (Operation.SINE, Operation.COSINE),
@@ -48,7 +48,7 @@ class CWriter:
         self.type, self._suffix = ("double", "") if double else ("float", "f")
         self._dtype = np.float64 if double else np.float32
         # Fewer and longer pieces of pi/2 than in JAX, for a shorter chain and smaller angles.
-        own = Precision(33, 2, 20, DOUBLE.sine, DOUBLE.cosine) if double else SINGLE
+        own = DOUBLE._replace(pieces=half_pi(33, 2), limit=2.0**20) if double else SINGLE
         self._precision = own
         self.turns = own.limit / 4
         self.widths: dict[str, int] = {}

@@ -1,5 +1,6 @@
 """JAX's persistent cache of compiled functions in the user's cache folder."""
 
+import contextlib
 import os
 import sys
 from pathlib import Path
@@ -66,15 +67,12 @@ def _remove_oldest(folder: Path, max_bytes: int) -> None:
     """Remove the least recently used files; other processes may do so at the same time."""
     files = []
     for path in folder.iterdir():
-        try:
+        with contextlib.suppress(FileNotFoundError):
             status = path.stat()
-        except FileNotFoundError:
-            continue
-        if path.is_file():
-            files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+            if path.is_file():
+                files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
     size = sum(bytes_ for _, bytes_, _ in files)
     for _, bytes_, path in sorted(files):
-        if size <= max_bytes:
-            return
-        path.unlink(missing_ok=True)
+        if size > max_bytes:
+            path.unlink(missing_ok=True)
         size -= bytes_

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray
@@ -51,15 +50,7 @@ def evaluate(program: Program, *arrays: AnyArray) -> Any:
     Raises:
         InputError: If the arrays do not fit the program's inputs.
     """
-    plan = _plan(program)
-    table, batch = _evaluate(program, plan, arrays)
-    leaves = []
-    for entries, shape in zip(program.split(program.outputs), program.output_shapes, strict=True):
-        leaf = np.empty((len(entries), table.shape[1]))
-        for row, x in zip(leaf, entries, strict=True):
-            row[:] = table[plan.results[x]] if isinstance(x, int) else x
-        leaves.append(leaf.reshape((*shape, *batch)))
-    return jax.tree.unflatten(program.structure, leaves)
+    return program.unpack(*_evaluate(program, arrays), np)
 
 
 def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | float]:
@@ -73,10 +64,7 @@ def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | fl
         For each entry of each output, in order, an array of the batch's shape, or a constant.
         Equal entries share one array.
     """
-    plan = _plan(program)
-    table, batch = _evaluate(program, plan, arrays)
-    rows = [row.reshape(batch) for row in table]
-    return [rows[plan.results[x]] if isinstance(x, int) else x for x in program.outputs]
+    return _evaluate(program, arrays)[0]
 
 
 @functools.lru_cache(maxsize=64)
@@ -113,38 +101,28 @@ def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
 
 
 def _evaluate(
-    program: Program, plan: _Plan, arrays: tuple[AnyArray, ...]
-) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Return one row for each distinct node among the outputs, and the batch's shape."""
-    given = [np.asarray(x, np.float64) for x in arrays]
-    batch = program.batch_shape([x.shape for x in given])
+    program: Program, arrays: tuple[AnyArray, ...]
+) -> tuple[list[np.ndarray | float], tuple[int, ...]]:
+    """Return the packed result, and the batch's shape."""
+    plan = _plan(program)
+    aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
-    inputs = []
-    for x, shape in zip(given, program.input_shapes, strict=True):
-        own = x.shape[len(shape) :]
-        aligned = x.reshape((*shape, *(1,) * (len(batch) - len(own)), *own))
-        whole = np.broadcast_to(aligned, (*shape, *batch))
-        inputs.append(whole.reshape(math.prod(shape), samples))
+    inputs = [x.reshape(len(x), samples) for x in aligned]
     table = np.empty((len(plan.results), samples))
     scratch = np.empty((plan.cells - len(plan.results), min(samples, _BLOCK)))
     with np.errstate(all="ignore"):
         for start in range(0, samples, _BLOCK):
             block = slice(start, min(start + _BLOCK, samples))
-            width = block.stop - block.start
-            _run(plan, [x[:, block] for x in inputs], [*table[:, block], *scratch[:, :width]])
-    return table, batch
-
-
-def _run(plan: _Plan, inputs: list[np.ndarray], cells: list[np.ndarray]) -> None:
-    values = list(cells)
-    for target, number, entry in plan.loads:
-        values[target][:] = inputs[number][entry]
-    for function, operands, result, in_place in plan.steps:
-        read = [values[x] if isinstance(x, int) else x for x in operands]
-        if in_place:
-            values[result] = function(*read, out=cells[result])
-        else:
-            values[result] = function(*read)
+            cells = [*table[:, block], *scratch[:, : block.stop - block.start]]
+            values = list(cells)
+            for target, number, entry in plan.loads:
+                values[target][:] = inputs[number][entry, block]
+            for function, operands, result, in_place in plan.steps:
+                read = [values[x] if isinstance(x, int) else x for x in operands]
+                own = {"out": cells[result]} if in_place else {}
+                values[result] = function(*read, **own)
+    rows = [row.reshape(batch) for row in table]
+    return [rows[plan.results[x]] if isinstance(x, int) else x for x in program.outputs], batch
 
 
 def to_python(program: Program) -> Callable[..., tuple[float, ...]]:

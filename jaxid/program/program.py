@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -37,43 +38,32 @@ class Node(NamedTuple):
         return int(number), int(entry)
 
 
-@dataclass(frozen=True)
-class OperationCounts:
+class OperationCounts(NamedTuple):
     """Numbers of operations of a program.
 
     Attributes:
         multiplications: Multiplications.
         additions: Additions and subtractions.
-        negations: Changes of sign.
         divisions: Divisions.
         functions: Calls of sin, cos, sqrt, tanh and similar functions.
         selections: Comparisons, choices, absolute values and signs.
+        negations: Changes of sign.
     """
 
     multiplications: int
     additions: int
-    negations: int
     divisions: int
     functions: int
     selections: int
+    negations: int
 
     @property
     def total(self) -> int:
         """Number of operations except negations, which cost nothing inside a sum."""
-        return (
-            self.multiplications
-            + self.additions
-            + self.divisions
-            + self.functions
-            + self.selections
-        )
+        return sum(self) - self.negations
 
     def __str__(self):
-        return (
-            f"{self.multiplications} multiplications, {self.additions} additions, "
-            f"{self.divisions} divisions, {self.functions} functions, "
-            f"{self.selections} selections, {self.negations} negations"
-        )
+        return ", ".join(f"{number} {name}" for name, number in self._asdict().items())
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,30 +126,46 @@ class Program:
         ends = np.cumsum([math.prod(shape) for shape in self.output_shapes], dtype=int)
         return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
 
-    def batch_shape(self, shapes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-        """Return the trailing batch axes of arrays, broadcast against each other.
+    def align(self, arrays: Sequence[Any], xp: ModuleType) -> tuple[list[Any], tuple[int, ...]]:
+        """Return the inputs with their own axes merged and the whole batch behind; and its shape.
 
         Args:
-            shapes: Shapes of the arrays, those of the inputs first.
+            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
+            xp: NumPy or `jax.numpy`.
 
         Raises:
             InputError: If the arrays are not as many as the inputs, or a shape does
                 not begin with its input's.
         """
-        if len(shapes) != len(self.input_shapes):
+        if len(arrays) != len(self.input_shapes):
             raise InputError(
                 f"The program takes {len(self.input_shapes)} arrays (of shapes "
                 f"{', '.join(map(str, self.input_shapes))} and batch axes behind), "
-                f"but got {len(shapes)}."
+                f"but got {len(arrays)}."
             )
-        for k, (given, expected) in enumerate(zip(shapes, self.input_shapes, strict=True)):
-            if given[: len(expected)] != expected:
+        batches = []
+        for k, (x, expected) in enumerate(zip(arrays, self.input_shapes, strict=True)):
+            if x.shape[: len(expected)] != expected:
                 raise InputError(
                     f"Input {k} of the program must have shape {expected} with batch axes behind, "
-                    f"but has shape {given}: put the batch last."
+                    f"but has shape {x.shape}: put the batch last."
                 )
-        batches = [s[len(e) :] for s, e in zip(shapes, self.input_shapes, strict=True)]
-        return np.broadcast_shapes(*batches) if batches else ()
+            batches.append(x.shape[len(expected) :])
+        batch = np.broadcast_shapes(*batches) if batches else ()
+        entries = []
+        for x, shape, own in zip(arrays, self.input_shapes, batches, strict=True):
+            size, missing = math.prod(shape), (1,) * (len(batch) - len(own))
+            entries.append(xp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch)))
+        return entries, batch
+
+    def unpack(self, packed: Sequence[Any], batch: tuple[int, ...], xp: ModuleType) -> Any:
+        """Return a packed result in the structure of the traced function, batch axes last."""
+        full = [xp.broadcast_to(x, batch) for x in packed]
+        leaves = []
+        for entries, shape in zip(self.split(full), self.output_shapes, strict=True):
+            stacked = xp.stack(entries) if entries else xp.zeros((0, *batch))
+            leaves.append(stacked.reshape((*shape, *batch)))
+        return jax.tree.unflatten(self.structure, leaves)
 
 
 def assemble(

@@ -14,7 +14,7 @@ With all uses known, `c x + c y` becomes `c (x + y)` where nothing else needs th
 import enum
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -127,27 +127,6 @@ class Scalar:
         self.operands = operands
         self.index = index
 
-    def __add__(self, other):
-        return add(self, other)
-
-    def __radd__(self, other):
-        return add(other, self)
-
-    def __sub__(self, other):
-        return add(self, negate(other))
-
-    def __rsub__(self, other):
-        return add(other, negate(self))
-
-    def __mul__(self, other):
-        return multiply(self, other)
-
-    def __rmul__(self, other):
-        return multiply(other, self)
-
-    def __neg__(self):
-        return negate(self)
-
     def __repr__(self):
         return f"<{self.operation} {self.index}>"
 
@@ -155,11 +134,7 @@ class Scalar:
 Operand = Scalar | float | bool
 
 
-@overload
-def _magnitude(x: Scalar) -> tuple[bool, Scalar]: ...
-@overload
-def _magnitude(x: float | bool) -> tuple[bool, float | bool]: ...
-def _magnitude(x: Operand) -> tuple[bool, Operand]:
+def _magnitude(x: Operand) -> tuple[bool, Any]:
     """Split x into (is negated, rest)."""
     if isinstance(x, Scalar):
         return (True, x.operands[0]) if x.operation is Operation.NEGATE else (False, x)
@@ -272,10 +247,12 @@ def select(condition: Operand, if_true: Operand, if_false: Operand) -> Operand:
     """Return `if_true` where the condition holds, else `if_false`."""
     if not isinstance(condition, Scalar):
         return if_true if condition else if_false
-    if if_true is if_false or (
-        not isinstance(if_true, Scalar) and not isinstance(if_false, Scalar) and if_true == if_false
-    ):
+    if if_true == if_false:
         return if_true
+    if is_truth(if_true):
+        chosen = logic(Operation.AND, condition, if_true)
+        other = logic(Operation.AND, logic(Operation.NOT, condition), if_false)
+        return logic(Operation.OR, chosen, other)
     return condition.graph.node(Operation.SELECT, condition, if_true, if_false)
 
 

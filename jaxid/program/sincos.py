@@ -6,6 +6,7 @@ that, and for x infinite or NaN, the result is NaN.
 """
 
 from fractions import Fraction
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from jaxid.arrays import Array
 _HALF_PI = Fraction("1.57079632679489661923132169163975144209858469968755291")
 
 
-def _pieces(bits: int, count: int) -> tuple[float, ...]:
+def half_pi(bits: int, count: int) -> tuple[float, ...]:
     """Return pi/2 as a sum of numbers with so few bits that whole multiples of each are exact."""
     rest, pieces = _HALF_PI, []
     for _ in range(count):
@@ -31,37 +32,28 @@ def _pieces(bits: int, count: int) -> tuple[float, ...]:
     return (*pieces, float(rest))
 
 
-class Precision:
+class Precision(NamedTuple):
     """Constants of one floating-point precision.
 
-    Args:
-        bits: Bits of each piece of pi/2.
-        pieces: Number of pieces; the rest follows as one more.
-        whole_bits: Bits of the largest number of quarter turns.
+    Attributes:
+        pieces: Parts of pi/2, the largest first.
+        limit: Largest number of quarter turns.
         sine: Coefficients of the sine's polynomial, lowest power first.
         cosine: Coefficients of the cosine's polynomial, lowest power first.
     """
 
-    def __init__(
-        self,
-        bits: int,
-        pieces: int,
-        whole_bits: int,
-        sine: tuple[float, ...],
-        cosine: tuple[float, ...],
-    ):
-        self.pieces = _pieces(bits, pieces)
-        self.limit = float(2**whole_bits)
-        self.sine, self.cosine = sine, cosine
+    pieces: tuple[float, ...]
+    limit: float
+    sine: tuple[float, ...]
+    cosine: tuple[float, ...]
 
 
 # Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded), lowest power
 # of z = r^2 first: sin r = r + r z P(z) with relative error 4e-18, and
 # cos r = 1 - z/2 + z^2 Q(z) with relative error 6e-20; in float32 4e-9 and 1e-10.
 DOUBLE = Precision(
-    22,
-    3,
-    31,
+    half_pi(22, 3),
+    2.0**31,
     (
         -0.1666666666666663,
         0.008333333333322106,
@@ -80,9 +72,8 @@ DOUBLE = Precision(
     ),
 )
 SINGLE = Precision(
-    8,
-    3,
-    16,
+    half_pi(8, 3),
+    2.0**16,
     (-0.16666654602275977, 0.008332160290263908, -0.00019515217828349702),
     (0.04166664567016134, -0.001388731561689898, 2.4433082734975143e-05),
 )

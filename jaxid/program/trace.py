@@ -52,11 +52,7 @@ def _broadcast(x: np.ndarray, *_, shape, broadcast_dimensions, **__) -> np.ndarr
 
 def _slice(x: np.ndarray, *, start_indices, limit_indices, strides) -> np.ndarray:
     steps = strides or (1,) * x.ndim
-    return x[tuple(slice(*s) for s in zip(start_indices, limit_indices, steps, strict=True))]
-
-
-def _split(x: np.ndarray, *, sizes, axis) -> list[np.ndarray]:
-    return np.split(x, np.cumsum(sizes)[:-1], axis=axis)
+    return x[tuple(map(slice, start_indices, limit_indices, steps))]
 
 
 def _pad(x: np.ndarray, filler: np.ndarray, *, padding_config) -> np.ndarray:
@@ -79,7 +75,7 @@ _MOVEMENTS: dict[str, Callable] = {
     "reshape": lambda x, *_, new_sizes, **__: x.reshape(new_sizes),
     "rev": lambda x, *, dimensions: np.flip(x, dimensions),
     "slice": _slice,
-    "split": _split,
+    "split": lambda x, *, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
     "squeeze": lambda x, *, dimensions: np.squeeze(x, tuple(dimensions)),
     "stack": lambda *x, axis: np.stack(x, axis=axis),
     "tile": lambda x, *, reps: np.tile(x, reps),
@@ -142,7 +138,7 @@ def _scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
         zeros = np.zeros(target.shape)
         (places,) = _on_numbers(equation, zeros, indices, one.reshape(updates.shape))
         for place in np.argwhere(places):
-            total[tuple(place)] = total[tuple(place)] + update
+            total[tuple(place)] = scalar.add(total[tuple(place)], update)
     return total
 
 
@@ -190,12 +186,6 @@ def _select_n(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
     if not _is_symbolic(which):
         return np.choose(np.broadcast_to(which, cases[0].shape).astype(int), cases)
     return np.asarray(_select(which, cases[1], cases[0]), object)
-
-
-def _select_truth(which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
-    if not _is_symbolic(which):
-        return _select_n(which, *cases)
-    return np.asarray(_or(_and(which, cases[1]), _and(_not(which), cases[0])), object)
 
 
 _ELEMENTARY = [
@@ -263,11 +253,6 @@ def _entries(x: np.ndarray) -> np.ndarray:
     return x.astype(np.float64).astype(object)
 
 
-def _dtype(equation: JaxprEqn) -> np.dtype:
-    """Return the type of the only result of an equation."""
-    return np.dtype(equation.outvars[0].aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Run one equation on arrays of which at least one is symbolic."""
     name = equation.primitive.name
@@ -278,10 +263,9 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
     if name in ("scatter-add", "scatter_add"):
         return [_scatter_add(equation, operands)]
     if name == "select_n":
-        truth = _dtype(equation).kind == "b"
-        which, cases = operands[0], [_entries(x) for x in operands[1:]]
-        return [(_select_truth if truth else _select_n)(which, *cases)]
-    if name in ("div", "pow") and np.issubdtype(_dtype(equation), np.integer):
+        return [_select_n(operands[0], *map(_entries, operands[1:]))]
+    aval: Any = equation.outvars[0].aval
+    if name in ("div", "pow") and np.issubdtype(aval.dtype, np.integer):
         raise InputError(f"`trace` cannot translate `{name}` of integers: use real numbers.")
     if name in _ARITHMETIC:
         with_parameters = name in ("integer_pow", "dot_general", "reduce_sum", "reduce_prod")

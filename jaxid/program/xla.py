@@ -5,20 +5,18 @@ shared operation into each of them. A program of a thousand operations with hund
 would be computed many times over. A fence on a shared value stops that.
 """
 
-import enum
 import functools
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxid.arrays import AnyArray, Array
 from jaxid.errors import InputError
-from jaxid.program.program import Node, Program, Reference
+from jaxid.program.program import Program
 from jaxid.program.scalar import Operation
 from jaxid.program.sincos import sine_cosine as polynomial_sine_cosine
 
@@ -28,96 +26,41 @@ ELEMENTWISE: dict[Operation, Callable] = {
 CIRCULAR = (Operation.SINE, Operation.COSINE)
 SineCosine = Callable[[Array], tuple[Array, Array]]
 Groups = tuple[tuple[int, ...], ...]
-
-
-class Fence(enum.Enum):
-    """A way to make XLA compute a shared value only once.
-
-    XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for NaN and
-    infinities: `DIVISION` divides by a one that XLA cannot recognise. The derivative has the same
-    fence. `BARRIER` is an optimization barrier, which newer versions of XLA respect on a CPU. With
-    `NONE` XLA decides.
-    """
-
-    NONE = "none"
-    BARRIER = "barrier"
-    DIVISION = "division"
-
-    def __call__(self, x: Array, one: Array) -> Array:
-        """Return x, which XLA now computes once.
-
-        Args:
-            x: Value.
-            one: The number that `hidden_one` makes.
-        """
-        if self is Fence.DIVISION:
-            return x / one
-        return jax.lax.optimization_barrier(x) if self is Fence.BARRIER else x
+Values = tuple[list[Array], dict[int, tuple[Array, Array]], Array]
+"""Array of each node, sines and cosines by the positions of their angles, and the fences' one."""
 
 
 def hidden_one(reference: Array) -> Array:
     """Return (sign bit of a number | 1), which is 1 for any number, NaN included.
 
+    XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for NaN and
+    infinities: division by a one that XLA cannot recognise is a fence. (An optimization barrier
+    does not stop XLA's CPU backend before JAX 0.12.)
+
     Args:
         reference: Number known only at run time, in the precision of the program.
     """
-    wide = reference.dtype == jnp.float64
-    bits = jax.lax.bitcast_convert_type(
-        jax.lax.stop_gradient(reference), jnp.uint64 if wide else jnp.uint32
-    )
-    sign = jax.lax.shift_right_logical(bits, jnp.full_like(bits, 63 if wide else 31))
-    return (sign | jnp.ones_like(bits)).astype(reference.dtype)
+    width = 8 * reference.dtype.itemsize
+    bits = jax.lax.stop_gradient(reference).view(f"uint{width}")
+    return (bits >> (width - 1) | 1).astype(reference.dtype)
 
 
-def default_fence(backend: str, version: tuple[int, ...]) -> Fence:
-    """Choose a fence that was measured to work (`benchmarks/fences.py`, JAX 0.10.2 and 0.12.0).
-
-    In 0.10 only the division works on a CPU; in 0.12 both do, equally fast, and the barrier adds
-    no arithmetic. On a GPU a fence would break the program into many kernels, and float64 divisions
-    are slow, so that none is placed; nothing was measured there.
-
-    Args:
-        backend: Name of JAX's platform as `jax.default_backend()` gives it.
-        version: Version of JAX as `jax.__version_info__` gives it.
-    """
-    if backend != "cpu":
-        return Fence.NONE
-    return Fence.BARRIER if version >= (0, 12) else Fence.DIVISION
-
-
-def fenced_nodes(program: Program, threshold: int = 6) -> frozenset[int]:
+def fenced_nodes(program: Program) -> frozenset[int]:
     """Return positions of the nodes that a fence pays for.
 
-    These are the nodes with (uses - 1) times the cost of computing them again > threshold.
-
-    Args:
-        program: Program to place fences in.
-        threshold: Threshold [operations]; between 0 and 30 the speed hardly depends on it.
+    These are the nodes with (uses - 1) times the cost of computing them again > 6 operations;
+    between 0 and 30 the speed hardly depends on it.
     """
     free = (Operation.INPUT, Operation.NEGATE)
     costs, fenced = [], set()
     for k, node in enumerate(program.nodes):
         own = 20 if "function" in node.operation.traits else node.operation not in free
         cost = own + sum(costs[i] for i in node.uses)
-        if cost * (program.uses[k] - 1) > threshold:
+        if cost * (program.uses[k] - 1) > 6:
             fenced.add(k)
             cost = 0
         costs.append(cost)
     return frozenset(fenced)
-
-
-class Values(NamedTuple):
-    """Values of a program.
-
-    Attributes:
-        nodes: Array of each node.
-        pairs: Sines and cosines by the positions of their angles.
-        anchor: The one that the fences divide by.
-    """
-
-    nodes: list[Array]
-    pairs: dict[int, tuple[Array, Array]]
-    anchor: Array
 
 
 class Lowered(eqx.Module):
@@ -128,13 +71,13 @@ class Lowered(eqx.Module):
 
     Attributes:
         program: Program made by `trace`.
-        fence: Fence of shared values.
-        fenced: Positions of the nodes that have a fence.
+        fence: Whether fences stand behind shared values.
+        fenced: Positions of these nodes.
         sine_cosine: Function from angles to their sines and cosines.
     """
 
     program: Program = eqx.field(static=True)
-    fence: Fence = eqx.field(static=True)
+    fence: bool = eqx.field(static=True)
     fenced: frozenset[int] = eqx.field(static=True)
     sine_cosine: SineCosine = eqx.field(static=True)
 
@@ -147,33 +90,42 @@ class Lowered(eqx.Module):
         Returns:
             For each entry of each output, in order, an array of the batch's shape, or a constant.
         """
-        values = self.run(self.entries(*arrays), ELEMENTWISE).nodes
+        values = self.run(self.entries(*arrays)[0], ELEMENTWISE)[0]
         return [values[x] if isinstance(x, int) else x for x in self.program.outputs]
 
-    def entries(self, *arrays: AnyArray) -> list[Array]:
-        """Return the inputs with their own axes merged into one, followed by the whole batch."""
-        batch = self.program.batch_shape([np.shape(x) for x in arrays])
+    def entries(self, *arrays: AnyArray) -> tuple[list[Array], tuple[int, ...]]:
+        """Return the inputs with their own axes merged and the whole batch behind; its shape."""
         dtype = jnp.result_type(*arrays, float) if arrays else jnp.result_type(float)
         if not jnp.issubdtype(dtype, jnp.floating):
             raise InputError(f"A program computes with real numbers, but got arrays of {dtype}.")
-        return [
-            _entries(jnp.asarray(x, dtype), shape, batch)
-            for x, shape in zip(arrays, self.program.input_shapes, strict=True)
-        ]
+        return self.program.align([jnp.asarray(x, dtype) for x in arrays], jnp)
+
+    def stacked(self, groups: Groups, *arrays: AnyArray) -> list[Array]:
+        """Compute entries of the packed result, stacked, for `grad` and `vjp`.
+
+        The numbers and their derivatives are those of a call, but JAX traces them faster: it
+        processes each operation once, not many times. There is no forward mode.
+
+        Args:
+            groups: Positions in the packed result; each group becomes one array.
+            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
+
+        Returns:
+            For each group an array with its entries along the last axis but one.
+        """
+        stacked: Any = _stacked(self, groups, self.entries(*arrays)[0])
+        return stacked
 
     def dense(self, *arrays: AnyArray) -> Any:
         """Compute the outputs in the structure of the traced function, batch axes last.
 
         Constants cost memory and time here; prefer the packed result.
         """
-        program, dtype = self.program, jnp.result_type(*arrays, float)
-        batch = program.batch_shape([np.shape(x) for x in arrays])
-        full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
-        leaves = []
-        for entries, shape in zip(program.split(full), program.output_shapes, strict=True):
-            stacked = jnp.stack(entries) if entries else jnp.zeros((0, *batch), dtype)
-            leaves.append(stacked.reshape((*shape, *batch)))
-        return jax.tree.unflatten(program.structure, leaves)
+        entries, batch = self.entries(*arrays)
+        values = self.run(entries, ELEMENTWISE)[0]
+        dtype = jnp.result_type(*arrays, float)
+        packed = [values[x] if isinstance(x, int) else x for x in self.program.outputs]
+        return self.program.unpack([jnp.asarray(x, dtype) for x in packed], batch, jnp)
 
     def run(self, entries: list[Array], operations: dict[Operation, Callable]) -> Values:
         """Compute all nodes.
@@ -185,9 +137,8 @@ class Lowered(eqx.Module):
         nodes = self.program.nodes
         dtype = entries[0].dtype if entries else jnp.result_type(float)
         source = next((x for x in entries if x.size), jnp.zeros((1,), dtype))
-        fence = self.fence
-        anchor = hidden_one(source[(0,) * source.ndim])
-        circular = _fenced(self.sine_cosine, fence)
+        anchor = hidden_one(source[(0,) * source.ndim]) if self.fence else jnp.ones((), dtype)
+        circular = _fenced(self.sine_cosine)
         pairs = {}
         angles = {n.uses[0]: None for n in nodes if n.operation in CIRCULAR}
         angles = [k for k in angles if nodes[k].operation is Operation.INPUT]
@@ -210,8 +161,8 @@ class Lowered(eqx.Module):
                 if node.operation is Operation.SELECT:
                     operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
                 value = operations[node.operation](*operands)
-                values.append(fence(value, anchor) if position in self.fenced else value)
-        return Values(values, pairs, anchor)
+                values.append(value / anchor if position in self.fenced else value)
+        return values, pairs, anchor
 
 
 def primitives(like: Array) -> dict[Operation, Callable]:
@@ -223,17 +174,13 @@ def primitives(like: Array) -> dict[Operation, Callable]:
     Args:
         like: Array of the batch's shape.
     """
-    numbers: dict[bytes, Array] = {}
+
+    @functools.cache
+    def number(text: str) -> Array:  # plus and minus zero are equal, but not their texts
+        return jax.lax.full_like(like, float(text))
 
     def whole(x: Any) -> Array:
-        """Return a number as an array, made once."""
-        if not isinstance(x, float):
-            return x
-        # Plus and minus zero are equal, but not identical.
-        bits = np.float64(x).tobytes()
-        if bits not in numbers:
-            numbers[bits] = jax.lax.full_like(like, x)
-        return numbers[bits]
+        return number(repr(x)) if isinstance(x, float) else x
 
     def on_arrays(primitive: Callable) -> Callable:
         return lambda *operands: primitive(*map(whole, operands))
@@ -247,38 +194,32 @@ def primitives(like: Array) -> dict[Operation, Callable]:
     }
 
 
+@functools.lru_cache(maxsize=64)
 def lower(
     program: Program,
-    fence: Fence | None = None,
+    fence: bool | None = None,
     sine_cosine: SineCosine = polynomial_sine_cosine,
 ) -> Lowered:
     """Prepare a program for JAX arrays.
 
     Args:
         program: Program made by `trace`.
-        fence: Fence of shared values; by default the fastest one for this backend and version of
-            JAX.
+        fence: Whether fences stand behind shared values; by default on a CPU. On a GPU they would
+            break the program into many kernels, and float64 divisions are slow.
         sine_cosine: Function from angles to their sines and cosines.
     """
     if fence is None:
-        fence = default_fence(jax.default_backend(), jax.__version_info__)
+        fence = jax.default_backend() == "cpu"
     return Lowered(program, fence, fenced_nodes(program), sine_cosine)
 
 
-def _entries(x: Array, shape: tuple[int, ...], batch: tuple[int, ...]) -> Array:
-    own = x.shape[len(shape) :]
-    size = math.prod(shape)
-    missing = (1,) * (len(batch) - len(own))
-    return jnp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch))
-
-
-def _fenced(sine_cosine: SineCosine, fence: Fence) -> Callable:
+def _fenced(sine_cosine: SineCosine) -> Callable:
     """Fence the pair, and make its derivative from the fenced values."""
 
     @jax.custom_jvp
     def circular(x: Array, anchor: Array) -> tuple[Array, Array]:
         sine, cosine = sine_cosine(x)
-        return fence(sine, anchor), fence(cosine, anchor)
+        return sine / anchor, cosine / anchor
 
     @circular.defjvp
     def _jvp(primals, tangents):
@@ -287,38 +228,6 @@ def _fenced(sine_cosine: SineCosine, fence: Fence) -> Callable:
         return (sine, cosine), (cosine * dx, -sine * dx)
 
     return circular
-
-
-class Reversible(eqx.Module):
-    """A lowered program for `grad` and `vjp`, with the same numbers and faster to trace.
-
-    JAX finds the same derivative, but processes each operation many times: where the compiled
-    result comes from a cache, that takes longer than everything else. It has no forward
-    mode: use the lowered program itself for `jvp`, `jacfwd` and `hessian`.
-
-    Attributes:
-        lowered: Program on JAX arrays.
-    """
-
-    lowered: Lowered
-
-    @property
-    def program(self) -> Program:
-        """Program that is computed."""
-        return self.lowered.program
-
-    def stacked(self, groups: Groups, *arrays: AnyArray) -> list[Array]:
-        """Compute entries of the packed result, stacked: faster to trace than one by one.
-
-        Args:
-            groups: Positions in the packed result; each group becomes one array.
-            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-
-        Returns:
-            For each group an array with its entries along the last axis but one.
-        """
-        stacked: Any = _stacked(self.lowered, groups, self.lowered.entries(*arrays))
-        return stacked
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -335,7 +244,7 @@ def _stacked_forward(
     arrays = []
     for group in groups:
         own = [lowered.program.outputs[k] for k in group]
-        rows = [values.nodes[x] if isinstance(x, int) else jax.lax.full_like(first, x) for x in own]
+        rows = [values[0][x] if isinstance(x, int) else jax.lax.full_like(first, x) for x in own]
         rows = [jax.lax.expand_dims(x, (axis,)) for x in rows]
         empty = jnp.zeros((*first.shape[:axis], 0, *first.shape[axis:]), first.dtype)
         arrays.append(jax.lax.concatenate(rows, axis) if rows else empty)
@@ -345,101 +254,53 @@ def _stacked_forward(
 def _stacked_backward(
     lowered: Lowered, groups: Groups, residuals: tuple[Values, Array], given: list[Array]
 ) -> tuple[list[Array]]:
-    values, first = residuals
+    (values, pairs, anchor), first = residuals
+    program, table = lowered.program, primitives(first)
+    multiply, negate = table[Operation.MULTIPLY], table[Operation.NEGATE]
+    sums: list[Any] = [None] * len(program.nodes)
+
+    def accumulate(x: int | float, c: Array) -> None:
+        if isinstance(x, int) and c.dtype != jax.dtypes.float0:
+            sums[x] = c if sums[x] is None else jax.lax.add(sums[x], c)
+
     axis = max(first.ndim - 1, 0)
-    each = []
     for group, stack in zip(groups, given, strict=True):
         for row, k in enumerate(group):
-            x = lowered.program.outputs[k]
-            if isinstance(x, int):
-                each.append((x, jax.lax.index_in_dim(stack, row, axis, keepdims=False)))
-    return (_pull(lowered, values, each, first),)
-
-
-_stacked.defvjp(_stacked_forward, _stacked_backward)
-
-
-def _pull(
-    lowered: Lowered, values: Values, given: Iterable[tuple[int, Array]], like: Array
-) -> list[Array]:
-    """Return cotangents of the inputs from those of some nodes.
-
-    Args:
-        lowered: Program on JAX arrays.
-        values: Values of the program.
-        given: Positions of nodes with their cotangents.
-        like: Array of the batch's shape.
-    """
-    nodes = lowered.program.nodes
-    sums: list[Array | None] = [None] * len(nodes)
-    table = primitives(like)
-    multiply, negate = table[Operation.MULTIPLY], table[Operation.NEGATE]
-
-    def value(x: Reference) -> Array | float:
-        return values.nodes[x] if isinstance(x, int) else x
-
-    def accumulate(x: Reference, c: Array) -> None:
-        if isinstance(x, int):
-            old = sums[x]
-            sums[x] = c if old is None else jax.lax.add(old, c)
-
-    for k, c in given:
-        accumulate(k, c)
-    for position in reversed(range(len(nodes))):
-        node, c = nodes[position], sums[position]
-        if c is None or node.operation is Operation.INPUT:
+            accumulate(program.outputs[k], jax.lax.index_in_dim(stack, row, axis, keepdims=False))
+    zero = jax.lax.full_like(first, 0)
+    inputs = [[zero] * math.prod(shape) for shape in program.input_shapes]
+    for position, node in reversed(list(enumerate(program.nodes))):
+        c, operation = sums[position], node.operation
+        if c is None:
             continue
-        operands = node.operands
-        if node.operation in CIRCULAR:
+        if operation is Operation.INPUT:
+            number, entry = node.place
+            inputs[number][entry] = c
+            continue
+        if operation in CIRCULAR:
             (angle,) = node.uses
-            sine, cosine = values.pairs[angle]
-            is_sine = node.operation is Operation.SINE
+            sine, cosine = pairs[angle]
+            is_sine = operation is Operation.SINE
             accumulate(angle, multiply(c, cosine) if is_sine else negate(multiply(c, sine)))
             continue
         if position in lowered.fenced:
-            c = lowered.fence(c, values.anchor)
-        if node.operation is Operation.ADD:
-            accumulate(operands[0], c)
-            accumulate(operands[1], c)
-        elif node.operation is Operation.SUBTRACT:
-            accumulate(operands[0], c)
-            if isinstance(operands[1], int):
-                accumulate(operands[1], negate(c))
-        elif node.operation is Operation.NEGATE:
-            accumulate(operands[0], negate(c))
-        elif node.operation is Operation.MULTIPLY:
-            for own, other in (operands, operands[::-1]):
-                if isinstance(own, int):
-                    accumulate(own, multiply(c, value(other)))
+            c = c / anchor
+        operands = [values[x] if isinstance(x, int) else x for x in node.operands]
+        if operation is Operation.ADD:
+            pulled = [c, c]
+        elif operation is Operation.SUBTRACT:
+            pulled = [c, negate(c)]
+        elif operation is Operation.NEGATE:
+            pulled = [negate(c)]
+        elif operation is Operation.MULTIPLY:
+            pulled = [multiply(c, x) for x in reversed(operands)]
         else:
-            for own, cotangent in _operand_cotangents(node, [value(x) for x in operands], c):
-                accumulate(own, cotangent)
-    return _input_cotangents(lowered.program, jax.lax.full_like(like, 0), sums)
+            real = [jnp.asarray(x, c.dtype) if isinstance(x, float) else x for x in operands]
+            pulled = jax.vjp(ELEMENTWISE[operation], *real)[1](c)
+        for x, own in zip(node.operands, pulled, strict=True):
+            accumulate(x, own)
+    empty = jnp.zeros((0, *zero.shape), zero.dtype)
+    return ([jnp.stack(own) if own else empty for own in inputs],)
 
 
-def _operand_cotangents(node: Node, operands: list[Any], c: Array) -> list[tuple[int, Array]]:
-    """Return the cotangents of an operation's operands by JAX's own rule."""
-    places = [
-        k
-        for k, x in enumerate(operands)
-        if isinstance(node.operands[k], int) and jnp.issubdtype(x.dtype, jnp.floating)
-    ]
-
-    def apply(*differentiated: Array) -> Array:
-        full = list(operands)
-        for k, x in zip(places, differentiated, strict=True):
-            full[k] = x
-        return ELEMENTWISE[node.operation](*full)
-
-    _, pull = jax.vjp(apply, *(operands[k] for k in places))
-    return [(int(node.operands[k]), x) for k, x in zip(places, pull(c), strict=True)]
-
-
-def _input_cotangents(program: Program, zero: Array, sums: list[Array | None]) -> list[Array]:
-    """Return cotangents of the inputs, entries first."""
-    rows = [[zero] * math.prod(shape) for shape in program.input_shapes]
-    for node, c in zip(program.nodes, sums, strict=True):
-        if node.operation is Operation.INPUT and c is not None:
-            number, entry = node.place
-            rows[number][entry] = c
-    return [jnp.stack(own) if own else jnp.zeros((0, *zero.shape), zero.dtype) for own in rows]
+_stacked.defvjp(_stacked_forward, _stacked_backward)

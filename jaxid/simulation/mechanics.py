@@ -176,20 +176,15 @@ class SimulatedPlant:
         theta = q + np.asarray(drives.gear.twist(M @ qdd + entries[n * n :]))
         z = np.asarray(drives.friction.settled(qd))
         halfway = q + 0.5 * dt * qd, qd + 0.5 * dt * qdd
-        self._set(np.concatenate([q, qd, qdd, theta, qd, qdd, z, *halfway]).tolist())
-
-    def _set(self, state: Sequence[float]) -> None:
-        n = self._joints
-        self._state, self._q, self._qd = (
-            list(state[a * n : b * n]) for a, b in ((0, 7), (7, 8), (8, 9))
-        )
+        self._state = np.concatenate([q, qd, qdd, theta, qd, qdd, z, *halfway]).tolist()
 
     def step(self, u: Sequence[float]) -> None:
         """Move on by one step with constant torques of the drives [N m or N]."""
-        bodies = self._bodies(self._p, self._q, self._qd)
-        self._set(self._advance(bodies, self._state, u))
+        n, state = self._joints, self._state
+        bodies = self._bodies(self._p, state[7 * n : 8 * n], state[8 * n :])
+        self._state = self._advance(bodies, state[: 7 * n], u)
 
-    def read(self) -> tuple[list[float], list[float]]:
+    def read(self) -> tuple[Sequence[float], Sequence[float]]:
         """Return angles of the motors; positions, velocities, accelerations of the joints."""
         n = self._joints
         return self._state[3 * n : 4 * n], self._state[: 3 * n]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+from jaxid.export.feed_forward import body_parameters
 from jaxid.export.simulators import mjcf_text
 from jaxid.simulation.virtual import VirtualRobot
 
@@ -38,7 +39,7 @@ class MujocoRobot(VirtualRobot):
         library, friction = _mujoco(), self.present_friction
         text = mjcf_text(
             self.robot,
-            self._all_bodies(),
+            self._bodies_with_tool(),
             {
                 "armature": self.rotors,
                 "damping": np.asarray(friction.viscous),
@@ -52,20 +53,14 @@ class MujocoRobot(VirtualRobot):
         model.opt.disableflags |= library.mjtDisableBit.mjDSBL_LIMIT
         return MujocoPlant(model, self.robot.joint_names)
 
-    def _all_bodies(self) -> Float[np.ndarray, "joints 10"]:
+    def _bodies_with_tool(self) -> Float[np.ndarray, "joints 10"]:
         """Return ten parameters of each body, with a known tool."""
-        robot = self.robot
-        parts = zip(self.terms, self.bodies.split(self.values), strict=True)
-        (first, own), *others = [(term, np.asarray(p)) for term, p in parts]
-        known = all(term.drive_matrices(robot)[0].any() or not p.any() for term, p in others)
-        size = first.body_parameters
-        if not (size and known):
-            raise InputError(
-                "MuJoCo needs `terms` that begin with `RigidBodies`; beside them it knows only "
-                "rotors."
-            )
-        bodies = np.zeros((robot.joints, 10))
-        bodies[:, :size] = own.reshape(-1, size)
+        robot, model = self.robot, self.bodies
+        for term, p in zip(self.terms, model.split(self.values), strict=True):
+            known = term.body_parameters or term.drive_matrices(robot)[0].any()
+            if not known and np.any(p):
+                raise InputError("MuJoCo knows only bodies and rotors: leave out other `terms`.")
+        bodies = body_parameters(model, self.values)
         if robot.tool is not None:
             bodies[robot.tool.body] += np.asarray(robot.tool.parameters)
         return bodies

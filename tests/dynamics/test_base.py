@@ -1,5 +1,7 @@
 """Base parameters: published counts, Eq. 24, the laws they obey, doubts that are reported."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +32,11 @@ def paper_robot(elbow: float = 0.05) -> Robot:
     offset = np.array(robot.offset)
     offset[3, 2] = elbow
     return robot.replace(offset=offset)
+
+
+@functools.cache
+def paper(bodies: RigidBodies) -> BaseParameters:
+    return base_parameters(Model(paper_robot(), (bodies, *DRIVES)))
 
 
 def terms_in(base: BaseParameters, row: int) -> dict[str, float]:
@@ -64,7 +71,7 @@ def test_published_counts(robot, terms, standard, base):
 
 
 def test_the_papers_own_numbering_and_equation_24():
-    base = base_parameters(Model(paper_robot(), (SEVEN, *DRIVES)))
+    base = paper(SEVEN)
     expected = {"m1": 1.0, "m2": 1.0, "m3": 1.0, "mz4": -1.0 / 0.05, "Ia1": 1.0}
     assert terms_in(base, 0) == pytest.approx(expected, rel=1e-10)
     assert terms_in(base, 1) == pytest.approx({"mx2": 1.0, "m3": 0.05, "mz4": -1.0}, rel=1e-10)
@@ -78,27 +85,26 @@ def test_the_papers_own_numbering_and_equation_24():
 
 
 def test_with_all_ten_parameters_the_rail_carries_all_masses():
-    base = base_parameters(Model(paper_robot(), (TEN, *DRIVES)))
+    base = paper(TEN)
     masses = {f"m{i}": 1.0 for i in range(1, 8)}
     assert terms_in(base, 0) == pytest.approx(masses | {"Ia1": 1.0}, rel=1e-12)
 
 
 @pytest.mark.parametrize("bodies", [SEVEN, TEN])
 def test_the_same_columns_for_every_seed(bodies):
-    model = Model(paper_robot(), (bodies, *DRIVES))
-    first = base_parameters(model)
-    for seed in range(1, 20):
-        other = base_parameters(model, seed=seed)
+    first = paper(bodies)
+    for seed in range(1, 6):
+        other = base_parameters(first.model, seed=seed)
         assert other.indices == first.indices
         np.testing.assert_allclose(other.kappa, first.kappa, atol=1e-11 * 20)
 
 
-@pytest.mark.parametrize("elbow", [1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("elbow", [1e-3, 1e-5])
 @pytest.mark.parametrize(("bodies", "size"), [(SEVEN, 44), (TEN, 57)])
 def test_a_nearly_degenerate_elbow_is_told_apart(elbow, bodies, size):
     base = base_parameters(Model(paper_robot(elbow), (bodies, *DRIVES)))
     assert base.size == size
-    assert base.indices == base_parameters(Model(paper_robot(), (bodies, *DRIVES))).indices
+    assert base.indices == paper(bodies).indices
     assert not any("disagree" in note for note in base.notes)
     assert base.largest_dependent < 1e-9
 
@@ -131,16 +137,16 @@ def test_rounded_quarter_turns_are_reported():
 
 
 MODELS = {
-    "paper": lambda: Model(paper_robot(), (SEVEN, *DRIVES)),
+    "paper": lambda: paper(SEVEN).model,
     "tree": lambda: Model(mixed_tree().robot(), (TEN, *DRIVES, ConstantOffset())),
     "coupled": lambda: Model(library.tx40(), (TEN, *DRIVES, CoupledDrives())),
     **{f"random{s}": lambda s=s: Model(random_tree(s, 5).robot(), (TEN, *DRIVES)) for s in (1, 4)},
 }
 
 
-@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
-def test_base_columns_reproduce_the_whole_regressor(make):
-    base = base_parameters(make())
+@pytest.mark.parametrize("name", MODELS)
+def test_base_parameters_give_the_forces_and_mass_matrix_of_the_standard_ones(name):
+    base = base_parameters(MODELS[name]())
     motion = random_motion(base.model.robot.joints, seed=77)
     full = np.asarray(base.model.regressor(motion))
     together = np.zeros((base.size, base.model.size))
@@ -149,19 +155,11 @@ def test_base_columns_reproduce_the_whole_regressor(make):
     again = np.asarray(base.regressor(motion)) @ together
     columns = np.abs(full).max(axis=(0, 1))
     assert (np.abs(again - full).max(axis=(0, 1)) <= 1e-12 * np.maximum(columns, 1.0)).all()
-
-
-@pytest.mark.parametrize("make", MODELS.values(), ids=MODELS.keys())
-def test_forces_and_mass_matrix_are_those_of_the_standard_parameters(make):
-    base = base_parameters(make())
-    rng = np.random.default_rng(3)
-    p = rng.normal(size=base.model.size)
-    motion = random_motion(base.model.robot.joints, seed=4, samples=6)
+    p = np.random.default_rng(3).normal(size=base.model.size)
     p_base = base.from_standard(p)
     forces = base.model.inverse_dynamics(jnp.asarray(p), motion)
     scale = float(jnp.abs(forces).max()) * float(1.0 + np.abs(base.kappa).max(initial=0.0))
     np.testing.assert_allclose(base.inverse_dynamics(p_base, motion), forces, atol=1e-12 * scale)
-    np.testing.assert_allclose(base.regressor(motion) @ p_base, forces, atol=1e-12 * scale)
     M = base.model.mass_matrix(jnp.asarray(p), motion.q)
     np.testing.assert_allclose(base.mass_matrix(p_base, motion.q), M, atol=1e-12 * scale)
 
@@ -172,7 +170,7 @@ def test_standard_parameters_and_back():
     np.testing.assert_array_equal(base.from_standard(base.to_standard(x)), x)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_both_methods_agree_with_lapack_on_random_trees(seed):
     bodies = SEVEN if seed % 2 else TEN
     model = Model(random_tree(seed, 2 + seed % 4).robot(), (bodies, *DRIVES, ConstantOffset()))
@@ -217,10 +215,9 @@ def test_identifiability_of_a_planar_arm():
 
 
 def test_rank_decisions_do_not_depend_on_jaxs_precision():
-    model = Model(paper_robot(), (SEVEN, *DRIVES))
-    double = base_parameters(model)
+    double = paper(SEVEN)
     with jax.enable_x64(False):
-        single = base_parameters(model)
+        single = base_parameters(double.model)
         expressions = single.expressions
     assert single.indices == double.indices
     np.testing.assert_array_equal(single.kappa, double.kappa)

@@ -26,7 +26,6 @@ METHODS = {
     "model.regressor": (MODEL.regressor, (MOTION,)),
     "model.inverse_dynamics": (MODEL.inverse_dynamics, (P, MOTION)),
     "model.mass_matrix": (MODEL.mass_matrix, (P, Q)),
-    "model.bias_forces": (MODEL.bias_forces, (P, Q, QD)),
     "model.kinetic_energy": (MODEL.kinetic_energy, (P, Q, QD)),
     "model.potential_energy": (MODEL.potential_energy, (P, Q)),
     "model.tool_forces": (MODEL.tool_forces, (MOTION,)),

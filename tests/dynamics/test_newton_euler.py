@@ -82,11 +82,6 @@ def test_tool_forces_are_newton_euler_of_the_tool(point_mass):
     np.testing.assert_array_equal(found[:, 3:], 0.0)
 
 
-def test_no_tool_adds_nothing():
-    motion = Motion(*np.ones((3, SAMPLES, TREE.joints)))
-    np.testing.assert_array_equal(Model(TREE.robot()).tool_forces(motion), 0.0)
-
-
 def test_known_tool_is_apart_from_the_models_own_forces(forces):
     rng = np.random.default_rng(5)
     motion = Motion(*trees.random_motion(rng, SAMPLES, TREE.joints))

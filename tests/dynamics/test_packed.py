@@ -22,28 +22,19 @@ def random_motion(model, samples):
     return jid.Motion(*x)
 
 
-@pytest.mark.parametrize("samples", [1, 30, FEW + 3])
+@pytest.mark.parametrize("samples", [1, FEW + 3])
 @pytest.mark.parametrize("in_jax", [False, True])
-def test_operators_are_those_of_the_dense_matrix(model, samples, in_jax):
+def test_the_matrix_is_the_dense_one(model, samples, in_jax):
     base = jid.base_parameters(model)
     motion = random_motion(model, samples)
     if in_jax:
         motion = jax.tree.map(jnp.asarray, motion)
     for owner in (model, base):
-        packed = owner.packed_regressor(motion)
         theta = np.asarray(owner.regressor(motion))
+        matrix = owner.packed_regressor(motion).matrix()
         stacked = theta.swapaxes(0, 1).reshape(-1, owner.size)
-        random = np.random.default_rng(1)
-        w = random.uniform(0.5, 2, model.robot.joints)
-        weighted = (theta * w[:, None]).reshape(-1, owner.size)
-        information = weighted.T @ weighted
-        assert packed.shape == stacked.shape == packed.matrix().shape
-        assert packed.matrix().flags.f_contiguous
-        np.testing.assert_allclose(packed.matrix(), stacked, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(packed.gram(w), information, atol=1e-9 * samples)
-        R = packed.factor(w)
-        assert np.array_equal(R, np.triu(R))
-        np.testing.assert_allclose(R.T @ R, information, atol=1e-9 * samples)
+        assert matrix.flags.f_contiguous
+        np.testing.assert_allclose(matrix, stacked, rtol=0, atol=1e-13)
 
 
 def test_constant_entries_are_kept_and_zeros_are_not_stored(model):
@@ -58,16 +49,20 @@ def test_constant_entries_are_kept_and_zeros_are_not_stored(model):
 
 def test_goes_through_jit_and_gradients(model):
     motion = jax.tree.map(jnp.asarray, random_motion(model, 20))
+    places = enumerate(model.packed_regressor(motion).places)
+    own = {x: (j, k) for j, row in places for k, x in row if isinstance(x, int)}
 
-    def log_det(q):
-        packed = model.packed_regressor(jid.Motion(q, motion.qd, motion.qdd))
-        return jnp.linalg.slogdet(packed.gram() + jnp.eye(model.size))[1]
+    def packed(q):
+        return model.packed_regressor(jid.Motion(q, motion.qd, motion.qdd)).values
 
     def dense(q):
-        theta = model.regressor(jid.Motion(q, motion.qd, motion.qdd)).reshape(-1, model.size)
-        return jnp.linalg.slogdet(theta.T @ theta + jnp.eye(model.size))[1]
+        theta = model.regressor(jid.Motion(q, motion.qd, motion.qdd))
+        return [theta[:, j, k] for _, (j, k) in sorted(own.items())]
 
-    np.testing.assert_allclose(jax.jit(jax.grad(log_det))(motion.q), jax.grad(dense)(motion.q))
+    def slope(entries):
+        return jax.grad(lambda q: sum(jnp.sum(jnp.cos(x)) for x in entries(q)))
+
+    np.testing.assert_allclose(jax.jit(slope(packed))(motion.q), slope(dense)(motion.q))
 
 
 def test_refuses_batches_and_traced_geometry(model):
@@ -77,7 +72,7 @@ def test_refuses_batches_and_traced_geometry(model):
 
     @eqx.filter_jit
     def traced(model):
-        return model.packed_regressor(motion).gram()
+        return model.packed_regressor(motion).values
 
     with pytest.raises(ValueError, match="geometry is known"):
         traced(jax.tree.map(jnp.asarray, model))

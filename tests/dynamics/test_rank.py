@@ -47,7 +47,7 @@ def test_columns_that_raise_the_rank_are_chosen(method, seed, columns, share):
 def test_kappa_explains_dependent_columns_by_earlier_ones(method):
     W = with_dependent_columns(5, 40, 14, 8)
     found = method(W)
-    kappa, left = regrouping(W, found)
+    kappa, left, _ = regrouping(W, found.independent, found.dependent)
     first, second = np.array(found.independent), np.array(found.dependent)
     assert left < 1e-13
     np.testing.assert_allclose(W[:, first] @ kappa, W[:, second], atol=1e-12)
@@ -67,7 +67,7 @@ def test_a_column_of_rounding_counts_as_zero(method):
     noisy = np.insert(W, 4, 1e-16 * np.random.default_rng(1).normal(size=40), axis=1)
     found = method(noisy)
     assert found.dependent == (4,)
-    kappa, _ = regrouping(noisy, found)
+    kappa, _, _ = regrouping(noisy, found.independent, found.dependent)
     assert not kappa.any()
 
 

@@ -80,10 +80,3 @@ def test_regressor_of_a_real_robot(file, tip, joints):
     assert trees.relative(found, np.array(regressors)) < 1e-12
     if tip is None:
         assert trees.relative(found @ p, np.array(forces)) < 1e-12
-
-
-def test_the_list_has_arms_a_rail_and_a_humanoid():
-    assert len(ARMS) + len(TREES) >= 8
-    tiago = load_urdf(ROBOTS / TREES[0][0])
-    assert tiago.revolute.count(False) == 1
-    assert len(set(load_urdf(ROBOTS / TREES[2][0]).parent)) < 29

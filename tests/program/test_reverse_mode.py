@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given, settings
 from sample_functions import SIZE, chain, random_functions, samples
 
-from jaxid.program import Fence, Reversible, lower, trace
-
-FENCES = tuple(Fence)
+from jaxid.program import lower, trace
 
 
 def assert_reverse_mode(lowered, *x, groups=None, tolerance=1e-12):
@@ -31,25 +29,23 @@ def assert_reverse_mode(lowered, *x, groups=None, tolerance=1e-12):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
         assert (a.dtype, a.shape) == (b.dtype, b.shape)
 
-    reverse = Reversible(lowered)
-    found = jax.jit(lambda *x: derivative(lambda *y: reverse.stacked(groups, *y), *x))(*x)
+    found = jax.jit(lambda *x: derivative(lambda *y: lowered.stacked(groups, *y), *x))(*x)
     jax.tree.map(close, found, jax.jit(lambda *x: derivative(one_by_one, *x))(*x))
 
 
 @given(random_functions(smooth=True))
-@settings(max_examples=5, deadline=None, derandomize=True)
+@settings(max_examples=3, deadline=None, derandomize=True)
 def test_the_same_as_jax_finds(function):
     lowered = lower(trace(function, (SIZE,), (SIZE,)))
     assert_reverse_mode(lowered, *samples(1, (4,)), tolerance=1e-10)
 
 
-@pytest.mark.parametrize("fence", FENCES, ids=lambda f: f.value)
-def test_behind_each_fence_and_under_vmap(fence):
-    lowered = lower(trace(chain, (3,), (3,)), fence)
+def test_under_vmap():
+    lowered = lower(trace(chain, (3,), (3,)))
     x = [jnp.asarray(a) for a in samples(2, (2, 6))]
     assert_reverse_mode(lowered, *(a[:, 0] for a in x))
     groups = (tuple(range(9)),)
-    pulled = jax.jit(jax.grad(lambda *a: jnp.sum(Reversible(lowered).stacked(groups, *a)[0] ** 3)))
+    pulled = jax.jit(jax.grad(lambda *a: jnp.sum(lowered.stacked(groups, *a)[0] ** 3)))
     mapped = jax.vmap(pulled, in_axes=1, out_axes=1)(*x)
     np.testing.assert_allclose(mapped[:, 1], pulled(*(a[:, 1] for a in x)), rtol=1e-12)
 

@@ -21,5 +21,4 @@ from .term import (
     NonlinearParameter as NonlinearParameter,
     RigidBodies as RigidBodies,
     RotorInertia as RotorInertia,
-    each_joint as each_joint,
 )

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, matching, one_or_each
 from jaxid.dynamics import projection
-from jaxid.dynamics.terms.term import AbstractTerm, NonlinearParameter, each_joint
+from jaxid.dynamics.terms.term import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
@@ -120,13 +120,10 @@ class AbstractDryFriction(AbstractTerm):
 
 
 class ViscousFriction(AbstractTerm):
-    r"""Friction that grows with speed, $\mathrm{diag}\{\dot q_i\}$ (Eq. 13)."""
+    r"""Friction `fv1`, … that grows with speed, $\mathrm{diag}\{\dot q_i\}$ (Eq. 13)."""
 
+    symbols = (("fv", "N m s", "N s/m"),)
     roles = ("viscous",)
-
-    def parameters(self, robot):
-        """Return `fv1`, … [N m s/rad or N s/m]."""
-        return each_joint(robot, "fv", "N m s", "N s/m")
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of speeds."""
@@ -136,17 +133,12 @@ class ViscousFriction(AbstractTerm):
 class AsymmetricViscousFriction(AbstractTerm):
     """Friction that grows with speed, at one rate for each direction of motion.
 
-    It takes the place of `ViscousFriction`.
+    It takes the place of `ViscousFriction`. Its parameters are `fvp1`, … for positive, then `fvn1`,
+    … for negative speeds [N m s or N s/m].
     """
 
+    symbols = (("fvp", "N m s", "N s/m"), ("fvn", "N m s", "N s/m"))
     roles = ("viscous", "viscous")
-
-    def parameters(self, robot):
-        """Return `fvp1`, … for positive, then `fvn1`, … for negative speeds [N m s or N s/m]."""
-        return (
-            *each_joint(robot, "fvp", "N m s", "N s/m"),
-            *each_joint(robot, "fvn", "N m s", "N s/m"),
-        )
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrices of speeds in either direction."""
@@ -155,18 +147,15 @@ class AsymmetricViscousFriction(AbstractTerm):
 
 
 class CoulombFriction(AbstractDryFriction):
-    r"""Dry friction, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14).
+    r"""Dry friction `fc1`, …, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14).
 
     Attributes:
         transition: Transition from one direction of motion to the other.
     """
 
     transition: AbstractTransition = Tanh()
+    symbols = (("fc", "N m", "N"),)
     roles = ("dry",)
-
-    def parameters(self, robot):
-        """Return `fc1`, … [N m or N]."""
-        return each_joint(robot, "fc", "N m", "N")
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of smooth signs."""
@@ -177,18 +166,16 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
     """Dry friction with one level for each direction of motion.
 
     It takes the place of `CoulombFriction` together with `ConstantOffset`, whose columns its own
-    columns span.
+    columns span. Its parameters are `fcp1`, … for positive, then `fcn1`, … for negative speeds
+    [N m or N].
 
     Attributes:
         transition: Transition from one direction of motion to the other.
     """
 
     transition: AbstractTransition = Tanh()
+    symbols = (("fcp", "N m", "N"), ("fcn", "N m", "N"))
     roles = ("dry", "dry")
-
-    def parameters(self, robot):
-        """Return `fcp1`, … for positive, then `fcn1`, … for negative speeds [N m or N]."""
-        return (*each_joint(robot, "fcp", "N m", "N"), *each_joint(robot, "fcn", "N m", "N"))
 
     def columns(self, robot, q, qd, qdd):
         """Return the fractions of the two directions."""
@@ -204,7 +191,8 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
 class StribeckFriction(AbstractDryFriction):
     r"""Dry friction that falls from a static level to Coulomb's as a joint gets moving.
 
-    $(f_c + f_s e^{-|\dot q / v_s|^\delta}) \tanh(\dot q / \epsilon)$ with $f_c$ and $f_s$ unknown.
+    $(f_c + f_s e^{-|\dot q / v_s|^\delta}) \tanh(\dot q / \epsilon)$ with $f_c$ and $f_s$ unknown:
+    `fc1`, … at speed, then `fs1`, … that is added near standstill [N m or N].
     It takes the place of `CoulombFriction`. (Armstrong-Hélouvry, Dupont and Canudas de Wit, 1994.)
 
     Attributes:
@@ -216,11 +204,8 @@ class StribeckFriction(AbstractDryFriction):
     speed: EachJoint = eqx.field(converter=one_or_each, default=0.1)
     exponent: EachJoint = eqx.field(converter=one_or_each, default=2.0)
     transition: AbstractTransition = Tanh()
+    symbols = (("fc", "N m", "N"), ("fs", "N m", "N"))
     roles = ("dry", None)
-
-    def parameters(self, robot):
-        """Return `fc1`, … at speed, then `fs1`, … that is added near standstill [N m or N]."""
-        return (*each_joint(robot, "fc", "N m", "N"), *each_joint(robot, "fs", "N m", "N"))
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrices of smooth signs, and of those that fade with speed."""
@@ -256,6 +241,7 @@ class LoadFriction(AbstractDryFriction):
 
     bodies: Float[AnyArray, "..."]
     transition: AbstractTransition = Tanh()
+    symbols = (("fl", "1", "1"),)
     roles = ("load",)
 
     def parameters(self, robot):
@@ -265,7 +251,7 @@ class LoadFriction(AbstractDryFriction):
             InputError: If `bodies` holds fewer than ten numbers for each body.
         """
         self._bodies(robot)
-        return each_joint(robot, "fl", "1", "1")
+        return super().parameters(robot)
 
     def _bodies(self, robot: Robot) -> AnyArray:
         size = robot.joints * len(INERTIAL_NAMES)

@@ -47,20 +47,27 @@ class NonlinearParameter(NamedTuple):
 class AbstractTerm(eqx.Module):
     """One effect in the equations of motion that is linear in unknown parameters.
 
-    A new effect is one class with two methods; regressor, inverse dynamics, mass matrix, base
-    parameters and compiled forms follow from them.
+    A new effect is one class with `columns`, and with `symbols` or the method `parameters`;
+    regressor, inverse dynamics, mass matrix, base parameters and compiled forms follow from them.
 
     Attributes:
+        symbols: For each block of parameters with one for each joint the name without the joint's
+            number, and the units for a revolute and a prismatic joint.
         roles: Physical role of each block of parameters, if the term has one or more blocks with
             one parameter for each joint: rotor inertia, viscous or dry friction, or friction by
             load. Parameters with a role cannot be negative.
     """
 
+    symbols: ClassVar[tuple[tuple[str, str, str], ...]] = ()
     roles: ClassVar[tuple[Role, ...]] = ()
 
-    @abstractmethod
     def parameters(self, robot: Robot) -> tuple[tuple[str, str], ...]:
         """Return name and unit of each parameter, in the order of the columns."""
+        return tuple(
+            (f"{name}{i + 1}", turning if revolute else sliding)
+            for name, turning, sliding in self.symbols
+            for i, revolute in enumerate(robot.revolute)
+        )
 
     @abstractmethod
     def columns(
@@ -129,11 +136,6 @@ class AbstractTerm(eqx.Module):
         return matrices
 
 
-def each_joint(robot: Robot, name: str, unit_r: str, unit_p: str) -> tuple[tuple[str, str], ...]:
-    """Return one parameter for each joint, with the unit of a revolute or a prismatic one."""
-    return tuple((f"{name}{i + 1}", unit_r if r else unit_p) for i, r in enumerate(robot.revolute))
-
-
 class RigidBodies(AbstractTerm):
     r"""Inertia and gravity of the bodies by the Projection Equation (Eqs. 1-12).
 
@@ -184,13 +186,10 @@ class RigidBodies(AbstractTerm):
 
 
 class RotorInertia(AbstractTerm):
-    r"""Inertia of the motors' rotors, felt through the gear: $i_{Gk}^2 C_{M,k}$ (Eq. 17)."""
+    r"""Inertia `Ia1`, … of the motors' rotors through the gear: $i_{Gk}^2 C_{M,k}$ (Eq. 17)."""
 
+    symbols = (("Ia", "kg m²", "kg"),)
     roles = ("inertia",)
-
-    def parameters(self, robot):
-        """Return `Ia1`, … [kg m² or kg]."""
-        return each_joint(robot, "Ia", "kg m²", "kg")
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of accelerations."""
@@ -198,11 +197,9 @@ class RotorInertia(AbstractTerm):
 
 
 class ConstantOffset(AbstractTerm):
-    """A constant force at each joint: a torque sensor's or current's offset, or uneven friction."""
+    """A constant force `fo1`, … at each joint: a sensor's offset, or uneven friction."""
 
-    def parameters(self, robot):
-        """Return `fo1`, … [N m or N]."""
-        return each_joint(robot, "fo", "N m", "N")
+    symbols = (("fo", "N m", "N"),)
 
     def columns(self, robot, q, qd, qdd):
         """Return the identity."""
@@ -212,15 +209,14 @@ class ConstantOffset(AbstractTerm):
 class LinearSpring(AbstractTerm):
     """A spring at each joint that pulls it to a rest position, such as a counterbalance.
 
+    Its parameters are the stiffnesses `ks1`, … [N m/rad or N/m].
+
     Attributes:
         rest: Position without force [rad or m]; an unknown one appears as a `ConstantOffset`.
     """
 
     rest: float | Float[AnyArray, " joints"] = eqx.field(converter=one_or_each, default=0.0)
-
-    def parameters(self, robot):
-        """Return `ks1`, … [N m/rad or N/m]."""
-        return each_joint(robot, "ks", "N m/rad", "N/m")
+    symbols = (("ks", "N m/rad", "N/m"),)
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of deflections."""
