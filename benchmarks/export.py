@@ -117,7 +117,7 @@ def projected_mass_matrix(model, p, q):
     rest = jnp.zeros_like(q)
     F = jax.jacfwd(partial_velocities(model.robot, q, rest, rest))(rest)
     total = jnp.zeros((len(q), len(q)))
-    for term, own in zip(model.terms, model.split(p), strict=True):
+    for term, own in model.split(p):
         if not term.body_parameters:
             total = total + term.mass_matrix(model.robot, own, q)
     for f, (m, x, y, z, A, B, C, D, E, G) in zip(

@@ -53,9 +53,8 @@ def remarks(study: Study) -> list[Remark]:
             f"The identified model predicts the torques of every axis to {worst[0]:.2g} % of the "
             f"largest torque, and to {worst[1]:.2g} % on an unseen path.",
             Status.GOOD if max(worst) < 1.0 else Status.DOUBTFUL,
-            f"Mean error of the worst axis; the paper states below 1 %. {true[0]:.2g} % and "
-            f"{true[1]:.2g} % by the true parameters: stiction, Stribeck friction, ripple and "
-            "noise are not in the model.",
+            "Mean error of the worst axis; below 1 % in the paper. The true parameters leave "
+            f"{true[0]:.2g} % and {true[1]:.2g} %.",
         ),
         Remark(
             f"Without weights the last axis errs by {plain:.2g} %, with weights by {weighted:.2g} "
@@ -98,9 +97,9 @@ def paper_table(study: Study) -> Table:
     ]
     for k in COLD:
         for state, paper, fit in (("cold", COLD, study.weighted.fit), ("warm", WARM, study.warm)):
-            pair = with_deviation(fit.parameters[k - 1], fit.standard_deviations[k - 1])
+            own = (fit.parameters[k - 1], fit.standard_deviations[k - 1])
             name = f"p_B({k}), {state} [{base.units[k - 1]}]"
-            rows.append((name, f"{paper[k]:.2f}", " ± ".join(pair)))
+            rows.append((name, f"{paper[k]:.2f}", " ± ".join(with_deviation(*map(float, own)))))
     title = f"the paper, and the results on the virtual {base.model.robot.name}"
     names = ("quantity", "paper", "here")
     return Table(title, *map(Column, names, zip(*rows, strict=True)))
@@ -143,8 +142,8 @@ def demo_page(study: Study) -> str:
         "assumed: the other parameters of bodies, rotors and friction, and all disturbances",
     )
     warming = (
-        "Two identifications of the same motion. Inertial parameters stay, friction falls as the "
-        "lubricant warms; a parameter has changed if its difference is more than chance."
+        "Inertial parameters stay, friction falls as the lubricant warms. A parameter has changed "
+        "if its difference is more than chance."
     )
     every, changes = "All base parameters, cold and warm", jid.plot.comparison(study.temperature)
     used = ", ".join(f"{name} {number}" for name, number in versions().items())
@@ -170,9 +169,8 @@ def _excitation(study: Study) -> Section:
     times = np.linspace(0.0, float(series.duration), POINTS)
     motion = series.motion(times)
     return "Base parameters, and the motion that excites them", [
-        "Seven bodies with seven parameters each, viscous and Coulomb friction and rotors make "
-        f"{base.model.size} columns. The QR decomposition without pivoting leaves {base.size} of "
-        "them; the first two are those that the paper prints in Eq. 24.",
+        f"Of {base.model.size} columns the QR decomposition without pivoting leaves {base.size}; "
+        "the first two are those of Eq. 24.",
         folded(f"All {base.size} base parameters, weighted", parameter_table(study.weighted.fit)),
         f"The motion is a Fourier series of {settings.HARMONICS} harmonics at {settings.OMEGA:g} "
         "rad/s within all limits and clear of collisions. As in the paper, it has the least "
@@ -180,8 +178,8 @@ def _excitation(study: Study) -> Section:
         *([side_by_side_table(study.plans)] if study.plans else []),
         picture(
             jid.plot.path(robot, motion, times),
-            "Fig. 3: path of the end-effector along the designed motion. The paper states up to "
-            f"2.7 m/s and 11.3 m/s²; here {speed:.3g} m/s and {acceleration:.3g} m/s².",
+            "Fig. 3: path of the end-effector along the designed motion, up to "
+            f"{speed:.3g} m/s and {acceleration:.3g} m/s² (in the paper 2.7 m/s and 11.3 m/s²).",
         ),
         picture(jid.plot.joints(robot, robot.limits, times, motion), "Fig. 4: one period of it."),
     ]
@@ -195,19 +193,16 @@ def _identification(study: Study) -> Section:
     desired, filtered = study.played.motion(time[shown]), observations.motion[shown]
     plain, weighted = (m.validation.errors[0] for m in (study.unweighted, study.weighted))
     return "Identification with and without weights", [
-        "The virtual robot follows the motion by its servo at 1000 Hz, cold and warm. Logs hold "
-        "angles of 17-bit encoders and motor torques with 1 % of noise, disturbed by ripple, "
-        "stiction and Stribeck friction, which the model does not have. "
+        "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of 17-bit "
+        "encoders and torques with 1 % of noise, ripple, stiction and Stribeck friction. "
         f"Filter (Eq. 25): {observations.filter}; {observations.rows} rows of each joint.",
         picture(
             jid.plot.filtered(robot, time[shown], desired, filtered, 2),
-            "Fig. 5: desired velocity and acceleration, and those that the filter makes of the "
-            "measured angles.",
+            "Fig. 5: desired velocity and acceleration, and those of the filtered angles.",
         ),
         picture(
             jid.plot.torques(plain, robot, "identified without weights", SHOWN),
-            "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction by a model that was "
-            "identified without weights.",
+            "Fig. 6: torques of the axes 1, 3, 5 and 7, and their prediction without weights.",
         ),
         picture(
             jid.plot.torques(weighted, robot, "identified with weights", SHOWN),
@@ -222,10 +217,9 @@ def _verification(study: Study) -> Section:
     motion, capsules = path.motion(times), jid.robots.tx90l_on_rail_collision()
     first, second = study.weighted.validation.errors
     return "Verification and application on another path", [
-        f"The path after ISO 9283 in a cube of {settings.EDGE:g} m: lines, a rectangle and two "
-        f"circles. Where pieces meet the end-effector rests; up to {settings.SPEED:g} m/s and "
-        f"{settings.ACCELERATION:g} m/s². Of the redundant joint angles the nearest to a posture "
-        "are taken.",
+        f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its corners, up "
+        f"to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of the redundant joint "
+        "angles the nearest to a posture are taken.",
         picture(jid.plot.path(robot, motion, times), "Fig. 8: path of the end-effector."),
         picture(jid.plot.poses(robot, motion.q[::5], capsules), "The robot with its capsules."),
         picture(

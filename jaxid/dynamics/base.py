@@ -287,15 +287,10 @@ def base_parameters(
 
 def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> tuple[str, ...]:
     notes = []
-    if len(found.independent) != len(other.independent):
+    if found.independent != other.independent:
         notes.append(
-            f"the two ways to count base parameters disagree: {len(found.independent)} and "
-            f"{len(other.independent)}; the geometry is nearly degenerate, or angles are rounded."
-        )
-    elif found.independent != other.independent:
-        notes.append(
-            "the two ways to count base parameters agree on their number but not on which columns "
-            "lead them; the geometry is nearly degenerate."
+            f"the two ways to choose base parameters disagree ({len(found.independent)} and "
+            f"{len(other.independent)}): the geometry is nearly degenerate, or angles are rounded."
         )
     if found.smallest_independent < 1e-4:
         notes.append(

@@ -83,8 +83,9 @@ def closed_forms(
         terms = [(first, Coefficient((Monomial(Fraction(1)),)))]
         for column, second in enumerate(dependent):
             own, other = units[first], units[second]
-            known = own is not None and other is not None
-            difference = np.subtract(own, other) if known else None
+            difference = None
+            if own is not None and other is not None:
+                difference = np.subtract(own, other)
             coefficient = finder.coefficient(row, column, difference, kappa[row, column])
             if coefficient is not None:
                 terms.append((second, coefficient))

@@ -76,8 +76,10 @@ class Model(Hashable):
         """Number of standard parameters."""
         return len(self.parameters)
 
-    def split(self, p: Float[AnyArray, " standard"]) -> list[Float[AnyArray, " columns"]]:
-        """Return the parameters of each term.
+    def split(
+        self, p: Float[AnyArray, " standard"]
+    ) -> list[tuple[AbstractTerm, Float[AnyArray, " columns"]]]:
+        """Return each term with its parameters.
 
         Raises:
             InputError: If there is not one number for each standard parameter.
@@ -89,7 +91,7 @@ class Model(Hashable):
                 f"but has shape {p.shape}."
             )
         ends = np.cumsum(sizes)
-        return [p[e - s : e] for s, e in zip(sizes, ends, strict=True)]
+        return [(t, p[e - s : e]) for t, s, e in zip(self.terms, sizes, ends, strict=True)]
 
     def columns(self, q, qd, qdd) -> Float[AnyArray, "joints standard"]:
         r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
@@ -97,13 +99,11 @@ class Model(Hashable):
 
     def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
         """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
-        parts = zip(self.terms, self.split(p), strict=True)
-        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in parts))
+        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in self.split(p)))
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
-        parts = zip(self.terms, self.split(p), strict=True)
-        return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in parts))
+        return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in self.split(p)))
 
     def bias(self, p, q, qd) -> Float[AnyArray, " joints"]:
         """Return the bias forces of one sample by definition (Eq. 38)."""
@@ -115,8 +115,7 @@ class Model(Hashable):
 
     def potential(self, p, q) -> Float[AnyArray, ""]:
         """Return the potential energy of one sample by definition."""
-        parts = zip(self.terms, self.split(p), strict=True)
-        return reduce(add, (t.potential_columns(self.robot, q) @ x for t, x in parts))
+        return reduce(add, (t.potential_columns(self.robot, q) @ x for t, x in self.split(p)))
 
     def known_forces(self, q, qd, qdd) -> Float[AnyArray, " joints"]:
         """Return the generalised forces of the known tool at one sample [N m or N]."""

@@ -129,7 +129,9 @@ def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6)
 
 
 def regrouping(
-    W: Float[AnyArray, "rows columns"], independent: Sequence[int], dependent: Sequence[int]
+    W: Float[AnyArray, "rows columns"],
+    independent: Sequence[int] | np.ndarray,
+    dependent: Sequence[int] | np.ndarray,
 ) -> tuple[Float[np.ndarray, "base dependent"], float, Float[np.ndarray, " base"]]:
     r"""Return $\kappa$ with $\hat\Theta_2 = \hat\Theta_1 \kappa$, and how exact it is (Eq. 22).
 

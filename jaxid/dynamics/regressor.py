@@ -5,6 +5,7 @@ A joint feels only the bodies beyond it, so most entries of a regressor are zero
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -109,7 +110,7 @@ class PackedRegressor(eqx.Module):
         if self.samples > FEW or is_traced(arrays):
             self.values = _compiled(program)(*arrays)
         else:
-            outputs = evaluate_packed(program, *arrays)
+            outputs: Any = evaluate_packed(program, *arrays)
             self.values = tuple(outputs[k] for k in varying)
 
     def matrix(self) -> Float[np.ndarray, "rows columns"]:

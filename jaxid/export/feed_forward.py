@@ -167,7 +167,7 @@ def body_parameters(
     """Return ten parameters of each body, with zeros for those that the model leaves out."""
     n = model.robot.joints
     bodies = np.zeros((n, 10))
-    for term, own in zip(model.terms, model.split(np.asarray(p, np.float64)), strict=True):
+    for term, own in model.split(np.asarray(p, np.float64)):
         if term.body_parameters:
             bodies[:, : term.body_parameters] += np.asarray(own).reshape(n, -1)
     return bodies
@@ -176,11 +176,7 @@ def body_parameters(
 def other_forces(fit: Fit) -> Callable[..., Any]:
     """Return the function of one sample that gives the forces of all terms but the bodies."""
     model = fit.base.model
-    parts = [
-        (term, own)
-        for term, own in zip(model.terms, model.split(fit.standard_parameters), strict=True)
-        if not term.body_parameters
-    ]
+    parts = [part for part in model.split(fit.standard_parameters) if not part[0].body_parameters]
 
     def forces(q, qd, qdd):
         total = jnp.zeros_like(q)
@@ -244,9 +240,6 @@ def export_jax(fit: Fit, path: str | Path) -> Path:
         RuntimeError: If the package `flatbuffers` is not installed.
     """
     if importlib.util.find_spec("flatbuffers") is None:
-        raise RuntimeError(
-            "JAX writes exported functions with the package `flatbuffers`, which is not installed: "
-            "`pip install flatbuffers`."
-        )
+        raise RuntimeError("JAX needs `flatbuffers` to export: `pip install flatbuffers`.")
     write_bytes(path, bytes(exported_function(fit).serialize()))
     return Path(path)

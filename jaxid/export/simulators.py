@@ -38,7 +38,7 @@ def joint_dynamics(
     """
     model = fit.base.model
     robot, total, rotors, left_out = model.robot, np.zeros((3, model.robot.joints)), [], []
-    for term, p in zip(model.terms, model.split(fit.standard_parameters), strict=True):
+    for term, p in model.split(fit.standard_parameters):
         if term.body_parameters:
             continue
         coefficients = _joint_coefficients(term, robot)

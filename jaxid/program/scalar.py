@@ -14,7 +14,7 @@ With all uses known, `c x + c y` becomes `c (x + y)` where nothing else needs th
 import enum
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -134,7 +134,11 @@ class Scalar:
 Operand = Scalar | float | bool
 
 
-def _magnitude(x: Operand) -> tuple[bool, Any]:
+@overload
+def _magnitude(x: Scalar) -> tuple[bool, Scalar]: ...
+@overload
+def _magnitude(x: float | bool) -> tuple[bool, float | bool]: ...
+def _magnitude(x: Operand) -> tuple[bool, Operand]:
     """Split x into (is negated, rest)."""
     if isinstance(x, Scalar):
         return (True, x.operands[0]) if x.operation is Operation.NEGATE else (False, x)

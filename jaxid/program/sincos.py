@@ -5,6 +5,8 @@ series, is at most 1.5e-16 (float64) for |x| up to 3e9, or 1e-7 (float32) for |x
 that, and for x infinite or NaN, the result is NaN.
 """
 
+import functools
+import math
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -21,11 +23,7 @@ def half_pi(bits: int, count: int) -> tuple[float, ...]:
     """Return pi/2 as a sum of numbers with so few bits that whole multiples of each are exact."""
     rest, pieces = _HALF_PI, []
     for _ in range(count):
-        scale = Fraction(2) ** bits
-        while rest * scale >= 2**bits:
-            scale /= 2
-        while rest * scale * 2 < 2**bits:
-            scale *= 2
+        scale = Fraction(2) ** (bits - math.frexp(rest)[1])
         piece = Fraction(int(rest * scale)) / scale
         pieces.append(float(piece))
         rest -= piece
@@ -80,10 +78,8 @@ SINGLE = Precision(
 
 
 def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
-    total = jnp.full_like(z, coefficients[-1])
-    for c in coefficients[-2::-1]:
-        total = total * z + c
-    return total
+    last, *others = reversed(coefficients)
+    return functools.reduce(lambda total, c: total * z + c, others, jnp.full_like(z, last))
 
 
 @jax.custom_jvp

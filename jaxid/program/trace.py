@@ -83,11 +83,13 @@ _MOVEMENTS: dict[str, Callable] = {
     "unstack": lambda x, *, axis: list(np.moveaxis(x, axis, 0)),
 }
 
-_INDEXED_MOVEMENTS = {
+_INDEXED = {
     "dynamic_slice": (0,),
     "dynamic_update_slice": (0, 1),
     "gather": (0,),
     "scatter": (0, 2),
+    "scatter-add": (0, 2),
+    "scatter_add": (0, 2),
 }
 """Positions of the operands that hold entries; the others hold indices."""
 
@@ -102,35 +104,27 @@ def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
         return [np.asarray(x) for x in results]
 
 
-def _move_by_index(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
+def _move_by_index(
+    equation: JaxprEqn, carriers: tuple[int, ...], operands: list[np.ndarray]
+) -> np.ndarray:
     """Move entries to the places that the indices among the operands give."""
-    name = equation.primitive.name
-    carriers = _INDEXED_MOVEMENTS[name]
     entries, labels, start = [], list(operands), 0
     for k in carriers:
-        entries.append(operands[k].astype(object).ravel())
+        entries.append(_entries(operands[k]).ravel())
         positions = np.arange(start, start + operands[k].size, dtype=np.float64)
         labels[k] = positions.reshape(operands[k].shape)
         start += operands[k].size
-    if any(_is_symbolic(x) for x in labels):
-        raise InputError(
-            f"`trace` cannot translate `{name}` with an index that depends on the inputs: "
-            "index with constant integers."
-        )
     (moved,) = _on_numbers(equation, *labels)
     if not ((moved >= 0) & (moved < start)).all():
-        raise InputError(f"`trace` met an index outside of its array in `{name}`: correct it.")
+        raise InputError(
+            f"`trace` met an index outside of its array in `{equation.primitive}`: correct it."
+        )
     return np.concatenate(entries)[moved.astype(int)]
 
 
 def _scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
     """Add entries at known places, as the transpose of a gather does."""
     target, indices, updates = operands
-    if _is_symbolic(indices):
-        raise InputError(
-            "`trace` cannot add at an index that depends on the inputs: "
-            "index with constant integers."
-        )
     total = target.astype(object).copy()
     for k, update in enumerate(updates.astype(object).ravel()):
         one = np.zeros(updates.size)
@@ -138,7 +132,7 @@ def _scatter_add(equation: JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
         zeros = np.zeros(target.shape)
         (places,) = _on_numbers(equation, zeros, indices, one.reshape(updates.shape))
         for place in np.argwhere(places):
-            total[tuple(place)] = scalar.add(total[tuple(place)], update)
+            total[tuple(place)] = _add(total[tuple(place)], update)
     return total
 
 
@@ -256,12 +250,16 @@ def _entries(x: np.ndarray) -> np.ndarray:
 def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Run one equation on arrays of which at least one is symbolic."""
     name = equation.primitive.name
-    if name in _INDEXED_MOVEMENTS:
-        integers = [np.issubdtype(x.dtype, np.integer) for x in operands]
-        arrays = [x if whole else _entries(x) for x, whole in zip(operands, integers, strict=True)]
-        return [_move_by_index(equation, arrays)]
-    if name in ("scatter-add", "scatter_add"):
-        return [_scatter_add(equation, operands)]
+    if name in _INDEXED:
+        carriers = _INDEXED[name]
+        if any(_is_symbolic(x) for k, x in enumerate(operands) if k not in carriers):
+            raise InputError(
+                f"`trace` cannot translate `{name}` with an index that depends on the inputs: "
+                "index with constant integers."
+            )
+        if "add" in name:
+            return [_scatter_add(equation, operands)]
+        return [_move_by_index(equation, carriers, operands)]
     if name == "select_n":
         return [_select_n(operands[0], *map(_entries, operands[1:]))]
     aval: Any = equation.outvars[0].aval
@@ -320,16 +318,6 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: list[np.ndarray]) -> list[np.
     return [read(name) for name in jaxpr.outvars]
 
 
-def _argument(graph: Graph, number: int, given: tuple[int, ...] | np.ndarray) -> np.ndarray:
-    template = np.full(given, FREE, object) if isinstance(given, tuple) else np.asarray(given)
-    entries = np.empty(template.shape, object)
-    for position, index in enumerate(np.ndindex(template.shape)):
-        value = template[index]
-        free = value is FREE
-        entries[index] = graph.node(Operation.INPUT, number, position) if free else float(value)
-    return entries
-
-
 def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
     """Translate a function of a few arrays into a scalar program.
 
@@ -351,7 +339,14 @@ def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
             loop or a sort, or closes over a value that JAX is tracing.
     """
     graph = Graph()
-    arguments = [_argument(graph, k, given) for k, given in enumerate(inputs)]
+    arguments = []
+    for number, given in enumerate(inputs):
+        template = np.full(given, FREE, object) if isinstance(given, tuple) else np.asarray(given)
+        entries = np.empty(template.shape, object)
+        for position, value in enumerate(template.ravel()):
+            free = graph.node(Operation.INPUT, number, position) if value is FREE else float(value)
+            entries.flat[position] = free
+        arguments.append(entries)
     with double_precision():
         avals = [jax.ShapeDtypeStruct(x.shape, np.float64) for x in arguments]
         jaxpr, result = jax.make_jaxpr(function, return_shape=True)(*avals)

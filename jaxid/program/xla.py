@@ -121,11 +121,9 @@ class Lowered(eqx.Module):
 
         Constants cost memory and time here; prefer the packed result.
         """
-        entries, batch = self.entries(*arrays)
-        values = self.run(entries, ELEMENTWISE)[0]
         dtype = jnp.result_type(*arrays, float)
-        packed = [values[x] if isinstance(x, int) else x for x in self.program.outputs]
-        return self.program.unpack([jnp.asarray(x, dtype) for x in packed], batch, jnp)
+        packed = [jnp.asarray(x, dtype) for x in self(*arrays)]
+        return self.program.unpack(packed, self.entries(*arrays)[1], jnp)
 
     def run(self, entries: list[Array], operations: dict[Operation, Callable]) -> Values:
         """Compute all nodes.

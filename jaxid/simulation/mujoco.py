@@ -56,7 +56,7 @@ class MujocoRobot(VirtualRobot):
     def _bodies_with_tool(self) -> Float[np.ndarray, "joints 10"]:
         """Return ten parameters of each body, with a known tool."""
         robot, model = self.robot, self.bodies
-        for term, p in zip(self.terms, model.split(self.values), strict=True):
+        for term, p in model.split(self.values):
             known = term.body_parameters or term.drive_matrices(robot)[0].any()
             if not known and np.any(p):
                 raise InputError("MuJoCo knows only bodies and rotors: leave out other `terms`.")

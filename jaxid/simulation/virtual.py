@@ -193,7 +193,7 @@ class VirtualRobot(Hashable):
     @property
     def rotors(self) -> Float[np.ndarray, " joints"]:
         """Inertia of the rotors on the joint side [kg m² or kg]."""
-        parts = zip(self.terms, self.bodies.split(self.values), strict=True)
+        parts = self.bodies.split(self.values)
         inertia = sum(t.drive_matrices(self.robot)[0] @ np.asarray(x) for t, x in parts)
         return np.diagonal(np.asarray(inertia))
 
@@ -212,7 +212,7 @@ class VirtualRobot(Hashable):
     @property
     def parameters(self) -> Float[np.ndarray, " standard"]:
         """True standard parameters of `model` at the present temperature."""
-        first, *others = (np.asarray(x) for x in self.bodies.split(self.values))
+        first, *others = (np.asarray(x) for _, x in self.bodies.split(self.values))
         return np.concatenate([first, self.present_friction.parameters, *others])
 
     def replace(self, **fields: Any) -> "VirtualRobot":
@@ -416,19 +416,10 @@ class VirtualRobot(Hashable):
             plant, servo, desired, forward, limits, resolution, substeps
         )
         mean_forces = 0.5 * (forces + np.concatenate([forces[:1], forces[:-1]]))
+        saturated = (np.abs(forces) >= limits).mean(axis=0)
         kept = slice(None, None, every)
-        return Tracking(
-            time=time[kept],
-            desired=desired[kept],
-            actual=actual[kept],
-            forces=mean_forces[kept],
-            recording=self.sensors.record(
-                self.robot,
-                motors[kept],
-                mean_forces[kept],
-                sample_time=every * tick,
-                seed=seed,
-                name=name,
-            ),
-            saturated=(np.abs(forces) >= limits).mean(axis=0),
+        time, desired, actual, felt = (x[kept] for x in (time, desired, actual, mean_forces))
+        log = self.sensors.record(
+            self.robot, motors[kept], felt, sample_time=every * tick, seed=seed, name=name
         )
+        return Tracking(time, desired, actual, felt, log, saturated)

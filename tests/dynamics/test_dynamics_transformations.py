@@ -41,7 +41,7 @@ def alone():
 
     def methods(one):
         q, qd, qdd = one.q, one.qd, one.qdd
-        rest, parts = jnp.zeros(N), zip(MODEL.terms, MODEL.split(P), strict=True)
+        rest = jnp.zeros(N)
         mass = jax.jacfwd(lambda x: MODEL.forces(P, q, rest, x))(rest)
         return {
             "regressor": MODEL.columns(q, qd, qdd),
@@ -49,7 +49,7 @@ def alone():
             "mass_matrix": mass,
             "bias_forces": MODEL.forces(P, q, qd, rest),
             "kinetic_energy": 0.5 * qd @ mass @ qd,
-            "potential_energy": sum(t.potential_columns(ROBOT, q) @ x for t, x in parts),
+            "potential_energy": sum(t.potential_columns(ROBOT, q) @ x for t, x in MODEL.split(P)),
         }
 
     return trees.compiled(methods)
