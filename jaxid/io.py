@@ -217,32 +217,23 @@ def _object_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
     if len(names) != 1 or not names <= {*_DTYPES, "float", "member"}:
         raise InputError(f"`{place}` has the keys {', '.join(sorted(map(str, value)))}")
     (name,) = names
-    entries, shape = value[name], value.get("shape")
-    if name == "float":
-        return _number_from_json(entries, float, place)
+    entries = value[name]
+    if name == "float" and entries in ("inf", "-inf", "nan"):
+        return float(entries)
     if name == "member":
         enums = (o for o in options if isinstance(o, type) and issubclass(o, enum.Enum))
         members = {f"{o.__name__}.{member.name}": member for o in enums for member in o}
         if str(entries) not in members:
             raise InputError(f"`{place}` names `{entries}`, which is not known")
         return members[entries]
-    exact = {"f": float, "i": int, "b": bool}[np.dtype(name).kind]
-    numbers = _number_from_json(entries, exact, place)
     try:
-        return np.array(numbers, name).reshape(np.shape(numbers) if shape is None else shape)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"`{place}` is no array of {name}") from error
-
-
-def _number_from_json(entry: Any, kind: type, place: str) -> Any:
-    """Return a number of one type, or nested lists of them; infinities are named."""
-    if isinstance(entry, list):
-        return [_number_from_json(x, kind, place) for x in entry]
-    if kind is float and entry in ("inf", "-inf", "nan"):
-        return float(entry)
-    if type(entry) is not kind:
-        raise InputError(f"`{place}` holds {entry!r:.30} in an array of {kind.__name__}")
-    return entry
+        array = np.array(entries, name)
+        array = array.reshape(value.get("shape", array.shape))
+    except (TypeError, ValueError, OverflowError):
+        array = None
+    if array is None or to_json(array) != value:
+        raise InputError(f"`{place}` is no array of {name}")
+    return array
 
 
 def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str) -> Any:

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jaxid.errors import InputError
-
+Lines = Iterator[list[tuple[str, "Status | str"]]]
+"""Lines of text, as parts with a style each."""
 MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
 
@@ -150,9 +150,6 @@ class Table:
         remarks: Sentences, or `Remark`s with a status, shown below the columns.
         status: Judgement of each row; no marks are shown if empty.
         rules: Indices of rows above which a line is drawn.
-
-    Raises:
-        InputError: If columns and `status` are not of the same length.
     """
 
     def __init__(
@@ -170,9 +167,6 @@ class Table:
         self.remarks = tuple(Remark(x) if isinstance(x, str) else x for x in remarks)
         self.status = tuple(status)
         self.rules = frozenset(rules)
-        lengths = {len(c.values) for c in columns} | ({len(self.status)} if self.status else set())
-        if len(lengths) > 1:
-            raise InputError(f"`columns` and `status` must have one length, not {sorted(lengths)}.")
 
     @property
     def rows(self) -> list[tuple[str, ...]]:
@@ -189,7 +183,7 @@ class Table:
     def __str__(self) -> str:
         return self.text()
 
-    def lines(self, width: int | None = None) -> Iterator[list[tuple[str, Status | str]]]:
+    def lines(self, width: int | None = None) -> Lines:
         """Yield the lines of the text as parts with a style each, for renderers with colours.
 
         A style is a `Status`, `title`, `header`, `dim`, or empty.
@@ -204,13 +198,13 @@ class Table:
                 yield []
             yield from lines
 
-    def _facts(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
+    def _facts(self, width: int) -> Lines:
         indent = max((len(word) for word, _ in self.facts), default=0) + 2
         for word, text in self.facts:
             for k, line in enumerate(_wrapped(text, width - indent)):
                 yield [(_padded("" if k else word, indent), "dim"), (line, "")]
 
-    def _grid(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
+    def _grid(self, width: int) -> Lines:
         if not self.columns:
             return
         texts, headers = zip(*((c.texts, c.header) for c in self.columns), strict=True)
@@ -232,7 +226,7 @@ class Table:
             mark = self.status[k] if self.status else Status.NEUTRAL
             yield [(f"{mark.value}  "[:margin], mark), (line(row), "")]
 
-    def _remarks(self, width: int) -> Iterator[list[tuple[str, Status | str]]]:
+    def _remarks(self, width: int) -> Lines:
         for remark in self.remarks:
             text = f"{remark.text} ({remark.detail})" if remark.detail else remark.text
             for k, line in enumerate(_wrapped(text, width - 3)):

@@ -40,6 +40,7 @@ from jaxid.identification.states import identify_states
 from jaxid.io import require_writable
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import (
+    Report,
     body_table,
     motor_tables,
     residual_table,
@@ -129,18 +130,17 @@ def identify(
             "min_speed": experiment.min_speed,
         }
         errors = result.validation.errors
-        written = write_report(
-            output,
+        report = Report(
             result.fit,
             errors[: result.fitted],
             errors[result.fitted :],
             result.validation.definiteness,
             settings,
             (*result.experiment.notes, *result.notes, *result.findings),
-            result.choice,
             (*result.findings, *result.mistakes),
-            pdf,
+            result.choice,
         )
+        written = write_report(output, report, pdf)
     _show_identification(console, result)
     show_files(console, output, [p.name for p in written])
 

@@ -195,13 +195,21 @@ def diagnose(
             *(log.time, np.asarray(log.motion.q), np.asarray(log.forces), None, False, False),
             *(log.segments, log.sample_time),
         )
-    statistics = _statistics(whole, progress)
+    statistics = LogStatistics(robot.joints, whole.samples)
+    for a, b in whole.segments:
+        # Differences at the ends of parts are not central: logs in memory are taken at once.
+        step = AT_ONCE if isinstance(whole.source, SamplesOnDisk) else b - a
+        for start in range(a, b, step):
+            samples = slice(start, min(start + step, b))
+            statistics.add(*whole.read(samples), whole.sample_time)
+            if progress is not None:
+                progress(samples.stop / whole.samples)
     sides = part.angles_on_motor_side, part.forces_on_motor_side
     faults = channel_findings(robot, part)
     faulty = tuple(dict.fromkeys(joint for joint, _ in faults))
     findings = [
         *(text for _, text in faults),
-        *limit_findings(robot, statistics, sides[0], part.velocities is not None, faulty),
+        *limit_findings(robot, part, statistics, faulty),
         *stuck_findings(robot, part, faulty),
     ]
     rate = 1.0 / part.sample_time
@@ -217,21 +225,6 @@ def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...
     """Return what a fit to several logs reveals, apart from delays, with the names of the logs."""
     friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit)
     return (*friction, *(f"{d.log.name}: {text}" for d in diagnoses for text in d.mistakes(fit)))
-
-
-def _statistics(observations: Observations, progress: Progress | None) -> LogStatistics:
-    """Go through a log in parts."""
-    o = observations
-    statistics = LogStatistics(o.joints, o.samples)
-    for a, b in o.segments:
-        # Differences at the ends of parts are not central: logs in memory are taken at once.
-        step = AT_ONCE if isinstance(o.source, SamplesOnDisk) else b - a
-        for start in range(a, b, step):
-            samples = slice(start, min(start + step, b))
-            statistics.add(*o.read(samples), o.sample_time)
-            if progress is not None:
-                progress(samples.stop / o.samples)
-    return statistics
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:

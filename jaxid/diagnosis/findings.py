@@ -66,27 +66,25 @@ class LogStatistics:
 
 
 def limit_findings(
-    robot: Robot,
-    statistics: LogStatistics,
-    on_motor_side: bool,
-    measured_velocities: bool,
-    faulty: Collection[int] = (),
+    robot: Robot, log: Recording, statistics: LogStatistics, faulty: Collection[int]
 ) -> list[str]:
     """Compare a log with the limits of its robot: a wrong unit or sign shows here.
 
     Joints in `faulty` have faults of single channels, which explain more.
     """
     s, ratio = statistics, statistics.velocity_ratio
-    angles = [] if faulty else unit_findings(robot, s.lowest, s.highest, on_motor_side)
+    angles = [] if faulty else unit_findings(robot, s.lowest, s.highest, log.angles_on_motor_side)
     forces = [] if faulty else _force_findings(robot, s)
     findings = angles + forces
-    for j in (j for j in range(robot.joints) if j not in faulty):
+    for j, name in enumerate(robot.joint_names):
+        if j in faulty:
+            continue
         findings += _joint_findings(robot, j, s, not angles, not forces)
-        if measured_velocities and abs(ratio[j] - 1.0) > 0.2:
+        if log.velocities is not None and abs(ratio[j] - 1.0) > 0.2:
             findings.append(
-                f"the measured velocities of joint `{robot.joint_names[j]}` are {ratio[j]:.3g} "
-                "times the derivatives of its angles: check `recording.velocity_unit` and the "
-                "order of the columns."
+                f"the measured velocities of joint `{name}` are {ratio[j]:.3g} times the "
+                "derivatives of its angles: check `recording.velocity_unit` and the order of the "
+                "columns."
             )
     # Over a whole log, friction makes a robot consume energy.
     if not faulty and s.power < -0.05:
@@ -140,9 +138,8 @@ def _joint_findings(
 
 def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
     """Report forces that are all too large or all too small: one unit or side is wrong."""
-    known = np.asarray(robot.known_max_forces)
-    ratio = statistics.force / np.where(np.isfinite(known), known, np.nan)
-    ratio = ratio[np.isfinite(ratio)]
+    ratio = statistics.force / robot.known_max_forces
+    ratio = ratio[np.isfinite(robot.known_max_forces)]
     cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
     if ratio.size < 2:
         return []

@@ -1,7 +1,7 @@
 """The tables `[robot]`, `[limits]`, `[drives]` and `[load]` of an experiment file."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -12,7 +12,7 @@ from jaxid.errors import InputError
 from jaxid.experiment.decoder import Finite, Magnitude, PerJoint, Positive, Vector
 from jaxid.robot import library
 from jaxid.robot.inertia import INERTIAL_NAMES
-from jaxid.robot.joints import Limits, far_notes, fast_notes, per_joint, range_fault
+from jaxid.robot.joints import Limits, per_joint, range_fault
 from jaxid.robot.library import from_dh
 from jaxid.robot.robot import GRAVITY, Robot, Tool
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
@@ -269,8 +269,7 @@ def replace_limits(
     _check_limits(robot, fields)
     assumed = tuple(name for name in robot.limits.assumed if name not in told)
     limits = Limits(robot.joints, **fields, assumed=assumed)
-    notes = dict.fromkeys((*robot.notes, *_doubts(robot, limits)))
-    return robot.replace(limits=limits, notes=tuple(notes))
+    return robot.replace(limits=limits)
 
 
 def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
@@ -289,15 +288,6 @@ def _check_limits(robot: Robot, fields: dict[str, np.ndarray]) -> None:
             if robot.revolute[j]:
                 cure = 'for degrees add `angle_unit = "deg"`, and inf means no limit'
             raise InputError(f"joint `{name}` {why}: {cure}.")
-
-
-def _doubts(robot: Robot, limits: Limits) -> Iterator[str]:
-    """Name limits of the file that look as if they were in other units."""
-    for j, name in enumerate(robot.joint_names):
-        if not robot.revolute[j]:
-            ends = (float(limits.position_min[j]), float(limits.position_max[j]))
-            yield from far_notes(f"joint `{name}`: an end of its range", ends)
-        yield from fast_notes(name, float(limits.velocity[j]), robot.revolute[j])
 
 
 def replace_drives(

@@ -1,7 +1,7 @@
 """Meaning and units of the columns of a log, and logs in SI units."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,6 @@ PerJoint = tuple[float, ...] | None
 
 def _listed(value: Any) -> Any:
     return value if value is None or isinstance(value, str | int | Unit) else tuple(value)
-
-
-def _numbers(value: Iterable[float | int] | np.ndarray | None) -> tuple[float, ...] | None:
-    return None if value is None else tuple(float(v) for v in value)
 
 
 class Columns(eqx.Module):
@@ -71,11 +67,11 @@ class Columns(eqx.Module):
     angle_unit: Units = eqx.field(static=True, converter=_listed, default=units.RAD)
     velocity_unit: Units | None = eqx.field(static=True, converter=_listed, default=None)
     force_unit: Units = eqx.field(static=True, converter=_listed, default=units.NM)
-    torque_constants: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
-    angle_signs: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
-    force_signs: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
-    angle_offsets: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
-    force_gains: PerJoint = eqx.field(static=True, converter=_numbers, default=None)
+    torque_constants: PerJoint = eqx.field(static=True, converter=_listed, default=None)
+    angle_signs: PerJoint = eqx.field(static=True, converter=_listed, default=None)
+    force_signs: PerJoint = eqx.field(static=True, converter=_listed, default=None)
+    angle_offsets: PerJoint = eqx.field(static=True, converter=_listed, default=None)
+    force_gains: PerJoint = eqx.field(static=True, converter=_listed, default=None)
     angles_on_motor_side: bool = eqx.field(static=True, default=False)
     forces_on_motor_side: bool = eqx.field(static=True, default=False)
 
@@ -158,7 +154,8 @@ class Log:
         arrays: dict[str, np.ndarray] = {}
         for table in self.tables:
             part = table.read((c for c in table.channels if c != "time"), start, stop)
-            arrays |= {channel: part.array(channel) for channel in part.channels}
+            for channel, names in part.channels.items():
+                arrays[channel] = np.concatenate([part.numbers(name) for name in names], axis=1)
         angles = arrays["angles"]
         for channel, array in arrays.items():
             if array.shape[1] != angles.shape[1]:

@@ -84,10 +84,6 @@ class LogTable:
         row = self.first_row + start
         return dataclasses.replace(self, columns=columns, channels=kept, first_row=row)
 
-    def array(self, channel: str) -> np.ndarray:
-        """Return the finite numbers of a channel (samples x columns)."""
-        return np.concatenate([self.numbers(name) for name in self.channels[channel]], axis=1)
-
     def stamps(self) -> tuple[np.ndarray, bool]:
         """Return the time stamps, and whether they are dates (then in seconds).
 
@@ -349,7 +345,8 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     separator = next((s for s in (";", "\t", ",", " ") if s in line.strip()), ",")
     line = " ".join(line.split()) if separator == " " else line
     cells = [cell.strip().strip('"') for cell in line.split(separator)]
-    named = not all(_is_number(cell) for cell in cells if cell) or not any(cells)
+    filled = pl.Series([cell.replace(",", ".") for cell in cells if cell], dtype=pl.String)
+    named = filled.is_empty() or filled.cast(pl.Float64, strict=False).null_count() > 0
     names = cells if named else [str(i) for i in range(len(cells))]
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
@@ -360,14 +357,6 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     mark = len(codecs.BOM_UTF8) if first.startswith(codecs.BOM_UTF8) else 0
     start = min(len(first) + 1, len(head)) if named else mark
     return _Layout(source, tuple(names), named, separator, comma, start)
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell.replace(",", "."))
-    except ValueError:
-        return False
-    return True
 
 
 @contextlib.contextmanager

@@ -21,7 +21,13 @@ from jaxid.measurement.filters import (
     Subsample,
     ZeroPhaseButterworth,
 )
-from jaxid.measurement.recording import Recording, consecutive, finite_channel, positive_time
+from jaxid.measurement.recording import (
+    Recording,
+    TimeGrid,
+    consecutive,
+    finite_channel,
+    positive_time,
+)
 from jaxid.robot.joints import per_joint
 from jaxid.robot.robot import Robot
 
@@ -247,12 +253,7 @@ class Observations(eqx.Module):
         For columns that do not fit into memory at the full rate: evaluate them at the motion of
         `read(slice(*chunk.samples))`, and `chunk.reduce` gives the rows `slice(*chunk.rows)` of
         `reduce`, up to rounding.
-
-        Raises:
-            InputError: If `samples` is not positive.
         """
-        if samples < 1:
-            raise InputError(f"`samples` must be positive, but is {samples}.")
         factor, edge = self.decimation.factor, self.filter.edge(self.sample_time)
         low_pass = self.filter.low_pass(self.sample_time)
         before, after = self.decimation.memory(), low_pass.memory()
@@ -354,118 +355,103 @@ def observe(
         InputError: If the numbers of joints differ, forces and columns would be aliased, nothing
             is left between the edges of the segments, or some joint is never fast enough.
     """
-    require_joints(recording.name, recording.joints, robot)
-    decimation = Subsample(1) if decimation is None else decimation
-    dt = recording.sample_time
-    used, omitted = usable_segments(recording.segments, filter, decimation, dt, recording.name)
-    if recording.velocities is not None and not filter.uses_velocities:
-        kind = type(filter).__name__
-        omitted += [f"the measured velocities are not used: `{kind}` takes them from the angles"]
-    angles, velocities, forces = joint_side(
-        robot,
-        np.asarray(recording.angles),
-        None if recording.velocities is None else np.asarray(recording.velocities),
-        np.asarray(recording.forces),
-        recording.angles_on_motor_side,
-        recording.forces_on_motor_side,
-    )
-    parts = [
-        (
-            filter.motion(angles[a:b], None if velocities is None else velocities[a:b], dt),
-            forces[a:b],
-        )
-        for a, b in used
-    ]
-    segments = consecutive(b - a for a, b in used)
-    observations = Observations(
-        source=SamplesInMemory(*joined(parts)),
-        filter=filter,
-        decimation=decimation,
-        segments=segments,
-        start_times=tuple(float(recording.time[a]) for a, _ in used),
-        mask=np.ones((0, robot.joints), bool),
-        sample_time=dt,
-        name=recording.name if name is None else name,
-        notes=(*recording.notes, *omitted),
-    )
-    return with_fast_rows(observations, robot, min_speed, [observations.reduced_motion.qd])
+    r = recording
+
+    def load(segments: list[tuple[int, int]]) -> SamplesInMemory:
+        q, qd, forces = joint_side(robot, r, r.angles, r.velocities, r.forces)
+        parts = []
+        for a, b in segments:
+            measured = None if qd is None else qd[a:b]
+            parts.append((filter.motion(q[a:b], measured, r.sample_time), forces[a:b]))
+        return SamplesInMemory(*joined(parts))
+
+    name, measured = r.name if name is None else name, r.velocities is not None
+    return prepare(load, r.grid, r.joints, measured, robot, filter, decimation, min_speed, name)
 
 
-def require_joints(name: str, joints: int, robot: Robot) -> None:
-    """Refuse a log of another robot."""
+def prepare(
+    load: Callable[[list[tuple[int, int]]], AbstractSamples],
+    grid: TimeGrid,
+    joints: int,
+    measured: bool,
+    robot: Robot,
+    filter: AbstractFilter,
+    decimation: AbstractDecimation | None,
+    min_speed: ArrayLike | tuple[float | int, ...] | None,
+    name: str,
+    progress: Progress | None = None,
+) -> Observations:
+    """Return observations of a log whose usable segments `load` reads and filters.
+
+    `measured` tells whether the log holds velocities; for the rest see `observe` and `scan_log`.
+    """
     if joints != robot.joints:
         raise InputError(
             f"`{name}` has {joints} joints, but the robot `{robot.name}` has {robot.joints}: "
             "choose the columns of its joints, or the robot of this log."
         )
-
-
-def usable_segments(
-    segments: Sequence[tuple[int, int]],
-    filter: AbstractFilter,
-    decimation: AbstractDecimation,
-    sample_time: float,
-    name: str,
-) -> tuple[list[tuple[int, int]], list[str]]:
-    """Return the segments that are longer than the filter's edges, and remarks on the others.
-
-    Raises:
-        InputError: If there is none, or forces and columns would be aliased.
-    """
-    decimation.check(filter.low_pass(sample_time).cutoff, sample_time)
-    edge = filter.edge(sample_time)
-    fewest = 2 * edge + (FEWEST_ROWS - 1) * decimation.factor + 1
-    used = [(a, b) for a, b in segments if b - a >= max(fewest, 5)]
+    decimation = Subsample(1) if decimation is None else decimation
+    dt, factor, notes = grid.sample_time, decimation.factor, [*grid.notes]
+    decimation.check(filter.low_pass(dt).cutoff, dt)
+    edge = filter.edge(dt)
+    fewest = 2 * edge + (FEWEST_ROWS - 1) * factor + 1
+    used = {
+        ends: t
+        for ends, t in zip(grid.ranges, grid.start_times, strict=True)
+        if ends[1] - ends[0] >= max(fewest, 5)
+    }
     if not used:
-        longest = max(b - a for a, b in segments)
+        longest = max(b - a for a, b in grid.ranges)
         raise InputError(
-            f"the longest segment of `{name}` has {longest} samples at {1 / sample_time:.6g} Hz, "
+            f"the longest segment of `{name}` has {longest} samples at {1 / dt:.6g} Hz, "
             f"but {edge} at each end are lost to the filter and {FEWEST_ROWS} rows of "
-            f"{decimation.factor} are needed: record longer, close the gaps (`largest_gap`), set a "
+            f"{factor} are needed: record longer, close the gaps (`largest_gap`), set a "
             "smaller `margin`, or check `time_unit`."
         )
-    short = len(segments) - len(used)
-    text = f"{short} segment(s), shorter than the filter's edges, were left out"
-    return used, [text] if short else []
-
-
-def with_fast_rows(
-    observations: Observations,
-    robot: Robot,
-    min_speed: ArrayLike | tuple[float | int, ...] | None,
-    velocities: Iterable[Float[AnyArray, "rows joints"]],
-) -> Observations:
-    """Return observations in which only rows count whose joint reaches its minimum speed.
-
-    Raises:
-        InputError: If no row of some joint counts.
-    """
-    given = None if min_speed is None else np.asarray(min_speed, np.float64)
-    speeds = per_joint("min_speed", given, robot.joints, 0.0)
-    mask = np.concatenate([np.abs(np.asarray(qd)) >= speeds for qd in velocities])
+    if short := len(grid.ranges) - len(used):
+        notes.append(f"{short} segment(s), shorter than the filter's edges, were left out")
+    if measured and not filter.uses_velocities:
+        kind = type(filter).__name__
+        notes.append(f"the measured velocities are not used: `{kind}` takes them from the angles")
+    rows = sum(map(len, _row_samples([*used], edge, factor)))
+    observations = Observations(
+        source=load([*used]),
+        filter=filter,
+        decimation=decimation,
+        segments=consecutive(b - a for a, b in used),
+        start_times=tuple(used.values()),
+        mask=np.broadcast_to(True, (rows, joints)),
+        sample_time=dt,
+        name=name,
+        notes=tuple(notes),
+    )
+    if min_speed is None:
+        return observations
+    speeds = per_joint("min_speed", np.asarray(min_speed, np.float64), joints, 0.0)
+    instants, parts = observations.instants, []
+    for chunk in observations.chunks(65536):
+        k = instants[slice(*chunk.rows)].tolist()
+        motion, _ = observations.read(slice(k[0], k[-1] + 1, factor))
+        parts.append(np.abs(np.asarray(motion.qd)) >= speeds)
+        if progress is not None:
+            progress(chunk.rows[1] / rows)
+    mask = np.concatenate(parts)
     slow = np.flatnonzero(~mask.any(axis=0))
     if slow.size:
         j = int(slow[0])
         raise InputError(
             f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of `min_speed` "
-            f"in `{observations.name}`: take a smaller one, or a log in which it moves."
+            f"in `{name}`: take a smaller one, or a log in which it moves."
         )
     return observations.replace(mask=mask)
 
 
-def joint_side(
-    robot: Robot,
-    angles: Float[np.ndarray, "samples joints"],
-    velocities: Float[np.ndarray, "samples joints"] | None,
-    forces: Float[np.ndarray, "samples joints"],
-    angles_on_motor_side: bool,
-    forces_on_motor_side: bool,
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Convert angles, velocities and forces from the motors to the joints where needed."""
-    drives = robot.drives
-    if angles_on_motor_side:
-        angles = np.asarray(drives.joint_angles(angles))
-        velocities = None if velocities is None else np.asarray(drives.joint_velocities(velocities))
-    if forces_on_motor_side:
-        forces = np.asarray(drives.joint_forces(forces))
+def joint_side(robot: Robot, log: Any, *channels: AnyArray | None) -> tuple[Any, ...]:
+    """Convert angles, velocities, forces to the joints' side; `log`: a recording, or `Columns`."""
+    angles, velocities, forces = (None if x is None else np.asarray(x) for x in channels)
+    if log.angles_on_motor_side:
+        angles = robot.drives.joint_angles(angles)
+        velocities = None if velocities is None else robot.drives.joint_velocities(velocities)
+    if log.forces_on_motor_side:
+        forces = robot.drives.joint_forces(forces)
     return angles, velocities, forces

@@ -7,19 +7,16 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.columns import Columns, Log, open_log
-from jaxid.measurement.filters import AbstractDecimation, AbstractFilter, Subsample
+from jaxid.measurement.filters import AbstractDecimation, AbstractFilter
 from jaxid.measurement.observations import (
     AbstractSamples,
     Observations,
     Progress,
     joined,
     joint_side,
-    require_joints,
-    usable_segments,
-    with_fast_rows,
+    prepare,
 )
 from jaxid.measurement.recording import (
     NeedsMemory,
@@ -92,9 +89,8 @@ class SamplesOnDisk(AbstractSamples):
         """Return motion and forces of some samples of one segment, joint side."""
         begin, end = self.segments[self._segment(samples)]
         a, b = max(begin, samples.start - self.overlap), min(end, samples.stop + self.overlap)
-        columns = self.log.columns
-        sides = columns.angles_on_motor_side, columns.forces_on_motor_side
-        angles, velocities, forces = joint_side(self.robot, *self.read_rows(slice(a, b)), *sides)
+        rows = self.read_rows(slice(a, b))
+        angles, velocities, forces = joint_side(self.robot, self.log.columns, *rows)
         motion = self.filter.motion(angles, velocities, self.sample_time)
         wanted = slice(samples.start - a, samples.stop - a, samples.step)
         return motion[wanted], forces[wanted]
@@ -110,8 +106,7 @@ class SamplesOnDisk(AbstractSamples):
         return self.log.read(behind + samples.start, behind + samples.stop)
 
     def _segment(self, samples: slice) -> int:
-        starts = [a for a, _ in self.segments]
-        return int(np.searchsorted(starts, samples.start, "right")) - 1
+        return sum(a <= samples.start for a, _ in self.segments) - 1
 
 
 def scan_log(
@@ -158,37 +153,27 @@ def scan_log(
             columns would be aliased, or no samples are left.
     """
     log = open_log(path, columns, forces_path, velocities_path, on_disk=True)
-    source = Path(path)
+    rows, first_row = log.tables[0].rows, log.tables[0].first_row
+    source, measured = Path(path), columns.velocities is not None
     name = source.stem if name is None else name
-    require_joints(name, log.read(0, 1)[0].shape[1], robot)
-    decimation = Subsample(1) if decimation is None else decimation
     if columns.sample_time is not None:
-        grid = TimeGrid(columns.sample_time, ((0, log.tables[0].rows),))
+        grid = TimeGrid(columns.sample_time, ((0, rows),))
     else:
-        first_row = log.tables[0].first_row
         grid = find_grid(lambda: _stamps(log), source.name, largest_gap, first_row, in_parts=True)
-    grid, dt = grid.cropped(start, stop, name), grid.sample_time
-    used, omitted = usable_segments(grid.ranges, filter, decimation, dt, name)
-    segments = consecutive(b - a for a, b in used)
-    starts = dict(zip(grid.ranges, grid.start_times, strict=True))
-    overlap = filter_memory(filter, dt, columns.velocities is not None)
-    first_rows = tuple(a for a, _ in used)
-    observations = Observations(
-        source=SamplesOnDisk(log, robot, filter, overlap, segments, first_rows, dt),
-        filter=filter,
-        decimation=decimation,
-        segments=segments,
-        start_times=tuple(starts[ends] for ends in used),
-        mask=np.ones((0, robot.joints), bool),
-        sample_time=dt,
-        name=name,
-        notes=(*grid.notes, *omitted),
+    grid = grid.cropped(start, stop, name)
+
+    def load(segments: list[tuple[int, int]]) -> SamplesOnDisk:
+        overlap = filter_memory(filter, grid.sample_time, measured)
+        first_rows = tuple(a for a, _ in segments)
+        segments_here = consecutive(b - a for a, b in segments)
+        return SamplesOnDisk(
+            log, robot, filter, overlap, segments_here, first_rows, grid.sample_time
+        )
+
+    joints = log.read(0, 1)[0].shape[1]
+    return prepare(
+        load, grid, joints, measured, robot, filter, decimation, min_speed, name, progress
     )
-    if min_speed is None:
-        rows = observations.row_segments[-1][1]
-        return observations.replace(mask=np.broadcast_to(True, (rows, robot.joints)))
-    velocities = _row_velocities(observations, progress)
-    return with_fast_rows(observations, robot, min_speed, velocities)
 
 
 def _stamps(log: Log) -> Iterator[np.ndarray]:
@@ -201,24 +186,6 @@ def _stamps(log: Log) -> Iterator[np.ndarray]:
             part = (part - part[0] + last)[1:]
         last = float(part[-1])
         yield part
-
-
-def _row_velocities(
-    observations: Observations, progress: Progress | None
-) -> Iterator[Float[np.ndarray, "rows joints"]]:
-    """Yield the velocities of all rows in parts."""
-    o = observations
-    rows = o.row_segments[-1][1]
-    factor, edge = o.decimation.factor, o.filter.edge(o.sample_time)
-    for (a, _), (r0, r1) in zip(o.segments, o.row_segments, strict=True):
-        step = max(1, AT_ONCE // factor)
-        for r in range(r0, r1, step):
-            stop = min(r + step, r1)
-            first = a + edge + (r - r0) * factor
-            motion, _ = o.read(slice(first, first + (stop - 1 - r) * factor + 1, factor))
-            yield np.asarray(motion.qd)
-            if progress is not None:
-                progress(stop / rows)
 
 
 def filter_memory(filter: AbstractFilter, sample_time: float, measured: bool) -> int:

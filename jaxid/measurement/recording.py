@@ -3,10 +3,11 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
@@ -144,14 +145,19 @@ class Recording(eqx.Module):
         """Recorded time without gaps [s]."""
         return self.samples * self.sample_time
 
+    @property
+    def grid(self) -> "TimeGrid":
+        """Segments, their start times and notes."""
+        starts = tuple(float(self.time[a]) for a, _ in self.segments)
+        return TimeGrid(self.sample_time, self.segments, starts, self.notes)
+
     def crop(self, start: float | int = -np.inf, stop: float | int = np.inf) -> "Recording":
         """Return the part from `start` [s] on and before `stop` [s], on the clock of `time`.
 
         Raises:
             InputError: If fewer than ten samples are left.
         """
-        starts = tuple(float(self.time[a]) for a, _ in self.segments)
-        grid = TimeGrid(self.sample_time, self.segments, starts).cropped(start, stop, self.name)
+        grid = self.grid.cropped(start, stop, self.name)
         return self._range(grid.ranges[0][0], grid.ranges[-1][1])
 
     def split(self, fraction: float) -> "tuple[Recording, Recording]":
@@ -170,22 +176,14 @@ class Recording(eqx.Module):
 
     def _range(self, a: int, b: int) -> "Recording":
         segments = ((max(i, a) - a, min(j, b) - a) for i, j in self.segments)
-        return dataclasses.replace(
-            self,
-            time=self.time[a:b],
-            angles=self.angles[a:b],
-            forces=self.forces[a:b],
-            velocities=None if self.velocities is None else self.velocities[a:b],
-            segments=tuple((i, j) for i, j in segments if i < j),
-        )
+        kept = tuple((i, j) for i, j in segments if i < j)
+        return dataclasses.replace(jax.tree.map(lambda x: x[a:b], self), segments=kept)
 
 
 def finite_channel(
     name: str, key: str, value: ArrayLike, shape: tuple[int, ...], first_row: int
 ) -> np.ndarray:
     """Return a channel as finite real numbers."""
-    if np.iscomplexobj(value):
-        raise InputError(f"`{key}` of `{name}` holds complex numbers: give real ones.")
     array = np.array(value, np.float64)
     if array.ndim != 2 or array.shape != shape:
         raise InputError(
@@ -357,9 +355,10 @@ def find_grid(
     sample_time = total / count
     short = float(f"{sample_time:.6g}")
     sample_time = short if abs(short - sample_time) * rows < 0.01 * sample_time else sample_time
-    lengths = np.diff([*starts, rows])
-    kept = lengths >= 4
-    if not kept.any():
+    lengths = np.diff([*starts, rows]).tolist()
+    stretches = zip(starts, lengths, start_times, strict=True)
+    kept = {(a, a + n): t for a, n, t in stretches if n >= 4}
+    if not kept:
         raise InputError(
             f"`{source}` has no four rows in sequence: its time stamps are {typical:.6g} s apart "
             f"at the median, with {len(pauses)} gaps; check `time_unit`, or give `sample_time`."
@@ -374,15 +373,10 @@ def find_grid(
             f"{sample_time:.6g} s), split the log into segments; a `largest_gap` above "
             f"{max(pauses) / sample_time:.3g} would bridge them"
         )
-    if lost := int(lengths[~kept].sum()):
+    if lost := rows - sum(b - a for a, b in kept):
         notes.append(f"{lost} rows between gaps are too few for a segment and were left out")
-    grid = TimeGrid(
-        sample_time,
-        tuple((a, a + int(n)) for a, n, keep in zip(starts, lengths, kept, strict=True) if keep),
-        tuple(t for t, keep in zip(start_times, kept, strict=True) if keep),
-        tuple(notes),
-        _deviation(_linked(read(), origin), starts, start_times, kept, sample_time),
-    )
+    grid = TimeGrid(sample_time, tuple(kept), tuple(kept.values()), tuple(notes))
+    grid = grid._replace(deviation=_deviation(grid, _linked(read(), origin)))
     if in_parts and not grid.is_exact:
         raise NeedsMemory(
             f"time stamps of `{source}` leave a uniform grid of {sample_time:.6g} s by "
@@ -411,20 +405,15 @@ def _require_forward(stamps: np.ndarray, steps: np.ndarray, row: int, source: st
         )
 
 
-def _deviation(
-    parts: Iterable[tuple[np.ndarray, int]],
-    starts: Sequence[int],
-    start_times: Sequence[float],
-    kept: np.ndarray,
-    sample_time: float,
-) -> float:
+def _deviation(grid: TimeGrid, parts: Iterable[tuple[np.ndarray, int]]) -> float:
     """Return the largest deviation from the grid [s]."""
-    first_rows, first_times, largest = np.array(starts), np.array(start_times), 0.0
+    (first, last), start, largest = np.transpose(grid.ranges), np.array(grid.start_times), 0.0
     for t, row in parts:
         rows = row + np.arange(len(t))
-        number = np.searchsorted(first_rows, rows, "right") - 1
-        off = t - first_times[number] - sample_time * (rows - first_rows[number])
-        largest = max(largest, float(np.abs(off[kept[number]]).max(initial=0.0)))
+        k = np.maximum(np.searchsorted(first, rows, "right") - 1, 0)
+        off = np.abs(t - start[k] - grid.sample_time * (rows - first[k]))
+        inside = (first[k] <= rows) & (rows < last[k])
+        largest = max(largest, float(off[inside].max(initial=0.0)))
     return largest
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxid.arrays import double_precision
 from jaxid.excitation.plan import VAGUE, ExcitationPlan
@@ -102,27 +101,11 @@ def write_excitation(
         "joints": joint_figure(robot, plan.limits.limits, time, motion),
         "end_effector": tip_figure(robot, time, motion),
     }
-    page = excitation_page(plan, figures, remarks, settings)
-    with atomic_folder(folder) as staging:
-        (staging / "report.html").write_text(page, encoding="utf-8")
-        for name, figure in figures.items():
-            save(figure, staging / f"{name}.png")
-    return [folder / name for name in ("report.html", *(f"{name}.png" for name in figures))]
-
-
-def excitation_page(
-    plan: ExcitationPlan,
-    figures: Mapping[str, Figure],
-    remarks: Sequence[Remark] = (),
-    settings: Mapping[str, Any] | None = None,
-) -> str:
-    """Return the page of a designed motion as HTML."""
-    robot, base = plan.base.model.robot, plan.base
     captions = {"path": "Circle: start; square: end.", "poses": "Earlier poses are paler."}
     criteria, deviations, *use = plan.tables()
     every = ordered((*plan_remarks(plan), *remarks))
     text = "A random motion that fills the same limits is shown beside this one."
-    return render_page(
+    page = render_page(
         f"{robot.name}: a motion to record",
         [
             ("Verdict", [_headline(plan, remarks), every]),
@@ -132,8 +115,13 @@ def excitation_page(
             ("Expected standard deviations", [deviations]),
             provenance(settings or {}),
         ],
-        f"Designed to determine {base.size} base parameters of {robot.joints} joints.",
+        f"Designed to determine {plan.base.size} base parameters of {robot.joints} joints.",
     )
+    with atomic_folder(folder) as staging:
+        (staging / "report.html").write_text(page, encoding="utf-8")
+        for name, figure in figures.items():
+            save(figure, staging / f"{name}.png")
+    return [folder / name for name in ("report.html", *(f"{name}.png" for name in figures))]
 
 
 def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:

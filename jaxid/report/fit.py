@@ -11,7 +11,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.signal import fftconvolve
 
 from jaxid.arrays import Float
-from jaxid.errors import InputError
 from jaxid.identification.choices import FilterChoice
 from jaxid.identification.comparison import Comparison, Verdict
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit
@@ -271,12 +270,10 @@ def autocorrelation_figure(
             white noise behind them.
 
     Raises:
-        InputError: If the numbers of joints differ, or there are fewer than three rows.
+        InputError: If the numbers of joints differ.
     """
     require_joints(errors, robot)
     time = np.asarray(errors.time)
-    if len(time) < 3:
-        raise InputError(f"`{errors.name}` must have three rows at least, but has {len(time)}.")
     count = min(50, len(time) // 2) + 1
     lags = float(np.median(np.diff(time))) * np.arange(count)
     values = autocorrelation(errors, count)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxid.identification.choices import FilterChoice
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit
@@ -34,36 +35,77 @@ LARGE_CONDITION = 1e3
 """Condition number, with scaled columns, above which parameters are hard to tell apart."""
 
 
-def identification_page(
-    fit: Fit,
-    identification: Sequence[TorqueErrors],
-    verification: Sequence[TorqueErrors],
-    definiteness: Definiteness,
-    settings: Mapping[str, Any],
-    figures: Mapping[str, Figure],
-    notes: Sequence[str] = (),
-    doubts: Sequence[str] = (),
-) -> str:
-    """Return the page of an identification as HTML; the arguments are those of `write_report`."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Report:
+    """Content of the report of an identification.
+
+    Attributes:
+        fit: Identified parameters.
+        identification: Errors on the logs of the fit.
+        verification: Errors on logs that the fit has not seen.
+        definiteness: Definiteness of the mass matrix.
+        settings: Origin of the result.
+        notes: Notes on the logs, as sentences.
+        doubts: Findings that deserve attention, as sentences.
+        choice: Choice of the filter, where it was left to the logs.
+    """
+
+    fit: Fit
+    identification: Sequence[TorqueErrors]
+    verification: Sequence[TorqueErrors]
+    definiteness: Definiteness
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    notes: Sequence[str] = ()
+    doubts: Sequence[str] = ()
+    choice: FilterChoice | None = None
+
+    @property
+    def every_note(self) -> tuple[str, ...]:
+        """Notes on the robot, the fit and the logs, each once."""
+        fit = self.fit
+        return tuple(dict.fromkeys((*fit.base.model.robot.notes, *fit.notes, *self.notes)))
+
+
+def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
+    """Return the page of an identification as HTML."""
+    fit, settings = report.fit, report.settings
     base, robot = fit.base, fit.base.model.robot
-    overall, *criteria = verdict(fit, identification, verification, definiteness, doubts)
-    every_note = dict.fromkeys((*robot.notes, *fit.notes, *notes))
-    tables = tuple(error_table(errors, robot) for errors in (*identification, *verification))
+    overall, *criteria = verdict(report)
+    notes = [Remark(note) for note in report.every_note if note not in report.doubts]
+    errors = (*report.identification, *report.verification)
     lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
+    task = [
+        ("experiment", settings.get("experiment")),
+        ("identified with", ", ".join(settings.get("identification", ())) or None),
+        ("verified with", ", ".join(settings.get("verification", ())) or None),
+        *((key, settings.get(key)) for key in ("split", "filter", "decimation")),
+        ("estimator", fit.estimator),
+        ("solution", fit.solution),
+        *fit.facts[:-1],
+    ]
+    # 42 panels at most; the files of the others are named.
+    names = [name for name in figures if name.startswith("torque_")]
+    shown = max(1, 42 // robot.joints)
+    blocks: list[Figure | str] = [figures[name] for name in names[:shown]]
+    if others := ", ".join(f"{name}.png" for name in names[shown:]):
+        blocks.append(f"Figures of more recordings lie beside this page: {others}.")
+    about, gravity = robot.summary(), ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
+    assumed = ", ".join(robot.limits.assumed) or "nothing"
+    facts = [*about.facts, ("gravity [m/s²]", gravity), ("assumed", assumed)]
     sections = [
         ("Verdict", [overall, criteria]),
-        ("Task", [_task_table(fit, settings), [Remark(n) for n in every_note if n not in doubts]]),
-        ("Robot and drives", [_robot_table(robot), *motor_tables(robot)]),
+        ("Task", [Table("", facts=[fact for fact in task if fact[1] is not None]), notes]),
+        ("Robot and drives", [Table("", *about.columns, facts=facts), *motor_tables(robot)]),
         (
             "Errors",
             [
                 "Predicted less measured forces. Bars: the mean of their absolute values (Eq. 37, "
                 "Fig. 10 of the paper); marks: their RMS.",
                 figures["errors"],
-                tables,
+                tuple(error_table(e, robot) for e in errors),
             ],
         ),
-        ("Measured and predicted forces", _torque_blocks(figures, robot.joints)),
+        ("Measured and predicted forces", blocks),
         (
             f"{base.size} base parameters",
             [
@@ -93,36 +135,6 @@ def identification_page(
         f"{base.size} base parameters of {robot.joints} joints, from {logs}.",
         "All numbers: result.json and parameters.csv beside this page.",
     )
-
-
-def _task_table(fit: Fit, settings: Mapping[str, Any]) -> Table:
-    rows = [
-        ("experiment", settings.get("experiment")),
-        ("identified with", ", ".join(settings.get("identification", ())) or None),
-        ("verified with", ", ".join(settings.get("verification", ())) or None),
-        *((key, settings.get(key)) for key in ("split", "filter", "decimation")),
-        ("estimator", fit.estimator),
-        ("solution", fit.solution),
-        *fit.facts[:-1],
-    ]
-    return Table("", facts=[(word, text) for word, text in rows if text is not None])
-
-
-def _robot_table(robot: Robot) -> Table:
-    table, assumed = robot.summary(), ", ".join(robot.limits.assumed)
-    gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
-    more = [("gravity [m/s²]", gravity), ("assumed", assumed or "nothing")]
-    return Table("", *table.columns, facts=[*table.facts, *more])
-
-
-def _torque_blocks(figures: Mapping[str, Figure], joints: int) -> list[Figure | str]:
-    """Return figures of the first recordings (42 panels at most), and the files of the others."""
-    names = [name for name in figures if name.startswith("torque_")]
-    shown = max(1, 42 // joints)
-    blocks: list[Figure | str] = [figures[name] for name in names[:shown]]
-    if others := ", ".join(f"{name}.png" for name in names[shown:]):
-        blocks.append(f"Figures of more recordings lie beside this page: {others}.")
-    return blocks
 
 
 def parameter_table(fit: Fit) -> Table:
@@ -221,22 +233,17 @@ def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
     )
 
 
-def verdict(
-    fit: Fit,
-    identification: Sequence[TorqueErrors],
-    verification: Sequence[TorqueErrors],
-    definiteness: Definiteness,
-    doubts: Sequence[str] = (),
-) -> list[Remark]:
+def verdict(report: Report) -> list[Remark]:
     """Return the verdict on a model: one sentence for everything, then one for each criterion."""
+    fit, definiteness = report.fit, report.definiteness
     condition, eigenvalue = fit.condition_numbers.scaled, significant(definiteness.smallest)
     bodies = []
     if fit.consistency is not None:
         active = "; ".join(fit.consistency.active) or "none"
         bodies = [Remark(f"All bodies are physically consistent; active bounds: {active}")]
     found = [
-        _judge_forces(verification or identification, bool(verification)),
-        *_judge_new_motions(identification, verification),
+        _judge_forces(report.verification or report.identification, bool(report.verification)),
+        *_judge_new_motions(report.identification, report.verification),
         dataclasses.replace(
             fit.determination[0],
             detail="A combination counts as undetermined if it leaves more than "
@@ -260,7 +267,10 @@ def verdict(
             f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to tell apart.",
         ),
         *bodies,
-        *(Remark(text[:1].upper() + text[1:], Status.DOUBTFUL) for text in dict.fromkeys(doubts)),
+        *(
+            Remark(text[:1].upper() + text[1:], Status.DOUBTFUL)
+            for text in dict.fromkeys(report.doubts)
+        ),
     ]
     statuses = [remark.status for remark in found]
     if Status.BAD in statuses:

@@ -16,7 +16,6 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
-from jaxid.errors import InputError
 from jaxid.excitation.constraints import tip_motion
 from jaxid.report.style import (
     BLUE,
@@ -112,12 +111,7 @@ def filtered_figure(
         desired: Desired motion at the samples.
         filtered: Motion that the filter makes of measured positions.
         joint: Index of the joint, from 0.
-
-    Raises:
-        InputError: If there is no such joint.
     """
-    if not 0 <= joint < robot.joints:
-        raise InputError(f"`joint` must lie between 0 and {robot.joints - 1}, but is {joint}.")
     unit, title = robot.joint_unit(joint), f"{robot.name}: {robot.joint_names[joint]}"
     with drawing(f"{title}, desired and filtered", WIDTH, 4.5) as figure:
         panels = figure.subplots(2, 1, sharex=True)
@@ -271,6 +265,11 @@ def _project(robot: Robot, q: np.ndarray, collision: CollisionModel | None) -> _
     bones = [np.stack([p, origins[:, i]], axis=1) for i, p in enumerate(starts)]
     bones.append(np.stack([origins[:, robot.tip_body], tips], axis=1))
     points = np.stack(bones, axis=1)
+    low, high = points.min(axis=(0, 1, 2)), points.max(axis=(0, 1, 2))
+    margin = 0.1 * np.max(high - low)
+    x, y = (MaxNLocator(12).tick_values(low[k] - margin, high[k] + margin) for k in range(2))
+    across = [[[u, y[0], 0.0], [u, y[-1], 0.0]] for u in x]
+    floor = np.array([*across, *([[x[0], v, 0.0], [x[-1], v, 0.0]] for v in y)])
     a, e = np.radians((AZIMUTH, ELEVATION))
     ahead = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])
@@ -282,7 +281,7 @@ def _project(robot: Robot, q: np.ndarray, collision: CollisionModel | None) -> _
     return _View(
         points @ camera,
         (tips @ camera)[:, :2],
-        _floor(points.reshape(-1, 3)) @ camera[:, :2],
+        floor @ camera[:, :2],
         seen[:, moves],
         radii[moves],
         [_outline(seen[0, i, :, :2], float(radii[i])) for i in np.flatnonzero(~moves)],
@@ -299,16 +298,6 @@ def _place_bodies(robot: Robot, collision: CollisionModel | None, q: Float[AnyAr
         return placements(robot, x)[1], tip_placement(robot, x)[1], ends
 
     return jax.vmap(place)(q)
-
-
-def _floor(points: np.ndarray) -> Float[np.ndarray, "lines 2 3"]:
-    """Return a grid on the ground below all points."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.1 * np.max(high - low)
-    x, y = (MaxNLocator(12).tick_values(low[k] - margin, high[k] + margin) for k in range(2))
-    across = [[[u, y[0], 0.0], [u, y[-1], 0.0]] for u in x]
-    along = [[[x[0], v, 0.0], [x[-1], v, 0.0]] for v in y]
-    return np.array([*across, *along])
 
 
 def _outline(ends: Float[np.ndarray, "2 2"], radius: float) -> Float[np.ndarray, "points 2"]:

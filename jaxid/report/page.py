@@ -114,6 +114,11 @@ def _macros() -> Any:
     # Commands that write no page do not wait for it.
     import jinja2
 
+    def aligned(number: str) -> str:
+        # Blanks behind a number become as wide as the digits and the point left out.
+        pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
+        return pointed.replace(" ", "\N{FIGURE SPACE}")
+
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
@@ -121,14 +126,8 @@ def _macros() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["aligned"] = _align
+    environment.filters["aligned"] = aligned
     return environment.get_template("page.html").module
-
-
-def _align(number: str) -> str:
-    """Replace blanks behind a number by blanks as wide as the digits and the point left out."""
-    pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
-    return pointed.replace(" ", "\N{FIGURE SPACE}")
 
 
 def show(console: Console, *tables: Table) -> None:

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
-from jaxid.identification.choices import FilterChoice
 from jaxid.identification.comparison import LEVEL, Comparison, parameter_kinds
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit, load
@@ -28,12 +27,12 @@ from jaxid.report.fit import (
     parameter_figure,
     residual_figure,
 )
-from jaxid.report.identification import identification_page
+from jaxid.report.identification import Report, identification_page
 from jaxid.report.page import versions
 from jaxid.report.style import save
 from jaxid.report.torques import error_figure, torque_figure
 from jaxid.robot.robot import Robot
-from jaxid.validation import Definiteness, TorqueErrors
+from jaxid.validation import TorqueErrors
 
 MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""
@@ -46,35 +45,20 @@ Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
 """Names, units, values and uncertainty of some estimates."""
 
 
-def write_report(
-    folder: Path,
-    fit: Fit,
-    identification: Sequence[TorqueErrors],
-    verification: Sequence[TorqueErrors],
-    definiteness: Definiteness,
-    settings: Mapping[str, Any],
-    notes: Sequence[str] = (),
-    choice: FilterChoice | None = None,
-    doubts: Sequence[str] = (),
-    pdf: bool = False,
-) -> list[Path]:
+def write_report(folder: Path, report: Report, pdf: bool = False) -> list[Path]:
     """Write `report.html`, `result.json`, `parameters.csv`, `model.json` and figures; return them.
 
     A folder that exists keeps its other files; files of an earlier report in it are replaced.
-    `settings` tell the origin of the result, `notes` and `doubts` about the logs are sentences.
     """
-    record = _record(fit, identification, verification, definiteness, settings, notes)
-    figures = _draw(fit, identification, verification, choice)
-    page = identification_page(
-        fit, identification, verification, definiteness, settings, figures, notes, doubts
-    )
+    record, figures = _record(report), _draw(report)
+    page = identification_page(report, figures)
     suffixes = (".png", ".pdf") if pdf else (".png",)
     names = ["report.html", "result.json", "parameters.csv", MODEL]
     names += [f"{stem}{suffix}" for stem in figures for suffix in suffixes]
     with atomic_folder(folder, _earlier_files) as staging:
         write_json(staging / "result.json", {**record, "files": names})
-        write_csv(staging / "parameters.csv", parameter_rows(fit))
-        fit.save(staging / MODEL)
+        write_csv(staging / "parameters.csv", parameter_rows(report.fit))
+        report.fit.save(staging / MODEL)
         (staging / "report.html").write_text(page, encoding="utf-8")
         for stem, figure in figures.items():
             for suffix in suffixes:
@@ -82,27 +66,22 @@ def write_report(
     return [folder / name for name in names]
 
 
-def _draw(
-    fit: Fit,
-    identification: Sequence[TorqueErrors],
-    verification: Sequence[TorqueErrors],
-    choice: FilterChoice | None,
-) -> dict[str, Figure]:
+def _draw(report: Report) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
-    robot, spectra = fit.base.model.robot, fit.residual_spectra
+    robot, spectra = report.fit.base.model.robot, report.fit.residual_spectra
     figures = {
-        "errors": error_figure(identification, verification, robot),
-        "parameters": parameter_figure(fit),
+        "errors": error_figure(report.identification, report.verification, robot),
+        "parameters": parameter_figure(report.fit),
     }
-    if choice is not None:
-        figures["filter"] = filter_figure(choice)
+    if report.choice is not None:
+        figures["filter"] = filter_figure(report.choice)
     if spectra is not None:
         figures["residuals"] = residual_figure(spectra, robot)
-        longest = max(identification, key=lambda errors: len(errors.time))
+        longest = max(report.identification, key=lambda errors: len(errors.time))
         figures["autocorrelation"] = autocorrelation_figure(longest, robot, spectra)
     used: set[str] = set()
-    for role, group in (("identification", identification), ("verification", verification)):
-        for errors in group:
+    for role in ("identification", "verification"):
+        for errors in getattr(report, role):
             stem = safe_name(errors.name)
             more = (f"{stem}_{role}_{k}" for k in range(2, 10_000))
             # Unique also where case is ignored.
@@ -268,15 +247,9 @@ def _rows(**columns: Any) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
 
-def _record(
-    fit: Fit,
-    identification: Sequence[TorqueErrors],
-    verification: Sequence[TorqueErrors],
-    definiteness: Definiteness,
-    settings: Mapping[str, Any],
-    notes: Sequence[str],
-) -> dict[str, Any]:
+def _record(report: Report) -> dict[str, Any]:
     """Return the content of `result.json`."""
+    fit, definiteness = report.fit, report.definiteness
     base, model, robot = fit.base, fit.base.model, fit.base.model.robot
     return plain(
         {
@@ -295,8 +268,8 @@ def _record(
             "fit": _fit_record(fit),
             "consistency": consistency_record(fit),
             "errors": {
-                "identification": [_error_record(e, robot) for e in identification],
-                "verification": [_error_record(e, robot) for e in verification],
+                role: [_error_record(errors, robot) for errors in getattr(report, role)]
+                for role in ("identification", "verification")
             },
             "mass_matrix": _entries(
                 definiteness,
@@ -304,8 +277,8 @@ def _record(
                 smallest_eigenvalue="smallest",
                 indefinite_share="indefinite",
             ),
-            "settings": settings,
-            "notes": tuple(dict.fromkeys((*robot.notes, *fit.notes, *notes))),
+            "settings": report.settings,
+            "notes": report.every_note,
         }
     )
 
@@ -384,7 +357,7 @@ def consistency_record(fit: Fit) -> dict[str, Any] | None:
 def _robot_record(robot: Robot) -> dict[str, Any]:
     """Return names, units and limits; geometry, drives and tool are in the model file."""
     joints = range(robot.joints)
-    names = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
+    limits = "position_min position_max velocity acceleration jerk force"
     return {
         **_entries(robot, "name source"),
         "joints": _rows(
@@ -392,7 +365,7 @@ def _robot_record(robot: Robot) -> dict[str, Any]:
             kind=["revolute" if revolute else "prismatic" for revolute in robot.revolute],
             unit=[robot.joint_unit(j) for j in joints],
             force_unit=[robot.force_unit(j) for j in joints],
-            **{name: getattr(robot.limits, name) for name in names},
+            **_entries(robot.limits, limits),
         ),
     }
 
@@ -404,10 +377,6 @@ def _error_record(errors: TorqueErrors, robot: Robot) -> dict[str, Any]:
             name=robot.joint_names,
             unit=[robot.force_unit(j) for j in range(robot.joints)],
             rows=np.asarray(errors.counted).sum(axis=0),
-            mean=errors.mean,
-            rms=errors.rms,
-            mean_percent=errors.mean_percent,
-            rms_percent=errors.rms_percent,
-            rms_relative=errors.rms_relative,
+            **_entries(errors, "mean rms mean_percent rms_percent rms_relative"),
         ),
     }

@@ -26,40 +26,13 @@ MEASURED, PREDICTED, ERROR = "#9aa6b2", VERMILION, BLUE
 WIDTH = 11.0
 """Width of a figure [inch]."""
 
-_SETTINGS = {
-    "font.size": 9,
-    "text.color": INK,
-    # Names of joints and files are no formulas, whatever characters they contain.
-    "text.parse_math": False,
-    "axes.titlesize": 9,
-    "axes.titlepad": 5,
-    "axes.labelsize": 8.5,
-    "axes.labelcolor": GREY,
-    "axes.edgecolor": GREY,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": PALE,
-    "grid.linewidth": 0.5,
-    **{f"{axis}tick.labelsize": 8 for axis in "xy"},
-    **{f"{axis}tick.color": GREY for axis in "xy"},
-    **{f"{axis}tick.major.width": 0.6 for axis in "xy"},
-    **{f"{axis}tick.major.size": 3 for axis in "xy"},
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "legend.handlelength": 1.6,
-    "agg.path.chunksize": 20000,
-    "pdf.fonttype": 42,
-    "svg.hashsalt": "jaxid",
-}
+_STYLE = Path(__file__).with_name("figures.mplstyle")
 
 
 def house_style(**settings: Any) -> contextlib.AbstractContextManager[None]:
     """Return a context with the settings of matplotlib, and further ones (`_` for the dots)."""
     further = {key.replace("_", "."): value for key, value in settings.items()}
-    return matplotlib.style.context(["default", {**_SETTINGS, **further}])
+    return matplotlib.style.context(["default", _STYLE, further])
 
 
 @contextlib.contextmanager

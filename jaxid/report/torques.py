@@ -48,19 +48,11 @@ def torque_figure(
         joints: Indices of the joints to show, from 0; all if None.
 
     Raises:
-        InputError: If the numbers of joints differ, there is no such joint, or no row counts.
+        InputError: If the numbers of joints differ.
     """
     require_joints(errors, robot)
     shown = range(robot.joints) if joints is None else tuple(joints)
-    if not shown or not set(shown) <= set(range(robot.joints)):
-        raise InputError(
-            f"`joints` must hold numbers from 0 to {robot.joints - 1}, but is {joints}."
-        )
     counted = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
-    if not len(counted):
-        raise InputError(
-            f"no row of `{errors.name}` counts for any joint: there is nothing to draw."
-        )
     window = slice(counted[0], counted[-1] + 1)
     columns = 1 if len(shown) <= 2 else 2 if len(shown) <= 16 else 3
     rows = math.ceil(len(shown) / columns)

@@ -64,7 +64,7 @@ class CollisionModel(Hashable):
         pairs: Sequence[tuple[str, str]] | None = None,
     ):
         self.capsules, self.obstacles = tuple(capsules), tuple(obstacles)
-        names, notes = [shape.name for shape in (*capsules, *obstacles)], []
+        names = [shape.name for shape in (*capsules, *obstacles)]
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"two shapes are named `{name}`: rename one.")
@@ -72,21 +72,22 @@ class CollisionModel(Hashable):
             if not GROUND <= c.body < robot.joints:
                 bodies = f"from 0 to {robot.joints - 1}, or -1 for the ground"
                 raise InputError(f"`body` of capsule `{c.name}` must be {bodies}, but is {c.body}.")
+        overlap: list[str] = []
         if pairs is None:
-            pairs, together = [], list(_meeting_pairs(robot, capsules, names))
-            if together:
-                trial = CollisionModel(robot, capsules, obstacles, together)
-                overlap = _always_overlapping(robot, trial)
-                pairs = [p for p in together if " and ".join(p) not in overlap]
-                notes = [
-                    f"{pair} overlap in every pose that was tried, so they are not watched."
-                    for pair in overlap
-                ]
+            pairs = _meeting_pairs(robot, capsules, names)
+            if pairs:
+                overlap = _always_overlapping(
+                    robot, CollisionModel(robot, capsules, obstacles, pairs)
+                )
+            pairs = [p for p in pairs if " and ".join(p) not in overlap]
         found = [_indices(names, len(capsules), pair) for pair in pairs]
         if not found:
             raise InputError("a collision model needs at least one pair of shapes that can meet.")
         self.pairs = tuple(sorted(found, key=lambda pair: pair[1] >= len(capsules)))
-        self.notes = tuple(notes)
+        self.notes = tuple(
+            f"{pair} overlap in every pose that was tried, so they are not watched."
+            for pair in overlap
+        )
 
     @property
     def pair_names(self) -> tuple[str, ...]:
@@ -124,6 +125,7 @@ class CollisionModel(Hashable):
             gaps.append((gap - radii[i])[..., None])
         return jnp.concatenate(gaps, axis=-1)
 
+    @eqx.filter_jit
     def clearance(
         self, robot: Robot, q: Float[AnyArray, "*batch joints"]
     ) -> Float[Array, "*batch pairs"]:
@@ -134,13 +136,9 @@ class CollisionModel(Hashable):
             q: Joint coordinates [rad or m].
         """
         q = jnp.asarray(q)
-        gaps = _clearances_of_poses(self, robot, jnp.reshape(q, (-1, robot.joints)))
+        poses = jnp.reshape(q, (-1, robot.joints))
+        gaps = self.clearances(jax.vmap(lambda x: self.ends(robot, x))(poses))
         return gaps.reshape(*q.shape[:-1], gaps.shape[-1])
-
-
-@eqx.filter_jit
-def _clearances_of_poses(model: CollisionModel, robot: Robot, q: Array) -> Array:
-    return model.clearances(jax.vmap(lambda x: model.ends(robot, x))(q))
 
 
 def _always_overlapping(robot: Robot, model: CollisionModel) -> list[str]:
@@ -155,14 +153,18 @@ def _always_overlapping(robot: Robot, model: CollisionModel) -> list[str]:
     return [model.pair_names[k] for k in np.flatnonzero(gaps.max(axis=0) <= 0)]
 
 
-def _meeting_pairs(robot: Robot, capsules: Sequence[Capsule], names: list[str]) -> Any:
-    """Yield names of the shapes on bodies that are neither one nor neighbours."""
+def _meeting_pairs(
+    robot: Robot, capsules: Sequence[Capsule], names: list[str]
+) -> list[tuple[str, str]]:
+    """Return names of the shapes on bodies that are neither one nor neighbours."""
     bodies = [*(c.body for c in capsules), *[GROUND] * (len(names) - len(capsules))]
     parents = [robot.parent[b] if b != GROUND else None for b in bodies]
-    for i, k in itertools.combinations(range(len(names)), 2):
-        apart = bodies[i] != bodies[k] and parents[i] != bodies[k] and parents[k] != bodies[i]
-        if i < len(capsules) and apart:
-            yield names[i], names[k]
+    return [
+        (names[i], names[k])
+        for i, k in itertools.combinations(range(len(names)), 2)
+        if i < len(capsules) and bodies[k] not in (bodies[i], parents[i])
+        if parents[k] != bodies[i]
+    ]
 
 
 def _indices(names: list[str], capsules: int, pair: tuple[str, str]) -> tuple[int, int]:
@@ -319,17 +321,6 @@ def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndar
             f"`{tree.path}` has collision meshes, which need the package trimesh: install the "
             'extra `meshes` (`pip install "jaxid-robotics[meshes]"`).'
         ) from error
-    file = _mesh_file(tree, packages, mesh)
-    try:
-        loaded = trimesh.load(str(file), force="mesh")
-        vertices = np.asarray(loaded.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
-    except Exception as error:  # readers of many formats raise many exceptions
-        raise InputError(f"`{file}` is no mesh that can be read: {error}.") from error
-    return vertices
-
-
-def _mesh_file(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> Path:
-    """Return the file of a mesh: beside the URDF file, or in a package in a folder above it."""
     path, name = Path(tree.path), mesh.get("filename") or ""
     scheme, _, rest = name.rpartition("://")
     files, folders = [Path(rest)], [path.parent]
@@ -339,10 +330,16 @@ def _mesh_file(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> Path:
         folders = [path.parent, *path.absolute().parents]
     if packages is not None:
         folders = [Path(packages)]
-    for folder, file in itertools.product(folders, files):
-        if (folder / file).is_file():
-            return folder / file
-    raise FileNotFoundError(
-        f"{tree.place(mesh)}: the mesh `{name}` does not exist; give by `packages` the folder that "
-        "holds its package."
-    )
+    places = (folder / file for folder, file in itertools.product(folders, files))
+    file = next(filter(Path.is_file, places), None)
+    if file is None:
+        raise FileNotFoundError(
+            f"{tree.place(mesh)}: the mesh `{name}` does not exist; give by `packages` the folder "
+            "that holds its package."
+        )
+    try:
+        loaded = trimesh.load(str(file), force="mesh")
+        vertices = np.asarray(loaded.vertices, np.float64)  # pyright: ignore[reportAttributeAccessIssue]
+    except Exception as error:  # readers of many formats raise many exceptions
+        raise InputError(f"`{file}` is no mesh that can be read: {error}.") from error
+    return vertices

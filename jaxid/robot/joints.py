@@ -1,5 +1,6 @@
 """Limits and drives of a robot's joints, and numbers that may be in other units."""
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -238,11 +239,16 @@ def far_notes(owner: str, lengths: Numbers) -> tuple[str, ...]:
     return (f"{owner} is {max(far):g} m: is the length in millimetres?",) if far else ()
 
 
-def fast_notes(joint: str, speed: float, revolute: bool) -> tuple[str, ...]:
-    """Return a note if a velocity limit [rad/s] may be in degrees per second."""
-    if not (revolute and 50.0 < speed < np.inf):
-        return ()
-    return (
-        f"joint `{joint}`: a velocity of up to {speed:g} rad/s is "
-        f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per second?",
-    )
+def limit_notes(names: Sequence[str], revolute: Sequence[bool], limits: Limits) -> Iterator[str]:
+    """Yield notes on limits that may be in millimetres or in degrees per second."""
+    low, high, speeds = limits.position_min, limits.position_max, limits.velocity
+    if not all(isinstance(x, np.ndarray) for x in (low, high, speeds)):
+        return
+    for name, turns, speed, *ends in zip(names, revolute, speeds, low, high, strict=True):
+        if not turns:
+            yield from far_notes(f"joint `{name}`: an end of its range", ends)
+        elif 50.0 < speed < np.inf:
+            yield (
+                f"joint `{name}`: a velocity of up to {speed:g} rad/s is "
+                f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per second?"
+            )

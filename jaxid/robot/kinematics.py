@@ -149,10 +149,17 @@ def inverse_kinematics_along(
     count, faults = len(goals), []
     for start in _candidates(task, goals[:1], f"pose 1 of {count}")[:8]:
         q = _follow(task, goals, start)
-        fault = _path_fault(task, goals, q)
-        if fault is None:
+        missed = ~(_distances(task, goals, q).max(axis=1) <= _REACHED)
+        beyond = _beyond(task, q)
+        outside = beyond.max(axis=1) > _REACHED
+        jumps = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half).max(axis=1) > 0.25
+        failed = np.flatnonzero(missed | jumps | outside)
+        if not len(failed):
             return np.clip(q, task.low, task.high)
-        faults.append(fault)
+        k, reason = int(failed[0]), "the joints would have to jump, for the pose is singular"
+        if outside[k] and not missed[k]:
+            reason = f"joint `{robot.joint_names[int(beyond[k].argmax())]}` leaves its range"
+        faults.append((k, reason))
     k, reason = max(faults)
     name = f"pose {k + 1} of {count}"
     _candidates(task, goals[k : k + 1], name)
@@ -230,23 +237,6 @@ def _beyond(task: _Task, q: np.ndarray) -> np.ndarray:
     return np.maximum(task.low - q, q - task.high) / task.half
 
 
-def _search(task: _Task, goals: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Go from the starts to the poses by steps of Levenberg and Marquardt within limits."""
-    q, eye = np.clip(task.starts, low, high), np.eye(task.robot.joints)
-    damping = np.full(len(q), 1e-2)
-    e, J, _, _ = _linearise(task, goals, q)
-    for _ in range(80):
-        H = np.swapaxes(J, 1, 2) @ J + damping[:, None, None] * eye
-        slope = np.einsum("pij,pi->pj", J, e)[..., None]
-        then = np.clip(q - task.half * np.linalg.solve(H, slope)[..., 0], low, high)
-        e_then, J_then, _, _ = _linearise(task, goals, then)
-        better = (e_then**2).sum(axis=1) < (e**2).sum(axis=1)
-        damping = np.clip(damping * np.where(better, 0.2, 4.0), 1e-12, 1e3)
-        q, e = np.where(better[:, None], then, q), np.where(better[:, None], e_then, e)
-        J = np.where(better[:, None, None], J_then, J)
-    return q
-
-
 def _descend(
     task: _Task, goals: np.ndarray, q: np.ndarray, multipliers: np.ndarray, gauss: int, newton: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -275,10 +265,21 @@ def _descend(
 
 def _try_starts(task: _Task, goal: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return solutions from all starts: nearest to the posture, and as the search found them."""
-    goals = np.broadcast_to(goal, (len(task.starts), *goal.shape[1:]))
-    found = _search(task, goals, low, high)
-    none = np.zeros((len(found), 3 if goal.shape[2] == 1 else 6))
-    return np.concatenate([_descend(task, goals, found, none, 60, 6)[0], found])
+    # Steps of Levenberg and Marquardt within limits.
+    q, eye = np.clip(task.starts, low, high), np.eye(task.robot.joints)
+    damping = np.full(len(q), 1e-2)
+    e, J, _, _ = _linearise(task, goal, q)
+    for _ in range(80):
+        H = np.swapaxes(J, 1, 2) @ J + damping[:, None, None] * eye
+        slope = np.einsum("pij,pi->pj", J, e)[..., None]
+        then = np.clip(q - task.half * np.linalg.solve(H, slope)[..., 0], low, high)
+        e_then, J_then, _, _ = _linearise(task, goal, then)
+        better = (e_then**2).sum(axis=1) < (e**2).sum(axis=1)
+        damping = np.clip(damping * np.where(better, 0.2, 4.0), 1e-12, 1e3)
+        q, e = np.where(better[:, None], then, q), np.where(better[:, None], e_then, e)
+        J = np.where(better[:, None, None], J_then, J)
+    none = np.zeros((len(q), 3 if goal.shape[2] == 1 else 6))
+    return np.concatenate([_descend(task, goal, q, none, 60, 6)[0], q])
 
 
 def _candidates(task: _Task, goal: np.ndarray, name: str) -> list[np.ndarray]:
@@ -288,7 +289,7 @@ def _candidates(task: _Task, goal: np.ndarray, name: str) -> list[np.ndarray]:
         InputError: If there are none; the message names the reason.
     """
     q = _try_starts(task, goal, task.low, task.high)
-    reached = _distances(task, np.broadcast_to(goal, (len(q), *goal.shape[1:])), q).max(axis=1)
+    reached = _distances(task, goal, q).max(axis=1)
     good = q[(reached <= _REACHED) & (_beyond(task, q).max(axis=1) <= _REACHED)]
     away = np.sum(((good - task.posture) / task.half) ** 2, axis=1)
     kept: list[np.ndarray] = []
@@ -317,26 +318,11 @@ def _follow(task: _Task, goals: np.ndarray, start: np.ndarray) -> np.ndarray:
     return _descend(task, goals, guess[:, :-6], guess[:, -6:], 0, 6)[0]
 
 
-def _path_fault(task: _Task, goals: np.ndarray, q: np.ndarray) -> tuple[int, str] | None:
-    """Return the first pose of a path that fails, and the reason; None if none does."""
-    missed = ~(_distances(task, goals, q).max(axis=1) <= _REACHED)
-    beyond = _beyond(task, q)
-    outside = beyond.max(axis=1) > _REACHED
-    jumps = np.abs(np.diff(q, axis=0, prepend=q[:1]) / task.half).max(axis=1) > 0.25
-    failed = np.flatnonzero(missed | jumps | outside)
-    if not len(failed):
-        return None
-    k = int(failed[0])
-    if outside[k] and not missed[k]:
-        return k, f"joint `{task.robot.joint_names[int(beyond[k].argmax())]}` leaves its range"
-    return k, "the joints would have to jump, for the pose is singular"
-
-
 def _explanation(task: _Task, goal: np.ndarray) -> str:
     """Return the reason why there are no coordinates for a pose, as the predicate of a sentence."""
     robot, free = task.robot, np.full(task.robot.joints, np.inf)
     q = _try_starts(task, goal, -free, free)
-    distances = _distances(task, np.broadcast_to(goal, (len(q), *goal.shape[1:])), q)
+    distances = _distances(task, goal, q)
     reached = distances.max(axis=1) <= _REACHED
     if reached.any():
         beyond = _beyond(task, q[reached])

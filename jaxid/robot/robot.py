@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.inertia import Inertia
-from jaxid.robot.joints import FARTHEST, Drives, Limits, far_notes
+from jaxid.robot.joints import FARTHEST, Drives, Limits, far_notes, limit_notes
 from jaxid.table import Column, Table
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -139,7 +139,13 @@ class Robot(eqx.Module):
         self.name, self.joint_names = name, tuple(names)
         self.parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
         self.revolute = tuple(bool(r) for r in revolute)
-        self.axis = self._unit_axes(_checked("`axis`", axis, (n, 3)))
+        self.axis = _checked("`axis`", axis, (n, 3))
+        if isinstance(self.axis, np.ndarray):
+            length = np.linalg.norm(self.axis, axis=-1, keepdims=True)
+            if (length < 1e-9).any():
+                j = int(length.argmin()) + 1
+                raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
+            self.axis = np.where(np.abs(length - 1.0) > 1e-15, self.axis / length, self.axis)
         self.rotation = _rotations("`rotation`", rotation, (n, 3, 3))
         self.offset = _checked("`offset`", offset, (n, 3))
         self.gravity = _checked("`gravity`", gravity, (3,))
@@ -152,16 +158,8 @@ class Robot(eqx.Module):
         self.tip_offset = _checked("`tip_offset`", tip_offset, (3,))
         self.source = source
         self._check_joints()
-        self.notes = tuple(dict.fromkeys((*notes, *self._far_notes())))
-
-    def _unit_axes(self, axes: AnyArray) -> AnyArray:
-        if isinstance(axes, jax.Array):
-            return axes
-        length = np.linalg.norm(axes, axis=-1, keepdims=True)
-        if (length < 1e-9).any():
-            j = int(length.argmin()) + 1
-            raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
-        return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
+        doubts = limit_notes(self.joint_names, self.revolute, self.limits)
+        self.notes = tuple(dict.fromkeys((*notes, *self._far_notes(), *doubts)))
 
     def _check_joints(self) -> None:
         """Reject names, parents and bodies that do not fit the number of joints."""

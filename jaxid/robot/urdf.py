@@ -10,7 +10,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from jaxid.arrays import AnyArray, Float, Numbers
 from jaxid.errors import InputError
 from jaxid.robot.inertia import Inertia
-from jaxid.robot.joints import Limits, far_notes, fast_notes, range_fault
+from jaxid.robot.joints import Limits, range_fault
 from jaxid.robot.robot import GRAVITY, Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation, snap_angles, snap_directions
 
@@ -201,23 +201,20 @@ class UrdfTree:
     def _find_root(self) -> str:
         """Return the only link that no joint moves."""
         roots = [link for link in self.links if link not in self._above]
-        if len(roots) > 1:
-            raise InputError(
-                f"`{self.path}` has several root links ({_listed(roots)}), but must be one tree: "
-                "connect them by fixed joints."
-            )
         reached = list(roots)
         for link in reached:
             reached += [_ends(joint)[1] for joint in self._below[link]]
-        for link in self.links:
-            if link not in reached:
-                raise self.error(
-                    self._above[link],
-                    f"is part of a closed loop: no path leads from a root link to `{link}`; "
-                    "remove one joint of the loop",
-                )
-        if not roots:
-            raise InputError(f"`{self.path}` has no links.")
+        if link := next((link for link in self.links if link not in reached), None):
+            raise self.error(
+                self._above[link],
+                f"is part of a closed loop: no path leads from a root link to `{link}`; "
+                "remove one joint of the loop",
+            )
+        if len(roots) != 1:
+            raise InputError(
+                f"`{self.path}` must have one root link, but has {_listed(roots) or 'none'}: "
+                "connect several by fixed joints."
+            )
         return roots[0]
 
     def _merge(self, base: str, tip: str | None, tolerance: float) -> None:
@@ -357,7 +354,7 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
     values, notes = np.full((4, len(tree.joints)), np.inf), []
     values[0] = -np.inf
     for i, joint in enumerate(tree.joints):
-        name, turns = joint.get("name"), joint.get("type") in _TURNING
+        name = joint.get("name")
         if joint.get("type") != "continuous":
             low, high = values[:2, i] = _range(tree, joint)
             if low == high == 0.0:
@@ -369,9 +366,6 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
                 values[k, i] = value
             else:
                 notes.append(f"joint `{name}`: {key} {value:g} is taken as unknown.")
-        notes += fast_notes(name, values[2, i], turns)
-        if not turns:
-            notes += far_notes(f"joint `{name}`: an end of its range", values[:2, i])
     low, high, speed, force = values
     limits = Limits(position_min=low, position_max=high, velocity=speed, force=force)
     return limits, notes

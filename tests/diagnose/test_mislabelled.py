@@ -87,7 +87,7 @@ def test_a_good_log_has_no_findings_and_prints_its_limits(motors):
     assert text.count("!") >= len(diagnosis.findings)
 
 
-@pytest.mark.parametrize(("joint", "channel"), [(0, "angle"), (3, "force"), (3, "angle")])
+@pytest.mark.parametrize(("joint", "channel"), [(3, "force"), (3, "angle")])
 def test_a_sign_is_found_in_the_motors_columns_by_friction_that_must_brake(
     motors, said, joint, channel
 ):

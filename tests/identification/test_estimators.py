@@ -170,7 +170,6 @@ REFUSALS = [
     (lambda base, o: identify(base, o.motion), "`observations`"),
     (lambda base, o: identify(base.model, o), "`base`"),
     (lambda base, o: jid.identify(base, o, LINEAR[0]).predict(jid.Motion(*ONES)), "`motion`"),
-    (lambda base, o: jid.Recording.of(1j * ONES[0], ONES[0], sample_time=0.1), "complex"),
     *[(lambda base, o, k=k: alone(base, o, k), "only their factors") for k in range(3, 8)],
 ]
 

@@ -110,7 +110,7 @@ def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
         (lambda d: d["model"].pop("base"), "lacks `base`"),
         (lambda d: d["model"].update(kind="BaseParameters"), "not known"),
         (lambda d: d["model"].update(weights=None), "`weights` holds None"),
-        (lambda d: d["model"].update(weights={"float64": ["one", 1.0]}), "'one'"),
+        (lambda d: d["model"].update(weights={"float64": ["one", 1.0]}), "`weights` is no array"),
         (lambda d: d["model"].update(weights={"object": []}), "has the keys object"),
         (lambda d: d["model"].update(rows=[1.5, 2]), r"`rows\[0\]` holds 1.5"),
         (lambda d: d["model"]["base"]["model"]["robot"].update(parent=[3, 0]), "`parent`"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
+from jaxid.report.identification import Report
 from jaxid.report.result_files import write_report
 from jaxid.simulation.friction import SmoothFriction
 from jaxid.simulation.virtual import Sensors, random_bodies
@@ -107,15 +108,14 @@ def written(validated, tmp_path_factory):
     """Return a folder with a report."""
     fit, validation = validated
     folder = tmp_path_factory.mktemp("new") / "report"
-    write_report(
-        folder,
+    report = Report(
         fit,
         validation.errors[:1],
         validation.errors[1:],
         validation.definiteness,
         {"experiment": "cart.toml", "experiment_text": "[robot]\nurdf = 'a<b'\n"},
         ("a note <script>alert('&\"')</script>",),
-        doubts=("the log looks odd",),
-        pdf=True,
+        ("the log looks odd",),
     )
+    write_report(folder, report, pdf=True)
     return folder

@@ -6,7 +6,7 @@ import re
 from html.parser import HTMLParser
 
 import jaxid as jid
-from jaxid.report.identification import verdict
+from jaxid.report.identification import Report, verdict
 from jaxid.report.page import code, folded, picture, render_page
 from jaxid.table import Column, Remark, Status, Table
 
@@ -114,17 +114,17 @@ def test_every_block_is_written_and_escaped(errors_of):
 
 def test_the_verdict_follows_what_was_found(fit, validation):
     first, second = validation.errors
-    good = verdict(fit, (first,), (second,), validation.definiteness)
+    good = verdict(Report(fit, (first,), (second,), validation.definiteness))
     assert Status.BAD not in [remark.status for remark in good]
     assert good[0].status is max(
         (r.status for r in good[1:] if r.status is not Status.NEUTRAL), key=list(Status).index
     )
     bad = dataclasses.replace(second, predicted=second.predicted + 20.0)
-    found = verdict(fit, (first,), (bad,), validation.definiteness)
+    found = verdict(Report(fit, (first,), (bad,), validation.definiteness))
     assert found[0].status is Status.BAD
     assert found[1].status is Status.BAD
     assert "has not seen" in found[1].text
-    alone = verdict(fit, (first,), (), validation.definiteness)
+    alone = verdict(Report(fit, (first,), (), validation.definiteness))
     assert any("--verify" in remark.text for remark in alone)
     sick = dataclasses.replace(validation.definiteness, smallest=-1.0, indefinite=0.2)
-    assert verdict(fit, (first,), (second,), sick)[0].status is Status.BAD
+    assert verdict(Report(fit, (first,), (second,), sick))[0].status is Status.BAD

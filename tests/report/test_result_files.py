@@ -9,6 +9,7 @@ import pytest
 
 from jaxid.identification.comparison import Verdict, compare
 from jaxid.report import result_files
+from jaxid.report.identification import Report
 from jaxid.report.result_files import (
     consistency_record,
     plain,
@@ -26,7 +27,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(result_files, "identification_page", lambda *_: "page")
 
 
-def report(folder, fit, validation, **changes):
+def report(folder, fit, validation, pdf=False, **changes):
     arguments = {
         "identification": validation.errors[:1],
         "verification": validation.errors[1:],
@@ -34,7 +35,7 @@ def report(folder, fit, validation, **changes):
         "settings": {"split": 0.6, "min_speed": np.array([0.1, np.inf])},
         "notes": ("a note",),
     }
-    return write_report(folder, fit, **{**arguments, **changes})
+    return write_report(folder, Report(fit, **{**arguments, **changes}), pdf)
 
 
 def load(folder):

@@ -1,6 +1,5 @@
 """Tables: numbers as text, alignment, units, widths, CSV; and what stands in those of results."""
 
-import dataclasses
 import io
 
 import numpy as np
@@ -96,19 +95,11 @@ def test_the_terminal_shows_the_same_letters_in_colour():
 def test_a_fit_shows_estimates_with_both_deviations(fit):
     table = fit.summary()
     for k, row in enumerate(table.rows):
-        number, expression, estimate, deviation, unit, *_, naive, ratio = map(str.strip, row)
-        assert (number, expression, unit) == (
-            str(k + 1),
-            fit.base.expressions[k],
-            fit.base.units[k],
-        )
-        assert abs(float(estimate) - fit.parameters[k]) <= 0.5 * fit.standard_deviations[k]
-        assert float(deviation) == pytest.approx(fit.standard_deviations[k], rel=0.06)
-        assert float(naive) == pytest.approx(fit.naive_standard_deviations[k], rel=0.06)
-        assert float(ratio) == pytest.approx(fit.uncertainty.ratios[k], rel=0.06)
-    naive = fit.uncertainty.naive_covariance
-    known = dataclasses.replace(fit.uncertainty, covariance=naive)
-    assert "naive" not in dataclasses.replace(fit, uncertainty=known).summary().text()
+        numbers = [float(row[column]) for column in (2, 3, -2, -1)]
+        assert abs(numbers[0] - fit.parameters[k]) <= 0.5 * fit.standard_deviations[k]
+        naive, ratio = fit.naive_standard_deviations[k], fit.uncertainty.ratios[k]
+        expected = [fit.standard_deviations[k], naive, ratio]
+        np.testing.assert_allclose(numbers[1:], expected, rtol=0.06)
 
 
 def test_bodies_show_their_margins_and_the_active_bounds(consistent):

@@ -88,10 +88,10 @@ def test_published_limits(facts, name):
 
 
 def test_ur10_has_the_limits_of_its_urdf():
-    urdf = load_urdf(Path(str(distribution("example-robot-data").locate_file(SHARE)))).limits
-    ours = library.ur10().limits
+    urdf = load_urdf(Path(str(distribution("example-robot-data").locate_file(SHARE))))
     for field in ("position_min", "position_max", "velocity", "force"):
-        np.testing.assert_allclose(getattr(ours, field), getattr(urdf, field), rtol=1e-11)
+        ours, expected = (getattr(x.limits, field) for x in (library.ur10(), urdf))
+        np.testing.assert_allclose(ours, expected, rtol=1e-11)
 
 
 def test_iiwa_is_its_chain(facts):
