@@ -247,18 +247,16 @@ def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
             f"`{place or 'the model'}` is a `{kind}`, which is not known: import the module that "
             "defines it, or use a newer version of jaxid"
         )
-    fields = {f.name: f for f in dataclasses.fields(named[-1]) if f.init}
-    entries = {}
-    for name, entry in value.items():
-        if name in fields:
-            entries[name] = from_json(entry, fields[name].type, f"{place}.{name}".strip("."))
-        elif name != "kind":
-            raise InputError(f"`{place or kind}` ({kind}) has an unknown key `{name}`")
-    absent = dataclasses.MISSING
-    for name, field in fields.items():
-        if name not in value and field.default is field.default_factory is absent:
-            raise InputError(f"`{place or kind}` ({kind}) lacks `{name}`")
-    return named[-1](**entries)
+    hints = {f.name: f.type for f in dataclasses.fields(named[-1]) if f.init}
+    entries = {
+        name: from_json(entry, hints.get(name, Any), f"{place}.{name}".strip("."))
+        for name, entry in value.items()
+        if name != "kind"
+    }
+    try:
+        return named[-1](**entries)
+    except TypeError as error:
+        raise InputError(f"`{place or kind}` ({kind}) has other keys: {error}") from error
 
 
 def _subclasses(family: type) -> list[type]:

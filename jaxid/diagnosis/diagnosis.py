@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray
 from jaxid.diagnosis.findings import (
     LogStatistics,
     channel_findings,
@@ -305,9 +305,7 @@ def _corrected(
         yield without(text, sides=other)
 
 
-def _unexplained(
-    base: BaseParameters, motion: Motion, forces: Float[np.ndarray, "rows joints"]
-) -> float:
+def _unexplained(base: BaseParameters, motion: Motion, forces: np.ndarray) -> float:
     """Return the fraction (0 to 1) of the forces that least squares leave unexplained.
 
     All joints count equally. Friction terms that would come out negative are left out.

@@ -203,7 +203,7 @@ def channel_findings(robot: Robot, recording: Recording) -> list[tuple[int, str]
     return [(j, f"{channel} {text}") for j, channel, text in found if text]
 
 
-def _wrapped(x: Float[np.ndarray, " samples"], time: np.ndarray) -> str:
+def _wrapped(x: np.ndarray, time: np.ndarray) -> str:
     """Report jumps at full turns without which the angle would be smooth."""
     step = np.diff(x)
     # In radians, or in degrees that are taken for radians.

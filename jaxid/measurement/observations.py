@@ -273,25 +273,10 @@ class Observations(eqx.Module):
                 chunks.append(Chunk((begin, end), (start, stop), reduce))
         return tuple(chunks)
 
-    def between(self, start: float, stop: float) -> "Observations":
-        """Return the same observations, of which only rows from `start` to before `stop` [s] count.
-
-        The log is filtered as a whole: no rows are lost where it is divided.
-
-        Raises:
-            InputError: If no row is left for some joint.
-        """
-        time = self.reduced_time
-        mask = np.asarray(self.mask) & ((time >= start) & (time < stop))[:, None]
-        if not mask.any(axis=0).all():
-            raise InputError(
-                f"`{self.name}` has no rows from {start:g} s to {stop:g} s for every joint: its "
-                f"rows reach from {time[0]:g} s to {time[-1]:g} s."
-            )
-        return self.replace(mask=mask)
-
     def split(self, fraction: float) -> tuple["Observations", "Observations"]:
         """Divide the rows in time: a part for identification and the rest for validation.
+
+        The log is filtered as a whole: no rows are lost where it is divided.
 
         Args:
             fraction: Fraction (0 to 1) of the recording's duration in the first part.
@@ -304,7 +289,14 @@ class Observations(eqx.Module):
         (a, b), first = self.segments[-1], self.start_times[0]
         last = self.start_times[-1] + (b - a - 1) * self.sample_time
         middle = float(first + fraction * (last - first))
-        return self.between(-np.inf, middle), self.between(middle, np.inf)
+        early = self.reduced_time[:, None] < middle
+        masks = np.asarray(self.mask) & early, np.asarray(self.mask) & ~early
+        if not all(mask.any(axis=0).all() for mask in masks):
+            raise InputError(
+                f"`fraction` of {fraction:g} leaves a part of `{self.name}` without rows of some "
+                "joint: take another one."
+            )
+        return self.replace(mask=masks[0]), self.replace(mask=masks[1])
 
     @property
     def reduced_time(self) -> Float[np.ndarray, " rows"]:

@@ -418,7 +418,7 @@ def _deviation(grid: TimeGrid, parts: Iterable[tuple[np.ndarray, int]]) -> float
 
 
 def _resampling(
-    stamps: Float[np.ndarray, " rows"], source: str, largest_gap: float, first_row: int
+    stamps: np.ndarray, source: str, largest_gap: float, first_row: int
 ) -> tuple[float, list[np.ndarray], list[str], Callable[[np.ndarray], np.ndarray]]:
     """Return how rows come to the uniform grid behind their time stamps.
 

@@ -300,7 +300,7 @@ def _place_bodies(robot: Robot, collision: CollisionModel | None, q: Float[AnyAr
     return jax.vmap(place)(q)
 
 
-def _outline(ends: Float[np.ndarray, "2 2"], radius: float) -> Float[np.ndarray, "points 2"]:
+def _outline(ends: np.ndarray, radius: float) -> np.ndarray:
     """Return the outline of a capsule: a circle if it is seen from its end."""
     dx, dy = ends[1] - ends[0]
     half_turn = np.arctan2(dy, dx) + np.linspace(-0.5 * np.pi, 0.5 * np.pi, 13)

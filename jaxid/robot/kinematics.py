@@ -199,7 +199,7 @@ def _task(robot: Robot, posture: Numbers | None) -> _Task:
     return _Task(robot, middle, half, low, high, middle + half * begin)
 
 
-def _goals(positions: np.ndarray, rotation: Numbers | None) -> Float[np.ndarray, "poses 3 columns"]:
+def _goals(positions: np.ndarray, rotation: Numbers | None) -> np.ndarray:
     """Return checked poses: the position in the first column, and then the attitude if given."""
     if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
         raise InputError(f"a position must hold three finite numbers [m], but is {positions}.")
@@ -296,9 +296,25 @@ def _candidates(task: _Task, goal: np.ndarray, name: str) -> list[np.ndarray]:
     for one in good[np.argsort(away)]:
         if all(np.abs((one - other) / task.half).max() > 1e-6 for other in kept):
             kept.append(np.clip(one, task.low, task.high))
-    if not kept:
-        raise InputError(f"{name}, {_place(goal[0])}, {_explanation(task, goal)}")
-    return kept
+    if kept:
+        return kept
+    robot, free = task.robot, np.full(task.robot.joints, np.inf)
+    q = _try_starts(task, goal, -free, free)
+    distances = _distances(task, goal, q)
+    reached = distances.max(axis=1) <= _REACHED
+    if reached.any():
+        beyond = _beyond(task, q[reached])
+        j = int(beyond[beyond.max(axis=1).argmin()].argmax())
+        raise InputError(
+            f"{name}, {_place(goal[0])}, can be reached by `{robot.name}` only beyond the range of "
+            f"joint `{robot.joint_names[j]}`: choose another pose."
+        )
+    nearest = distances[int(np.argmin(distances.sum(axis=1)))]
+    angle = "" if len(nearest) == 1 else f" and {nearest[1]:.3g} rad"
+    raise InputError(
+        f"{name}, {_place(goal[0])}, is out of reach of `{robot.name}`: its end-effector comes to "
+        f"within {nearest[0]:.3g} m{angle} of it."
+    )
 
 
 def _follow(task: _Task, goals: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -316,24 +332,3 @@ def _follow(task: _Task, goals: np.ndarray, start: np.ndarray) -> np.ndarray:
     every = np.arange(len(goals))
     guess = np.stack([np.interp(every, places, x) for x in np.transpose(steps)], axis=1)
     return _descend(task, goals, guess[:, :-6], guess[:, -6:], 0, 6)[0]
-
-
-def _explanation(task: _Task, goal: np.ndarray) -> str:
-    """Return the reason why there are no coordinates for a pose, as the predicate of a sentence."""
-    robot, free = task.robot, np.full(task.robot.joints, np.inf)
-    q = _try_starts(task, goal, -free, free)
-    distances = _distances(task, goal, q)
-    reached = distances.max(axis=1) <= _REACHED
-    if reached.any():
-        beyond = _beyond(task, q[reached])
-        least = beyond[int(beyond.max(axis=1).argmin())]
-        return (
-            f"can be reached by `{robot.name}` only beyond the range of joint "
-            f"`{robot.joint_names[int(least.argmax())]}`: choose another pose."
-        )
-    nearest = distances[int(np.argmin(distances.sum(axis=1)))]
-    angle = "" if len(nearest) == 1 else f" and {nearest[1]:.3g} rad"
-    return (
-        f"is out of reach of `{robot.name}`: its end-effector comes to within {nearest[0]:.3g} m"
-        f"{angle} of it."
-    )

@@ -81,7 +81,7 @@ def snap_directions(
     return signs + 0.0, (note,) if change > 1e-12 else ()
 
 
-def _without_rounding(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def _without_rounding(values: np.ndarray) -> np.ndarray:
     """Set entries to 0, 1 or -1 that differ only by rounding, like 6e-17 for cos(pi/2)."""
     nearest = np.clip(np.round(values), -1.0, 1.0)
     return np.where(np.abs(values - nearest) <= 1e-15, nearest, values) + 0.0

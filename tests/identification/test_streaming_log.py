@@ -1,6 +1,5 @@
 """Logs on disk give what the same logs in memory give."""
 
-import dataclasses
 
 import numpy as np
 import polars as pl
@@ -10,7 +9,7 @@ from virtual import motion, standard_parameters
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification import streaming
-from jaxid.measurement import log_files, units
+from jaxid.measurement import log_files
 from jaxid.measurement.reading import scan_log
 from jaxid.measurement.recording import NeedsMemory
 
@@ -107,18 +106,6 @@ def test_a_part_is_filtered_like_the_whole(base, parquet):
 
 
 @pytest.mark.usefixtures("short_parts")
-def test_text_is_converted_in_parts(base, parquet, text):
-    log, other = (
-        scan_log(path, COLUMNS, base.model.robot, SMOOTH, EVERY) for path in (text, parquet)
-    )
-    assert log.sample_time == other.sample_time == DT
-    for a, b in ((4321, 4321 + 999), (0, SAMPLES), (SAMPLES - 1, SAMPLES)):
-        parts = (x.source.read_rows(slice(a, b)) for x in (log, other))
-        for x, y in zip(*parts, strict=True):
-            np.testing.assert_array_equal(x, y)
-
-
-@pytest.mark.usefixtures("short_parts")
 @pytest.mark.parametrize(
     ("separator", "header", "end", "point"),
     [(";", True, "\r\n", ","), (" , ", False, "\n", "."), ("\t", True, "\n", ".")],
@@ -178,15 +165,6 @@ def test_gaps_slow_rows_and_limits_as_in_memory(base, numbers, tmp_path):
         agree(base, a, b)
     with pytest.raises(ValueError, match="from 90 s to inf s"):
         scan_log(path, columns, *settings, start=90.0)
-
-
-def test_nanoseconds_since_1970(base, numbers, tmp_path):
-    _, angles, forces = (x[:5000] for x in numbers)
-    ticks = 1_700_000_000_000_000_001 + 1_000_000 * np.arange(5000)
-    frame(ticks, angles, forces).write_csv(tmp_path / "log.csv")
-    columns = dataclasses.replace(COLUMNS, time_unit=units.NS)
-    log = scan_log(tmp_path / "log.csv", columns, base.model.robot, SMOOTH)
-    assert (log.sample_time, log.segments) == (DT, ((0, 5000),))
 
 
 def test_refusals(base, numbers, parquet, tmp_path):

@@ -218,12 +218,4 @@ def test_decimation_is_scipys_with_gain_one():
     assert got.shape == (60, 2, 2)
     np.testing.assert_allclose(got[8:-8], expected[8:-8], atol=1e-2 * np.abs(x).max())
     np.testing.assert_allclose(Decimation((10, 5))(np.full(3000, 2.0)), 2.0, rtol=1e-9)
-
-
-def test_decimation_keeps_slow_and_drops_fast_sinusoids():
-    t = DT * np.arange(20000)
-    slow, fast = np.sin(2 * np.pi * 2 * t), np.sin(2 * np.pi * 60 * t)
-    out = Decimation((10,))(slow + fast)
-    np.testing.assert_allclose(out[50:-50], slow[::10][50:-50], atol=0.015)
-    assert np.abs(Subsample(10)(fast)).max() > 0.9
-    np.testing.assert_array_equal(Subsample(7)(slow), slow[::7])
+    np.testing.assert_array_equal(Subsample(7)(x), x[::7])

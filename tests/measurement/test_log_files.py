@@ -154,17 +154,6 @@ def refused(path, columns, *parts, **kwargs):
 
 
 @pytest.mark.parametrize(
-    ("cell", "complaint"),
-    [("", "is empty"), ("abc", "is `abc`, no number"), ("inf", "not finite")],
-)
-def test_bad_cells_are_named_with_file_column_and_line(tmp_path, cell, complaint):
-    rows = ["t,q1,tau1", *(f"{0.01 * i:.2f},{i},{-i}" for i in range(20))]
-    rows[8] = f"0.07,{cell},-7"
-    (tmp_path / "log.csv").write_text("\n".join(rows))
-    refused(tmp_path / "log.csv", PLAIN, "`log.csv`", "`q1`", "line 9", complaint)
-
-
-@pytest.mark.parametrize(
     ("q", "complaint"),
     [
         (np.repeat([[0.0, 0.0], [np.inf, -np.inf]], [3, 17], axis=0), "row 4"),
