@@ -438,9 +438,12 @@ def prepare(
     return observations.replace(mask=mask)
 
 
-def joint_side(robot: Robot, log: Any, *channels: AnyArray | None) -> tuple[Any, ...]:
+def joint_side(
+    robot: Robot, log: Any, angles: AnyArray, velocities: AnyArray | None, forces: AnyArray
+) -> tuple[Any, ...]:
     """Convert angles, velocities, forces to the joints' side; `log`: a recording, or `Columns`."""
-    angles, velocities, forces = (None if x is None else np.asarray(x) for x in channels)
+    angles, forces = np.asarray(angles), np.asarray(forces)
+    velocities = None if velocities is None else np.asarray(velocities)
     if log.angles_on_motor_side:
         angles = robot.drives.joint_angles(angles)
         velocities = None if velocities is None else robot.drives.joint_velocities(velocities)

@@ -110,7 +110,22 @@ class Drives(Hashable):
         rotor_inertia: Numbers | None = None,
     ):
         n = _count(joints, reduction, zero, max_torques, rotor_inertia)
-        self.reduction = _reduction(reduction, n)
+        matrix = np.eye(n) if reduction is None else reduction
+        if not isinstance(matrix, jax.Array) or matrix.ndim != 2:
+            matrix = np.array(matrix, dtype=np.float64)
+            matrix = np.diag(matrix) if matrix.shape == (n,) else matrix
+            if matrix.shape != (n, n) or not np.isfinite(matrix).all():
+                raise InputError(
+                    f"`reduction` must be {n} gear ratios or a {n} x {n} matrix of finite "
+                    f"numbers, but has shape {matrix.shape}."
+                )
+            largest = np.abs(matrix).max(axis=1)
+            if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
+                raise InputError(
+                    "`reduction` must be invertible, but some joint is moved by no motor of its "
+                    "own: is a gear ratio zero?"
+                )
+        self.reduction = matrix
         self.zero = per_joint("zero", zero, n, 0.0)
         _require("zero", self.zero, np.isfinite, "finite")
         self.max_torques = _magnitudes("max_torques", max_torques, n)
@@ -160,27 +175,6 @@ class Drives(Hashable):
         weights = np.abs(self.reduction)
         used = np.where(weights > 0, self.max_torques[:, None], 0.0)
         return (weights * used).sum(axis=0)
-
-
-def _reduction(value: Numbers | None, joints: int) -> AnyArray:
-    """Return the reduction as a checked matrix; a JAX matrix is taken as it is."""
-    if isinstance(value, jax.Array) and value.ndim == 2:
-        return value
-    matrix = np.eye(joints) if value is None else np.array(value, dtype=np.float64)
-    if matrix.shape == (joints,):
-        matrix = np.diag(matrix)
-    if matrix.shape != (joints, joints) or not np.isfinite(matrix).all():
-        raise InputError(
-            f"`reduction` must be {joints} gear ratios or a {joints} x {joints} matrix of finite "
-            f"numbers, but has shape {matrix.shape}."
-        )
-    largest = np.abs(matrix).max(axis=1)
-    if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
-        raise InputError(
-            "`reduction` must be invertible, but some joint is moved by no motor of its own: is a "
-            "gear ratio zero?"
-        )
-    return matrix
 
 
 def _count(joints: int | None, *values: Numbers | None) -> int:
@@ -242,7 +236,7 @@ def far_notes(owner: str, lengths: Numbers) -> tuple[str, ...]:
 def limit_notes(names: Sequence[str], revolute: Sequence[bool], limits: Limits) -> Iterator[str]:
     """Yield notes on limits that may be in millimetres or in degrees per second."""
     low, high, speeds = limits.position_min, limits.position_max, limits.velocity
-    if not all(isinstance(x, np.ndarray) for x in (low, high, speeds)):
+    if not all(isinstance(x, np.ndarray) and x.ndim == 1 for x in (low, high, speeds)):
         return
     for name, turns, speed, *ends in zip(names, revolute, speeds, low, high, strict=True):
         if not turns:

@@ -355,11 +355,21 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
     values[0] = -np.inf
     for i, joint in enumerate(tree.joints):
         name = joint.get("name")
-        if joint.get("type") != "continuous":
-            low, high = values[:2, i] = _range(tree, joint)
-            if low == high == 0.0:
-                values[:2, i] = -np.inf, np.inf
-                notes.append(f"joint `{name}`: a range from 0 to 0 is taken as unknown.")
+        turns = joint.get("type") in _TURNING
+        low, high = (tree.limit(joint, key, np.nan) for key in ("lower", "upper"))
+        # A missing bound is zero if the other one is given, as the URDF standard says.
+        bounded = np.isfinite(low) or np.isfinite(high)
+        low = (0.0 if bounded else -np.inf) if np.isnan(low) else low
+        high = (0.0 if bounded else np.inf) if np.isnan(high) else high
+        if low == high == 0.0 and joint.get("type") != "continuous":
+            notes.append(f"joint `{name}`: a range from 0 to 0 is taken as unknown.")
+        elif joint.get("type") != "continuous" and not (turns and high - low >= _ENDLESS):
+            if fault := range_fault(low, high, turns):
+                unit = "radians, not degrees" if turns else "metres"
+                raise tree.error(joint, f"{fault}: limits in a URDF are in {unit}")
+            if low >= high:
+                raise tree.error(joint, f"ranges from {low:g} to {high:g}: exchange the ends")
+            values[:2, i] = low, high
         for k, key in enumerate(("velocity", "effort"), 2):
             value = tree.limit(joint, key, np.inf)
             if value > 0.0:
@@ -369,24 +379,6 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
     low, high, speed, force = values
     limits = Limits(position_min=low, position_max=high, velocity=speed, force=force)
     return limits, notes
-
-
-def _range(tree: UrdfTree, joint: Any) -> tuple[float, float]:
-    """Return the range of a joint, infinite where unknown."""
-    low, high = (tree.limit(joint, key, np.nan) for key in ("lower", "upper"))
-    # A missing bound is zero if the other one is given, as the URDF standard says.
-    bounded = np.isfinite(low) or np.isfinite(high)
-    low = (0.0 if bounded else -np.inf) if np.isnan(low) else low
-    high = (0.0 if bounded else np.inf) if np.isnan(high) else high
-    turns = joint.get("type") in _TURNING
-    if turns and high - low >= _ENDLESS:
-        return -np.inf, np.inf
-    if fault := range_fault(low, high, turns):
-        unit = "radians, not degrees" if turns else "metres"
-        raise tree.error(joint, f"{fault}: limits in a URDF are in {unit}")
-    if low >= high and (low, high) != (0.0, 0.0):
-        raise tree.error(joint, f"ranges from {low:g} to {high:g}: exchange the ends")
-    return low, high
 
 
 def _inertial_notes(tree: UrdfTree) -> Iterator[str]:
