@@ -1,6 +1,5 @@
 """Logs on disk give what the same logs in memory give."""
 
-
 import numpy as np
 import polars as pl
 import pytest
