@@ -81,7 +81,7 @@ class HalfSpace(eqx.Module):
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""
         n, start, end = (jnp.asarray(x) for x in (self.normal, start, end))
-        return jnp.minimum(start @ n, end @ n) - self.height
+        return _smaller(start @ n, end @ n) - self.height
 
 
 class Box(eqx.Module):
@@ -147,8 +147,19 @@ class Box(eqx.Module):
 
     def _signed(self, point: Array) -> Array:
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
-        inside = jnp.minimum(jnp.max(beyond, -1), 0.0)
-        return _rounded_norm(jnp.maximum(beyond, 0.0)) + inside
+        x, y, z = jnp.unstack(-beyond, axis=-1)
+        depth = _smaller(_smaller(x, y), z)
+        outside = jnp.where(beyond > 0, beyond, 0.0)
+        return _rounded_norm(outside) - jnp.where(depth > 0, depth, 0.0)
+
+
+def _smaller(x: Array, y: Array) -> Array:
+    """Return the smaller numbers, with the derivatives of one of both.
+
+    Derivatives of `jnp.minimum` ask which argument equals the result. None does where a compiler
+    rounds the two in different ways.
+    """
+    return jnp.where(x < y, x, y)
 
 
 def _rounded_norm(vector: Vectors) -> Lengths:
