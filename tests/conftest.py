@@ -5,9 +5,14 @@ about half of the time of a run: `benchmarks/run.py --check` does so before a re
 """
 
 import os
+import tempfile
 
-# Tests compile anew, and leave the user's cache alone.
+# The workers of one run share what they compile; the user's cache is left alone.
 os.environ["JAXID_CACHE_DIR"] = "off"
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    COMPILED = tempfile.TemporaryDirectory(prefix="jaxid-compiled-")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = COMPILED.name
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 
 import jax
 
@@ -25,7 +30,6 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from jax.experimental.compilation_cache import compilation_cache
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -55,13 +59,3 @@ def blank_figures() -> Iterator[None]:
         patch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
         patch.setattr(Figure, "draw", lambda figure, renderer: None)
         yield
-
-
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A cache of compiled code that commands share, for tests of many commands on one robot."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAXID_CACHE_DIR", str(tmp_path_factory.mktemp("compiled")))
-        yield
-    jax.config.update("jax_compilation_cache_dir", None)
-    compilation_cache.reset_cache()

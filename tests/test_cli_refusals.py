@@ -8,7 +8,7 @@ from test_cli import EXPERIMENT, first, folder, material, refused, run  # noqa: 
 
 from jaxid.cli import main
 
-pytestmark = pytest.mark.usefixtures("blank_figures", "compiled")
+pytestmark = pytest.mark.usefixtures("blank_figures")
 
 KEYS = [
     ('"t"', '"t"\ntime_unit = "ns"', "has 2e+11 samples in a second: check"),

@@ -22,7 +22,7 @@ import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.experiment import load_experiment
 
-pytestmark = pytest.mark.usefixtures("blank_figures", "compiled")
+pytestmark = pytest.mark.usefixtures("blank_figures")
 
 SPATIAL = """\
 [robot]

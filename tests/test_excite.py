@@ -66,8 +66,8 @@ FAST = EXPERIMENT.replace("generations = 1\npolish = 1", "generations = 0\npolis
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory, compiled):
-    """A folder with a robot; what is compiled for it is kept from test to test."""
+def written(tmp_path_factory):
+    """A folder with a robot."""
     folder = tmp_path_factory.mktemp("excite")
     (folder / "pendulum.urdf").write_text(PENDULUM)
     (folder / "experiment.toml").write_text(EXPERIMENT)
