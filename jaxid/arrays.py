@@ -4,7 +4,9 @@ Axes: `joints` (= bodies), `standard` (columns of the full regressor), `base` (c
 regressor), `samples` (rows of a log), `rows` (rows left after filtering), `batch`.
 """
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from types import ModuleType
 from typing import Any
@@ -85,6 +87,27 @@ def is_traced(*trees: Any) -> bool:
 def namespace(*arrays: AnyArray) -> ModuleType:
     """Return `jax.numpy` if one of the arrays is JAX's, else NumPy (results stay constants)."""
     return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
+
+
+def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
+    """Return the results of a compiled function, called for so many entries of data at a time.
+
+    XLA leaves small operations to one core, so each core gets entries of its own. Parts of equal
+    size also mean that another number of entries compiles nothing anew. An accelerator takes the
+    parts one after the other.
+    """
+    count = len(jax.tree.leaves(data)[0])
+    size = min(count, size)
+
+    def part(start: int) -> Any:
+        chosen = np.arange(start, start + size) % count
+        return jax.block_until_ready(solve(jax.tree.map(lambda x: x[chosen], data)))
+
+    # The first part compiles for all.
+    first = part(0)
+    with ThreadPoolExecutor(os.cpu_count() if jax.default_backend() == "cpu" else 1) as pool:
+        found = [first, *pool.map(part, range(size, count, size))]
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *found)
 
 
 def content(tree: Any) -> tuple:

@@ -39,9 +39,7 @@ class TorqueErrors(eqx.Module):
     @property
     def errors(self) -> Float[np.ndarray, "rows joints"]:
         """Predicted minus measured forces; NaN where a row does not count [N m or N] (Eq. 27)."""
-        return np.where(
-            self.counted, np.asarray(self.predicted) - np.asarray(self.measured), np.nan
-        )
+        return np.asarray(self.predicted) - self._measured
 
     @property
     def mean(self) -> Float[np.ndarray, " joints"]:
@@ -76,8 +74,7 @@ class TorqueErrors(eqx.Module):
     @property
     def relative(self) -> float:
         r"""Norm of all errors over the norm of all forces, $|Wp - Q| / |Q|$."""
-        squares = np.nansum(self.errors**2), np.nansum(self._measured**2)
-        return float(np.sqrt(_ratio(*squares)))
+        return float(np.sqrt(_ratio(np.nansum(self.errors**2), np.nansum(self._measured**2))))
 
     @property
     def _measured(self) -> np.ndarray:
@@ -172,8 +169,7 @@ def validate(
         observations: One or several recordings, preferably not used for the fit.
         progress: Callback, called with the completed fraction (0 to 1) of each recording.
     """
-    single = isinstance(observations, Observations)
-    recordings = (observations,) if single else tuple(observations)
+    recordings = (observations,) if isinstance(observations, Observations) else observations
     robot = fit.base.model.robot
     return Validation(
         errors=tuple(torque_errors(fit, o, progress) for o in recordings),

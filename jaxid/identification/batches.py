@@ -15,24 +15,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
-from jaxid.arrays import AnyArray, Bool, Float, is_traced, require_float64
+from jaxid.arrays import AnyArray, Bool, Float, in_parts, is_traced, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.regressor import JointRegressor
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
-from jaxid.identification.factors import Blocks, Factors, empty_factors
 from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_problem, identify
+from jaxid.identification.identify import identify
 from jaxid.identification.normal_equations import BatchFit, DataSets, solve
-from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.uncertainty import IndependentRows
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
-
-IN_A_CALL = 16
-"""Data sets of one call of the compiled computation."""
 
 
 def identify_batch(
@@ -77,35 +73,39 @@ def identify_batch(
     require_float64("a batch of identifications")
     robot = base.model.robot
     _check(base, motion, forces, mask, robots)
+    if estimator is not None and not (robots is None and weights is None):
+        raise InputError(
+            "`estimator` goes with neither `robots` nor `weights`: the estimator has its own "
+            "weights, and solves for one robot."
+        )
     sets, draws = len(forces), forces.shape[1:-2]
+    if weights is None:
+        weights = np.ones(robot.joints) if estimator else 1.0 / np.asarray(robot.max_forces)
+    batch = DataSets(
+        motion,
+        jnp.asarray(forces).reshape(sets, -1, *forces.shape[-2:]),
+        jnp.broadcast_to(jnp.asarray(weights), (sets, robot.joints)),
+        None if mask is None else jnp.asarray(mask, float),
+        None,
+    )
     if estimator is not None:
-        if robots is not None or weights is not None:
-            raise InputError(
-                "`estimator` goes with neither `robots` nor `weights`: the estimator has its own "
-                "weights, and solves for one robot."
-            )
-        fit = _estimate_each(base, motion, forces, mask, estimator, row_time)
+        fit = _estimate_each(base, batch, estimator, row_time)
     else:
-        rows, numbers = base.joint_regressor, None
+        rows, reduced = base.joint_regressor, batch
         if robots is not None:
             family, numbers = _family(base, robots)
             n = (robot.joints,)
             rows = JointRegressor(family, family.columns, n, n, n, (numbers.shape[1],))
+            reduced = batch._replace(numbers=numbers)
         if robot.tool is not None:
             known = base.model.tool_forces(motion)
-            forces = forces - known.reshape(sets, *(1,) * len(draws), *known.shape[-2:])
-        weights = 1.0 / np.asarray(robot.max_forces) if weights is None else weights
-        batch = DataSets(
-            motion,
-            jnp.asarray(forces).reshape(sets, -1, *forces.shape[-2:]),
-            jnp.broadcast_to(jnp.asarray(weights), (sets, robot.joints)),
-            None if mask is None else jnp.asarray(mask, float),
-            numbers,
-        )
+            reduced = reduced._replace(forces=batch.forces - known[:, None])
         if is_traced(batch):
-            fit = solve(rows, batch, row_time)
+            fit = solve(rows, reduced, row_time)
         else:
-            fit = _solved_again(base, rows, batch, _solve_in_parts(rows, batch, row_time), row_time)
+            reduced = jax.tree.map(np.asarray, reduced)
+            fit = in_parts(lambda part: solve(rows, part, row_time), reduced)
+            fit = _solve_again(base, robots, batch, fit, row_time)
     return jax.tree.map(lambda x: x if x.ndim == 1 else x.reshape(sets, *draws, x.shape[-1]), fit)
 
 
@@ -128,86 +128,31 @@ def _check(base, motion, forces, mask, robots) -> None:
         )
 
 
-def _solve_in_parts(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
-    """Call the compiled computation for a few data sets at a time, on all cores.
-
-    XLA leaves small operations to one core, so each core gets data sets of its own. Parts of equal
-    size also mean that another number of data sets compiles nothing anew.
-    """
-    datasets = len(batch.forces)
-    size = min(datasets, IN_A_CALL)
-    batch = jax.tree.map(np.asarray, batch)
-
-    def part(start: int) -> BatchFit:
-        chosen = np.arange(start, start + size) % datasets
-        return jax.block_until_ready(
-            solve(rows, jax.tree.map(lambda x: x[chosen], batch), row_time)
-        )
-
-    # The first part compiles for all.
-    first, starts = part(0), range(size, datasets, size)
-    with ThreadPoolExecutor(os.cpu_count() if jax.default_backend() == "cpu" else 1) as pool:
-        fits = [first, *pool.map(part, starts)]
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:datasets], *fits)
-
-
-def _solved_again(
-    base: BaseParameters,
-    rows: JointRegressor,
-    batch: DataSets,
-    fit: BatchFit,
-    row_time: float | None,
-) -> BatchFit:
-    """Solve the data sets that are not well conditioned by orthogonal factors, one by one.
-
-    Where standard deviations are not naive, they come from blocks of time, left out in turn.
-    """
-    weak = np.flatnonzero(~np.asarray(fit.determined))
-    if not len(weak):
-        return fit
-    uncertainty = IndependentRows() if row_time is None else None
+def _solve_again(base, robots, batch: DataSets, fit: BatchFit, row_time) -> BatchFit:
+    """Solve the data sets that are not well conditioned by orthogonal factors, one by one."""
     fit = jax.tree.map(np.array, fit)
-    for k in weak:
-        one = jax.tree.map(lambda x, k=k: np.asarray(x)[k], batch)
-        problems = [RegressionProblem(base, blocks=_blocks(rows, one, Q)) for Q in one.forces]
-        if problems[0].factors.rows.sum() <= rows.size:
+    for k in np.flatnonzero(~fit.determined):
+        one = jax.tree.map(lambda x, k=k: np.asarray(x)[k : k + 1], batch)
+        if one.mask is not None and one.mask.sum() <= base.size:
             fit.parameters[k], fit.condition_numbers[k] = 0.0, np.inf
             fit.standard_deviations[k] = fit.naive_standard_deviations[k] = np.inf
             continue
-        estimator = WeightedLeastSquares(GivenWeights(one.weights))
-        again = _stacked([fit_problem(problem, estimator, uncertainty) for problem in problems])
+        own = base
+        if robots is not None:
+            own = eqx.tree_at(lambda b: b.model.robot, base, robots[k])
+        estimator = WeightedLeastSquares(GivenWeights(one.weights[0]))
+        again = _estimate_each(own, one, estimator, row_time)
         for x, y in zip(jax.tree.leaves(fit), jax.tree.leaves(again), strict=True):
-            x[k] = y if y.ndim > 1 else y[0]
+            x[k] = y[0]
     return jax.tree.map(jnp.asarray, fit)
 
 
-def _blocks(rows: JointRegressor, one: DataSets, forces: np.ndarray) -> Blocks:
-    """Return the triangular factors of one data set and one draw of its forces, by time."""
-    samples = len(forces)
-    counted = np.ones(forces.shape, bool) if one.mask is None else one.mask > 0
-    parts: list[Factors] = []
-    for own in filter(len, np.array_split(np.arange(samples), max(10, -(-samples // 65536)))):
-        arrays = [x[own].T for x in jax.tree.leaves(one.motion)]
-        if one.numbers is not None:
-            arrays.append(np.repeat(one.numbers[:, None], len(own), axis=1))
-        joints = zip(rows.in_numpy(*arrays), forces[own].T, counted[own].T, strict=True)
-        equations = [np.column_stack([theta.T, Q])[kept] for theta, Q, kept in joints]
-        parts.append(empty_factors(rows.columns, rows.size).append(equations))
-    return Blocks(tuple(parts))
-
-
 def _estimate_each(
-    base: BaseParameters,
-    motion: Motion,
-    forces: AnyArray,
-    mask: AnyArray | None,
-    estimator: AbstractEstimator,
-    row_time: float | None,
+    base: BaseParameters, batch: DataSets, estimator: AbstractEstimator, row_time: float | None
 ) -> BatchFit:
     """Return the estimates of `identify` for each data set and draw, on all cores."""
-    motion = jax.tree.map(np.asarray, motion)
-    Q = np.asarray(forces).reshape(len(forces), -1, *forces.shape[-2:])
-    counted = np.ones(motion.q.shape, bool) if mask is None else np.asarray(mask) > 0
+    motion, Q = jax.tree.map(np.asarray, (batch.motion, batch.forces))
+    counted = np.ones(motion.q.shape, bool) if batch.mask is None else np.asarray(batch.mask) > 0
     uncertainty = IndependentRows() if row_time is None else None
 
     def one(case: tuple[int, int]) -> Fit:
@@ -221,7 +166,9 @@ def _estimate_each(
     cases = itertools.product(range(len(Q)), range(Q.shape[1]))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         fit = _stacked(list(pool.map(one, cases)))
-    return jax.tree.map(lambda x: x if x.ndim > 1 else x[:: Q.shape[1]], fit)
+    return jax.tree.map(
+        lambda x: x.reshape(*Q.shape[:2], -1) if x.ndim > 1 else x[:: Q.shape[1]], fit
+    )
 
 
 def _stacked(fits: list[Fit]) -> BatchFit:
@@ -235,9 +182,6 @@ def _stacked(fits: list[Fit]) -> BatchFit:
         determined=jnp.asarray(known),
         dof=jnp.stack([fit.uncertainty.dof for fit in fits]),
     )
-
-
-GEOMETRY = ("axis", "rotation", "offset", "gravity")
 
 
 class RobotFamily(eqx.Module):
@@ -257,14 +201,10 @@ class RobotFamily(eqx.Module):
     def columns(self, q, qd, qdd, x) -> Float[AnyArray, "joints base"]:
         """Return the base regressor of one sample and one robot with the numbers `x` (Eq. 23)."""
         robot = self.base.model.robot
-        fixed = _geometry(robot)
+        fixed, unravel = ravel_pytree(_geometry(robot))
         order = np.arange(fixed.size)
         order[list(self.varying)] = fixed.size + np.arange(len(self.varying))
-        whole = jnp.concatenate([jnp.asarray(fixed, x.dtype), x])[order]
-        shapes = [np.shape(getattr(robot, name)) for name in GEOMETRY]
-        ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-        parts = zip(GEOMETRY, jnp.split(whole, ends[:-1]), shapes, strict=True)
-        changed = {name: part.reshape(shape) for name, part, shape in parts}
+        changed = unravel(jnp.concatenate([fixed, x])[order])
         placed = eqx.tree_at(lambda b: b.model.robot, self.base, robot.replace(**changed))
         return placed.columns(q, qd, qdd)
 
@@ -281,10 +221,11 @@ def _family(
                 f"`robots` must have the topology of `{own.name}` and no known tools, but "
                 f"`{robot.name}` differs: identify it with its own base parameters."
             )
-    numbers = np.array([_geometry(robot) for robot in robots])
-    varying = tuple(np.flatnonzero((numbers != _geometry(own)).any(axis=0)).tolist())
-    return RobotFamily(base, varying), numbers[:, list(varying)]
+    first, *numbers = [np.asarray(ravel_pytree(_geometry(x))[0]) for x in (own, *robots)]
+    varying = tuple(np.flatnonzero((np.array(numbers) != first).any(axis=0)).tolist())
+    return RobotFamily(base, varying), np.array(numbers)[:, list(varying)]
 
 
-def _geometry(robot: Robot) -> np.ndarray:
-    return np.concatenate([np.ravel(getattr(robot, x)) for x in GEOMETRY]).astype(np.float64)
+def _geometry(robot: Robot) -> dict[str, np.ndarray]:
+    names = "axis", "rotation", "offset", "gravity"
+    return {name: np.asarray(getattr(robot, name), np.float64) for name in names}

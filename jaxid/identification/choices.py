@@ -12,9 +12,8 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
 from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.factors import Factors
 from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_problem
+from jaxid.identification.identify import fit_problem, naive_covariance
 from jaxid.identification.problem import RegressionProblem, cross_validation_folds
 from jaxid.identification.uncertainty import AbstractUncertainty
 from jaxid.measurement.filters import (
@@ -102,7 +101,13 @@ def choose_filter(
     """
     logs = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
     if candidates is None:
-        candidates = _butterworth_candidates(logs[0].sample_time)
+        # About five rows for each period of a cut-off.
+        dt = logs[0].sample_time
+        highest = min(100.0, 0.2 / dt)
+        cutoffs = np.geomspace(min(1.0, 0.1 * highest), highest, 9).tolist()
+        steps = [max(1, int(1.0 / (5.0 * f * dt))) for f in cutoffs]
+        pairs = zip(cutoffs, steps, strict=True)
+        candidates = [(ZeroPhaseButterworth(f), Subsample(step)) for f, step in pairs]
     if not candidates:
         raise InputError("`candidates` must hold at least one filter, but is empty.")
     estimator = WeightedLeastSquares() if estimator is None else estimator
@@ -111,7 +116,13 @@ def choose_filter(
     edge = max(filter.edge(dt) for filter, _ in candidates)
 
     def inner_observations(candidate: FilterCandidate) -> list[Observations]:
-        return [_inner_rows(observe(log, robot, *candidate, min_speed), edge) for log in logs]
+        """Observe, and mask rows that are too close to the ends for the slowest candidate."""
+        inner = []
+        for o in (observe(log, robot, *candidate, min_speed) for log in logs):
+            at = o.instants
+            far = [(at >= a + edge) & (at < b - edge) for a, b in o.segments]
+            inner.append(o.replace(mask=np.asarray(o.mask) & np.any(far, axis=0)[:, None]))
+        return inner
 
     widest = inner_observations(candidates[int(np.argmax(cutoffs))])
     weights = np.asarray(estimator(RegressionProblem(base, widest)).weights)
@@ -119,7 +130,11 @@ def choose_filter(
     for number, candidate in enumerate(candidates):
         own = inner_observations(candidate)
         problem = RegressionProblem(base, own)
-        test = RegressionProblem(base, [_with_motion(*x) for x in zip(widest, own, strict=True)])
+        if [o.samples for o in own] != [o.samples for o in widest]:
+            raise InputError("`candidates` leave different parts of the recordings: avoid gaps.")
+        pairs = zip(widest, own, strict=True)
+        # The candidate's motion, with forces and rows of the widest band.
+        test = RegressionProblem(base, [o.replace(motion=x.motion) for o, x in pairs])
         errors.append(_held_out_errors(problem, test, estimator, weights**2))
         correlations.append(_correlation(problem, estimator))
         if progress is not None:
@@ -129,29 +144,6 @@ def choose_filter(
         order = np.where(whole <= 1.05**2 * whole.min(), np.abs(correlations), np.inf)
     best = int(np.argmin(order))
     return FilterChoice(tuple(candidates), cutoffs, np.array(errors), np.array(correlations), best)
-
-
-def _butterworth_candidates(sample_time: float) -> list[FilterCandidate]:
-    """Return filters, each decimated to about five rows for each period of its cut-off."""
-    highest = min(100.0, 0.2 / sample_time)
-    cutoffs = np.geomspace(min(1.0, 0.1 * highest), highest, 9)
-    steps = [max(1, int(1.0 / (5.0 * f * sample_time))) for f in cutoffs]
-    pairs = zip(cutoffs, steps, strict=True)
-    return [(ZeroPhaseButterworth(float(f)), Subsample(step)) for f, step in pairs]
-
-
-def _inner_rows(observations: Observations, edge: int) -> Observations:
-    """Mask rows that are too close to the ends for the slowest candidate."""
-    at = observations.instants
-    far = [(at >= a + edge) & (at < b - edge) for a, b in observations.segments]
-    return observations.replace(mask=np.asarray(observations.mask) & np.any(far, axis=0)[:, None])
-
-
-def _with_motion(widest: Observations, own: Observations) -> Observations:
-    """Return a candidate's motion with forces and rows of the widest band."""
-    if widest.samples != own.samples:
-        raise InputError(f"`candidates` leave different parts of `{widest.name}`: avoid its gaps.")
-    return widest.replace(motion=own.motion)
 
 
 def _held_out_errors(problem, test, estimator: AbstractEstimator, squares) -> np.ndarray:
@@ -272,22 +264,21 @@ def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination],
     factors, weights = problem.factors, np.asarray(fit.weights)
     squares = weights**2
     total = float(squares @ factors.force_squares)
-    parts = [(rest.total, part.total) for rest, part in cross_validation_folds(problem.blocks, 10)]
-    folds = [(*rest.weighted(weights), part) for rest, part in parts]
+    parts = cross_validation_folds(problem.blocks, 10)
+    folds = [(*rest.total.weighted(weights), part.total) for rest, part in parts]
     R, z = factors.weighted(weights)
-    kept = list(range(fit.base.size))
-    naive = _naive_deviations(factors, weights, *_solve(R, z, kept))
-    deviations = np.asarray(fit.standard_deviations)
-    known = np.isfinite(deviations) & (naive > 0)
-    ratio = np.divide(deviations, naive, out=np.full_like(naive, np.inf), where=known)
+    kept, ratio = list(range(fit.base.size)), np.empty(0)
     path, sets, name = [], [], ""
     while kept:
         held_out = sum(squares @ x.residual_squares(_solve(A, b, kept)[0]) for A, b, x in folds)
         sets.append(list(kept))
         path.append(Elimination(name, len(kept), float(np.sqrt(held_out / total))))
         p, B = _solve(R, z, kept)
-        size = np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
-        relative = ratio[kept] * _naive_deviations(factors, weights, p, B) / size
+        naive = np.sqrt(np.diag(naive_covariance(factors, weights, p, B)))
+        if not ratio.size:
+            known = np.isfinite(fit.standard_deviations) & (naive > 0)
+            ratio = np.where(known, fit.standard_deviations / np.where(known, naive, 1.0), np.inf)
+        relative = ratio[kept] * naive / np.maximum(np.abs(p[kept]), np.finfo(float).tiny)
         name = fit.base.names[kept.pop(int(np.argmax(relative)))]
     return path, sets
 
@@ -298,13 +289,3 @@ def _solve(R: np.ndarray, z: np.ndarray, kept: list[int]) -> tuple[np.ndarray, n
     decomposition = Decomposition.of(R[:, kept], z)
     p[kept], B[kept] = decomposition.solve(), decomposition.inverse_information()
     return p, B
-
-
-def _naive_deviations(factors: Factors, weights, p: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Return standard deviations for independent rows, and a variance of each joint."""
-    variances = factors.residual_squares(p) / np.maximum(factors.rows, 1)
-    total = np.zeros(B.shape[1])
-    for joint, w, variance in zip(factors.joints, weights, variances, strict=True):
-        influence = w**2 * np.asarray(joint.R)[:, :-1] @ B[list(joint.columns)]
-        total += variance * np.sum(influence**2, axis=0)
-    return np.sqrt(total)

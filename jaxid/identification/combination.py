@@ -22,7 +22,7 @@ from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.uncertainty import Uncertainty
-from jaxid.identification.uncertainty.blocks import block_covariance
+from jaxid.identification.uncertainty.blocks import solve_blocks
 
 
 def require_same_base(fits: Sequence[Fit]) -> None:
@@ -87,34 +87,25 @@ def combine(
     B = decomposition.inverse_information()
     covariance, scatter = np.zeros_like(B), np.zeros(len(B))
     for fit, (R, _), E in zip(fits, factors, maps, strict=True):
-        part, dof = _propagate(fit, B @ E.T @ R.T @ R)
+        C, dof = np.asarray(fit.covariance), np.asarray(fit.uncertainty.dof)
+        if not np.isfinite(C).all():
+            # The fit alone does not determine everything, so not all of its estimates have a
+            # variance. The effect of its errors on others follows from blocks of time.
+            parts = [part.weighted(fit.weights) for part in fit.time_blocks.parts]
+            _, C, few = solve_blocks(parts)
+            dof = np.full(len(C), few)
+        A = B @ E.T @ R.T @ R
+        part = A @ C @ A.T
         covariance += part
-        scatter += np.diag(part) ** 2 / dof
+        # The degrees of freedom of a sum are a mean of those of its terms.
+        weights = A**2 * np.diag(C)
+        whole = np.maximum(weights.sum(axis=1), 1e-300)
+        scatter += np.diag(part) ** 2 * (weights / dof).sum(axis=1) / whole
     with np.errstate(divide="ignore", invalid="ignore"):
         dof = np.where(scatter > 0, np.diag(covariance) ** 2 / scatter, np.inf)
     unknown = decomposition.unknown
     covariance[unknown, unknown] = np.inf
     return decomposition.solve(), Uncertainty(covariance, dof, covariance)
-
-
-def _propagate(
-    fit: Fit, A: Float[np.ndarray, "unknowns base"]
-) -> tuple[Float[np.ndarray, "unknowns unknowns"], Float[np.ndarray, " unknowns"]]:
-    """Return the covariance of unknowns that a fit's errors cause, and its degrees of freedom."""
-    C, dof = np.asarray(fit.covariance), np.asarray(fit.uncertainty.dof)
-    if not np.isfinite(C).all():
-        # The fit alone does not determine everything, so not all of its estimates have a variance.
-        # The effect of its errors on others follows from blocks of time.
-        decomposition = Decomposition.of(*fit.factor)
-        p = decomposition.solve()
-        parts = (part.weighted(fit.weights) for part in fit.time_blocks.parts)
-        blocks = [(R, z - R @ p) for R, z in parts]
-        C, few = block_covariance(blocks, decomposition.inverse_information())
-        dof = np.full(len(C), few)
-    weights = A**2 * np.diag(C)
-    whole = weights.sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return A @ C @ A.T, np.where(whole > 0, whole / (weights / dof).sum(axis=1), np.inf)
 
 
 def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:

@@ -2,7 +2,6 @@
 
 import enum
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -201,13 +200,7 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
     return compare_some(first, second, range(first.base.size), none, level)
 
 
-def compare_some(
-    first: Fit,
-    second: Fit,
-    indices: Sequence[int],
-    cross: Float[np.ndarray, "compared compared"],
-    level: float,
-) -> Comparison:
+def compare_some(first: Fit, second: Fit, indices, cross, level: float) -> Comparison:
     """Compare some base parameters of two fits, whose estimates have a cross-covariance."""
     if not 0 < level < 1:
         raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
@@ -238,11 +231,7 @@ def _holm(p: Float[np.ndarray, " tests"]) -> Float[np.ndarray, " tests"]:
     return adjusted
 
 
-def joint_test(
-    difference: Float[np.ndarray, " tested"],
-    covariance: Float[np.ndarray, "tested tested"],
-    dof: float,
-) -> tuple[float, float]:
+def joint_test(difference, covariance, dof: float) -> tuple[float, float]:
     r"""Test by $d^T C^{-1} d$ if differences are more than chance: statistic and p-value.
 
     It is chi-squared where the covariance is exact, else Hotelling's $T^2$. All variances must be

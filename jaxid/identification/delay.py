@@ -17,7 +17,7 @@ from jaxid.identification.estimators import AbstractWeights, MaximumForces
 from jaxid.identification.estimators.solutions import Decomposition
 from jaxid.identification.factors import Blocks, RowChunk
 from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.uncertainty.blocks import block_covariance
+from jaxid.identification.uncertainty.blocks import solve_blocks
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import require_finite_delay
 
@@ -75,8 +75,7 @@ def estimate_delay(
         InputError: If weights are not known, or the search does not settle: the delay is longer
             than the motion's shortest swings.
     """
-    single = isinstance(observations, Observations)
-    recordings = (observations,) if single else tuple(observations)
+    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
     n, size = base.model.robot.joints, base.size
     common = linalg.block_diag(np.eye(size), np.ones((n, 1)))
     total = _add_delays(base, recordings, np.zeros(size)).total
@@ -85,13 +84,8 @@ def estimate_delay(
     for _ in range(PASSES):
         shifted = [without_delay(o, seconds) for o in recordings]
         blocks = _add_delays(base, shifted, p)
-        R, z = blocks.total.weighted(w)
         parts = [part.weighted(w) for part in blocks.parts]
-        decomposition = Decomposition.of(R @ common, z)
-        x, B = decomposition.solve(), decomposition.inverse_information()
-        covariance, dof = block_covariance(
-            [(rows @ common, f - rows @ common @ x) for rows, f in parts], B
-        )
+        x, covariance, dof = solve_blocks([(R @ common, z) for R, z in parts])
         p, step, deviation = x[:size], float(x[size]), float(np.sqrt(covariance[size, size]))
         seconds += step
         if abs(step) <= max(1e-3 * deviation, 1e-9 * recordings[0].sample_time):
@@ -101,9 +95,7 @@ def estimate_delay(
             f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the log to where "
             "the robot moves, check angle columns and signs, or remove most of the delay first."
         )
-    decomposition = Decomposition.of(R, z)
-    x, B = decomposition.solve(), decomposition.inverse_information()
-    covariance, _ = block_covariance([(rows, f - rows @ x) for rows, f in parts], B)
+    x, covariance, _ = solve_blocks(parts)
     contrast = np.eye(n)[1:] - np.eye(n)[:1]
     differences = contrast @ covariance[size:, size:] @ contrast.T
     p_value = joint_test(contrast @ x[size:], differences, dof)[1]

@@ -5,8 +5,8 @@ kilobytes for each block of time. Factors are joined in a fixed order, so that e
 the same answer. The devices of one process need no function: `identify` uses all CPU devices.
 """
 
-import io
 import itertools
+import pickle
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from jax.experimental import multihost_utils
 from jaxid.arrays import require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.factors import Blocks, Factors, JointFactor
+from jaxid.identification.factors import Blocks
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations, Progress
 
@@ -85,7 +85,8 @@ def factorise_across_processes(
     content = repr((names, base.indices, np.round(base.kappa, 9).tolist())).encode()
     try:
         _wait(patience)
-        packed = _pack(own.condense(max(1, MOST // processes)))
+        own = own.condense(max(1, MOST // processes))
+        packed = np.frombuffer(pickle.dumps(own), np.uint8)
         head = np.array([zlib.crc32(content), len(packed)])
         heads = multihost_utils.process_allgather(head)
         if (heads[:, 0] != heads[0, 0]).any():
@@ -96,7 +97,7 @@ def factorise_across_processes(
         filled = np.pad(packed, (0, heads[:, 1].max() - len(packed)))
         gathered = np.asarray(multihost_utils.process_allgather(filled))
         found = zip(gathered, heads[:, 1], strict=True)
-        parts = [part for x, length in found for part in _unpack(x[:length], base)]
+        parts = [part for x, length in found for part in pickle.loads(x[:length]).parts]
         return RegressionProblem(base, blocks=Blocks(tuple(parts)))
     except jax.errors.JaxRuntimeError as error:
         raise RuntimeError(
@@ -124,21 +125,3 @@ def _wait(patience: float) -> None:
             f"factors, but not all came within {patience:g} s: look for the first error in the "
             f"others' logs, or raise `patience`. ({str(error).splitlines()[0]})"
         ) from error
-
-
-def _pack(blocks: Blocks) -> np.ndarray:
-    """Return the factors as bytes."""
-    buffer, triangles = io.BytesIO(), [joint.R for part in blocks.parts for joint in part.joints]
-    np.savez(buffer, *triangles, rows=[part.rows for part in blocks.parts])
-    return np.frombuffer(buffer.getvalue(), np.uint8)
-
-
-def _unpack(packed: np.ndarray, base: BaseParameters) -> list[Factors]:
-    """Return the factors of some bytes."""
-    found = np.load(io.BytesIO(packed.tobytes()))
-    triangles = (found[f"arr_{k}"] for k in itertools.count())
-    parts = []
-    for rows in found["rows"].tolist():
-        joints = zip(base.acting_columns, triangles, rows, strict=False)
-        parts.append(Factors(tuple(JointFactor(*joint) for joint in joints), base.size))
-    return parts

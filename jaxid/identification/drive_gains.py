@@ -125,13 +125,7 @@ def identify_drive_gains(
     return DriveGains(1.0 / c, uncertainty, maps[0] @ solution.x[:size], robot.joint_names)
 
 
-def _linearise(
-    factors: Factors,
-    weights: Float[AnyArray, " joints"],
-    E: Float[np.ndarray, "base unknowns"],
-    offset: Float[np.ndarray, " base"],
-    unknowns: Float[np.ndarray, " all"],
-) -> tuple[Float[np.ndarray, " height"], Float[np.ndarray, "height all"]]:
+def _linearise(factors: Factors, weights, E, offset, unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Return weighted predicted less measured forces, in nominal units, and their derivatives.
 
     The unknowns are those of the base parameters, then the reciprocal gains.

@@ -9,7 +9,7 @@ factors. The observation matrix is never held in memory.
 import functools
 import itertools
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Observations
 
 Columns = Sequence[tuple[int, ...]]
@@ -73,10 +74,7 @@ class RowChunk(NamedTuple):
 
 
 def row_chunks(
-    base: BaseParameters,
-    observations: Observations,
-    samples: int,
-    wanted: Sequence[tuple[int, int]] | None = None,
+    base: BaseParameters, observations: Observations, samples: int, wanted=None
 ) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
 
@@ -88,12 +86,16 @@ def row_chunks(
         if wanted is not None and not any(a < last and first < b for a, b in wanted):
             continue
         motion, forces = observations.read(slice(*chunk.samples))
-        forces = np.asarray(forces)
-        if base.model.robot.tool is not None:
-            forces = forces - base.tool_forces(motion)
+        forces = without_tool(base, motion, forces)
         columns = [chunk.reduce(theta) for theta in base.regressor_rows(motion)]
         rows = slice(first, last)
         yield RowChunk(0, 0, rows, indices, columns, chunk.reduce(forces), mask[rows])
+
+
+def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> np.ndarray:
+    """Return measured forces less those of a known tool [N m or N]."""
+    forces = np.asarray(forces)
+    return forces if base.model.robot.tool is None else forces - base.tool_forces(motion)
 
 
 def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]]:
@@ -144,12 +146,6 @@ class Factors(eqx.Module):
         joints = []
         for a, b in zip(self.joints, other.joints, strict=True):
             joints.append(JointFactor(a.columns, a.append(b.R).R, a.rows + b.rows))
-        return Factors(tuple(joints), self.size)
-
-    def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Factors":
-        """Return the factors of rows that are multiplied by one factor for each joint."""
-        pairs = zip(self.joints, np.asarray(factors), strict=True)
-        joints = [JointFactor(j.columns, x * np.asarray(j.R), j.rows) for j, x in pairs]
         return Factors(tuple(joints), self.size)
 
     @property
@@ -205,13 +201,18 @@ class Blocks(eqx.Module):
         """The factors of all rows."""
         return functools.reduce(operator.add, self.parts)
 
-    def without(self, block: int) -> Factors:
-        """Return the factors of all rows but those of one block."""
-        return Blocks((*self.parts[:block], *self.parts[block + 1 :])).total
+    def select(self, chosen: Iterable[int]) -> "Blocks":
+        """Return some of the blocks."""
+        return Blocks(tuple(self.parts[k] for k in chosen))
 
     def scale_joints(self, factors: Float[AnyArray, " joints"]) -> "Blocks":
         """Return the factors of rows that are multiplied by one factor for each joint."""
-        return Blocks(tuple(part.scale_joints(factors) for part in self.parts))
+        parts = []
+        for part in self.parts:
+            pairs = zip(part.joints, np.asarray(factors), strict=True)
+            joints = (JointFactor(j.columns, x * np.asarray(j.R), j.rows) for j, x in pairs)
+            parts.append(Factors(tuple(joints), part.size))
+        return Blocks(tuple(parts))
 
     def condense(self, most: int) -> "Blocks":
         """Return the same rows in at most so many blocks; neighbours are joined in pairs."""

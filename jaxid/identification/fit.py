@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -383,14 +382,7 @@ def _check(fit: Fit) -> None:
         raise InputError("`parameters` must hold finite numbers")
 
 
-def interval_table(
-    title: str,
-    names: Sequence[str],
-    units: Sequence[str],
-    values: Float[AnyArray, " estimates"],
-    uncertainty: Uncertainty,
-    remarks: Iterable[Remark] = (),
-) -> Table:
+def interval_table(title: str, names, units, values, uncertainty: Uncertainty, remarks=()) -> Table:
     """Return a table of estimates with their 95 % intervals."""
     estimates, half_widths = with_deviations(values, uncertainty.half_widths())
     return Table(

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.estimators.estimate import AbstractEstimator, Estimate
+from jaxid.identification.estimators.estimate import AbstractEstimator
 from jaxid.identification.estimators.least_squares import WeightedLeastSquares
 from jaxid.identification.estimators.solutions import (
     NUMERICAL,
@@ -91,7 +91,15 @@ def fit_problem(
     factors = plain.factors if blocks is plain.blocks else blocks.total
     R, z = factors.weighted(weights)
     decomposition = Decomposition.of(R, z)
-    naive = _naive_covariance(factors, R, decomposition, estimate)
+    B, taken = np.asarray(estimate.inverse), estimate.effective_parameters
+    taken = float(np.sum((R @ B) * R)) if taken is None else taken
+    naive = naive_covariance(factors, weights, p, B, taken)
+    unknown = decomposition.unknown
+    naive[unknown, unknown] = np.inf
+    raw, _ = factors.weighted(np.ones(len(weights)))
+    # Columns of length one.
+    scaled = R / np.where(R.any(axis=0), np.linalg.norm(R, axis=0), 1.0)
+    numbers = [float(np.linalg.cond(x)) if x.any() else np.inf for x in (raw, R, scaled)]
     method = SpectralSandwich() if uncertainty is None else uncertainty
     errors, spectra = method(plain, estimate, naive)
     shrinkage = _shrinkage_notes(decomposition, estimate.solution)
@@ -100,7 +108,7 @@ def fit_problem(
         parameters=p,
         uncertainty=errors,
         weights=weights,
-        condition_numbers=_condition_numbers(factors, R),
+        condition_numbers=ConditionNumbers(*numbers),
         rows=tuple(int(n) for n in plain.factors.rows),
         residual_rms=np.sqrt(squares / np.maximum(plain.factors.rows, 1)),
         residual_spectra=spectra,
@@ -119,46 +127,39 @@ def fit_problem(
 
 
 def _check(base: Any, recordings: Sequence[Any]) -> None:
-    if not isinstance(base, BaseParameters):
-        raise TypeError(
-            f"`base` must be base parameters, but is a `{type(base).__name__}`: pass the result of "
-            "`base_parameters(model)`."
-        )
-    n = base.model.robot.joints
-    for observations in recordings:
-        if not isinstance(observations, Observations):
+    wanted = [("base", base, BaseParameters, "base_parameters(model)")]
+    wanted += [("observations", o, Observations, "observe(...)") for o in recordings]
+    for name, value, kind, function in wanted:
+        if not isinstance(value, kind):
             raise TypeError(
-                "`observations` must be the result of `observe`, or a sequence of such, but hold a "
-                f"`{type(observations).__name__}`."
+                f"`{name}` must be `{kind.__name__}`, but holds a `{type(value).__name__}`: pass "
+                f"the result of `{function}`."
             )
-        if observations.joints != n:
+    n = base.model.robot.joints
+    for o in recordings:
+        if o.joints != n:
             raise InputError(
-                f"`observations` of `{observations.name}` have {observations.joints} joints, but "
+                f"`observations` of `{o.name}` have {o.joints} joints, but "
                 f"`{base.model.robot.name}` has {n}."
             )
 
 
-def _naive_covariance(
-    factors: Factors, R: np.ndarray, decomposition: Decomposition, estimate: Estimate
+def naive_covariance(
+    factors: Factors, weights: np.ndarray, p: np.ndarray, B: np.ndarray, taken: float = 0.0
 ) -> np.ndarray:
     r"""Return the covariance for independent rows and a variance of each joint.
 
     The estimates are $B \Theta^T W^2 Q$, so their covariance is
     $B (\sum_j w_j^4 \sigma_j^2 \Theta_j^T \Theta_j) B$: right also where the weights are not the
-    reciprocals of the standard deviations.
+    reciprocals of the standard deviations. The rows determine so many (`taken`) parameters.
     """
-    B, weights = np.asarray(estimate.inverse), np.asarray(estimate.weights)
-    squares = factors.residual_squares(estimate.parameters)
-    taken = estimate.effective_parameters
-    taken = float(np.sum((R @ B) * R)) if taken is None else taken
     free = 1.0 - taken / float(factors.rows.sum())
-    covariance = np.zeros_like(B)
-    for joint, w, square in zip(factors.joints, weights, squares, strict=True):
+    total = np.zeros((B.shape[1], B.shape[1]))
+    joints = zip(factors.joints, weights, factors.residual_squares(p), strict=True)
+    for joint, w, square in joints:
         gain = w**2 * np.asarray(joint.R)[:, :-1] @ B[list(joint.columns)]
-        covariance += square / max(joint.rows * free, 1.0) * (gain.T @ gain)
-    unknown = decomposition.unknown
-    covariance[unknown, unknown] = np.inf
-    return covariance
+        total += square / max(joint.rows * free, 1.0) * (gain.T @ gain)
+    return total
 
 
 def _shrinkage_notes(
@@ -174,13 +175,4 @@ def _shrinkage_notes(
         f"the solution pulls {pulled} of {len(s)} directions of the parameters to less than half "
         "of what the data say: standard deviations tell how estimates scatter, not how far this "
         "pull takes them from the truth, and look too good where logs leave parameters open.",
-    )
-
-
-def _condition_numbers(factors: Factors, weighted: np.ndarray) -> ConditionNumbers:
-    raw, _ = factors.weighted(np.ones(len(factors.joints)))
-    norms = np.linalg.norm(weighted, axis=0)
-    scaled = weighted / np.where(norms > 0, norms, 1.0)
-    return ConditionNumbers(
-        *(float(np.linalg.cond(x)) if x.any() else np.inf for x in (raw, weighted, scaled))
     )

@@ -17,7 +17,6 @@ from jaxid.identification.estimators.friction import (
     NonlinearFriction,
     SeparableProblem,
     Shapes,
-    join_blocks,
     project,
     search_shapes,
 )
@@ -126,7 +125,16 @@ def identify_nonlinear(
     shapes, size = separable.shapes, base.size
     shaped = shapes.set(base, x)
     fit = fit_problem(RegressionProblem(shaped, recordings), estimator.linear)
-    linearised = _with_slopes(shaped, dataclasses.replace(shapes, model=shaped.model), x, fit)
+    # Small changes of the shapes are further parameters.
+    model, kappa = shaped.model, np.asarray(base.kappa)
+    p = np.asarray(shaped.to_standard(np.asarray(fit.parameters)))[shapes.columns_of_terms]
+    slopes = ShapeSlopes(dataclasses.replace(shapes, model=model), x, p)
+    linearised = dataclasses.replace(
+        shaped,
+        model=Model(model.robot, (*model.terms, slopes)),
+        indices=(*base.indices, *range(model.size, model.size + shapes.size)),
+        kappa=np.vstack([kappa, np.zeros((shapes.size, kappa.shape[1]))]),
+    )
     both = fit_problem(RegressionProblem(linearised, recordings), estimator.linear).uncertainty
     uncertainty = jax.tree.map(lambda x: x[(slice(size),) * x.ndim], both)
     return NonlinearFit(
@@ -148,12 +156,12 @@ def _held_out_errors(blocks, problem: SeparableProblem, found, weights, progress
     folds = [part.tolist() for part in np.array_split(np.arange(count), min(5, count))]
     for out in folds:
         rest = [k for k in range(count) if k not in out]
-        p = Decomposition.of(*join_blocks(blocks, rest).weighted(weights)).solve()
+        p = Decomposition.of(*blocks.select(rest).total.weighted(weights)).solve()
         x, _ = search_shapes(problem, weights, problem.shapes.values, found, rest)
         shaped = problem.blocks(x)
         c = np.zeros(problem.size)
-        c[: problem.base.size] = project(problem, join_blocks(shaped, rest), weights)[0]
-        tests = join_blocks(blocks, out), join_blocks(shaped, out)
+        c[: problem.base.size] = project(problem, shaped.select(rest).total, weights)[0]
+        tests = blocks.select(out).total, shaped.select(out).total
         own = [t.residual_squares(y) for t, y in zip(tests, (p, c), strict=True)]
         errors.append([squares @ y for y in (*own, tests[0].force_squares)])
         if progress is not None:
@@ -192,20 +200,6 @@ class ShapeSlopes(AbstractTerm):
             return self.shapes.columns(x, q, qd, qdd) @ jnp.asarray(self.p)
 
         return jax.jacfwd(forces)(jnp.asarray(self.x, q.dtype))
-
-
-def _with_slopes(base: BaseParameters, shapes: Shapes, x: np.ndarray, fit: Fit) -> BaseParameters:
-    """Return base parameters with small changes of shapes as further parameters."""
-    model, n = base.model, base.model.size
-    p = np.asarray(base.to_standard(np.asarray(fit.parameters)))
-    slopes = ShapeSlopes(shapes, x, p[shapes.columns_of_terms])
-    kappa = np.asarray(base.kappa)
-    return dataclasses.replace(
-        base,
-        model=Model(model.robot, (*model.terms, slopes)),
-        indices=(*base.indices, *range(n, n + shapes.size)),
-        kappa=np.vstack([kappa, np.zeros((shapes.size, kappa.shape[1]))]),
-    )
 
 
 class TemperatureLaw(eqx.Module):

@@ -5,9 +5,7 @@ and with the forces (Gram matrices) and the solution follow for each, with one r
 residuals themselves where products alone would lose digits.
 """
 
-import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +15,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.regressor import JointRegressor
-from jaxid.identification.uncertainty.spectral import line_sums, variances
+from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
 AT_ONCE = 2048
 """Samples up to which several data sets evaluate their columns together."""
@@ -28,8 +26,6 @@ ACCURATE = 1e3
 """Bound of the condition number up to which the products' solution needs no refinement."""
 SMALL = 1e-6
 """Fraction of the forces' squares below which the residuals' are summed themselves."""
-KEPT = 8
-"""Shapes of batches for which what was compiled is kept: memory does not grow with their number."""
 RIDGE = 64 * np.finfo(float).eps
 
 
@@ -74,25 +70,12 @@ class DataSets(NamedTuple):
     numbers: AnyArray | None
 
 
+@eqx.filter_jit
 def solve(rows: JointRegressor, batch: DataSets, row_time: float | None = None) -> BatchFit:
-    """Solve all data sets, a group at a time; compiled once for each of the latest shapes.
+    """Solve all data sets, a group at a time.
 
     With the time between two rows [s], standard deviations come from the spectral sandwich.
     """
-    arrays, rest = eqx.partition((rows, batch, row_time), lambda x: isinstance(x, AnyArray))
-    constants, tree = jax.tree.flatten(rest)
-    shapes = tuple((x.shape, str(x.dtype)) for x in jax.tree.leaves(arrays))
-    return _compiled(tree, tuple(constants), shapes)(arrays)
-
-
-@functools.lru_cache(maxsize=KEPT)
-def _compiled(tree: Any, constants: tuple, shapes: tuple) -> Callable:
-    """Return the computation for some shapes; what is forgotten here gives its memory back."""
-    rest = jax.tree.unflatten(tree, constants)
-    return jax.jit(lambda arrays: _solved(*eqx.combine(arrays, rest)))
-
-
-def _solved(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
     batch = jax.tree.map(jnp.asarray, batch)
     datasets, samples, _ = batch.motion.q.shape
     calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
@@ -107,21 +90,17 @@ def _solved(rows: JointRegressor, batch: DataSets, row_time: float | None) -> Ba
         return _solve_one(rows, *pair, row_time)
 
     def solve_group(sets: DataSets) -> BatchFit:
-        pairs = sets, _columns(rows, sets)
+        arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(sets.motion)]
+        if sets.numbers is not None:
+            numbers = sets.numbers.T[:, :, None]
+            arrays.append(jnp.broadcast_to(numbers, (*numbers.shape[:2], samples)))
+        # Columns of each joint [datasets, columns, samples].
+        pairs = sets, rows(*arrays)
         # A CPU multiplies the matrices of one data set faster than those of several together.
         return jax.vmap(one)(pairs) if jax.default_backend() != "cpu" else jax.lax.map(one, pairs)
 
     fits = jax.lax.map(solve_group, groups)
     return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
-
-
-def _columns(rows: JointRegressor, batch: DataSets) -> list[Array]:
-    """Return for each joint the columns of some data sets, [datasets, columns, samples]."""
-    arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(batch.motion)]
-    if batch.numbers is not None:
-        numbers = batch.numbers.T[:, :, None]
-        arrays.append(jnp.broadcast_to(numbers, (*numbers.shape[:2], arrays[0].shape[-1])))
-    return rows(*arrays)
 
 
 def _solve_one(
@@ -130,7 +109,10 @@ def _solve_one(
     """Solve one data set by the products of its rows."""
     weights, places = one.weights, [np.array(own, int) for own in rows.columns]
     length, size = len(one.motion.q), rows.size
-    A, Q = _counted(one, columns)
+    A, Q = columns, list(jnp.moveaxis(one.forces, -1, 0))
+    if one.mask is not None:
+        masks = one.mask.T[:, None] > 0
+        A, Q = ([jnp.where(*x, 0.0) for x in zip(masks, y, strict=True)] for y in (A, Q))
 
     def weighted_sum(products: list[Array]) -> Array:
         """Add the weighted products of columns with forces [draws, base]."""
@@ -174,8 +156,10 @@ def _solve_one(
     naive = jnp.sqrt(jnp.maximum(naive, 0.0))
     deviations, dof = naive, jnp.broadcast_to(count.sum() - size, naive.shape)
     if row_time is not None:
-        lines = line_sums(rows.columns, weights, inverse, p, A, Q, count / length)
-        variance, dof = variances(lines, length, row_time)
+        exposure = count / length
+        variance, dof = sandwich_of_columns(
+            rows.columns, weights, inverse, p, A, Q, exposure, row_time
+        )
         deviations = jnp.sqrt(jnp.maximum(variance, 0.0))
     return BatchFit(
         p,
@@ -185,18 +169,6 @@ def _solve_one(
         (condition < WELL_CONDITIONED) & (count.sum() > size),
         naive,
         dof,
-    )
-
-
-def _counted(one: DataSets, columns: list[Array]) -> tuple[list[Array], list[Array]]:
-    """Return each joint's columns [columns, samples] and forces [draws, samples] that count."""
-    forces = list(jnp.moveaxis(one.forces, -1, 0))
-    if one.mask is None:
-        return columns, forces
-    masks = one.mask.T[:, None]
-    return (
-        [jnp.where(m > 0, x, 0.0) for m, x in zip(masks, columns, strict=True)],
-        [jnp.where(m > 0, x, 0.0) for m, x in zip(masks, forces, strict=True)],
     )
 
 

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.combination import as_least_squares, combine, require_same_base
@@ -14,7 +16,7 @@ from jaxid.identification.fit import Fit, interval_table
 from jaxid.identification.states import state_maps, varying_parameters
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
-from jaxid.robot.robot import Robot, Tool
+from jaxid.robot.robot import Tool
 from jaxid.table import Remark, Status, Table
 
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
@@ -69,7 +71,9 @@ class Payload(eqx.Module):
     @property
     def central(self) -> tuple[Float[np.ndarray, "10"], Uncertainty]:
         """Mass, centre of mass, and moments about it, with their uncertainty (`CENTRAL_NAMES`)."""
-        values, J = _about_centre(np.asarray(self.parameters))
+        with double_precision():
+            p = jnp.asarray(self.parameters)
+            values, J = (np.asarray(f(p)) for f in (_about_centre, jax.jacfwd(_about_centre)))
         C = np.asarray(self.uncertainty.covariance)
         covariance = J @ np.where(np.isfinite(C), C, 0.0) @ J.T
         lost = np.any(J[:, ~np.isfinite(np.diag(C))] != 0.0, axis=1)
@@ -133,26 +137,15 @@ def identify_payload(
     first, second = state_maps(base.size, varying_parameters(base, varying), 2)
     added = body_columns(base, body)
     maps = [np.hstack([first, np.zeros_like(added)]), np.hstack([second, added])]
-    x, known = combine([as_least_squares(unloaded), as_least_squares(loaded)], maps)
-    covariance = np.asarray(known.covariance)[-10:, -10:]
-    dof = np.full(10, np.min(np.asarray(known.dof)[-10:]))
-    p, distance = _nearest_body(x[-10:], covariance, base.model.robot, bounds)
-    return Payload(body, p, x[-10:], Uncertainty(covariance, dof, covariance), distance)
-
-
-def _nearest_body(
-    estimate: Float[np.ndarray, "10"],
-    covariance: Float[np.ndarray, "10 10"],
-    robot: Robot,
-    bounds: BodyBounds | None,
-) -> tuple[Float[np.ndarray, "10"], float]:
-    """Return the nearest parameters of a body that can exist, and their distance."""
-    if not np.isfinite(covariance).all():
-        return estimate, np.nan
+    x, both = combine([as_least_squares(unloaded), as_least_squares(loaded)], maps)
+    covariance = np.asarray(both.covariance)[-10:, -10:]
+    dof = np.full(10, np.min(np.asarray(both.dof)[-10:]))
+    estimate, uncertainty = x[-10:], Uncertainty(covariance, dof, covariance)
+    known = np.isfinite(covariance).all()
+    if not known or (bounds is None and consistency_margin(estimate) >= 0):
+        return Payload(body, estimate, estimate, uncertainty, 0.0 if known else np.nan)
     if bounds is None:
-        if consistency_margin(estimate) >= 0:
-            return estimate, 0.0
-        wide = BodyBounds.from_geometry(robot)
+        wide = BodyBounds.from_geometry(base.model.robot)
         bounds = BodyBounds(mass_max=np.max(wide.mass_max), radius=np.max(wide.radius))
     # Estimates that are known too well, as those of noiseless data, leave no digits for a proof:
     # a relative error of one percent of half the squared distance is good enough.
@@ -162,7 +155,7 @@ def _nearest_body(
             "no body that could exist was proved to be the nearest to the payload's estimate, "
             f"whose mass is {estimate[0]:.4g} kg: are the runs those of the same robot?"
         )
-    return p, distance
+    return Payload(body, p, estimate, uncertainty, distance)
 
 
 def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"]:
@@ -181,17 +174,8 @@ def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"
     return np.asarray(base.from_standard(unit)).T
 
 
-def _about_centre(
-    p: Float[np.ndarray, "10"],
-) -> tuple[Float[np.ndarray, "10"], Float[np.ndarray, "10 10"]]:
-    """Return mass, centre of mass, and the six moments about it; and their derivatives."""
-    m, h = p[0], p[1:4]
-    x, y, z = np.eye(3)
-    squares = np.array([np.diag(y + z), np.diag(x + z), np.diag(x + y)])
-    products = np.array([np.outer(a, b) + np.outer(b, a) for a, b in ((y, z), (x, z), (x, y))])
-    shift = np.concatenate([squares, 0.5 * products]) @ h / m
-    values = np.concatenate([[m], h / m, p[4:] - shift @ h])
-    J = np.eye(10)
-    J[1:4, 0], J[1:4, 1:4] = -h / m**2, np.eye(3) / m
-    J[4:, 0], J[4:, 1:4] = shift @ h / m, -2.0 * shift
-    return values, J
+def _about_centre(p: Float[Array, "10"]) -> Float[Array, "10"]:
+    """Return mass, centre of mass, and the six moments about it."""
+    body = Inertia.from_parameters(p)
+    central = Inertia(body.mass, jnp.zeros_like(body.centre), body.tensor).parameters
+    return jnp.concatenate([p[:1], body.centre, central[4:]])

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.factors import (
@@ -81,9 +82,8 @@ class RegressionProblem:
                 report = functools.partial(self._report, number)
                 parts += stream_blocks(self.base, recording, edges, report)
             else:
-                chunks, acting = self._chunks(number), self.base.acting_columns
-                folded = self._fold(chunks, RowChunk.equations, acting, self.base.size)
-                parts += folded[first : first + len(edges) - 1]
+                folded = self.fold(RowChunk.equations, chunks=self._chunks(number))
+                parts += folded.parts[first : first + len(edges) - 1]
         return Blocks(tuple(parts))
 
     @functools.cached_property
@@ -119,6 +119,7 @@ class RegressionProblem:
         equations: Equations,
         columns: Columns | None = None,
         size: int | None = None,
+        chunks: Iterable[RowChunk] | None = None,
     ) -> Blocks:
         """Return the factors of transformed rows, by blocks of time.
 
@@ -126,21 +127,17 @@ class RegressionProblem:
             equations: Function from a chunk to the rows `[columns, force]` of each joint.
             columns: Parameters to which these columns belong; by default those of the rows.
             size: Number of all parameters; by default that of the base parameters.
+            chunks: Rows; by default all.
 
         Raises:
             InputError: If only factors are known.
         """
         columns = self.base.acting_columns if columns is None else columns
         size = self.base.size if size is None else size
-        return Blocks(tuple(self._fold(self.chunks(), equations, columns, size)))
-
-    def _fold(
-        self, chunks: Iterable[RowChunk], equations: Equations, columns: Columns, size: int
-    ) -> list[Factors]:
         parts = [empty_factors(columns, size)] * self._first_block(len(self.recordings))
-        for chunk in chunks:
+        for chunk in self.chunks() if chunks is None else chunks:
             parts[chunk.block] = parts[chunk.block].append(equations(chunk))
-        return parts
+        return Blocks(tuple(parts))
 
     def chunks(self, spans: Sequence[Span] | None = None) -> Iterator[RowChunk]:
         """Yield the rows, recording by recording, in their order.
@@ -191,17 +188,21 @@ class RegressionProblem:
             yield chunk, chunk.residuals(p)
 
     def reweighted(
-        self, p: np.ndarray, weight: Callable[[np.ndarray, np.ndarray], np.ndarray]
+        self,
+        p: np.ndarray,
+        weight: Callable[[np.ndarray], np.ndarray],
+        scale: Float[np.ndarray, " joints"],
     ) -> Blocks:
         """Return the factors of rows that have weights of their own, by the same blocks of time.
 
         Args:
             p: Base parameters, which give each row its residual.
-            weight: Function from residuals and mask [rows, joints] to weights from 0 to 1.
+            weight: Function from residuals, divided by their scale, to weights from 0 to 1.
+            scale: Size of each joint's residuals [N m or N].
         """
 
         def equations(chunk: RowChunk) -> list[np.ndarray]:
-            root = np.sqrt(weight(chunk.residuals(p), chunk.mask))
+            root = np.sqrt(weight(chunk.residuals(p) / scale))
             parts = zip(chunk.equations(), root.T, chunk.mask.T, strict=True)
             return [w[kept, None] * rows for rows, w, kept in parts]
 
@@ -219,7 +220,7 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
 
 
 def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blocks, Blocks]]:
-    """Yield the blocks of time without one contiguous part, and that part, for each part in turn.
+    """Yield the blocks without one contiguous part of time, and that part, for each part in turn.
 
     Raises:
         InputError: If there are fewer than two blocks.
@@ -230,6 +231,5 @@ def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blo
             "held-out errors need at least two blocks of rows, but there is one: record longer."
         )
     for part in np.array_split(np.arange(size), min(count, size)):
-        out = part.tolist()
-        rest = tuple(b for k, b in enumerate(blocks.parts) if k not in out)
-        yield Blocks(rest), Blocks(tuple(blocks.parts[k] for k in out))
+        rest = np.setdiff1d(np.arange(size), part)
+        yield blocks.select(rest), blocks.select(part)

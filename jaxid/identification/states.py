@@ -118,9 +118,7 @@ class StatesFit(eqx.Module):
         return state_indices(self.base.size, self.varying, self.states.index(state))
 
 
-def identify_states(
-    fits: Sequence[Fit], varying: Sequence[str] | None = None, shared: Sequence[str] | None = None
-) -> StatesFit:
+def identify_states(fits: Sequence[Fit], varying: Sequence[str] | None = None) -> StatesFit:
     """Identify a robot in several states at once: inertia is shared, friction is each state's.
 
     The factors of the fits are combined, without another pass over the data. Shared parameters
@@ -131,8 +129,6 @@ def identify_states(
         fits: Fit of each state, with different names.
         varying: Names of the base parameters that each state has for itself. If None, those that
             store no energy: friction and offsets.
-        shared: Names of the base parameters that are the same in all states; an alternative to
-            `varying`.
 
     Raises:
         InputError: If there are fewer than two fits, two have the same name, base parameters
@@ -147,7 +143,7 @@ def identify_states(
         )
     fits = tuple(map(as_least_squares, fits))
     base = fits[0].base
-    own = varying_parameters(base, varying, shared)
+    own = varying_parameters(base, varying)
     same = tuple(k for k in range(base.size) if k not in own)
     return StatesFit(fits, same, own, *combine(fits, state_maps(base.size, own, len(fits))))
 
@@ -168,21 +164,16 @@ def state_maps(
     return [unit[state_indices(size, varying, state)] for state in range(states)]
 
 
-def varying_parameters(
-    base: BaseParameters, varying: Sequence[str] | None, shared: Sequence[str] | None = None
-) -> tuple[int, ...]:
+def varying_parameters(base: BaseParameters, varying: Sequence[str] | None) -> tuple[int, ...]:
     """Return which base parameters each state has for itself; by default those without energy."""
-    if varying is not None and shared is not None:
-        raise InputError("give either `varying` or `shared`, and not both.")
-    names = shared if varying is None else varying
-    if names is None:
-        return tuple(int(k) for k in np.flatnonzero(~stores_energy(base)))
-    for name in names:
+    if varying is None:
+        return tuple(np.flatnonzero(~stores_energy(base)).tolist())
+    for name in varying:
         if name not in base.names:
             raise InputError(
                 f"`{name}` is no base parameter of `{base.model.robot.name}`: see `base.names`."
             )
-    return tuple(k for k, x in enumerate(base.names) if (x in names) == (varying is not None))
+    return tuple(k for k, x in enumerate(base.names) if x in varying)
 
 
 def stores_energy(base: BaseParameters) -> Bool[np.ndarray, " base"]:

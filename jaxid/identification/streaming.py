@@ -18,13 +18,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
-from scipy import signal
 
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import program_of
-from jaxid.identification.factors import Factors, JointFactor, divide_rows, row_chunks
+from jaxid.identification.factors import Factors, JointFactor, divide_rows, row_chunks, without_tool
 from jaxid.measurement.filters import LowPass
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.program import Program, lower
@@ -71,58 +69,50 @@ def impulse_response(low_pass: LowPass) -> Float[np.ndarray, " lags"]:
     if not low_pass.sections:
         return np.ones(1)
     half = low_pass.memory()
-    sos = np.array(low_pass.sections)
-    impulse = np.zeros(2 * half + 1)
-    impulse[0] = 1.0
-    backward = signal.sosfilt(sos, impulse)[::-1]
-    two_way = signal.sosfilt(sos, np.concatenate([backward, np.zeros(half)]))
-    # The tail that the first pass cut off has decayed: the middle of the response is symmetric.
-    right = two_way[2 * half :]
-    return np.concatenate([right[:0:-1], right])
+    return low_pass(np.eye(1, 6 * half + 1, 3 * half)[0])[2 * half : 4 * half + 1]
 
 
 class LoopShape(NamedTuple):
-    """Samples of an iteration, largest number of iterations of a call, and sizes of the stages.
+    """Sizes of the loop and of its stages.
 
-    These are the decimation factors, the lengths of the responses, and the rows by which results
-    come late.
+    Attributes:
+        samples: Samples of an iteration.
+        rows: Rows of an iteration.
+        iterations: Largest number of iterations of a call.
+        factors: Decimation factor of each stage.
+        lags: Length of the response of each stage.
+        delays: Rows by which the results of each stage come late.
+        delay: Rows at the start of a call that stand for nothing yet.
+        reach: Number of samples before, and after, a row's instant on which it depends.
     """
 
     samples: int
+    rows: int
     iterations: int
     factors: tuple[int, ...]
     lags: tuple[int, ...]
     delays: tuple[int, ...]
+    delay: int
+    reach: int
 
     @classmethod
     def of(cls, stages: Sequence[Stage], chunk: int) -> "LoopShape":
         """Return the sizes for some stages and about so many samples of an iteration."""
         factors = tuple(factor for _, factor in stages)
         lags = tuple(len(response) for response, _ in stages)
-        samples = max(1, round(chunk / math.prod(factors))) * math.prod(factors)
-        delays = []
-        for k, (n, f) in enumerate(zip(lags, factors, strict=True)):
+        later = whole = math.prod(factors)
+        delays, delay, reach = [], 0, 0
+        for n, factor in zip(lags, factors, strict=True):
+            reach += whole // later * (n // 2)
+            later //= factor
             # Later stages must get complete rows.
-            later = math.prod(factors[k + 1 :])
-            delays.append(later * -(-max(0, n - f) // (f * later)))
-        return cls(samples, max(1, PIECE // samples), factors, lags, tuple(delays))
-
-    @property
-    def rows(self) -> int:
-        """Rows of an iteration."""
-        return self.samples // math.prod(self.factors)
-
-    @property
-    def delay(self) -> int:
-        """Rows at the start of a call that stand for nothing yet."""
-        rates = [math.prod(self.factors[k + 1 :]) for k in range(len(self.factors))]
-        return sum(d // rate for d, rate in zip(self.delays, rates, strict=True))
-
-    @property
-    def reach(self) -> int:
-        """Number of samples before, and after, a row's instant on which it depends."""
-        rates = [math.prod(self.factors[:k]) for k in range(len(self.factors))]
-        return sum(rate * (n // 2) for rate, n in zip(rates, self.lags, strict=True))
+            rows = -(-max(0, n - factor) // (factor * later))
+            delays.append(later * rows)
+            delay += rows
+        rows = max(1, round(chunk / whole))
+        samples = rows * whole
+        sizes = samples, rows, max(1, PIECE // samples)
+        return cls(*sizes, factors, lags, tuple(delays), delay, reach)
 
 
 Piece = tuple[int, tuple[int, int], slice]
@@ -153,18 +143,13 @@ def stream_blocks(
 class _Stream:
     """Pass of one log through the compiled loop; see `stream_blocks`."""
 
-    def __init__(
-        self,
-        base: BaseParameters,
-        observations: Observations,
-        edges: Sequence[int],
-        progress: Progress | None,
-    ):
+    def __init__(self, base: BaseParameters, observations: Observations, edges, progress):
         stages, self._stride = _stages(observations), 1
         if all(len(response) == 1 for response, _ in stages):
             # Without filters the samples between the rows are not needed.
             self._stride, stages = math.prod(factor for _, factor in stages), ()
-        self._observations, self._edges, self._progress = observations, list(edges), progress
+        self._base, self._observations = base, observations
+        self._edges, self._progress = list(edges), progress
         self._widths = [len(columns) + 1 for columns in base.acting_columns]
         self._mask = np.asarray(observations.mask)
         self._shape = LoopShape.of(stages, CHUNK)
@@ -175,13 +160,11 @@ class _Stream:
         ]
         self._devices = jax.local_devices(backend="cpu")
         n = (base.model.robot.joints,)
-        columns, tool = program_of(base, base.columns, n, n, n), None
-        if base.model.robot.tool is not None:
-            tool = program_of(base.model, base.model.known_forces, n, n, n)
-        self._loop = _compiled(columns, tool, tuple(base.acting_columns), self._shape)
+        columns = program_of(base, base.columns, n, n, n)
+        self._loop = _compiled(columns, tuple(base.acting_columns), self._shape)
         segments = range(len(observations.segments))
         self._pieces = [piece for k in segments for piece in self._divide(k)]
-        self._ends = list(self._reduce_ends(base)) if self._shape.reach else []
+        self._ends = list(self._reduce_ends()) if self._shape.reach else []
 
     def _divide(self, segment: int) -> Iterator[Piece]:
         """Yield the pieces of the rows of a segment that do not depend on its ends."""
@@ -205,7 +188,7 @@ class _Stream:
         shape = self._shape
         return -(-(rows + shape.delay) // shape.rows) * shape.samples * self._stride
 
-    def _reduce_ends(self, base: BaseParameters) -> Iterator[tuple[int, list[np.ndarray]]]:
+    def _reduce_ends(self) -> Iterator[tuple[int, list[np.ndarray]]]:
         """Yield block and equations of the rows that no piece covers, reduced in NumPy."""
         outer = np.ones(len(self._mask), bool)
         for _, rows, _ in self._pieces:
@@ -213,19 +196,30 @@ class _Stream:
         changes = np.flatnonzero(np.diff(np.r_[False, outer, False])).tolist()
         runs = list(zip(changes[::2], changes[1::2], strict=True))
         samples = max(4096, 2 * self._shape.reach)
-        for chunk in row_chunks(base, self._observations, samples, runs):
+        for chunk in row_chunks(self._base, self._observations, samples, runs):
             mask = chunk.mask & outer[chunk.rows, None]
             for part in chunk._replace(mask=mask).divide(self._edges):
                 yield part.block, part.equations()
 
     def triangles(self) -> list[list[np.ndarray]]:
         """Return an R factor of columns and forces for each block and joint."""
-        first = self._first_grams()
-        R, blocks, similar = self._pass(first)
-        if not similar:
-            # The first look has missed what the pass has seen: now it is known.
+        first, R, blocks = self._first_grams(), [], []
+        for _ in range(2):
+            R = []
+            for G in first:
+                norms = np.sqrt(np.diag(G))
+                scale = np.where(norms > 0, norms, max(norms.max(initial=0.0), 1.0))
+                # A triangle that is never singular.
+                regular = G / scale / scale[:, None] + 1e-13 * np.eye(len(G))
+                R.append(np.linalg.cholesky(regular).T * scale)
+            mixing = [np.linalg.inv(r) for r in R]
+            blocks = [[np.zeros((w, w)) for w in self._widths] for _ in self._edges[1:]]
+            self._add(blocks, self._pieces, mixing, self._progress)
             total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
-            R, blocks, _ = self._pass([r.T @ G @ r for r, G in zip(R, total, strict=True)])
+            if all(_similar(*x) for x in zip(total, first, mixing, strict=True)):
+                break
+            # The first look has missed what the pass has seen: now it is known.
+            first = [r.T @ G @ r for r, G in zip(R, total, strict=True)]
         return [[_root(G) @ r for G, r in zip(grams, R, strict=True)] for grams in blocks]
 
     def _first_grams(self, parts: int = 8) -> Grams:
@@ -240,22 +234,7 @@ class _Stream:
         self._add([total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths])
         return total
 
-    def _pass(self, first: Grams) -> tuple[Grams, list[Grams], bool]:
-        """Return the first triangles, Gram matrices of every block, and whether they agree."""
-        R = [_triangle(G) for G in first]
-        mixing = [np.linalg.inv(r) for r in R]
-        blocks = [[np.zeros((w, w)) for w in self._widths] for _ in self._edges[1:]]
-        self._add(blocks, self._pieces, mixing, self._progress)
-        total = [np.sum(parts, axis=0) for parts in zip(*blocks, strict=True)]
-        return R, blocks, all(_similar(*x) for x in zip(total, first, mixing, strict=True))
-
-    def _add(
-        self,
-        blocks: list[Grams],
-        pieces: Sequence[Piece],
-        mixing: Grams,
-        progress: Progress | None = None,
-    ) -> None:
+    def _add(self, blocks: list[Grams], pieces: list[Piece], mixing: Grams, progress=None) -> None:
         """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
         for done, ((block, _, _), grams) in enumerate(self._run(pieces, mixing), 1):
             for total, G in zip(blocks[block], grams, strict=True):
@@ -293,7 +272,7 @@ class _Stream:
         length = shape.iterations * shape.samples
         arrays = [
             _filled_up(np.asarray(x, np.float64), length)
-            for x in (motion.q, motion.qd, motion.qdd, forces)
+            for x in (motion.q, motion.qd, motion.qdd, without_tool(self._base, motion, forces))
         ]
         arrays.append(_filled_up(mask, shape.iterations * shape.rows))
         return [*arrays, np.asarray(-(-len(mask) // shape.rows), np.int32)]
@@ -306,26 +285,15 @@ class _Stream:
                 grams = [self._loop(*x, mixing, self._matrices) for x in pieces]
                 return [[np.asarray(G) for G in joints] for joints in grams]
             pieces = pieces + [[np.zeros_like(x) for x in pieces[0]]] * (len(devices) - count)
-            run = _on_devices(self._loop, Mesh(np.array(devices), ("pieces",)))
+            run = _on_devices(self._loop, tuple(devices))
             stacked = (np.stack(x) for x in zip(*pieces, strict=True))
             grams = [np.asarray(G) for G in run(*stacked, mixing, self._matrices)]
         return [[G[k] for G in grams] for k in range(count)]
 
 
 def _filled_up(x: np.ndarray, length: int) -> np.ndarray:
-    if len(x) >= length:
-        return np.ascontiguousarray(x[:length])
-    out = np.zeros((length, *x.shape[1:]), x.dtype)
-    out[: len(x)] = x
-    return out
-
-
-def _triangle(G: np.ndarray) -> np.ndarray:
-    """Return an upper triangle R, never singular, with R'R about G."""
-    norms = np.sqrt(np.diag(G))
-    scale = np.where(norms > 0, norms, max(norms.max(initial=0.0), 1.0))
-    regular = G / scale / scale[:, None] + 1e-13 * np.eye(len(G))
-    return np.linalg.cholesky(regular).T * scale
+    missing = max(0, length - len(x))
+    return np.pad(x, ((0, missing), (0, 0))) if missing else np.ascontiguousarray(x[:length])
 
 
 def _similar(total: np.ndarray, first: np.ndarray, mixing: np.ndarray, ratio: float = 1e4) -> bool:
@@ -345,28 +313,21 @@ def _root(G: np.ndarray) -> np.ndarray:
     root = np.zeros_like(G)
     live = np.flatnonzero(np.diag(G) > 0)
     own = np.ix_(live, live)
-    try:
-        root[own] = np.linalg.cholesky(G[own]).T
-    except np.linalg.LinAlgError:
-        values, directions = np.linalg.eigh(G[own])
-        rows = np.sqrt(np.maximum(values, 0.0))[:, None] * directions.T
-        root[own] = np.linalg.qr(rows, mode="r")
+    values, directions = np.linalg.eigh(G[own])
+    rows = np.sqrt(np.maximum(values, 0.0))[:, None] * directions.T
+    root[own] = np.linalg.qr(rows, mode="r")
     return root
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(
-    program: Program, tool: Program | None, acting: tuple[tuple[int, ...], ...], shape: LoopShape
-) -> Callable:
+def _compiled(program: Program, acting: tuple[tuple[int, ...], ...], shape: LoopShape) -> Callable:
     """Return the loop, which is compiled when it is first called."""
     joints = len(acting)
     size = len(program.outputs) // joints
     base_columns = lower(program, fence=True)
-    tool_forces = None if tool is None else lower(tool, fence=True)
 
-    def entry(j: int, k: int) -> tuple[bool, int | float]:
-        x = program.outputs[j * size + k]
-        return isinstance(x, int), x
+    def entry(j: int, k: int) -> str:
+        return repr(program.outputs[j * size + k])
 
     # Joints share columns: every distinct one is filtered once.
     distinct = {entry(j, k): j * size + k for j, own in enumerate(acting) for k in own}
@@ -380,34 +341,28 @@ def _compiled(
     def evaluate(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
         packed = base_columns(q, qd, qdd)
         columns = [jnp.broadcast_to(jnp.asarray(packed[i], float), q.shape[1:]) for i in first]
-        known = [0.0] * joints if tool_forces is None else tool_forces(q, qd, qdd)
-        return columns + [f - k for f, k in zip(forces, known, strict=True)]
+        return columns + list(forces)
 
-    def nothing(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
-        return [jnp.zeros(q.shape[1:])] * height
-
-    def run(
-        q: AnyArray,
-        qd: AnyArray,
-        qdd: AnyArray,
-        forces: AnyArray,
-        mask: AnyArray,
-        count: AnyArray,
-        mixing: list,
-        matrices: list,
-    ) -> list[Array]:
+    def run(q, qd, qdd, forces, mask, count, mixing, matrices) -> list[Array]:
         def iteration(k: Array, state: tuple) -> tuple:
             carried, grams = state
             parts = [_part(x, k, shape.samples) for x in (q, qd, qdd, forces)]
             # Results of a branch are stored: no consumer computes them again.
-            columns = jax.lax.cond(count > 0, evaluate, nothing, *parts)
+            columns = jax.lax.cond(count > 0, evaluate, lambda *_: nothing, *parts)
             new = jnp.stack(columns)
             left = []
             stages = zip(carried, matrices, shape.factors, shape.lags, strict=True)
             for before, H, factor, lags in stages:
                 joined = jnp.concatenate([before, new], axis=1)
                 left.append(joined[:, new.shape[1] :])
-                new = _decimate(joined, H, new.shape[1] // factor, factor, lags)
+                tiles, rows = [], new.shape[1] // factor
+                # A banded matrix product, tile by tile.
+                for low in range(0, rows, TILE):
+                    height = min(TILE, rows - low)
+                    window = (height - 1) * factor + lags
+                    part = joined[:, low * factor : low * factor + window]
+                    tiles.append(part @ H[:height, :window].T)
+                new = jnp.concatenate(tiles, axis=1)
             counted = _part(mask, k, shape.rows).astype(new.dtype)
             sums = []
             for j, own in enumerate(places):
@@ -416,6 +371,7 @@ def _compiled(
                 sums.append(grams[j] + rows @ rows.T)
             return left, sums
 
+        nothing = [jnp.zeros(shape.samples)] * height
         carried = [
             jnp.zeros((height, d * f)) for d, f in zip(shape.delays, shape.factors, strict=True)
         ]
@@ -431,31 +387,7 @@ def _part(x: AnyArray, k: Array, length: int) -> Array:
     return jax.lax.dynamic_slice(x, start, (length, x.shape[1])).T
 
 
-def _decimate(x: Array, H: Array, rows: int, factor: int, lags: int) -> Array:
-    """Return the banded matrix product, tile by tile."""
-    tiles = []
-    for start in range(0, rows, TILE):
-        height = min(TILE, rows - start)
-        window = (height - 1) * factor + lags
-        low = start * factor
-        tiles.append(x[:, low : low + window] @ H[:height, :window].T)
-    return jnp.concatenate(tiles, axis=1)
-
-
 @functools.lru_cache(maxsize=16)
-def _on_devices(run: Callable, mesh: Mesh) -> Callable:
+def _on_devices(run: Callable, devices: tuple) -> Callable:
     """Return the loop for one piece on each device, compiled once for all."""
-    own, same = PartitionSpec(*mesh.axis_names), PartitionSpec()
-
-    def device(*arrays) -> list[Array]:
-        *piece, mixing, matrices = arrays
-        return [x[None] for x in run(*(x[0] for x in piece), mixing, matrices)]
-
-    specs = (*(own,) * 6, same, same)
-    if hasattr(jax, "shard_map"):
-        mapped = jax.shard_map(device, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)
-    else:
-        from jax.experimental.shard_map import shard_map
-
-        mapped = shard_map(device, mesh=mesh, in_specs=specs, out_specs=own, check_rep=False)
-    return jax.jit(mapped)
+    return jax.pmap(run, in_axes=(*(0,) * 6, None, None), devices=devices)

@@ -12,6 +12,7 @@ import pytest
 from virtual import observations, standard_parameters
 
 import jaxid as jid
+from jaxid.identification import streaming
 
 HERE = Path(__file__).resolve().parent
 COMMON = """
@@ -38,7 +39,7 @@ def write(fit):
     np.savez(sys.argv[1], p=fit.parameters, s=fit.naive_standard_deviations, rows=fit.rows)
 """
 LONG = """
-assert len(jax.devices()) == int(sys.argv[2])
+assert len(jax.devices()) == 3
 from jaxid.identification import streaming
 streaming.LONG, streaming.PIECE = 1000, 2048
 smooth, shares = jid.ZeroPhaseButterworth(30.0), []
@@ -50,7 +51,7 @@ SHARDS = """
 from pathlib import Path
 columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
 paths = jid.devices.shards(sys.argv[4])
-assert 1 <= len(paths) <= 3, paths
+assert 1 <= len(paths) <= 2, paths
 logs = [jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0)) for p in paths]
 problem = factorise_across_processes(base, logs, patience=60.0)
 write(jid.identify(base, problem, jid.estimators.LeastSquares()))
@@ -108,24 +109,32 @@ def assert_same(found, p, deviations, rows):
     np.testing.assert_array_equal(found["rows"], rows)
 
 
-def test_a_long_log_on_three_devices_without_asking(tmp_path):
-    flags = "--xla_force_host_platform_device_count={}"
-    processes = [start(LONG, tmp_path / f"{n}.npz", n, flags=flags.format(n)) for n in (1, 3)]
-    outputs = finish(*processes)
-    assert [p.returncode for p in processes] == [0, 0], "\n\n".join(outputs)
-    one, three = (np.load(tmp_path / f"{n}.npz") for n in (1, 3))
-    assert_same(three, one["p"], one["s"], one["rows"])
-
-
-def test_three_processes_read_their_own_shards(tmp_path):
-    """One of them has more recordings than the others."""
-    count, folder = 3, tmp_path / "logs"
-    folder.mkdir()
+@pytest.fixture(scope="module")
+def base():
     terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
-    base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+
+
+def test_a_long_log_on_three_devices_without_asking(base, tmp_path, monkeypatch):
+    process = start(LONG, tmp_path / "3.npz", flags="--xla_force_host_platform_device_count=3")
+    monkeypatch.setattr(streaming, "LONG", 1000)
+    monkeypatch.setattr(streaming, "PIECE", 2048)
+    smooth, p = jid.ZeroPhaseButterworth(30.0), standard_parameters(base.model)
+    o = observations(base.model, p, samples=20011, noise=0.3, filter=smooth, every=15)
+    fit = jid.identify(base, o, jid.estimators.LeastSquares())
+    (output,) = finish(process)
+    assert process.returncode == 0, output
+    found = np.load(tmp_path / "3.npz")
+    assert_same(found, fit.parameters, fit.naive_standard_deviations, fit.rows)
+
+
+def test_processes_read_their_own_shards(base, tmp_path):
+    """One of them has more recordings than the others."""
+    count, folder = 2, tmp_path / "logs"
+    folder.mkdir()
     p = standard_parameters(base.model)
     columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
-    for k, samples in enumerate((9000, 8000, 3000, 2900, 2800)):
+    for k, samples in enumerate((9000, 3000, 2800)):
         o = observations(base.model, p, samples=samples, noise=0.3, seed=k, noise_seed=k)
         arrays = {"q": o.motion.q, "tau": o.forces}
         frame = {f"{n}{j + 1}": x[:, j] for n, x in arrays.items() for j in range(2)}
@@ -134,7 +143,7 @@ def test_three_processes_read_their_own_shards(tmp_path):
     processes = [start(SHARDS, p, port, f"{k}/{count}", folder) for k, p in enumerate(paths)]
     outputs = finish(*processes)
     assert [p.returncode for p in processes] == [0] * count, "\n\n".join(outputs)
-    assert len(jid.devices.shards(folder)) == 5
+    assert len(jid.devices.shards(folder)) == 3
     logs = [
         jid.scan_log(p, columns, base.model.robot, jid.ZeroPhaseButterworth(20.0))
         for p in jid.devices.shards(folder)
@@ -146,20 +155,19 @@ def test_three_processes_read_their_own_shards(tmp_path):
         np.testing.assert_array_equal(found["p"], results[0]["p"])
 
 
-@pytest.mark.parametrize(
-    ("heartbeat", "patience", "said"),
-    [
-        (100, 3, "TimeoutError process 0 of 2 waited for the others' factors, but not all came"),
-        (3, 100, "RuntimeError process 0 lost another one"),
-    ],
-)
-def test_a_process_that_dies_ends_the_others(tmp_path, heartbeat, patience, said):
+def test_a_process_that_dies_ends_the_others(tmp_path):
     """Whichever of the two notices first: this package's patience or JAX's own watch."""
-    arguments = tmp_path / "no.npz", free_port()
-    processes = [
-        start(LEFT_ALONE, *arguments, f"{k}/2", patience, heartbeat=heartbeat) for k in range(2)
-    ]
+    cases = {
+        (100, 3): "TimeoutError process 0 of 2 waited for the others' factors, but not all came",
+        (3, 100): "RuntimeError process 0 lost another one",
+    }
+    processes = []
+    for heartbeat, patience in cases:
+        port = free_port()
+        for k in range(2):
+            arguments = tmp_path / "no.npz", port, f"{k}/2", patience
+            processes.append(start(LEFT_ALONE, *arguments, heartbeat=heartbeat))
     outputs = finish(*processes)
-    assert processes[1].returncode == 3
-    assert processes[0].returncode == 7, outputs[0]
-    assert said in outputs[0], outputs[0]
+    assert [p.returncode for p in processes] == [7, 3, 7, 3], "\n\n".join(outputs)
+    for said, output in zip(cases.values(), outputs[::2], strict=True):
+        assert said in output, output

@@ -37,8 +37,8 @@ def observations(**changed):
     return virtual.observations(TRUTH, P, **{"samples": 1500, **changed})
 
 
-def separable(base, *logs, free=None):
-    return SeparableProblem(jid.RegressionProblem(base, logs), select_shapes(base, free))
+def separable(base, *logs):
+    return SeparableProblem(jid.RegressionProblem(base, logs), select_shapes(base))
 
 
 def test_shapes_are_found_again_through_filters():
@@ -71,13 +71,10 @@ def test_factors_are_those_of_the_model_with_these_shapes():
         np.testing.assert_array_equal(a.rows, b.rows)
 
 
-@pytest.mark.parametrize("exponent", [2.0, 1.3])
-def test_the_jacobian_is_that_of_what_is_left(exponent):
+def test_the_jacobian_is_that_of_what_is_left():
     """Central differences of half the squared residual; the linear parameters follow the shapes."""
-    base = jid.base_parameters(model(0.04, 0.4, exponent))
-    free = lambda t: (t[2].transition.epsilon, t[2].speed, t[2].exponent)  # noqa: E731
-    rows = separable(base, observations(noise=1.0), free=free)
-    assert [n for n, _ in rows.shapes.parameters][-3:] == ["delta1", "delta2", "delta3"]
+    base = jid.base_parameters(model(0.04, 0.4, 1.3))
+    rows = separable(base, observations(samples=600, noise=1.0))
     weights, x = np.array([1.0, 2.0, 3.0]), rows.shapes.values
 
     def left(x):
@@ -92,15 +89,15 @@ def test_the_jacobian_is_that_of_what_is_left(exponent):
 
 
 def test_deviations_of_shapes_agree_with_their_scatter():
-    """White noise on every row: the linearised problem predicts the scatter over 20 draws."""
+    """White noise on every row: the linearised problem predicts the scatter over 14 draws."""
     found = []
-    for seed in range(20):
+    for seed in range(14):
         rows = separable(START, observations(samples=600, noise=0.3, noise_seed=seed))
         start = rows.shapes.values
         found.append(search_shapes(rows, np.ones(3), start, start)[0])
     o = observations(samples=600, noise=0.3)
     fit = jid.identify_nonlinear(START, o, NonlinearFriction(WLS))
-    # 20 draws tell a deviation to 16 %: 1.6 is three of these.
+    # 14 draws tell a deviation to 19 %: 1.6 is less than three of these.
     scatter = np.std(found, axis=0, ddof=1) / fit.shape_deviations
     assert np.abs(np.log(scatter)).max() < np.log(1.6)
     assert (np.abs(fit.shapes - [*TRUE_EPSILON, *TRUE_SPEED]) < 4 * fit.shape_deviations).all()
@@ -126,19 +123,10 @@ def test_it_pays_where_friction_is_nonlinear_and_only_there(truth, noise, low, h
     assert ("vs3 = 0.1" in whole.better.notes[-1]) == (truth is TRUTH)
 
 
-TWO = jid.terms.StribeckFriction(), jid.terms.LoadFriction(np.ones((3, 10)))
-REFUSALS = [
-    ((jid.CoulombFriction(jid.terms.HardSign()),), None, "`model`"),
-    (TWO, lambda t: (t[1].transition.dead_zone,), "`free`"),
-    (TWO, lambda t: (t[1].transition.epsilon, t[2].transition.epsilon), "`eps`"),
-]
-
-
-@pytest.mark.parametrize(("friction", "free", "named"), REFUSALS)
-def test_what_cannot_be_searched_is_rejected(friction, free, named):
-    base = jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), *friction)))
-    with pytest.raises(ValueError, match=named):
-        select_shapes(base, free)
+def test_what_cannot_be_searched_is_rejected():
+    hard = jid.CoulombFriction(jid.terms.HardSign())
+    with pytest.raises(ValueError, match="`StribeckFriction`"):
+        select_shapes(jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), hard))))
     zero = dataclasses.replace(START, model=model(0.04, np.array([0.1, 0.0, 0.1])))
     with pytest.raises(ValueError, match="`vs2`"):
         _ = select_shapes(zero).values

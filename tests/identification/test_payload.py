@@ -9,7 +9,6 @@ from virtual import observations, standard_parameters
 import jaxid as jid
 from jaxid.identification.delay import without_delay
 from jaxid.identification.payload import body_columns
-from jaxid.identification.uncertainty.blocks import block_covariance
 from jaxid.measurement.recording import remove_delay
 
 LOAD = jid.Tool(
@@ -68,7 +67,7 @@ def test_all_ten_parameters_come_back_without_noise(base, exact):
 def test_deviations_are_those_of_many_draws_and_carry_both_runs(base):
     noise = np.array([0.05, 0.05, 0.02])
     draws, variances, central = [], [], []
-    for seed in range(30):
+    for seed in range(20):
         found = jid.identify_payload(*pair(base, noise, seed, samples=200))
         # What could exist scatters less than the estimates do.
         values, known = dataclasses.replace(found, parameters=found.estimate).central
@@ -77,11 +76,11 @@ def test_deviations_are_those_of_many_draws_and_carry_both_runs(base):
         central.append(np.diag(known.covariance))
     scatter = np.var(draws, axis=0)
     ratio = np.mean(variances, axis=0) / scatter[:10]
-    # A variance from 30 draws scatters by sqrt(2 / 30) = 0.26, the mean of ten alike ones less.
+    # A variance from 20 draws scatters by sqrt(2 / 20) = 0.32, the mean of ten alike ones less.
     np.testing.assert_allclose(ratio, 1.0, atol=0.9)
     assert abs(ratio.mean() - 1.0) < 0.3
     assert abs(np.mean(np.mean(central, axis=0) / scatter[10:]) - 1.0) < 0.35
-    assert np.abs(np.mean(draws, axis=0)[0] - 3.0) < 4 * np.sqrt(scatter[0] / 30)
+    assert np.abs(np.mean(draws, axis=0)[0] - 3.0) < 4 * np.sqrt(scatter[0] / 20)
 
 
 def test_gains_come_back(base):
@@ -117,11 +116,11 @@ def test_a_delay_of_part_of_a_sample_is_found(base, seconds):
 
 def test_a_delays_deviation_is_that_of_many_draws(base):
     options = {"noise": np.array([2.0, 2.0, 0.7]), "samples": 800}
-    logs = [late(base, 0.003, noise_seed=seed, **options) for seed in range(12)]
+    logs = [late(base, 0.003, noise_seed=seed, **options) for seed in range(8)]
     found = [jid.estimate_delay(base, o) for o in logs]
     errors = np.array([d.seconds - 0.003 for d in found])
     sizes = np.array([d.standard_deviation for d in found])
-    assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(12), "noise does not pull towards zero"
+    assert abs(errors.mean()) < 4 * errors.std() / np.sqrt(8), "noise does not pull towards zero"
     assert 0.5 < sizes.mean() / errors.std() < 2.0
     assert np.mean([d.p_value < 0.01 for d in found]) < 0.2
 
@@ -149,15 +148,6 @@ def test_rows_whose_motion_is_not_known_do_not_count(base):
     np.testing.assert_array_equal(lost, range(4))
     with pytest.raises(ValueError, match="no rows of some joint are left"):
         without_delay(o, 100.0)
-
-
-def test_the_jackknife_of_a_mean_is_the_textbooks():
-    """Blocks of one row and one unknown: the variance of a mean."""
-    x = np.random.default_rng(0).normal(size=30)
-    blocks = [(np.ones((1, 1)), np.array([v - x.mean()])) for v in x]
-    covariance, dof = block_covariance(blocks, np.array([[1 / 30]]))
-    np.testing.assert_allclose(covariance[0, 0], x.var(ddof=1) / 30)
-    assert dof == 29
 
 
 def test_refusals(base, exact):

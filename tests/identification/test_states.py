@@ -169,7 +169,6 @@ def test_other_estimates_are_solved_again_from_their_factors(base, logs, fits):
     [
         ((0, 0), "different names"),
         ((0, 1, ["fv9"]), "`fv9` is no base"),
-        ((0, 1, ["fv1"], ["fv2"]), "`varying`"),
     ],
 )
 def test_refusals(fits, found, chosen, message):

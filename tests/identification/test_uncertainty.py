@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from scipy import signal, special
-from virtual import dense, observations, planar_base, standard_parameters
+from virtual import dense, left_out_in_turn, observations, planar_base, standard_parameters
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
@@ -189,8 +189,7 @@ def from_factors(base, o, divisions):
 def test_factors_alone_are_judged_by_blocks(base):
     o = observations(base.model, standard_parameters(base.model), noise=0.3)
     blocks, fit = from_factors(base, o, 12)
-    rest = [blocks.without(k).weighted(fit.weights) for k in range(12)]
-    left_out = np.array([np.linalg.lstsq(R, z, rcond=None)[0] for R, z in rest])
+    left_out = left_out_in_turn(blocks, fit.weights)
     expected = np.sqrt(11 / 12 * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0))
     np.testing.assert_allclose(fit.standard_deviations, expected, rtol=1e-7)
     assert (fit.uncertainty.dof == 11).all()

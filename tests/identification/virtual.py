@@ -6,6 +6,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
+from jaxid.identification.factors import Blocks
 from jaxid.identification.fit import ConditionNumbers
 from jaxid.identification.uncertainty import Uncertainty
 
@@ -72,6 +73,14 @@ def dense(
     keep = np.asarray(o.mask)
     joint = np.broadcast_to(np.arange(keep.shape[1]), keep.shape)
     return rows[keep], forces[keep], joint[keep]
+
+
+def left_out_in_turn(blocks: Blocks, weights: np.ndarray) -> np.ndarray:
+    """Least squares without one block of time each."""
+    count = len(blocks.parts)
+    rest = (blocks.select(k for k in range(count) if k != out) for out in range(count))
+    parts = (blocks.total.weighted(weights) for blocks in rest)
+    return np.array([np.linalg.lstsq(R, z, rcond=None)[0] for R, z in parts])
 
 
 def planar_base(joints: int = 2) -> jid.BaseParameters:

@@ -60,8 +60,7 @@ class BodyBounds(eqx.Module):
                 raise InputError(f"`{name}` must be for all or each of {bodies} bodies: {value}.")
             return np.broadcast_to(array, (bodies, *shape)).copy()
 
-        self.mass_max = each("mass_max", mass_max)
-        self.radius = each("radius", radius)
+        self.mass_max, self.radius = each("mass_max", mass_max), each("radius", radius)
         self.mass_min = each("mass_min", mass_min)
         self.centre_min = each("centre_min", centre_min, 3)
         self.centre_max = each("centre_max", centre_max, 3)
@@ -147,30 +146,25 @@ class BodyBounds(eqx.Module):
         Raises:
             InputError: If there are none for some body.
         """
-        radius = self.radius[:, None]
+        radius, known = self.radius[:, None], self.has_ellipsoid[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
-        axes = np.where(self.has_ellipsoid[:, None], self.ellipsoid_axes, radius)
-        centre = np.where(self.has_ellipsoid[:, None], self.ellipsoid_centre, 0.0)
-
-        def toward(point: np.ndarray, middle: np.ndarray | float, axes: np.ndarray) -> np.ndarray:
-            """Pull points that lie outside 90 % of an ellipsoid onto its surface."""
-            away = point - middle
-            size = np.linalg.norm(away / axes, axis=1) / 0.9
-            return middle + away / np.maximum(size, 1.0)[:, None]
-
-        point = 0.5 * (low + high)
-        # Alternating projections onto the box, the ellipsoid and the sphere, each a little smaller.
-        inner_low, inner_high = low + 0.1 * (high - low), high - 0.1 * (high - low)
-        for _ in range(200):
-            point = toward(toward(point, centre, axes), 0.0, radius)
-            point = np.clip(point, inner_low, inner_high)
-        inside = (
-            (np.linalg.norm((point - centre) / axes, axis=1) < 0.99)
-            & (np.linalg.norm(point / radius, axis=1) < 0.99)
-            & (low < point).all(axis=1)
-            & (point < high).all(axis=1)
+        ellipsoid = (
+            np.where(known, self.ellipsoid_centre, 0.0),
+            np.where(known, self.ellipsoid_axes, radius),
         )
+        regions = ellipsoid, (0.0, radius)
+        point, edge = 0.5 * (low + high), 0.1 * (high - low)
+        # Alternating projections onto the ellipsoid, the sphere and the box, each a little smaller.
+        for _ in range(200):
+            for middle, axes in regions:
+                away = point - middle
+                size = np.linalg.norm(away / axes, axis=1, keepdims=True) / 0.9
+                point = middle + away / np.maximum(size, 1.0)
+            point = np.clip(point, low + edge, high - edge)
+        inside = ((low < point) & (point < high)).all(axis=1)
+        for middle, axes in regions:
+            inside &= np.linalg.norm((point - middle) / axes, axis=1) < 0.99
         if not inside.all():
             k = int(np.argmin(inside))
             raise InputError(

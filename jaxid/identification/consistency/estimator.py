@@ -2,15 +2,23 @@
 
 import dataclasses
 import functools
-import os
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, Hashable, Int, content, require_float64
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Bool,
+    Float,
+    Hashable,
+    Int,
+    content,
+    in_parts,
+    require_float64,
+)
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 from jaxid.identification.consistency import solver
@@ -362,7 +370,6 @@ def consistent_batch(
         InputError: If shapes do not fit, or bounds leave no body.
         RuntimeError: If JAX's 64-bit mode is off.
     """
-    require_float64("a batch of physically consistent estimates")
     count = len(R)
     if not count or R.shape[-1] != base.size or z.shape != R.shape[:-1] or rows.shape != (count,):
         raise InputError(
@@ -373,32 +380,14 @@ def consistent_batch(
     estimator = PhysicallyConsistent() if estimator is None else estimator
     first, feasible = (x[0] for x in arrays), estimator.feasible_set(base)
     estimator.program(np, base, feasible, *first)[1].require_interior()
-    # An accelerator takes all data sets at once; below eight of them another thread does not pay.
-    usable = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))
-    threads = len(usable(0)) if jax.default_backend() == "cpu" else 1
-    parts = min(threads, -(-count // 8))
-    size = -(-count // parts)
-    solve = _compiled(ConsistentSolver(base, estimator), (size, *R.shape[1:]))
-
-    def part(k: int) -> ConsistentBatch:
-        chosen = np.arange(k * size, (k + 1) * size) % count
-        return jax.block_until_ready(solve(*(x[chosen] for x in arrays)))
-
-    with ThreadPoolExecutor(parts) as pool:
-        results = list(pool.map(part, range(parts)))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *results)
+    one = ConsistentSolver(base, estimator)
+    # An accelerator takes all data sets at once.
+    size = 16 if jax.default_backend() == "cpu" else count
+    return in_parts(lambda part: _solve_many(one, *part), arrays, size)
 
 
-@functools.lru_cache(maxsize=16)
-def _compiled(one: ConsistentSolver, shape: tuple[int, int, int]):
-    """Compile a solver for a number of data sets, ahead of time so that threads do not wait."""
+@functools.partial(jax.jit, static_argnums=0)
+def _solve_many(one: ConsistentSolver, R: Array, z: Array, rows: Array) -> ConsistentBatch:
     # A core gains nothing from solving data sets in step: it waits for the slowest.
     together = None if jax.default_backend() == "cpu" else 256
-
-    def many(R: Array, z: Array, rows: Array) -> ConsistentBatch:
-        return jax.lax.map(lambda x: one(*x), (R, z, rows), batch_size=together)
-
-    shapes = (shape, shape[:2], shape[:1])
-    kinds = (np.float64, np.float64, np.int64)
-    arguments = (jax.ShapeDtypeStruct(s, k) for s, k in zip(shapes, kinds, strict=True))
-    return jax.jit(many).lower(*arguments).compile()
+    return jax.lax.map(lambda x: one(*x), (R, z, rows), batch_size=together)

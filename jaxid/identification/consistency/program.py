@@ -349,7 +349,14 @@ def _coupled(xp: ModuleType, feasible: FeasibleSet, largest: Values):
     w, bounds = feasible.width, feasible.bounds
     matrices, members, fillings = [], [], []
     for k in np.flatnonzero(bounds.has_ellipsoid).tolist():
-        matrices.append(xp.asarray(_ellipsoid(bounds, k)))
+        # Schur complements whose sum is definite for centres of mass in the ellipsoid.
+        L, basis = bounds.radius[k], np.zeros((4, 4, 4))
+        basis[0, range(3), range(3)] = (bounds.ellipsoid_axes[k] / L) ** 2
+        basis[0, :3, 3] = basis[0, 3, :3] = -bounds.ellipsoid_centre[k] / L
+        basis[0, 3, 3] = 1.0
+        for axis in range(3):
+            basis[1 + axis, axis, 3] = basis[1 + axis, 3, axis] = 1.0
+        matrices.append(xp.asarray(basis))
         members.append([*range(k * w, k * w + 4)])
         fillings.append(np.zeros((4, 4)))
     for coupling in feasible.couplings:
@@ -367,18 +374,6 @@ def _coupled(xp: ModuleType, feasible: FeasibleSet, largest: Values):
     matrices = [xp.pad(x, ((0, longest - len(x)), (0, 0), (0, 0))) for x in matrices]
     members = [[*m, *[0] * (longest - len(m))] for m in members]
     return xp.stack(matrices), np.array(members), np.array(fillings)
-
-
-def _ellipsoid(bounds: BodyBounds, k: int) -> np.ndarray:
-    """Return the Schur complements whose sum is definite for centres of mass in an ellipsoid."""
-    L = bounds.radius[k]
-    basis = np.zeros((4, 4, 4))
-    basis[0, range(3), range(3)] = (bounds.ellipsoid_axes[k] / L) ** 2
-    basis[0, :3, 3] = basis[0, 3, :3] = -bounds.ellipsoid_centre[k] / L
-    basis[0, 3, 3] = 1.0
-    for axis in range(3):
-        basis[1 + axis, axis, 3] = basis[1 + axis, 3, axis] = 1.0
-    return basis
 
 
 def _start(xp: ModuleType, feasible: FeasibleSet, A, b, prior) -> Values:

@@ -22,14 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
-from jaxid.arrays import AnyArray, Bool, Float, Int, require_float64
+from jaxid.arrays import AnyArray, Bool, Float, Int
 from jaxid.identification.consistency.program import ConeProgram, Number, indicators
 from jaxid.identification.consistency.pseudo_inertia import (
     BASIS,
     Values,
     are_definite,
-    inverse,
-    log_determinant,
     symmetric_part,
 )
 
@@ -88,7 +86,6 @@ def solve_in_numpy(program: ConeProgram) -> Optimum:
 @jax.jit
 def solve_compiled(program: ConeProgram) -> Optimum:
     """Solve one program; works under `jit` and `vmap`."""
-    require_float64("the search for physically consistent parameters")
     return _solve(jnp, jax.tree.map(jnp.asarray, program), jax.lax.while_loop)
 
 
@@ -116,23 +113,18 @@ def _solve(xp: ModuleType, p: ConeProgram, loop: Callable) -> Optimum:
         )
         return point, best, iterations, stalled, finished
 
-    first, zero = _first_point(xp, p), xp.zeros((), int)
+    S, s = p.slacks(xp, p.start)
+    inverse_S, rest = xp.linalg.inv(S), p.A @ p.start - p.b
+    # Multipliers on the start's central path, as large as its gradient.
+    force = xp.linalg.norm(p.adjoint(xp, inverse_S, 1.0 / s))
+    most = (0.5 * rest @ rest + TINY) / p.complementarity
+    mu = xp.clip(xp.linalg.norm(rest @ p.A) / force, 1e-6 * most, most)
+    Z = xp.maximum(_targets(xp, p), mu) * inverse_S
+    first, zero = _point(xp, p, p.start, Z, mu / s), xp.zeros((), int)
     best = first.y, first.z, first.value, first.error
     final = loop(lambda state: ~state[-1], iterate, (first, best, zero, zero, zero > 0))
     _, (y, z, value, error), iterations, _, _ = final
     return Optimum(y, value, error, is_certified(value, error), iterations, z)
-
-
-def _first_point(xp: ModuleType, p: ConeProgram) -> _Point:
-    """Return the start, with multipliers on its central path as large as its gradient."""
-    S, s = p.slacks(xp, p.start)
-    inverse_S = inverse(xp, S)
-    rest = p.A @ p.start - p.b
-    value = 0.5 * rest @ rest
-    force = xp.linalg.norm(p.adjoint(xp, inverse_S, 1.0 / s))
-    most = (value + TINY) / p.complementarity
-    mu = xp.clip(xp.linalg.norm(rest @ p.A) / force, 1e-6 * most, most)
-    return _point(xp, p, p.start, xp.maximum(_targets(xp, p), mu) * inverse_S, mu / s)
 
 
 def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _Point:
@@ -147,7 +139,15 @@ def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _
         normal = xp.linalg.solve(p.equal @ p.equal.T, p.equal @ residual)
         residual = residual - p.equal.T @ normal
     value = 0.5 * rest @ rest
-    error = _matrix_gap(xp, p, S, Z) + s @ z + xp.sum(xp.abs(residual) * p.diameters)
+    # The duality gap of the matrices; if pulled, with the eigenvalues of S Z / pull, all one at the
+    # optimum: their sum less that of one and of their logarithms.
+    product = xp.sum(S * Z, axis=(-2, -1))
+    gap, pulled = product[: p.bodies], p.pull > 0
+    logs = xp.linalg.slogdet(S[: p.bodies])[1] + xp.linalg.slogdet(Z[: p.bodies])[1]
+    strength = 4.0 * xp.log(xp.where(pulled, p.pull, 1.0))
+    gap = xp.where(pulled, gap - 4.0 * p.pull - p.pull * (logs - strength), gap)
+    gap = xp.sum(gap) + xp.sum(product[p.bodies :])
+    error = gap + s @ z + xp.sum(xp.abs(residual) * p.diameters)
     return _Point(y, S, s, Z, z, residual, value, error)
 
 
@@ -157,23 +157,9 @@ def _targets(xp: ModuleType, p: ConeProgram) -> Values:
     return xp.concatenate(strengths)[:, None, None]
 
 
-def _matrix_gap(xp: ModuleType, p: ConeProgram, S: Values, Z: Values) -> Values:
-    r"""Return the duality gap of the matrices: $\gamma \sum (\lambda - 1 - \ln \lambda)$ if pulled.
-
-    There $\lambda$ are the eigenvalues of $S Z / \gamma$, all one at the optimum.
-    """
-    product = xp.sum(S * Z, axis=(-2, -1))
-    bodies, more = product[: p.bodies], product[p.bodies :]
-    pulled = p.pull > 0
-    strength = xp.where(pulled, p.pull, 1.0)
-    logs = log_determinant(xp, S[: p.bodies]) + log_determinant(xp, Z[: p.bodies])
-    entropic = bodies - 4.0 * p.pull - p.pull * (logs - 4.0 * xp.log(strength))
-    return xp.sum(xp.where(pulled, entropic, bodies)) + xp.sum(more)
-
-
 def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Point, Values]:
     """Take the longer step of two correctors; return the new point and the step length."""
-    inverse_S, ratio, target = inverse(xp, x.S), x.z / x.s, _targets(xp, p)
+    inverse_S, ratio, target = xp.linalg.inv(x.S), x.z / x.s, _targets(xp, p)
     solve = _newton_solver(xp, p, gram + _barriers(xp, p, inverse_S, x.Z, ratio))
 
     def direction(rZ: Values, rz: Values, right: Values) -> _Direction:

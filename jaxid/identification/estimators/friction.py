@@ -9,8 +9,7 @@ the friction laws. Everything is computed from the triangles of the rows.
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -32,9 +31,6 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
 from jaxid.program import evaluate_packed
 
-Selection = Callable[[tuple[AbstractTerm, ...]], Sequence[Any]]
-"""Function from the terms of a model to those of their leaves that are identified."""
-
 
 class NonlinearFriction(AbstractEstimator):
     """Estimator of epsilons, Stribeck speeds and other shapes, and then of all parameters.
@@ -46,12 +42,9 @@ class NonlinearFriction(AbstractEstimator):
 
     Attributes:
         linear: Estimator of the linear parameters.
-        free: Function that selects leaves of the model's terms; by default epsilons, Stribeck
-            speeds and others that the terms propose.
     """
 
     linear: AbstractEstimator = WeightedLeastSquares()
-    free: Selection | None = eqx.field(static=True, default=None)
 
     def __call__(self, problem):
         """Search for the shapes, and estimate with them."""
@@ -62,7 +55,7 @@ class NonlinearFriction(AbstractEstimator):
 
     def search(self, problem: RegressionProblem, weights: np.ndarray):
         """Return the separable problem, the shapes found, and notes about the search."""
-        separable = SeparableProblem(problem, select_shapes(problem.base, self.free))
+        separable = SeparableProblem(problem, select_shapes(problem.base))
         start = separable.shapes.values
         begin = _best_multiples(separable, weights, start)
         return separable, *search_shapes(separable, weights, start, begin)
@@ -132,37 +125,24 @@ class Shapes(eqx.Module):
         parts = [terms[i].columns(self.model.robot, q, qd, qdd) for i in self._terms]
         return jnp.concatenate(parts, axis=1)
 
-    def columns_and_slopes(self, x, q, qd, qdd) -> tuple[jax.Array, jax.Array]:
-        """Return the columns, and their derivatives [joints, columns, shapes]."""
-        return self.columns(x, q, qd, qdd), jax.jacfwd(self.columns)(x, q, qd, qdd)
+    def columns_and_slopes(self, x, q, qd, qdd) -> jax.Array:
+        """Return the columns, and their derivatives behind them [joints, columns, 1 + shapes]."""
+        slopes = jax.jacfwd(self.columns)(x, q, qd, qdd)
+        return jnp.concatenate([self.columns(x, q, qd, qdd)[..., None], slopes], axis=-1)
 
 
-def select_shapes(base: BaseParameters, free: Selection | None = None) -> Shapes:
-    """Return the shapes that are identified: those that `free` selects, or the terms propose.
+def select_shapes(base: BaseParameters) -> Shapes:
+    """Return the shapes that are identified: epsilons, Stribeck speeds and others of the terms.
 
     Raises:
-        InputError: If there are none, a leaf is no shape, or two shapes have one name.
+        InputError: If there are none.
     """
-    terms = base.model.terms
-    numbered = jax.tree.unflatten(jax.tree.structure(terms), range(len(jax.tree.leaves(terms))))
-    selected = None if free is None else set(jax.tree.leaves(tuple(free(numbered))))
-    known = [
-        (i, s, s.value(numbered[i])) for i, t in enumerate(terms) for s in t.nonlinear_parameters
-    ]
-    if selected is not None and not selected <= {leaf for _, _, leaf in known}:
-        raise InputError("`free` must select shapes of friction laws, like `terms[2].speed`.")
-    members = tuple(
-        (i, shape)
-        for i, shape, leaf in known
-        if (shape.default if selected is None else leaf in selected)
-    )
+    terms = enumerate(base.model.terms)
+    members = [(i, s) for i, term in terms for s in term.nonlinear_parameters if s.default]
     names = [shape.name for _, shape in members]
     if not names:
         raise InputError("the `model` has no friction with a shape: use `StribeckFriction`.")
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"two terms have a shape called `{name}`: select one by `free`.")
-    return Shapes(base.model, members)
+    return Shapes(base.model, tuple(members))
 
 
 class SeparableProblem:
@@ -188,22 +168,18 @@ class SeparableProblem:
         varying = [(k, shaped.index(i)) for k, i in enumerate(base.indices) if i in shaped]
         self._varying = {place for place, _ in varying}
         self._program = program_of(shapes, shapes.columns_and_slopes, (shapes.size,), n, n, n)
-        moved, slopes = (np.asarray(x) for x in self._program.nonzeros)
-        pairs = [(k, c, i) for k, c in varying for i in np.flatnonzero(slopes[:, c].any(axis=0))]
-        self.pairs = [(k, int(i)) for k, _, i in pairs]
+        acts = np.asarray(self._program.nonzeros)
+        pairs = [
+            (k, c, int(i)) for k, c in varying for i in np.flatnonzero(acts[:, c, 1:].any(axis=0))
+        ]
+        self.pairs = [(k, i) for k, _, i in pairs]
         self.size = base.size + len(pairs)
         # For each joint the columns that vary, with their places in the output of the program.
-        at = np.arange(moved.size + slopes.size)
-        values, derivatives = np.split(at, [moved.size])
-        values, derivatives = values.reshape(moved.shape), derivatives.reshape(slopes.shape)
+        columns = [(k, c, 0) for k, c in varying]
+        columns += [(base.size + place, c, 1 + i) for place, (_, c, i) in enumerate(pairs)]
+        at = np.arange(acts.size).reshape(acts.shape)
         self._entries = [
-            [(k, int(values[j, c])) for k, c in varying if moved[j, c]]
-            + [
-                (base.size + place, int(derivatives[j, c, i]))
-                for place, (_, c, i) in enumerate(pairs)
-                if slopes[j, c, i]
-            ]
-            for j in range(n[0])
+            [(k, int(at[j, c, i])) for k, c, i in columns if acts[j, c, i]] for j in range(n[0])
         ]
         self._pieces = [self._factor(chunk) for chunk in problem.chunks()]
 
@@ -254,17 +230,8 @@ class SeparableProblem:
         return np.split(rows, np.cumsum([len(own) for own in self._entries])[:-1], axis=1)
 
 
-def join_blocks(blocks: Blocks, chosen: Sequence[int]) -> Factors:
-    """Return the factors of some blocks together."""
-    return Blocks(tuple(blocks.parts[k] for k in chosen)).total
-
-
 def search_shapes(
-    problem: SeparableProblem,
-    weights: np.ndarray,
-    start: np.ndarray,
-    begin: np.ndarray,
-    blocks: Sequence[int] | None = None,
+    problem: SeparableProblem, weights, start, begin, blocks: Sequence[int] | None = None
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Search for shapes by Levenberg-Marquardt over their logarithms; return notes as well.
 
@@ -277,7 +244,7 @@ def search_shapes(
     def projected(u: bytes) -> tuple[Factors, np.ndarray, np.ndarray]:
         x = start * np.exp(np.frombuffer(u))
         found = problem.blocks(x)
-        factors = found.total if blocks is None else join_blocks(found, blocks)
+        factors = found.total if blocks is None else found.select(blocks).total
         _, residual, jacobian = project(problem, factors, weights)
         return factors, residual, jacobian * x
 

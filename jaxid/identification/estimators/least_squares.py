@@ -237,13 +237,23 @@ class IterativelyReweighted(AbstractEstimator):
         p = np.asarray(Estimate.solve(problem, weights, self.solution).parameters)
         change = np.inf
         for loss in (Huber(), self.loss):
-            p, change = self._iterate(problem, weights, p, loss)
+            for _ in range(self.iterations):
+                scale = _residual_scale(problem, p)
+                blocks = problem.reweighted(p, loss.weight, scale)
+                R, z = blocks.total.weighted(weights)
+                d = Decomposition.of(R, z)
+                new = d.solve(self.solution.choose(blocks, weights).inverse(d.values))
+                rest = float(np.linalg.norm(z - R @ new))
+                step = float(np.linalg.norm(R @ (new - p)))
+                p, change = new, step / rest if rest > 0 else 0.0
+                if change <= self.tolerance:
+                    break
         scale = _residual_scale(problem, p)
         slopes = np.zeros(len(scale))
         for chunk, residuals in problem.residuals(p):
             slopes += np.sum(np.where(chunk.mask, self.loss.slope(residuals / scale), 0.0), axis=0)
         slope = np.maximum(slopes / np.maximum(problem.factors.rows, 1), 0.1)
-        blocks = problem.reweighted(p, lambda r, _: self.loss.weight(r / scale))
+        blocks = problem.reweighted(p, self.loss.weight, scale)
         solution = self.solution.choose(blocks, weights)
 
         def influence(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
@@ -267,22 +277,6 @@ class IterativelyReweighted(AbstractEstimator):
             notes=notes,
             effective_parameters=None,
         )
-
-    def _iterate(self, problem, weights, p, loss: AbstractLoss) -> tuple[np.ndarray, float]:
-        """Return parameters that reweighting no longer changes, and the last change."""
-        change = np.inf
-        for _ in range(self.iterations):
-            scale = _residual_scale(problem, p)
-            blocks = problem.reweighted(p, lambda r, _, scale=scale: loss.weight(r / scale))
-            R, z = blocks.total.weighted(weights)
-            d = Decomposition.of(R, z)
-            new = d.solve(self.solution.choose(blocks, weights).inverse(d.values))
-            rest = float(np.linalg.norm(z - R @ new))
-            step = float(np.linalg.norm(R @ (new - p)))
-            p, change = new, step / rest if rest > 0 else 0.0
-            if change <= self.tolerance:
-                break
-        return p, change
 
 
 def _residual_scale(problem: RegressionProblem, p: np.ndarray) -> np.ndarray:

@@ -79,6 +79,16 @@ def block_covariance(blocks: Sequence[Block], inverse: AnyArray) -> tuple[np.nda
     return (count - 1) / count * steps.T @ steps, count - 1.0
 
 
+def solve_blocks(blocks: Sequence[Block]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return least squares of weighted blocks, the jackknife's covariance and its dof.
+
+    The blocks are derivatives by the unknowns and right-hand sides.
+    """
+    decomposition = Decomposition.of(*map(np.concatenate, zip(*blocks, strict=True)))
+    x, B = decomposition.solve(), decomposition.inverse_information()
+    return x, *block_covariance([(J, z - J @ x) for J, z in blocks], B)
+
+
 def bootstrap(
     blocks: Blocks, weights: Float[AnyArray, " joints"], draws: int, key: PRNGKeyArray
 ) -> Float[Array, "draws base"]:
@@ -101,7 +111,7 @@ def bootstrap(
         InputError: If there are fewer than two blocks, or draws do not determine all parameters.
         RuntimeError: If JAX's 64-bit mode is off.
     """
-    from jaxid.identification.normal_equations import RIDGE
+    from jaxid.identification.normal_equations import RIDGE, inverse_information
 
     require_float64("a bootstrap")
     count = len(blocks.parts)
@@ -117,21 +127,13 @@ def bootstrap(
         gradients.append(R.T @ (z - R @ (start * whole.scale)))
     drawn = jax.random.randint(key, (draws, count), 0, count)
     counts = np.apply_along_axis(np.bincount, 1, np.asarray(drawn), minlength=count).astype(float)
-    step, condition = _steps(counts, np.array(information), np.array(gradients))
+    total = np.tensordot(counts, np.array(information), 1)
+    inverse, condition = jax.vmap(inverse_information)(jnp.asarray(total))
+    step = jnp.einsum("dij,dj->di", inverse, counts @ np.array(gradients))
     poor = int(np.sum(~(np.asarray(condition) < 1 / np.sqrt(RIDGE))))
     if poor:
         raise InputError(
             f"{poor} of {draws} draws from {count} `blocks` do not determine all parameters: take "
             "longer blocks, in each of which every joint moves."
         )
-    return start[None] + step / whole.scale[None]
-
-
-@jax.jit
-def _steps(counts: Array, information: Array, gradients: Array) -> tuple[Array, Array]:
-    from jaxid.identification.normal_equations import inverse_information
-
-    size = gradients.shape[1]
-    total = (counts @ information.reshape(len(information), -1)).reshape((-1, size, size))
-    inverse, condition = jax.vmap(inverse_information)(total)
-    return jnp.einsum("dij,dj->di", inverse, counts @ gradients), condition
+    return jnp.asarray(start)[None] + step / whole.scale[None]

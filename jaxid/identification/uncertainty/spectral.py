@@ -9,7 +9,7 @@ with the leverage $h$ of each line: the fit has explained that fraction of the e
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -25,7 +25,6 @@ from jaxid.identification.uncertainty.result import (
     ResidualSpectra,
     Uncertainty,
 )
-from jaxid.measurement.observations import Observations
 
 MAX_ROWS = 2**15
 """Largest number of rows of a stretch; longer parts of a log are divided."""
@@ -112,14 +111,26 @@ def row_spectra(
         of each bin [bins, channels, base, base]; whether all rows were transformed.
     """
     stretches, complete = _divide(problem)
-    lengths = _padded_lengths(
-        {(b - a, problem.recordings[number].row_time) for number, a, b in stretches}
-    )
+    kinds = {(b - a, problem.recordings[number].row_time) for number, a, b in stretches}
+    lengths, longest = {}, {}
+    for n, row_time in sorted(kinds, reverse=True):
+        if len(kinds) <= MAX_LENGTHS or n * 1.5 < longest.get(row_time, math.inf):
+            longest[row_time] = n
+        lengths[n, row_time] = longest[row_time]
     found: dict[tuple, Lines] = {}
     B, p = np.asarray(estimate.inverse), np.asarray(estimate.parameters)
     correlated = np.zeros((0, 0, *B.shape))
-    for (number, a, b), parts in _gather(problem, stretches, p):
-        o = problem.recordings[number]
+
+    def pieces_of_stretches() -> Iterator[tuple[Span, RowChunk, np.ndarray]]:
+        for chunk, residuals in problem.residuals(p, stretches):
+            start, stop = chunk.rows.start, chunk.rows.stop
+            for number, a, b in stretches:
+                own = slice(max(start, a) - start, min(stop, b) - start)
+                if number == chunk.recording and own.start < own.stop:
+                    yield (number, a, b), chunk.part(own), residuals[own]
+
+    for (number, a, b), group in itertools.groupby(pieces_of_stretches(), lambda x: x[0]):
+        o, parts = problem.recordings[number], [(chunk, r) for _, chunk, r in group]
         pieces = [estimate.influence(chunk, residuals) for chunk, residuals in parts]
         if not len(correlated):
             correlated = np.zeros((len(BIN_EDGES) + 1, len(pieces[0]), *B.shape))
@@ -144,7 +155,11 @@ def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> 
     """Return the lines of one stretch; add the energies of pairs to `correlated`."""
     row_time = observations.row_time
     frequency = np.fft.rfftfreq(n, row_time)
-    gain = _gain(observations, frequency)
+    dt, decimation = observations.sample_time, observations.decimation
+    gain = observations.filter.low_pass(dt).gain(frequency, dt)
+    for k, factor in enumerate(decimation.stages):
+        gain = gain * decimation.low_pass(k).gain(frequency, dt)
+        dt *= factor
     # Lines with less gain carry no information.
     last = int(np.flatnonzero(gain > 1e-3)[-1]) + 1
     frequency, gain, m = frequency[:last], gain[:last], multiplicity(n)[:last]
@@ -195,45 +210,6 @@ def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
     count = max(1, len(stretches) * MAX_SAMPLES // samples)
     chosen = np.linspace(0, len(stretches) - 1, count).round().astype(int)
     return [stretches[k] for k in np.unique(chosen)], False
-
-
-def _padded_lengths(kinds: set[tuple[int, float]]) -> dict[tuple[int, float], int]:
-    """Return the padded length of stretches, by length and time between rows."""
-    padded, longest = {}, {}
-    for n, row_time in sorted(kinds, reverse=True):
-        if len(kinds) <= MAX_LENGTHS or n * 1.5 < longest.get(row_time, math.inf):
-            longest[row_time] = n
-        padded[n, row_time] = longest[row_time]
-    return padded
-
-
-def _gain(observations: Observations, frequency: Float[np.ndarray, " lines"]) -> np.ndarray:
-    """Return the gain of filter and decimation at some frequencies [Hz]."""
-    dt = observations.sample_time
-    gain = observations.filter.low_pass(dt).gain(frequency, dt)
-    for k, factor in enumerate(observations.decimation.stages):
-        gain = gain * observations.decimation.low_pass(k).gain(frequency, dt)
-        dt *= factor
-    return gain
-
-
-def _gather(problem: RegressionProblem, stretches: list[Span], p: np.ndarray):
-    """Yield each stretch with its chunks and residuals, in one pass over the rows."""
-    remaining = iter(stretches)
-    stretch = next(remaining, None)
-    parts: list[tuple[RowChunk, np.ndarray]] = []
-    for chunk, residuals in problem.residuals(p, stretches):
-        start, stop = chunk.rows.start, chunk.rows.stop
-        while stretch is not None and (chunk.recording, start) < (stretch[0], stretch[2]):
-            number, first, last = stretch
-            if (chunk.recording, stop) <= (number, first):
-                break
-            own = slice(max(start, first) - start, min(stop, last) - start)
-            parts.append((chunk.part(own), residuals[own]))
-            if stop < last:
-                break
-            yield stretch, parts
-            stretch, parts = next(remaining, None), []
 
 
 def window_sums(frequency: Float[np.ndarray, " lines"], longest: float):
@@ -365,36 +341,29 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     )
 
 
-LineSums = tuple[Array, Array, Array, Array]
-"""Energy, leverage, power [draws, joints, lines], and exposure of chunks, added up; see `Lines`."""
-
-
-def line_sums(own, weights, inverse, p, columns, forces, exposure) -> LineSums:
-    """Return the spectra of consecutive rows of estimates `p` [draws, base], in JAX.
+def sandwich_of_columns(
+    own, weights, inverse, p, columns, forces, exposure, row_time: float
+) -> tuple[Array, Array]:
+    """Return variances and degrees of freedom of estimates `p` [draws, base], in JAX.
 
     Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row does not
     count; the columns belong to its own parameters; `exposure` is the fraction of rows that count.
     """
     length = columns[0].shape[-1]
-    m = multiplicity(length)[None]
+    frequency, m = np.fft.rfftfreq(length, row_time), multiplicity(length)
     energy, leverage, power = [], [], []
     for k, A, Q, w in zip(own, columns, forces, weights, strict=True):
         mine = np.array(k, int)
         Z = jnp.fft.rfft(w * A)
         real, imaginary = inverse[:, mine] @ Z.real, inverse[:, mine] @ Z.imag
         r = jnp.fft.rfft(w * (Q - p[:, mine] @ A))
-        energy.append(m / length * (real**2 + imaginary**2))
+        energy.append(m[None] / length * (real**2 + imaginary**2))
         both = real[mine] * Z.real + imaginary[mine] * Z.imag
         leverage.append(jnp.sum(both, axis=0) / length)
         power.append((r.real**2 + r.imag**2) / length)
-    return jnp.stack(energy, axis=1), jnp.stack(leverage), jnp.stack(power, axis=1), exposure
-
-
-def variances(sums: LineSums, length: int, row_time: float) -> tuple[Array, Array]:
-    """Return variances and degrees of freedom from chunks of `length` rows, in JAX."""
-    energy, leverage, power, exposure = sums
-    frequency, m = np.fft.rfftfreq(length, row_time), multiplicity(length)
-    each = jnp.broadcast_to(exposure[:, None], leverage.shape)
-    table = SpectralTable(jnp, frequency, m, energy, leverage, each, length * row_time)
-    variance, dof = table(power)
+    leverage = jnp.stack(leverage)
+    sums = jnp.stack(energy, axis=1), leverage, jnp.broadcast_to(exposure[:, None], leverage.shape)
+    variance, dof = SpectralTable(jnp, frequency, m, *sums, length * row_time)(
+        jnp.stack(power, axis=1)
+    )
     return jnp.asarray(variance), jnp.maximum(dof, 1.0)
