@@ -42,7 +42,7 @@ print(
 # %% [markdown]
 # ## 2. Which motion
 #
-# The motion begins and ends at rest, stays within the limits, and is designed for these parameters. `plan.to_csv` writes it for the controller.
+# The motion begins and ends at rest, stays within the limits, and is designed for these parameters. `jid.trajectories.write_csv` writes it for the controller.
 
 # %%
 limits = jid.Limits(

@@ -16,7 +16,7 @@ KEYS = [
     ("cutoff = 10", "cutoff = 99", "take one of 1 samples at most"),
     ('"q{}"', '["q1"]', "for each joint"),
     ('"q{}"', '["q1", "tau1"]', "`tau1` of `a.csv` is used"),
-    ('builtin = "planar_arm"', 'urdf = "lost.urdf"', "`lost.urdf` is no file: paths in an experim"),
+    ('builtin = "planar_arm"', 'urdf = "lost.urdf"', "`lost.urdf` is no file: paths are relative"),
 ]
 
 
@@ -33,6 +33,7 @@ COMMANDS = [
     ("identify experiment.toml a.csv --verify b.csv c.csv", "repeat it before `c.csv`"),
     ("identify experiment.toml a.csv --verify=b.csv c.csv", "repeat it before `c.csv`"),
     ("identify experiment.toml a.csv ./a.csv", "`a.csv` is given twice"),
+    ("identify experiment.toml a.csv --split 2", "`--split` must lie between 0 and 1, like 0.6"),
     ("identify experiment.toml a.csv --verify ./a.csv", "`a.csv` is given both to identify and"),
     ("init none.urdf", "none.urdf"),
     ("excite experiment.toml -o a.csv", "`a.csv` is there already, and no motion of `jaxid exc"),

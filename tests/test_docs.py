@@ -20,7 +20,7 @@ import pytest
 import jaxid as jid
 from jaxid.diagnosis.diagnosis import BAD, SURE
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.experiment.decoder import check_tables, decode
+from jaxid.experiment.decoder import check_names, decode
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.method_tables import FILTERS, SIDES
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
@@ -177,7 +177,7 @@ def test_python_in_a_page_runs(page, given, monkeypatch):
 def test_keys_in_a_page_exist(page):
     for block in _blocks(page, "toml"):
         content = tomllib.loads(block)
-        check_tables(content, list(TABLES))
+        check_names(content, list(TABLES))
         for name, table in content.items():
             functions = TABLES[name]
             if name == "filter":

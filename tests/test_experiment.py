@@ -280,6 +280,7 @@ total_mass = 12
 
 BODIES = '[estimator]\nkind = "consistent"\n'
 COLUMNS = ARM + RECORDING
+RAIL = '[robot]\nbuiltin = "tx90l_on_rail"\n' + RECORDING
 BUTTERWORTH = ARM + "[filter]\nkind = 'butterworth'\n"
 TOOL = ARM + "[robot.tool]\nmass = 1\ncentre_of_mass = [0, 0, 0]\n"
 REFUSALS = [
@@ -313,6 +314,8 @@ REFUSALS = [
     (ARM + "[recording]\nangles = 'q{}'", "`recording.forces`"),
     (COLUMNS + "angle_unit = 'degree'", "`degree`"),
     (COLUMNS + "angle_signs = [1, 2]", "`angle_signs`"),
+    (RAIL + "angle_unit = 'deg'", '`angle_unit` of joint `rail` is "deg", but the joint slides'),
+    (RAIL + "force_unit = 'N'", '`force_unit` of joint `joint1` is "N", but the joint turns'),
     (BUTTERWORTH + "cutoff = []", "`filter.cutoff`"),
     (ARM + "[filter]\nkind = 'paper'\ncutoff = 3", "`filter.cutoff`.*velocity"),
     (ARM + "[rows]\nslow = 2", "`rows.slow` was renamed to `min_speed`"),
@@ -406,14 +409,6 @@ def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
             decode(functions, table, name, complete=False, skip=SIDES)
 
 
-def test_the_template_documents_every_key(tmp_path):
-    (tmp_path / "arm.urdf").write_text(URDF)
-    text = write_template(tmp_path / "arm.urdf")
-    for function in (function for functions in TABLES.values() for function in functions):
-        for key in set(keys_of(function)) - {*SIDES, "tool"}:
-            assert re.search(rf"^(# )?{key} = .", text, flags=re.M), key
-
-
 def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
     folder = tmp_path / 'a"b\\c  # d'
     folder.mkdir()
@@ -433,49 +428,20 @@ def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
         assert found.keys() == tomllib.loads(write_template(urdf, folder=tmp_path)).keys()
 
 
-def test_the_template_breaks_long_lists(tmp_path):
-    joints = "".join(
-        f'<link name="l{i}"/><joint name="turning_joint_{i}" type="revolute">'
-        f'<parent link="l{i - 1}"/><child link="l{i}"/><axis xyz="0 0 1"/>'
-        f'<limit lower="{-i / 3 - 1 / 3}" upper="{i / 3 + 1 / 7}" velocity="1" effort="2"/></joint>'
-        for i in range(1, 31)
-    )
-    (tmp_path / "snake.urdf").write_text(f'<robot name="snake"><link name="l0"/>{joints}</robot>')
-    path = tmp_path / "experiment.toml"
-    path.write_text(write_template(tmp_path / "snake.urdf", folder=tmp_path))
-    assert max(map(len, path.read_text().splitlines())) <= 100
-    low = load_experiment(path).robot.limits.position_min
-    np.testing.assert_array_equal(low, [-i / 3 - 1 / 3 for i in range(1, 31)])
-
-
-@pytest.mark.parametrize(
-    ("units", "sentence"),
-    [
-        ("angle_unit = 'deg'", '`angle_unit` of joint `rail` is "deg", but the joint slides'),
-        ("force_unit = 'N'", '`force_unit` of joint `shoulder` is "N", but the joint turns'),
-    ],
-)
-def test_degrees_for_a_rail_are_refused(tmp_path, load, units, sentence):
-    """A rail in metres would silently be taken for degrees and shrink by a factor of 57."""
-    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
-    with pytest.raises(ValueError, match=re.escape(sentence)):
-        load('[robot]\nurdf = "arm.urdf"\n' + RECORDING + units)
-
-
 def test_shapes_come_from_the_file(load):
     experiment = load(SHAPES)
-    model = experiment.collision
+    model = experiment.clearance.model
     assert model.pair_names == ("column and hand", "hand and table", "hand and ground")
-    assert experiment.clearance == 0.05
+    assert experiment.clearance.distance == 0.05
     gaps = np.asarray(model.clearance(experiment.robot, np.zeros(3)))
     # At zero the hand is at 0.9 m along x, at the height of the shoulder.
     assert gaps[2] == pytest.approx(0.3 + 0.1 - 0.08, abs=1e-5)
     assert gaps[0] == pytest.approx(0.9 - 0.18, abs=1e-5)
     named = SHAPES.replace("ground = -0.1", 'pairs = [["hand", "table"]]')
-    assert load(named).collision.pair_names == ("hand and table",)
-    assert load(ARM).collision is None
+    assert load(named).clearance.model.pair_names == ("hand and table",)
+    assert load(ARM).clearance is None
 
 
 def test_the_built_in_shapes_are_those_of_the_library(load):
-    model = load('[robot]\nbuiltin = "tx90l_on_rail"\n[collision]\nfit = true\n').collision
+    model = load('[robot]\nbuiltin = "tx90l_on_rail"\n[collision]\nfit = true\n').clearance.model
     assert model.pair_names == jid.robots.tx90l_on_rail_collision().pair_names

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxid.cli.options import refuse_foreign_folder, refuse_foreign_table
+from jaxid.cli.options import refuse_foreign_table, start
 from jaxid.errors import InputError
 from jaxid.io import atomic_folder, read_json, require_writable, write_text
 
@@ -108,7 +108,7 @@ def test_a_place_where_nothing_can_be_is_named_before_the_work(tmp_path):
     link.symlink_to(tmp_path / "gone")
     (place / "report").mkdir(parents=True)
     for refuse in (
-        lambda: refuse_foreign_folder(link, force=False),
+        lambda: start(link),
         lambda: require_writable(link / "deep"),
         lambda: write(place, "a", "report"),
     ):

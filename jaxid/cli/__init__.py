@@ -11,22 +11,7 @@ from typing import Annotated, Literal
 import typer
 from rich.text import Text
 
-from jaxid.cli.options import (
-    Base,
-    ExperimentFile,
-    Force,
-    Loaded,
-    Logs,
-    OutputFolder,
-    Seed,
-    Tip,
-    Unloaded,
-    describe_error,
-    open_console,
-    refuse_foreign_table,
-    require_one_log_per_option,
-    start,
-)
+from jaxid.cli import options
 from jaxid.errors import InputError
 
 app = typer.Typer(
@@ -37,15 +22,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-FILES = {
-    "c": "arm.c",
-    "urdf": "arm.urdf",
-    "mjcf": "arm.xml",
-    "json": "arm.json",
-    "pinocchio": "arm_pinocchio.json",
-    "jax": "arm.jax",
-}
-"""Formats of an exported model, and the files where no name is given."""
+ENDINGS = {"mjcf": ".xml", "pinocchio": "_pinocchio.json"}
+"""Endings of exported models where they are not the name of the format."""
 
 
 def main() -> None:
@@ -53,12 +31,13 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals know few characters
         sys.stdout.reconfigure(errors="replace")
     try:
-        require_one_log_per_option()
+        options.require_one_log_per_option()
         app()
     except (InputError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
             raise  # of JAX, not a failed search
-        open_console(stderr=True).print(Text(f"jaxid: {describe_error(error)}"), soft_wrap=True)
+        said = Text(f"jaxid: {options.describe_error(error)}")
+        options.open_console(stderr=True).print(said, soft_wrap=True)
         raise SystemExit(2) from None
 
 
@@ -75,9 +54,9 @@ def _options(
 
 @app.command()
 def demo(
-    output: OutputFolder = Path("demo"),
-    seed: Seed = 0,
-    force: Force = False,
+    output: options.OutputFolder = Path("demo"),
+    seed: options.Seed = 0,
+    force: options.Force = False,
 ) -> None:
     """Do the whole paper on a virtual TX90L on its rail.
 
@@ -89,8 +68,8 @@ def demo(
     from jaxid.experiment.session import stages
     from jaxid.report.page import show, show_remarks
 
-    console = start(output, force)
-    with stages(open_console(stderr=True)) as stage:
+    console = options.start(output, force)
+    with stages(options.open_console(stderr=True)) as stage:
 
         def progress(name: str, fraction: float) -> None:
             if fraction == 0.0:
@@ -109,7 +88,7 @@ def demo(
 @app.command()
 def example(
     folder: Annotated[Path, typer.Argument(help="Folder of the files.", metavar="DIR")],
-    seed: Seed = 0,
+    seed: options.Seed = 0,
 ) -> None:
     """Write an experiment to try things on.
 
@@ -117,7 +96,7 @@ def example(
     """
     from jaxid.simulation.example import write_example
 
-    console = start()
+    console = options.start()
     for file in write_example(folder, seed=seed):
         console.print(Text(f"wrote {file}"), soft_wrap=True)
     words = f"now: jaxid identify {folder}/experiment.toml {folder}/identification.csv "
@@ -128,8 +107,8 @@ def example(
 @app.command()
 def init(
     urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.", metavar="ARM.URDF")],
-    tip: Tip = None,
-    base: Base = None,
+    tip: options.Tip = None,
+    base: options.Base = None,
 ) -> None:
     """Print a commented experiment file for a robot.
 
@@ -137,14 +116,14 @@ def init(
     """
     from jaxid.experiment.template import write_template
 
-    start()
+    options.start()
     text = write_template(urdf, tip=tip, base=base)
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 
 @app.command()
 def excite(
-    experiment: ExperimentFile,
+    experiment: options.ExperimentFile,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
     ] = Path("trajectory.csv"),
@@ -163,14 +142,14 @@ def excite(
     """
     from jaxid.cli import commands
 
-    console = start()
-    refuse_foreign_table(output)
+    console = options.start()
+    options.refuse_foreign_table(output)
     commands.excite(console, experiment, output, resume, all_criteria)
 
 
 @app.command()
 def inspect(
-    experiment: ExperimentFile,
+    experiment: options.ExperimentFile,
     logs: Annotated[
         list[Path] | None, typer.Argument(help="Logs to examine.", metavar="LOG")
     ] = None,
@@ -182,35 +161,28 @@ def inspect(
     """
     from jaxid.cli import commands
 
-    commands.inspect(start(), experiment, logs or [])
+    commands.inspect(options.start(), experiment, logs or [])
 
 
 @app.command()
 def identify(
-    experiment: ExperimentFile,
-    logs: Logs,
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
     verify: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--verify",
-            metavar="LOG",
-            help="A log to verify with, which the fit does not see; may be repeated.",
-        ),
+        typer.Option(metavar="LOG", help="A log that the fit does not see; may be repeated."),
     ] = None,
     split: Annotated[
         float | None,
         typer.Option(
-            "--split",
-            metavar="F",
-            help="Use the first fraction F (0-1) of each log for identification, the rest for "
-            "validation.",
+            metavar="F", help="Fit the first fraction F (0-1) of each log, validate with the rest."
         ),
     ] = None,
-    output: OutputFolder = Path("report"),
+    output: options.OutputFolder = Path("report"),
     pdf: Annotated[
         bool, typer.Option("--pdf", help="Write the figures as PDF too, for papers.")
     ] = False,
-    force: Force = False,
+    force: options.Force = False,
 ) -> None:
     """Estimate the parameters and write a report.
 
@@ -218,18 +190,14 @@ def identify(
     """
     from jaxid.cli import commands
 
-    console, unseen = start(output, force), verify or []
-    commands.check_logs(logs, unseen, split)
-    commands.identify(console, experiment, logs, unseen, split, output, pdf)
+    console = options.start(output, force)
+    commands.identify(console, experiment, logs, verify or [], split, output, pdf)
 
 
 @app.command()
 def export(
     report: Annotated[
-        Path,
-        typer.Argument(
-            help="Report of `jaxid identify`, or a model file (.json).", metavar="REPORT"
-        ),
+        Path, typer.Argument(help="Report, or a model file (.json).", metavar="REPORT")
     ],
     to: Annotated[
         Literal["c", "urdf", "mjcf", "json", "pinocchio", "jax"],
@@ -237,22 +205,17 @@ def export(
     ],
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--output", metavar="FILE", help="The file; `arm` with the usual ending if left."
-        ),
+        typer.Option("-o", "--output", metavar="FILE", help="The file; by default `arm`."),
     ] = None,
     urdf: Annotated[
-        Path | None,
-        typer.Option("--urdf", metavar="ARM.URDF", help="The robot's own file, for `--to urdf`."),
+        Path | None, typer.Option(metavar="ARM.URDF", help="The robot's file, for `--to urdf`.")
     ] = None,
-    tip: Tip = None,
-    base: Base = None,
+    tip: options.Tip = None,
+    base: options.Base = None,
     single: Annotated[
         bool, typer.Option("--float", help="C that computes in single precision.")
     ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace a file that is there already.")
-    ] = False,
+    force: options.Force = False,
 ) -> None:
     """Write an identified model as C, URDF, MJCF, JSON, vectors, or a JAX function.
 
@@ -260,8 +223,8 @@ def export(
     """
     from jaxid.cli import commands
 
-    console = start()
-    path = Path(FILES[to]) if output is None else output
+    console = options.start()
+    path = Path(f"arm{ENDINGS.get(to, f'.{to}')}") if output is None else output
     made = [path, path.with_suffix(".h")] if to == "c" else [path]
     if to == "c" and path.suffix != ".c":
         raise InputError(f"`--output` must be a C file like arm.c, but is `{path}`.")
@@ -287,8 +250,8 @@ def compare(
     level: Annotated[
         float, typer.Option("--level", metavar="L", help="Confidence of the decisions (0-1).")
     ] = 0.95,
-    output: OutputFolder = Path("comparison"),
-    force: Force = False,
+    output: options.OutputFolder = Path("comparison"),
+    force: options.Force = False,
 ) -> None:
     """Decide which parameters have changed between two runs.
 
@@ -296,7 +259,7 @@ def compare(
     """
     from jaxid.cli import commands
 
-    console = start(output, force)
+    console = options.start(output, force)
     if first.resolve() == second.resolve():
         raise InputError(f"`{first}` is given twice: compare two different runs.")
     commands.compare(console, (first, second), level, output)
@@ -304,17 +267,14 @@ def compare(
 
 @app.command()
 def payload(
-    experiment: ExperimentFile,
-    logs: Unloaded,
-    loaded: Loaded,
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    loaded: options.Loaded,
     body: Annotated[
-        str | None,
-        typer.Option(
-            "--body", metavar="JOINT", help="The joint that moves the body with the payload."
-        ),
+        str | None, typer.Option(metavar="JOINT", help="The joint that moves the payload.")
     ] = None,
-    output: OutputFolder = Path("payload"),
-    force: Force = False,
+    output: options.OutputFolder = Path("payload"),
+    force: options.Force = False,
 ) -> None:
     """Find a payload's mass, centre of mass and moments of inertia.
 
@@ -322,17 +282,16 @@ def payload(
     """
     from jaxid.cli import commands
 
-    console = start(output, force)
-    commands.payload(console, experiment, logs, loaded, body, output)
+    commands.payload(options.start(output, force), experiment, logs, loaded, body, output)
 
 
 @app.command()
 def gains(
-    experiment: ExperimentFile,
-    logs: Unloaded,
-    loaded: Loaded,
-    output: OutputFolder = Path("gains"),
-    force: Force = False,
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    loaded: options.Loaded,
+    output: options.OutputFolder = Path("gains"),
+    force: options.Force = False,
 ) -> None:
     """Find the drives' true forces, like torque constants, with a load that is known.
 
@@ -340,16 +299,15 @@ def gains(
     """
     from jaxid.cli import commands
 
-    console = start(output, force)
-    commands.gains(console, experiment, logs, loaded, output)
+    commands.gains(options.start(output, force), experiment, logs, loaded, output)
 
 
 @app.command()
 def states(
-    experiment: ExperimentFile,
-    logs: Logs,
-    output: OutputFolder = Path("states"),
-    force: Force = False,
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    output: options.OutputFolder = Path("states"),
+    force: options.Force = False,
 ) -> None:
     """Fit several states of a robot at once: one inertia, friction for each.
 
@@ -358,5 +316,4 @@ def states(
     """
     from jaxid.cli import commands
 
-    console = start(output, force)
-    commands.states(console, experiment, logs, output)
+    commands.states(options.start(output, force), experiment, logs, output)

@@ -12,17 +12,10 @@ from rich.text import Text
 from jaxid.cli.options import command_line, open_console
 from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
+from jaxid.experiment import session
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
-from jaxid.experiment.session import (
-    Identification,
-    identify_logs,
-    load_log,
-    read_runs,
-    select_filter,
-    stages,
-)
 from jaxid.export.c_code import export_c
 from jaxid.export.feed_forward import export_jax
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
@@ -30,28 +23,13 @@ from jaxid.identification.comparison import compare as compare_fits
 from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import identify as estimate
-from jaxid.identification.payload import (
-    CENTRAL_NAMES,
-    CENTRAL_UNITS,
-    Payload,
-    identify_payload,
-)
+from jaxid.identification.payload import CENTRAL_NAMES, CENTRAL_UNITS, identify_payload
 from jaxid.identification.states import identify_states
 from jaxid.io import require_writable
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
-from jaxid.report.identification import (
-    Report,
-    body_table,
-    motor_tables,
-    residual_table,
-)
+from jaxid.report.identification import Report, body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
-from jaxid.report.result_files import (
-    read_fit,
-    write_comparison,
-    write_estimates,
-    write_report,
-)
+from jaxid.report.result_files import read_fit, write_comparison, write_estimates, write_report
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.table import Remark, Status, Table, significant
 
@@ -64,12 +42,12 @@ UNLIKELY = 0.01
 def inspect(console: Console, path: Path, logs: list[Path]) -> None:
     """Show what can be identified, and if logs are sane."""
     experiment, examined = load_experiment(path), []
-    with stages(open_console(stderr=True)) as stage:
+    with session.stages(open_console(stderr=True)) as stage:
         stage("finding base parameters")
         _ = experiment.base.expressions
-        experiment, _ = select_filter(experiment, logs, stage)
+        experiment, _ = session.select_filter(experiment, logs, stage)
         for log in logs:
-            _, observations, diagnosis = load_log(experiment, log, stage)
+            _, observations, diagnosis = session.load_log(experiment, log, stage)
             stage(f"factorising {log.name}")
             estimator = experiment.estimation.plain
             fit = estimate(experiment.base, observations, estimator, stage.through)
@@ -83,7 +61,7 @@ def inspect(console: Console, path: Path, logs: list[Path]) -> None:
         show(console, diagnosis.summary(), table)
 
 
-def check_logs(logs: list[Path], verify: list[Path], split: float | None) -> None:
+def _check_logs(logs: list[Path], verify: list[Path], split: float | None) -> None:
     """Reject logs that would count twice, or verify a model that has seen them."""
     if split is not None and not 0 < split < 1:
         raise InputError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
@@ -94,9 +72,10 @@ def check_logs(logs: list[Path], verify: list[Path], split: float | None) -> Non
     both = set(places) & {p.resolve() for p in verify}
     if both:
         raise InputError(
-            f"`{sorted(both)[0].name}` is given both to identify and to verify with: a model that "
-            "has seen a log is not verified by it; use `--split` to divide one log."
+            f"`{sorted(both)[0].name}` is given both to identify and to verify with: use `--split`."
         )
+    if all(p.is_dir() for p in logs):
+        raise InputError("give at least one log as a file, for torque errors and figures.")
 
 
 def identify(
@@ -109,14 +88,10 @@ def identify(
     pdf: bool,
 ) -> None:
     """Estimate the parameters and write a report."""
+    _check_logs(logs, verify, split)
     experiment = load_experiment(path)
-    if all(p.is_dir() for p in logs):
-        raise InputError(
-            "folders of earlier reports stand for their logs, but at least one log must be given "
-            "as a file, for torque errors and figures."
-        )
-    with stages(open_console(stderr=True)) as stage:
-        result = identify_logs(experiment, logs, verify, split, stage)
+    with session.stages(open_console(stderr=True)) as stage:
+        result = session.identify_logs(experiment, logs, verify, split, stage)
         stage("writing the report")
         settings = {
             "experiment": str(path),
@@ -141,11 +116,6 @@ def identify(
             result.choice,
         )
         written = write_report(output, report, pdf)
-    _show_identification(console, result)
-    show_files(console, output, [p.name for p in written])
-
-
-def _show_identification(console: Console, result: Identification) -> None:
     fit, robot = result.fit, result.experiment.robot
     tabulated = () if fit.consistency is None else fit.consistency.findings
     notes = [*result.experiment.notes, *result.notes]
@@ -159,6 +129,7 @@ def _show_identification(console: Console, result: Identification) -> None:
     if fit.consistency is not None:
         show(console, body_table(fit.consistency, robot.joint_names))
     show(console, result.validation.summary())
+    show_files(console, output, [p.name for p in written])
 
 
 def _doubts(texts: Any) -> list[Remark]:
@@ -170,14 +141,13 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
     state = output.with_suffix(".state.npz")
     if state.exists() and not resume:
         raise InputError(
-            f"`{state}` is there: a design was stopped before its end. `--resume` goes on with it; "
-            "to begin anew, remove the file, or choose another -o."
+            f"`{state}` is there: `--resume` goes on with it; to begin anew, remove the file."
         )
     experiment, errors = load_experiment(path), open_console(stderr=True)
     if resume and not state.exists():
         show_remarks(console, _doubts([f"`{state}` is not there: the design begins anew"]))
     try:
-        with stages(errors) as stage:
+        with session.stages(errors) as stage:
             design = design_motion(experiment, stage.design, state, resume)
     except KeyboardInterrupt:
         cure = "start again, and give it more time"
@@ -193,7 +163,7 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
     show_remarks(console, ordered((*plan_remarks(design.plan), *design.remarks)))
     show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in written])
     if all_criteria and not design.plan.interrupted:
-        with stages(errors) as stage:
+        with session.stages(errors) as stage:
             plans = compare_criteria(experiment, stage.design)
         if plans:
             show(console, side_by_side_table(plans))
@@ -251,9 +221,16 @@ def payload(
     files = write_estimates(output, "payload", [rows, central], content, sources)
     show(console, found.summary())
     show_remarks(console, _doubts(doubts))
-    _show_lines(
-        console, "to subtract it from other logs, in the experiment file:", _tool(found, name)
-    )
+    upper = [(k, i) for k in range(3) for i in range(k, 3)]
+    inertia = ", ".join(f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper)
+    lines = [
+        "[robot.tool]",
+        f'body = "{name}"',
+        f"mass = {found.mass:.6g}",
+        f"centre_of_mass = [{', '.join(f'{v:.6g}' for v in found.centre_of_mass)}]",
+        f"inertia = {{ {inertia} }}",
+    ]
+    _show_lines(console, "to subtract it from other logs, in the experiment file:", lines)
     show_files(console, output, [p.name for p in files])
 
 
@@ -262,12 +239,16 @@ def gains(console: Console, path: Path, logs: list[Path], loaded: list[Path], ou
     experiment = load_experiment(path)
     if experiment.load is None:
         raise InputError(
-            f"{path.name}: the table `[load]` is missing: `mass`, `centre_of_mass` and "
-            "`inertia` of what is on the robot in the logs behind `--loaded`."
+            f"{path.name}: the table `[load]` is missing: it describes the load behind `--loaded`."
         )
     (empty, full), doubts = _pair(experiment, logs, loaded)
     found = identify_drive_gains(empty, full, experiment.load)
-    key, values = _corrected(experiment, np.asarray(found.gains))
+    # The key of the file that corrects forces, and its values.
+    columns, key, known = experiment.columns, "force_gains", None
+    if columns is not None:
+        key = "force_gains" if columns.torque_constants is None else "torque_constants"
+        known = getattr(columns, key)
+    values = (np.array(1.0 if known is None else known) * np.asarray(found.gains)).tolist()
     sources = {"unloaded": logs, "loaded": loaded}
     names = found.joint_names
     rows = (names, ("1",) * len(names), found.gains, found.uncertainty)
@@ -286,11 +267,10 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
     names = [log.resolve().stem for log in logs]
     if len(set(names)) < max(len(names), 2):
         raise InputError(
-            f"give one log or report for each of two or more states, with different names: they "
-            f"name the states, but are {', '.join(names)}."
+            "give one log or report for each of two or more states, with different names."
         )
-    with stages(open_console(stderr=True)) as stage:
-        runs, doubts = read_runs(experiment, [[log] for log in logs], names, stage)
+    with session.stages(open_console(stderr=True)) as stage:
+        runs, doubts = session.read_runs(experiment, [[log] for log in logs], names, stage)
     found = identify_states(runs)
     chance = found.sharing[1]
     content = {
@@ -322,29 +302,8 @@ def _pair(
         raise InputError(
             f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
         )
-    with stages(open_console(stderr=True)) as stage:
-        return read_runs(experiment, [logs, loaded], ["unloaded", "loaded"], stage)
-
-
-def _tool(found: Payload, joint: str) -> list[str]:
-    upper = [(k, i) for k in range(3) for i in range(k, 3)]
-    inertia = ", ".join(f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper)
-    return [
-        "[robot.tool]",
-        f'body = "{joint}"',
-        f"mass = {found.mass:.6g}",
-        f"centre_of_mass = [{', '.join(f'{v:.6g}' for v in found.centre_of_mass)}]",
-        f"inertia = {{ {inertia} }}",
-    ]
-
-
-def _corrected(experiment: Experiment, gains: np.ndarray) -> tuple[str, list[float]]:
-    """Return the key of the file that corrects forces, and its values."""
-    columns = experiment.columns
-    if columns is not None and columns.torque_constants is not None:
-        return "torque_constants", (np.array(columns.torque_constants) * gains).tolist()
-    known = 1.0 if columns is None or columns.force_gains is None else columns.force_gains
-    return "force_gains", (np.array(known) * gains).tolist()
+    with session.stages(open_console(stderr=True)) as stage:
+        return session.read_runs(experiment, [logs, loaded], ["unloaded", "loaded"], stage)
 
 
 def _show_lines(console: Console, text: str, lines: list[str]) -> None:

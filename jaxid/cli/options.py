@@ -21,7 +21,7 @@ OutputFolder = Annotated[
     Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the result.")
 ]
 Force = Annotated[
-    bool, typer.Option("--force", help="Write into a folder that holds other files too.")
+    bool, typer.Option("--force", help="Write even where other files are there already.")
 ]
 Seed = Annotated[
     int, typer.Option("--seed", metavar="N", min=0, help="Seed of all that is random.")
@@ -40,19 +40,9 @@ Logs = Annotated[
         metavar="LOG",
     ),
 ]
-Unloaded = Annotated[
-    list[Path],
-    typer.Argument(
-        help="Logs without the load, or folders of reports on such logs.", metavar="LOG"
-    ),
-]
 Loaded = Annotated[
     list[Path],
-    typer.Option(
-        "--loaded",
-        metavar="LOG",
-        help="A log with the load, or the folder of a report; may be repeated.",
-    ),
+    typer.Option(metavar="LOG", help="A log with the load, or a report; may be repeated."),
 ]
 
 
@@ -64,10 +54,7 @@ def require_one_log_per_option() -> None:
     words = [word for arg in sys.argv[1:] for word in arg.split("=", 1)]
     for option, _, second in zip(words, words[1:], words[2:], strict=False):
         if option in ("--verify", "--loaded") and not second.startswith("-"):
-            raise InputError(
-                f"`{option}` takes one log: repeat it before `{second}`, and name the logs without "
-                "an option first."
-            )
+            raise InputError(f"`{option}` takes one log: repeat it before `{second}`.")
 
 
 def start(output: Path | None = None, force: bool = False) -> Console:
@@ -79,12 +66,23 @@ def start(output: Path | None = None, force: bool = False) -> Console:
     """
     import jax
 
+    from jaxid.io import require_writable
     from jaxid.program.cache import keep_compiled
+    from jaxid.report.result_files import SCHEMAS, schema_of
 
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
     if output is not None:
-        refuse_foreign_folder(output, force)
+        empty = not output.is_dir() or not any(output.iterdir())
+        if output.exists() and not output.is_dir():
+            raise InputError(
+                f"`{output}` is a file, but a report needs a folder: choose another -o."
+            )
+        if not (force or empty or any(schema_of(output / file) for file in SCHEMAS)):
+            raise InputError(
+                f"`{output}` holds files but no report: choose another -o, or add --force."
+            )
+        require_writable(output)
     return open_console()
 
 
@@ -102,10 +100,7 @@ def describe_error(error: Exception) -> str:
         return str(error)
     where = f"`{error.filename}`: " if error.filename else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return (
-            f"{where}{error.strerror}: nothing was written; make room, or choose another folder "
-            "with -o."
-        )
+        return f"{where}{error.strerror}: nothing was written; make room, or choose another -o."
     return f"{where}{error.strerror}."
 
 
@@ -113,27 +108,6 @@ def command_line() -> str:
     """Return the command line that gives the same result again."""
     words = (word for word in sys.argv[1:] if word not in ("--force", "--resume"))
     return shlex.join(["jaxid", *words])
-
-
-def refuse_foreign_folder(target: Path, force: bool) -> None:
-    """Reject a folder that holds other things than an earlier report.
-
-    Raises:
-        OSError: If nothing can be written there.
-        InputError: If there is something else in its place.
-    """
-    from jaxid.io import require_writable
-    from jaxid.report.result_files import SCHEMAS, schema_of
-
-    if target.exists() and not target.is_dir():
-        raise InputError(f"`{target}` is a file, but a report needs a folder: choose another -o.")
-    empty = not target.is_dir() or not any(target.iterdir())
-    if not (force or empty or any(schema_of(target / file) for file in SCHEMAS)):
-        raise InputError(
-            f"`{target}` holds files but no report: choose another folder with -o, or add --force "
-            "to put the report beside them."
-        )
-    require_writable(target)
 
 
 def refuse_foreign_table(target: Path) -> None:

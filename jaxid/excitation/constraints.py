@@ -212,10 +212,8 @@ class TipLimits(AbstractConstraint):
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the quantities that have a limit."""
         found = []
-        for name, limit, unit in (
-            ("speed", self.speed, "m/s"),
-            ("acceleration", self.acceleration, "m/s²"),
-        ):
+        rates = {"speed": (self.speed, "m/s"), "acceleration": (self.acceleration, "m/s²")}
+        for name, (limit, unit) in rates.items():
             if math.isfinite(limit):
                 found.append(Finding(f"the {name} of the end-effector", limit, unit, limit))
         for axis, sign, end, size in self._sides:
@@ -229,12 +227,12 @@ class TipLimits(AbstractConstraint):
     @property
     def _sides(self) -> list[tuple[int, float, float, float]]:
         """Axis, sign, end and half edge of each side that is not open."""
-        low, high = np.asarray(self.low), np.asarray(self.high)
-        half = np.where(np.isfinite(high - low), 0.5 * (high - low), 1.0)
+        half = 0.5 * (self.high - self.low)
+        half = np.where(np.isfinite(half), half, 1.0)
         return [
             (axis, sign, float(end), float(half[axis]))
             for axis in range(3)
-            for sign, end in ((1.0, high[axis]), (-1.0, -low[axis]))
+            for sign, end in ((1.0, self.high[axis]), (-1.0, -self.low[axis]))
             if np.isfinite(end)
         ]
 
@@ -258,7 +256,7 @@ class ForceLimits(AbstractConstraint):
 
     Raises:
         InputError: If there is not one number for each base parameter, or the covariance is not
-            positive.
+            finite.
     """
 
     base: BaseParameters
@@ -279,19 +277,16 @@ class ForceLimits(AbstractConstraint):
                 f"`parameters` must hold one finite number for each base parameter ({size}), "
                 f"but has shape {p.shape}: `base.from_standard` makes them of standard ones."
             )
-        if C is None:
-            return
-        fits = C.shape == (size, size) and np.isfinite(C).all()
-        if not fits or np.linalg.eigvalsh(0.5 * (C + C.T))[0] < -1e-9 * np.abs(C).max():
-            raise InputError(
-                f"`covariance` must be a finite matrix of {size} rows and columns without "
-                "negative eigenvalues."
-            )
+        if C is not None and (C.shape != (size, size) or not np.isfinite(C).all()):
+            raise InputError(f"`covariance` must be a finite matrix of {size} rows and columns.")
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the relative excess over each limit."""
-        limits, to_limited = self._limited(robot)
-        limits = (1 - self.margin) * limits
+        whole = self._whole(robot)
+        finite = np.isfinite(whole)
+        limits = (1 - self.margin) * whole[finite]
+        to_motors = np.linalg.inv(np.asarray(robot.drives.reduction))
+        to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)[:, finite]
         forces = on_samples(self, self.forces, motion.q, motion.qd, motion.qdd)
         size = jnp.max(jnp.abs(forces @ to_limited), axis=-2)
         if self.covariance is not None:
@@ -312,17 +307,13 @@ class ForceLimits(AbstractConstraint):
         def is_transition(part: Any) -> bool:
             return isinstance(part, AbstractTransition)
 
-        def reversing(side: float) -> Any:
-            terms = jax.tree.map(
-                lambda part: Reversal(part, side, width) if is_transition(part) else part,
-                model.terms,
-                is_leaf=is_transition,
-            )
-            return eqx.tree_at(lambda m: m.terms, model, terms)
+        def reversing(part: Any, side: float) -> Any:
+            return Reversal(part, side, width) if is_transition(part) else part
 
-        models = (model, reversing(1.0), reversing(-1.0))
+        sides = [eqx.Partial(reversing, side=side) for side in (1.0, -1.0)]
+        models = [model, *(jax.tree.map(side, model, is_leaf=is_transition) for side in sides)]
         found = jnp.stack([jnp.asarray(m.forces(p, q, qd, qdd)) for m in models])
-        return found if model.robot.tool is None else found + model.known_forces(q, qd, qdd)[None]
+        return found + model.known_forces(q, qd, qdd)[None]
 
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the forces and torques that have a limit."""
@@ -342,10 +333,3 @@ class ForceLimits(AbstractConstraint):
     def _whole(robot: Robot) -> np.ndarray:
         """Return the limits of all joints, then of all motors [N m or N]."""
         return np.concatenate([robot.limits.force, robot.drives.max_torques])
-
-    def _limited(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-        """Return the finite limits, and the matrix from joint forces to what they limit."""
-        whole = self._whole(robot)
-        to_motors = np.linalg.inv(np.asarray(robot.drives.reduction))
-        to_all = np.concatenate([np.eye(robot.joints), to_motors], axis=1)
-        return whole[np.isfinite(whole)], to_all[:, np.isfinite(whole)]

@@ -185,8 +185,13 @@ class DOptimal(AbstractCriterion):
 
     def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
         """Return the logarithm of the mean axis."""
-        size = information.weighted.shape[-1]
-        return -0.5 / size * jnp.asarray(_log_determinant(jnp.asarray(information.weighted)))
+        matrix = jnp.asarray(information.weighted)
+        # The determinant does not depend on the scale that makes the factor accurate.
+        scale = jax.lax.stop_gradient(_unit_diagonal(matrix)[1])
+        scaled = scale[:, None] * matrix * scale[None]
+        # A small ridge keeps a singular matrix with ones on its diagonal positive.
+        L = jnp.linalg.cholesky(scaled + 1e-13 * np.eye(len(scale)))
+        return -jnp.mean(jnp.log(jnp.diagonal(L)) - jnp.log(scale))
 
 
 class AOptimal(AbstractCriterion):
@@ -293,22 +298,3 @@ def _unit_diagonal(matrix: Array) -> tuple[Array, Array]:
     square = jnp.diagonal(matrix)
     scale = 1.0 / jnp.sqrt(jnp.where(square > 0, square, 1.0))
     return scale[:, None] * matrix * scale[None], scale
-
-
-@jax.custom_vjp
-def _log_determinant(matrix: Float[Array, "size size"]) -> Float[Array, ""]:
-    return _log_determinant_forward(matrix)[0]
-
-
-def _log_determinant_forward(matrix: Array) -> tuple[Array, Array]:
-    size = matrix.shape[-1]
-    scaled, scale = _unit_diagonal(matrix)
-    # A small ridge keeps a singular matrix with ones on its diagonal positive.
-    L = jnp.linalg.cholesky(scaled + 1e-13 * np.eye(size))
-    value = 2 * jnp.sum(jnp.log(jnp.diagonal(L))) - 2 * jnp.sum(jnp.log(scale))
-    inverse = jax.lax.linalg.triangular_solve(L, jnp.eye(size), left_side=True, lower=True)
-    inverse = inverse * scale[None]
-    return value, inverse.T @ inverse
-
-
-_log_determinant.defvjp(_log_determinant_forward, lambda inverse, g: (g * inverse,))

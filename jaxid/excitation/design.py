@@ -139,7 +139,8 @@ def minimise(
             first = int(search.best.order()[0])
             task = "searching from many starts" if search.searching else "polishing the best"
             value, kept = search.best.value[first], search.best.excess[first] <= 0.0
-            progress(DesignProgress(search.fraction, task, float(np.exp(value)), bool(kept)))
+            done = search.done / search.steps
+            progress(DesignProgress(done, task, float(np.exp(value)), bool(kept)))
 
     interrupted = False
     try:
@@ -164,7 +165,7 @@ def minimise(
         noise=problem.noise,
         samples=problem.samples,
         findings=tuple(problem.findings(x)),
-        nominal=None if nominal is None else np.asarray(nominal),
+        nominal=np.full(problem.base.size, np.nan) if nominal is None else np.asarray(nominal),
         interrupted=interrupted,
     )
     if throw and not plan.feasible:

@@ -8,6 +8,7 @@ Cholesky factor for each start. Curvature is a damped BFGS matrix [1, procedure 
 [1] J. Nocedal, S. Wright, Numerical Optimization, 2nd ed., 2006, chapters 18 and 19.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -99,22 +100,18 @@ class Stage(NamedTuple):
 def begin(grid: Grid, y: Float[AnyArray, "starts scaled"], constraints: int = 0) -> State:
     """Return the state of some starts before the first stage, with a number of constraints."""
     starts, size = np.shape(y)
-    slacks = 1 if constraints else 0
-    none, flat = jnp.zeros(starts), jnp.zeros((starts, size))
-    duals = Inequalities(
-        jnp.zeros((starts, 2, *grid.c.shape)),
-        jnp.zeros((starts, constraints)),
-        jnp.zeros((starts, slacks)),
-    )
+    slack = jnp.zeros((starts, 1 if constraints else 0))
+    none, excess = jnp.zeros(starts), jnp.zeros((starts, constraints))
+    duals = Inequalities(jnp.zeros((starts, 2, *grid.c.shape)), excess, slack)
     slopes = jnp.zeros((starts, constraints, size))
     return State(
         y=jnp.asarray(y),
-        slack=duals.slack,
-        evaluation=Evaluation(none, flat, duals.constraints, slopes),
+        slack=slack,
+        evaluation=Evaluation(none, jnp.zeros((starts, size)), excess, slopes),
         duals=duals,
         curvature=jnp.tile(STIFFNESS * jnp.eye(size), (starts, 1, 1)),
         barrier=none,
-        step=jnp.zeros((starts, size + slacks)),
+        step=jnp.zeros((starts, size + slack.shape[1])),
         dual_step=duals,
         length=none,
         dual_length=none,
@@ -138,13 +135,10 @@ def run(grid: Grid, objective: Callable[[Array], Evaluation], state: State, stag
     def iterate(carry: tuple[Array, State]) -> tuple[Array, State]:
         number, state = carry
         trial = state.y + state.length[:, None] * state.step[:, : state.y.shape[-1]]
-
-        def update(old: State, trial: Array, evaluation: Evaluation) -> State:
-            return _update(grid, stage, old, trial, evaluation)
-
+        update = functools.partial(_update, grid, stage)
         return number + 1, map_starts(update, state, trial, objective(trial))
 
-    begun = jax.vmap(lambda one: _begin_stage(grid, stage, one))(state)
+    begun = jax.vmap(functools.partial(_begin_stage, grid, stage))(state)
     return jax.lax.while_loop(proceed, iterate, (jnp.asarray(0), begun))[1]
 
 
@@ -169,9 +163,7 @@ def _begin_stage(grid: Grid, stage: Stage, one: State) -> State:
         duals=one.duals._replace(limits=jnp.where(moved, central, duals)),
         barrier=jnp.asarray(stage.barrier, float),
         step=jnp.zeros_like(one.step),
-        dual_step=jax.tree.map(jnp.zeros_like, one.dual_step),
         length=jnp.zeros_like(one.length),
-        dual_length=jnp.zeros_like(one.dual_length),
         fresh=jnp.ones((), bool),
     )
 
@@ -260,11 +252,9 @@ def _directed(grid: Grid, stage: Stage, state: State) -> State:
     step = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(H), True), downhill)
     # Where rounding makes the matrix indefinite, its diagonal alone decides.
     step = jnp.where(jnp.all(jnp.isfinite(step)), step, downhill / jnp.diagonal(H))
-    more = step[size:]
-    rows = grid.rows(step[:size])
-    change = Inequalities(
-        jnp.stack([rows, -rows]), evaluation.slopes @ step[:size] - jnp.sum(more), -more
-    )
+    rows, more = grid.rows(step[:size]), step[size:]
+    bent = evaluation.slopes @ step[:size] - jnp.sum(more)
+    change = Inequalities(jnp.stack([rows, -rows]), bent, -more)
     dual_step = jax.tree.map(
         lambda c, dual, r, x: c - dual + r * x, central, state.duals, ratio, change
     )

@@ -134,8 +134,7 @@ class JointLimits(eqx.Module):
         one = np.linalg.lstsq(rows[0], np.ones(len(rows[0])), rcond=None)[0]
         if np.abs(rows[0] @ one - 1.0).max() > 1e-9 or np.abs(rows[1] @ one).max() > 1e-9:
             raise InputError(
-                "`basis` must hold motions that stand still at any position, but its functions "
-                "have no constant among them: add one."
+                "`basis` must hold a constant, for motions that stand still at any position."
             )
         self.constant = self._sizes[0][:, None] * one[None] / self.scale
 
@@ -152,10 +151,6 @@ class JointLimits(eqx.Module):
         half = 0.5 * (np.asarray(x.position_max) - np.asarray(x.position_min))
         return np.array([half, x.velocity, x.acceleration, x.jerk], np.float64)
 
-    @property
-    def _middles(self) -> Float[np.ndarray, " joints"]:
-        return 0.5 * (np.asarray(self.limits.position_min) + np.asarray(self.limits.position_max))
-
     def coefficients(
         self, y: Float[AnyArray, "*batch scaled"]
     ) -> Float[AnyArray, "*batch joints variables"]:
@@ -170,7 +165,8 @@ class JointLimits(eqx.Module):
         orders = 4 if np.isfinite(size[3]).any() else 3
         R = [scale[:, None] * envelope[k][None] / size[k][:, None, None] for k in range(orders)]
         c = [np.zeros((len(scale), len(envelope[k]))) for k in range(orders)]
-        c[0] += (self._middles / size[0])[:, None]
+        ends = np.asarray(self.limits.position_min), np.asarray(self.limits.position_max)
+        c[0] += (0.5 * (ends[0] + ends[1]) / size[0])[:, None]
         ends = np.cumsum([0, *(part.shape[1] for part in c)])
         kinds = tuple(range(int(a), int(b)) for a, b in itertools.pairwise(ends))
         R, c = np.concatenate(R, axis=1), np.concatenate(c, axis=1)
@@ -181,15 +177,11 @@ class JointLimits(eqx.Module):
 
         The used fraction of a range is the distance from its middle, over half of the range.
         """
-        rows, factor = self.basis.envelope(scale_samples(512, self.basis))
-        centre = np.vstack([self._middles, np.zeros((3, len(self._middles)))])
-        x = np.asarray(x)
-        return np.array(
-            [
-                factor * np.abs(x @ r.T - c[:, None]).max(axis=1) / s
-                for r, c, s in zip(rows, centre, self._sizes, strict=True)
-            ]
-        )
+        grid, used = self.grid(), np.zeros((4, len(x)))
+        rows = np.einsum("jrk,jk->jr", grid.R, np.asarray(x) / self.scale) - grid.c
+        for order, kind in enumerate(grid.kinds):
+            used[order] = np.abs(rows[:, kind]).max(axis=1) / grid.bound
+        return used
 
     def random(
         self, key: PRNGKeyArray, count: int, size: float = 1.0

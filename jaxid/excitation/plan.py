@@ -20,7 +20,7 @@ from jaxid.excitation.criteria import (
 )
 from jaxid.excitation.limits import JointLimits
 from jaxid.table import MISSING, Column, Remark, Status, Table, percent, significant
-from jaxid.trajectory.files import save_trajectory, write_csv
+from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.trajectory import LinearTrajectory
 
 VAGUE = 0.5
@@ -49,7 +49,7 @@ class ExcitationPlan(eqx.Module):
         noise: Assumed standard deviation of the forces' noise by joint [N m or N].
         samples: Number of measured samples of one run.
         findings: Use of the constraints beside the limits of the joints.
-        nominal: Base parameters as far as they are known before, NaN where not; or None.
+        nominal: Base parameters as far as they are known before, NaN where not.
         interrupted: Whether the design was stopped before its end.
     """
 
@@ -62,7 +62,7 @@ class ExcitationPlan(eqx.Module):
     noise: Float[AnyArray, " joints"]
     samples: int = eqx.field(static=True)
     findings: tuple[Finding, ...]
-    nominal: Float[AnyArray, " base"] | None
+    nominal: Float[AnyArray, " base"]
     interrupted: bool = eqx.field(static=True)
 
     @property
@@ -94,10 +94,8 @@ class ExcitationPlan(eqx.Module):
         return standard_deviations(self.information.weighted)
 
     @property
-    def relative_deviations(self) -> Float[np.ndarray, " base"] | None:
+    def relative_deviations(self) -> Float[np.ndarray, " base"]:
         """Standard deviations over the nominal parameters; NaN where those are unknown or zero."""
-        if self.nominal is None:
-            return None
         size = np.abs(np.asarray(self.nominal))
         return self.standard_deviations / np.where(size > 0, size, np.nan)
 
@@ -130,27 +128,26 @@ class ExcitationPlan(eqx.Module):
     @property
     def vague(self) -> tuple[str, ...]:
         """Names of other base parameters whose deviation is above half of their nominal value."""
-        relative = self.relative_deviations
-        if relative is None:
-            return ()
-        return self._names((relative > VAGUE) & np.isfinite(self.standard_deviations))
+        vague = self.relative_deviations > VAGUE
+        return self._names(vague & np.isfinite(self.standard_deviations))
 
     def _names(self, chosen: Bool[np.ndarray, " base"]) -> tuple[str, ...]:
         return tuple(name for name, k in zip(self.base.names, chosen, strict=True) if k)
 
     def tables(self) -> tuple[Table, ...]:
         """Return the tables of criteria, expected deviations, and use of the limits."""
-        criteria, base, relative = self.criteria, self.base, self.relative_deviations
-        columns = [] if relative is None else [Column("±", relative, "%", percent)]
-        vague = [] if relative is None else [bool(r > VAGUE) for r in relative]
+        base, relative, columns, status = self.base, self.relative_deviations, [], []
+        if not np.isnan(relative).all():
+            columns = [Column("±", relative, "%", percent)]
+            status = [Status.DOUBTFUL if r > VAGUE else Status.NEUTRAL for r in relative]
         kinds = ("range", "speed", "acceleration", "jerk")
         tables = [
             Table(
                 f"criteria: smaller is better; this motion was designed by the "
                 f"{self.criterion.name}",
-                Column("criterion", [c.name for c in criteria]),
-                Column("random motion", [float(c.before) for c in criteria]),
-                Column("this motion", [float(c.after) for c in criteria]),
+                Column("criterion", [c.name for c in self.criteria]),
+                Column("random motion", [c.before for c in self.criteria]),
+                Column("this motion", [c.after for c in self.criteria]),
             ),
             Table(
                 "expected standard deviations",
@@ -160,7 +157,7 @@ class ExcitationPlan(eqx.Module):
                 Column("unit", base.units),
                 Column("better than\nrandom", self.gains, "factor", lambda gain: f"{gain:.2f}"),
                 *columns,
-                status=[Status.DOUBTFUL if x else Status.NEUTRAL for x in vague],
+                status=status,
             ),
             Table(
                 "use of the limits, for all times",
@@ -189,18 +186,6 @@ class ExcitationPlan(eqx.Module):
     def __str__(self) -> str:
         """Return all tables as text, and what must be known of the design."""
         return "\n\n".join(map(str, (*self.tables(), Table("", remarks=self.remarks))))
-
-    def to_csv(self, path: str | Path, *, sample_time: float | None = None) -> None:
-        """Write the motion as a table of samples; see `write_csv`.
-
-        Args:
-            path: Path of the CSV file.
-            sample_time: Largest time between two samples [s]; that of the experiment if None.
-        """
-        start, then = self.limits.basis.times(self.samples)[:2]
-        step = float(then - start) if sample_time is None else sample_time
-        with double_precision():
-            write_csv(self.trajectory, self.base.model.robot, path, sample_time=step)
 
     def save(self, path: str | Path) -> None:
         """Write the trajectory itself, exact, as a JSON file for `load_trajectory`."""

@@ -30,7 +30,7 @@ def polish(problem: ExcitationProblem, start: Float[AnyArray, " scaled"]) -> Can
     grid = problem.limits.grid()
     rows = np.zeros((2, *grid.c.shape), bool)
     for kind in grid.kinds:
-        rows[:, :, kind.start : kind.stop : max(1, len(kind) // 12)] = True
+        rows[:, :, kind[:: max(1, len(kind) // 12)]] = True
     instants = np.zeros((CHECKED, problem.conditions // (len(WATCHED) + PEAKS)), bool)
     best = evaluate_within_limits(problem, x[None])
     rounds = ((8.0, 5), (None, 8)) if problem.criterion.extreme else ((None, 8),)
@@ -75,20 +75,11 @@ def _minimise(
         def linearised(z: bytes) -> tuple[np.ndarray, np.ndarray]:
             return _linearise(problem, np.frombuffer(z), watched)
 
-        conditions.append(
-            {
-                "type": "ineq",
-                "fun": lambda z: -linearised(z.tobytes())[0] - MARGIN,
-                "jac": lambda z: -linearised(z.tobytes())[1],
-            }
-        )
-
-    def value(z: np.ndarray) -> tuple[float, np.ndarray]:
-        v, g = _value_and_gradient(problem, z, sharpness)
-        return float(v), np.asarray(g)
+        fun, jac = (lambda z, k=k: -linearised(z.tobytes())[k] for k in (0, 1))
+        conditions.append({"type": "ineq", "fun": lambda z: fun(z) - MARGIN, "jac": jac})
 
     return scipy.optimize.minimize(
-        value,
+        lambda z: jax.device_get(_value_and_gradient(problem, z, sharpness)),
         x,
         jac=True,
         method="SLSQP",
@@ -108,8 +99,8 @@ def _add_peaks(
     use = np.einsum("jrk,jk->jr", grid.R, x.reshape(problem.limits.shape)) - grid.c
     use = np.stack([use, -use]) / grid.bound
     for kind in grid.kinds:
-        part = use[:, :, kind.start : kind.stop]
-        rows[:, :, kind.start : kind.stop] |= _are_peaks(part, 2) & (part > threshold)
+        part = use[:, :, kind]
+        rows[:, :, kind] |= _are_peaks(part, 2) & (part > threshold)
     return float(use.max())
 
 

@@ -11,15 +11,9 @@ from jaxid.arrays import AnyArray, Array, Float, Int, PRNGKeyArray, require_floa
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+from jaxid.excitation import criteria
 from jaxid.excitation.constraints import AbstractConstraint, Finding
-from jaxid.excitation.criteria import (
-    AbstractCriterion,
-    DOptimal,
-    Information,
-    Sharpness,
-    information,
-    informations,
-)
+from jaxid.excitation.criteria import AbstractCriterion, Information, Sharpness
 from jaxid.excitation.interior_point import Evaluation, map_starts
 from jaxid.excitation.limits import JointLimits, scale_samples
 from jaxid.robot.joints import Limits
@@ -85,13 +79,24 @@ class ExcitationProblem:
     ):
         require_float64("designing a motion")
         robot = base.model.robot
-        self.base, self.criterion = base, DOptimal() if criterion is None else criterion
+        self.base, self.criterion = base, criteria.DOptimal() if criterion is None else criterion
         self.limits = JointLimits(robot, FourierBasis(5, 0.8) if basis is None else basis, limits)
         self.basis = self.limits.basis
         self.constraints, self.samples = tuple(constraints), samples
         self.noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
         self.prior = np.zeros((base.size, base.size)) if prior is None else np.asarray(prior)
-        self._check(given_prior=prior is not None)
+        if prior is not None and not self.criterion.weighted:
+            raise InputError(
+                f"`prior` needs a weighted criterion, but that is the {self.criterion.name}."
+            )
+        if self.prior.shape != (base.size, base.size):
+            raise InputError(
+                f"`prior` must have {base.size} rows and columns, but has shape {self.prior.shape}."
+            )
+        if self.noise.shape != (robot.joints,) or not (self.noise > 0).all():
+            raise InputError(
+                f"`noise` must hold one positive number for each joint, but is {self.noise}."
+            )
         # Constraints ask the robot for its limits of force.
         self._robot = robot.replace(limits=self.limits.limits)
         self._rows = np.asarray(self.basis.rows(self.basis.instants(CHECKED))[:3])
@@ -100,24 +105,6 @@ class ExcitationProblem:
         motions = self.limits.random(jax.random.key(0), 8)
         squares = np.mean([np.diag(self.information(x).weighted) for x in motions], axis=0)
         self.sizes = 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))
-
-    def _check(self, given_prior: bool) -> None:
-        size, joints = self.base.size, self.base.model.robot.joints
-        if self.noise.shape != (joints,) or not (self.noise > 0).all():
-            raise InputError(
-                f"`noise` must hold one positive number for each joint ({joints}), but is "
-                f"{self.noise}."
-            )
-        if self.prior.shape != (size, size):
-            raise InputError(
-                f"`prior` must be a matrix of the {size} base parameters, but has shape "
-                f"{self.prior.shape}."
-            )
-        if given_prior and not self.criterion.weighted:
-            raise InputError(
-                f"`prior` is in units of the noise, which the {self.criterion.name} does not use: "
-                "choose a weighted criterion."
-            )
 
     @property
     def size(self) -> int:
@@ -159,7 +146,7 @@ class ExcitationProblem:
         limits = jnp.concatenate([rows.reshape(-1), -rows.reshape(-1)]) / grid.bound - 1.0
         if not self.constraints:
             return limits
-        watched = self._constrained(jnp.asarray(x), WATCHED)
+        watched = self._constrained(x, WATCHED)
         return jnp.concatenate([limits, watched.reshape(-1) + MARGIN])
 
     def violation(self, x: Float[AnyArray, " scaled"]) -> Float[Array, ""]:
@@ -170,9 +157,8 @@ class ExcitationProblem:
         """
         grid = self.limits.grid()
         excess = jnp.max(jnp.abs(grid.rows(jnp.asarray(x)) - grid.c)) / grid.bound - 1.0
-        if not self.constraints:
-            return excess
-        return jnp.maximum(excess, jnp.max(_tops(self._constrained(jnp.asarray(x)))))
+        tops = _tops(self._constrained(x)) if self.constraints else excess
+        return jnp.maximum(excess, jnp.max(tops))
 
     def values(
         self,
@@ -181,7 +167,7 @@ class ExcitationProblem:
         samples: int | None = None,
     ) -> Float[Array, " starts"]:
         """Return `value` of several motions at once."""
-        plain, weighted = informations(
+        plain, weighted = criteria.informations(
             self.base,
             self.basis,
             self.limits.coefficients(x),
@@ -205,9 +191,9 @@ class ExcitationProblem:
         """Return the criterion, and the constraints at watched instants, of several motions."""
         count = scale_samples(SEARCHED, self.basis)
         values, pull = jax.vjp(lambda y: self.values(y, sharpness, count), x)
-        evaluation = Evaluation.unconstrained(values, pull(jnp.ones_like(values))[0])
+        gradient = pull(jnp.ones_like(values))[0]
         if not self.constraints:
-            return evaluation
+            return Evaluation.unconstrained(values, gradient)
         excess, slopes = map_starts(self.linearise, x, instants)
         starts, size = x.shape
         # At the peaks of one value only this value counts: the others have their own peaks.
@@ -215,10 +201,8 @@ class ExcitationProblem:
         always = len(WATCHED) * entries
         peaks = np.arange(PEAKS * entries) * entries + np.repeat(np.arange(entries), PEAKS)
         chosen = np.concatenate([np.arange(always), always + peaks])
-        return evaluation._replace(
-            excess=excess.reshape(starts, -1)[:, chosen] + MARGIN,
-            slopes=slopes.reshape(starts, -1, size)[:, chosen],
-        )
+        slopes = slopes.reshape(starts, -1, size)[:, chosen]
+        return Evaluation(values, gradient, excess.reshape(starts, -1)[:, chosen] + MARGIN, slopes)
 
     def linearise(
         self, x: Float[Array, " scaled"], instants: Int[AnyArray, " instants"]
@@ -270,11 +254,8 @@ class ExcitationProblem:
         rows = np.asarray(self.basis.rows(self.basis.times(self.samples))[:3])
         coefficients = np.asarray(self.limits.coefficients(np.asarray(x)))
         motion = Motion(*(part @ coefficients.T for part in rows))
-        return information(self.base, motion, 1.0 / self.noise, self.prior, self.sizes)
-
-    def exact_value(self, x: Float[AnyArray, " scaled"]) -> float:
-        """Return the logarithm of the criterion of one run, from information in NumPy."""
-        return float(self.criterion(jax.tree.map(jnp.asarray, self.information(x))))
+        weights = 1.0 / self.noise
+        return criteria.information(self.base, motion, weights, self.prior, self.sizes)
 
     def excess(self, x: Float[AnyArray, " scaled"]) -> float:
         """Return the largest excess over constraints for all times; minus infinity if none."""
@@ -363,7 +344,8 @@ class Candidates(NamedTuple):
 def evaluate(problem: ExcitationProblem, x: Float[AnyArray, "starts scaled"]) -> Candidates:
     """Return motions as they are, with their exact values."""
     x = np.asarray(x)
-    values = np.array([problem.exact_value(one) for one in x])
+    known = [jax.tree.map(jnp.asarray, problem.information(one)) for one in x]
+    values = np.array([float(problem.criterion(one)) for one in known])
     excess = np.array([problem.excess(one) for one in x])
     finite = np.isfinite(values) & ~np.isnan(excess)
     return Candidates(x, np.where(finite, values, np.inf), np.where(finite, excess, np.inf))

@@ -8,6 +8,7 @@ best motions are polished one by one.
 import functools
 import hashlib
 import io
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,7 @@ class Search:
 
     Attributes:
         done: Number of steps done.
+        steps: Number of steps: of the starts, of their descendants, the last one, and polishing.
         first: Values of the random motions.
         best: Best motions so far.
     """
@@ -82,6 +84,7 @@ class Search:
         self._schedule = SCHEDULE + SETTLING if problem.constraints else SCHEDULE
         self._generations, self._polished = generations, min(polished, starts)
         self._searching = len(self._schedule) + generations + 1
+        self.steps = self._searching + self._polished
         x = problem.limits.random(key, starts)
         self.done, self.best = 0, evaluate(problem, x)
         self.first = self.best.value
@@ -89,25 +92,15 @@ class Search:
         self._state = _begin(problem, SEARCHED, x)
 
     @property
-    def steps(self) -> int:
-        """Number of steps: of the starts, of their descendants, the last one, and polishing."""
-        return self._searching + self._polished
-
-    @property
     def searching(self) -> bool:
         """Whether the next step is one of the search from many starts, not polishing."""
         return self.done < self._searching
-
-    @property
-    def fraction(self) -> float:
-        """Completed fraction of the steps, from 0 to 1."""
-        return self.done / self.steps
 
     def advance(self) -> None:
         """Do the next step."""
         problem, number, generation = self._problem, self.done, self.done - len(self._schedule)
         if generation < 0:
-            if number == len(SCHEDULE):
+            if number == len(SCHEDULE) and self.best.broken.any():
                 self._restart_broken()
             self._state = _improve(problem, SEARCHED, self._state, self._schedule[number])
             if number in EVALUATED:
@@ -142,30 +135,20 @@ class Search:
         write_bytes(path, buffer.getvalue())
 
     def resume(self, path: str | Path) -> None:
-        """Go on from a state that was saved for the same problem and settings.
-
-        Raises:
-            InputError: If the file is no state, or belongs to another search.
-        """
-        digest = self._digest()
-        try:
-            with Path(path).open("rb") as file:
-                if (eqx.tree_deserialise_leaves(file, digest) != digest).any():
-                    raise InputError(
-                        f"`{path}` was saved by a design with other settings: use those again, or "
-                        "remove the file to start anew."
-                    )
-                content = eqx.tree_deserialise_leaves(file, self._content())
-        except (ValueError, EOFError, RuntimeError, TypeError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"`{path}` is no saved state of a design: remove it.") from error
+        """Go on from a state that was saved for the same problem and settings."""
+        digest, content = self._digest(), self._content()
+        saved = np.zeros_like(digest)
+        with Path(path).open("rb") as file, suppress(ValueError, EOFError, RuntimeError, TypeError):
+            saved, content = eqx.tree_deserialise_leaves(file, (digest, content))
+        if (saved != digest).any():
+            raise InputError(
+                f"`{path}` is damaged, or of a design with other settings: remove it to begin anew."
+            )
         self.done = int(content[0])
         self.first, self.best, self._order, self._state = content[1:]
 
     def _content(self) -> tuple:
-        content = np.array(self.done), self.first, self.best, self._order
-        return *jax.tree.map(np.asarray, content), self._state
+        return np.array(self.done), self.first, self.best, self._order, self._state
 
     def _digest(self) -> np.ndarray:
         """Return a digest of everything that the result depends on."""
@@ -180,8 +163,6 @@ class Search:
     def _restart_broken(self) -> None:
         """Start again where constraints are broken, from small motions that keep them best."""
         broken = self.best.broken > 0
-        if not broken.any():
-            return
         sizes = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
         random = self._problem.limits.random
         many = jnp.concatenate([random(jax.random.key(k), 16, s) for k, s in enumerate(sizes)])

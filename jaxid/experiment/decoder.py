@@ -14,6 +14,7 @@ import re
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from operator import ge, gt, le, lt
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jaxtyping
@@ -44,14 +45,9 @@ class Bounds(NamedTuple):
 
     def check(self, value: float | int, place: str) -> None:
         """Reject a number out of the range, and NaN."""
-        rules = (
-            (self.above, "above", lambda bound: value > bound),
-            (self.least, "at least", lambda bound: value >= bound),
-            (self.most, "at most", lambda bound: value <= bound),
-            (self.below, "below", lambda bound: value < bound),
-        )
-        for bound, words, holds in rules:
-            if bound is not None and not holds(bound):
+        rules = (("above", gt), ("at least", ge), ("at most", le), ("below", lt))
+        for bound, (words, holds) in zip(self, rules, strict=True):
+            if bound is not None and not holds(value, bound):
                 rule = f"{words} {bound:.10g}" if math.isfinite(bound) else "finite"
                 raise InputError(f"`{place}` must be {rule}, but is {value}.")
 
@@ -145,26 +141,18 @@ def decode(
     return [{n: values[n] for n in keys if n in values} for keys in groups]
 
 
-def check_tables(content: dict[str, Any], known: list[str]) -> None:
-    """Reject what is no table, or none of those that a file may have."""
-    check_names(content, known)
-    for name, table in content.items():
-        if not isinstance(table, dict):
-            raise InputError(f"`{name}` must be a table, but {_came(table)}.")
-
-
-def check_names(table: dict[str, Any], known: list[str], place: str = "") -> None:
+def check_names(table: dict[str, Any], known: list[str], place: str = "the file") -> None:
     """Reject a key of a table, or a table of the file, that is not known."""
     name = next((name for name in table if name not in known), None)
     if name is None:
         return
-    full = f"{place}.{name}" if place else name
+    full = name if place == "the file" else f"{place}.{name}"
     if full in RENAMED:
         raise InputError(f"`{full}` was renamed to `{RENAMED[full]}`.")
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if near:
         raise InputError(f"`{full}` is no known key: did you mean `{near[0]}`?")
-    where = f"the table `[{place}]`" if place else "the file"
+    where = place if full == name else f"the table `[{place}]`"
     raise InputError(f"`{full}` is no known key: {where} has {', '.join(known)}.")
 
 
@@ -184,7 +172,9 @@ def decode_value(value: Any, hint: Any, place: str) -> Any:
         if made is not _OTHER:
             return made
     words = dict.fromkeys(_describe(option) for option in options)
-    raise InputError(f"`{place}` must be {' or '.join(words)}, but {_came(value)}.")
+    shown = json.dumps(value, ensure_ascii=False, default=str)
+    came = "a table" if isinstance(value, dict) else shown
+    raise InputError(f"`{place}` must be {' or '.join(words)}, but is {came}.")
 
 
 _SCALARS: dict[Any, tuple[Any, str]] = {
@@ -210,37 +200,24 @@ def _convert(value: Any, option: Any, place: str) -> Any:
     if origin is Literal:
         return value if value in arguments else _OTHER
     if origin in (list, tuple):
-        return _elements(value, origin, arguments, place) if isinstance(value, list) else _OTHER
-    if option in _SCALARS:
-        fits = isinstance(value, _SCALARS[option][0]) and isinstance(value, bool) == (
-            option is bool
-        )
-        return _scalar(value, option, place) if fits else _OTHER
-    return _array(value, place) if isinstance(value, float | int | list) else _OTHER
-
-
-def _scalar(value: Any, option: Any, place: str) -> Any:
-    if option is Unit:
-        return unit(value)
+        if not isinstance(value, list):
+            return _OTHER
+        repeated = origin is list or arguments[-1] is Ellipsis
+        hints = arguments[:1] * len(value) if repeated else arguments
+        if len(hints) != len(value):
+            raise InputError(f"`{place}` must hold {len(hints)} values, but holds {len(value)}.")
+        pairs = enumerate(zip(value, hints, strict=True))
+        return origin(decode_value(x, hint, f"{place}[{k}]") for k, (x, hint) in pairs)
+    if option not in _SCALARS:
+        try:
+            return _OTHER if isinstance(value, str | dict) else np.array(value, np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"`{place}` must hold numbers, in rows of equal length.") from error
+    if not isinstance(value, _SCALARS[option][0]) or isinstance(value, bool) != (option is bool):
+        return _OTHER
     if isinstance(value, str) and not value.isprintable():
         raise InputError(f"`{place}` holds a control character, {value!a}: remove it.")
-    return option(value)
-
-
-def _elements(value: list, kind: Any, hints: tuple[Any, ...], place: str) -> Any:
-    if kind is list or hints[-1] is Ellipsis:
-        hints = (hints[0],) * len(value)
-    if len(hints) != len(value):
-        raise InputError(f"`{place}` must hold {len(hints)} values, but holds {len(value)}.")
-    pairs = enumerate(zip(value, hints, strict=True))
-    return kind(decode_value(x, hint, f"{place}[{k}]") for k, (x, hint) in pairs)
-
-
-def _array(value: Any, place: str) -> np.ndarray:
-    try:
-        return np.array(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"`{place}` must hold numbers, in rows of equal length.") from error
+    return unit(value) if option is Unit else option(value)
 
 
 def table_of(option: Any) -> Callable | None:
@@ -272,9 +249,3 @@ def quoted(values: Iterable[Any]) -> str:
     """Return values as a sentence lists them: `"a", "b" or "c"`."""
     words = [f'"{v}"' if isinstance(v, str) else str(v) for v in values]
     return " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
-
-
-def _came(value: Any) -> str:
-    if isinstance(value, dict):
-        return "is a table"
-    return f"is {json.dumps(value, ensure_ascii=False, default=str)}"

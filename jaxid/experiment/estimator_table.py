@@ -9,33 +9,14 @@ from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import Bounds, Fraction, Positive, decode, keys_of, quoted
 from jaxid.experiment.robot_tables import RobotSource, named
+from jaxid.identification import estimators
 from jaxid.identification.consistency import BodyBounds, EntropicPull, PhysicallyConsistent
-from jaxid.identification.estimators import (
-    AbstractEstimator,
-    AbstractSolution,
-    AbstractWeights,
-    Complete,
-    CrossValidated,
-    GeneralisedLeastSquares,
-    Huber,
-    InstrumentalVariables,
-    IterativelyReweighted,
-    LeastSquares,
-    MaximumForces,
-    RelativeTo,
-    ResidualVariances,
-    Ridge,
-    Truncated,
-    Tukey,
-    WeightedLeastSquares,
-)
 from jaxid.identification.uncertainty import (
     AbstractUncertainty,
     BlockJackknife,
     IndependentRows,
     SpectralSandwich,
 )
-from jaxid.robot.robot import Robot
 from jaxid.trajectory.files import load_trajectory
 
 UNCERTAINTIES = {
@@ -74,8 +55,8 @@ class Estimation(NamedTuple):
         notes: Assumptions, in sentences.
     """
 
-    estimator: AbstractEstimator
-    plain: LeastSquares | WeightedLeastSquares
+    estimator: estimators.AbstractEstimator
+    plain: estimators.LeastSquares | estimators.WeightedLeastSquares
     uncertainty: AbstractUncertainty
     essential: float | None
     nonlinear: bool
@@ -93,10 +74,7 @@ def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     for name in (*given, *bounds):
         owners = [owner for owner, keys in KINDS.items() if name in keys]
         if owners and kind not in owners:
-            raise InputError(
-                f"`estimator.{name}`: belongs to `kind = {quoted(owners)}`: leave it out, or "
-                "change `kind`."
-            )
+            raise InputError(f"`estimator.{name}`: belongs to `kind = {quoted(owners)}`.")
     defaults = {name: key.default for name, key in keys_of(build_estimation).items()}
     changed = {name for name, value in given.items() if value and value != defaults[name]}
     for name, others in ALTERNATIVES:
@@ -123,7 +101,7 @@ def build_estimation(
     uncertainty: Literal["spectral", "jackknife", "independent"] = "spectral",
     limit: float | None = None,
     reference: str | list[str] | None = None,
-    reference_start: float | list[float] | None = None,
+    reference_start: float | list[float] = 0.0,
     margin: Fraction | None = None,
     pull: Positive | None = None,
 ) -> Estimation:
@@ -165,15 +143,27 @@ def build_estimation(
         InputError: If keys do not go together, or a file cannot be read.
     """
     robot = model.robot
-    joint_weights, notes = ResidualVariances(), []
-    if kind not in ("least_squares", "correlated"):
-        joint_weights, notes = _weights(robot, weights)
-    solution: AbstractSolution = Complete()
+    joint_weights: estimators.AbstractWeights = estimators.ResidualVariances()
+    notes = []
+    if weights != "residual_variances" and kind not in ("least_squares", "correlated"):
+        try:
+            _ = robot.max_forces
+            joint_weights = estimators.MaximumForces()
+        except InputError as error:
+            if weights is not None:
+                raise InputError(f'`weights = "maximum_forces"`: {error}') from error
+            notes.append(
+                "the largest forces of the joints are not known: joints are weighted by the "
+                "residuals' variances."
+            )
+    solution: estimators.AbstractSolution = estimators.Complete()
     if truncate is not None:
-        solution = Truncated(truncate)
+        solution = estimators.Truncated(truncate)
+    elif ridge == "cross_validated":
+        solution = estimators.CrossValidated()
     elif ridge is not None:
-        solution = CrossValidated() if isinstance(ridge, str) else Ridge(ridge)
-    plain = WeightedLeastSquares(joint_weights, solution)
+        solution = estimators.Ridge(ridge)
+    plain = estimators.WeightedLeastSquares(joint_weights, solution)
     bodies = None if prior is None else source.parameters(folder)
     if prior is not None and bodies is None:
         raise InputError('`prior = "urdf"` needs a robot with `robot.urdf`.')
@@ -181,21 +171,20 @@ def build_estimation(
         case "weighted":
             estimator = plain
         case "least_squares":
-            estimator = plain = LeastSquares(solution)
+            estimator = plain = estimators.LeastSquares(solution)
         case "huber" | "tukey":
-            loss = Huber if kind == "huber" else Tukey
-            given = {} if limit is None else {"limit": limit}
-            estimator = IterativelyReweighted(loss(**given), joint_weights, solution)
+            loss = estimators.Huber if kind == "huber" else estimators.Tukey
+            chosen = loss() if limit is None else loss(limit)
+            estimator = estimators.IterativelyReweighted(chosen, joint_weights, solution)
         case "correlated":
-            estimator = GeneralisedLeastSquares(solution)
+            estimator = estimators.GeneralisedLeastSquares(solution)
         case "instrumental":
             if reference is None:
                 raise InputError('`reference` is missing: `kind = "instrumental"` needs it.')
             names = [reference] if isinstance(reference, str) else reference
             references = tuple(load_trajectory(folder / name) for name in names)
-            begin = reference_start
-            starts = tuple(begin) if isinstance(begin, list) else (begin or 0.0,)
-            estimator = InstrumentalVariables(references, joint_weights, starts)
+            starts = reference_start if isinstance(reference_start, list) else [reference_start]
+            estimator = estimators.InstrumentalVariables(references, joint_weights, tuple(starts))
         case "consistent":
             entropic = EntropicPull(bodies, pull or 1.0) if pull or bodies is not None else None
             if "ellipsoid_centre" in bounds and "ellipsoid_axes" not in bounds:
@@ -203,29 +192,12 @@ def build_estimation(
             limits = BodyBounds.from_geometry(robot).replace(**bounds) if bounds else None
             estimator = PhysicallyConsistent(joint_weights, limits, margin or 0.0, entropic)
     if bodies is not None and kind != "consistent":
-        if isinstance(solution, Complete):
+        if isinstance(solution, estimators.Complete):
             raise InputError(
                 "`prior` needs `ridge` or `truncate`: without them the logs decide everything."
             )
         known = named(bodies)
         p = np.array([known.get(name, 0.0) for name in model.parameter_names])
-        estimator = RelativeTo(p, estimator)
+        estimator = estimators.RelativeTo(p, estimator)
     method = UNCERTAINTIES[uncertainty]()
     return Estimation(estimator, plain, method, essential, nonlinear_friction, notes)
-
-
-def _weights(robot: Robot, weights: str | None) -> tuple[AbstractWeights, list[str]]:
-    """Return the weights of the joints, and what is assumed."""
-    if weights == "residual_variances":
-        return ResidualVariances(), []
-    try:
-        _ = robot.max_forces
-    except InputError as error:
-        if weights is not None:
-            raise InputError(f'`weights = "maximum_forces"`: {error}') from error
-        note = (
-            "the largest forces of the joints are not known: joints are weighted by the residuals' "
-            "variances."
-        )
-        return ResidualVariances(), [note]
-    return MaximumForces(), []

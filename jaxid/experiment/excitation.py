@@ -8,13 +8,9 @@ import jax
 import numpy as np
 
 from jaxid.arrays import Float, double_precision
+from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.excitation.constraints import (
-    AbstractConstraint,
-    Clearance,
-    ForceLimits,
-    TipLimits,
-)
+from jaxid.excitation.constraints import AbstractConstraint, ForceLimits, TipLimits
 from jaxid.excitation.criteria import CRITERIA, information
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.plan import ExcitationPlan
@@ -35,22 +31,19 @@ class Nominal(NamedTuple):
     """Base parameters as far as they are known before the experiment.
 
     Attributes:
-        names: Names of the base parameters.
         parameters: Values; NaN where nothing is known.
         covariance: Covariance of an earlier fit; None if the parameters are only claimed. Zero for
             what the fit does not determine.
         undetermined: Names of parameters that an earlier fit does not determine.
     """
 
-    names: tuple[str, ...]
     parameters: Float[np.ndarray, " base"]
     covariance: Float[np.ndarray, "base base"] | None
     undetermined: tuple[str, ...] = ()
 
-    @property
-    def sizes(self) -> Float[np.ndarray, " base"]:
-        """Parameters; NaN also for what is not determined, whose estimate alone means nothing."""
-        return np.where(np.isin(self.names, self.undetermined), np.nan, self.parameters)
+    def force_limits(self, base: BaseParameters, margin: float) -> ForceLimits:
+        """Return the limits of forces that these parameters need."""
+        return ForceLimits(base, np.nan_to_num(self.parameters), self.covariance, margin)
 
 
 class Design(NamedTuple):
@@ -59,7 +52,6 @@ class Design(NamedTuple):
     Attributes:
         plan: Result of the optimisation.
         played: Motion from standstill to standstill where that is possible.
-        window: Times of it between which lies the designed motion [s].
         remarks: Remarks beside those of the plan.
         sampled: Motion as it is written in samples: until a sample meets its end.
         sample_time: Time between those samples [s].
@@ -67,7 +59,6 @@ class Design(NamedTuple):
 
     plan: ExcitationPlan
     played: AbstractTrajectory
-    window: tuple[float, float]
     remarks: tuple[Remark, ...]
     sampled: AbstractTrajectory
     sample_time: float
@@ -155,13 +146,17 @@ def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = 
     """Return what all designs of one experiment have in common."""
     table = experiment.excitation
     noise = assumed_noise(experiment.robot) if table.noise is None else np.array(table.noise)
-    constraints = find_constraints(experiment, nominal)
+    constraints, sizes = find_constraints(experiment, nominal), None
+    if nominal is not None:
+        # An estimate of what is not determined means nothing alone.
+        open_ones = np.isin(experiment.base.names, nominal.undetermined)
+        sizes = np.where(open_ones, np.nan, nominal.parameters)
     return {
         "basis": table.basis(bool(constraints)),
         "constraints": constraints,
         "key": jax.random.key(table.seed),
         "noise": noise,
-        "nominal": None if nominal is None else nominal.sizes,
+        "nominal": sizes,
         "prior": _earlier_information(experiment, noise) if weighted else None,
         "samples": table.samples,
     }
@@ -177,30 +172,23 @@ def find_constraints(
     """
     table = experiment.excitation
     constraints: list[AbstractConstraint] = []
-    if experiment.collision is not None:
-        constraints.append(Clearance(experiment.collision, experiment.clearance))
-    if table.tip_speed or table.tip_acceleration or table.workspace is not None:
-        box = ((-np.inf,) * 3, (np.inf,) * 3) if table.workspace is None else table.workspace
-        speeds = table.tip_speed or np.inf, table.tip_acceleration or np.inf
-        constraints.append(TipLimits(*speeds, *box))
+    if experiment.clearance is not None:
+        constraints.append(experiment.clearance)
+    tip = TipLimits(table.tip_speed, table.tip_acceleration, *(table.workspace or ()))
+    if tip.entries(experiment.robot):
+        constraints.append(tip)
     if table.force_margin is None:
         return tuple(constraints)
     if nominal is None:
         raise InputError(
-            "`force_margin` needs parameters to compute forces with: say in `nominal` where an "
-            "earlier result of `jaxid identify` is."
+            "`force_margin` needs parameters: say in `nominal` where an earlier report is."
         )
-    forces = _force_limits(experiment, nominal, table.force_margin)
+    forces = nominal.force_limits(experiment.base, table.force_margin)
     if not forces.entries(experiment.robot):
         raise InputError(
             "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
         )
     return (*constraints, forces)
-
-
-def _force_limits(experiment: Experiment, nominal: Nominal, margin: float) -> ForceLimits:
-    parameters = np.nan_to_num(nominal.parameters)
-    return ForceLimits(experiment.base, parameters, nominal.covariance, margin)
 
 
 def _earlier_information(
@@ -212,9 +200,8 @@ def _earlier_information(
         return None
     if not table.objective.weighted:
         raise InputError(
-            f'`earlier` and `criterion = "{table.criterion}"` do not go together: what motions '
-            "tell adds up in units of the noise, which this criterion does not know; leave out "
-            '`earlier`, or choose a criterion like "d_optimal".'
+            f'`earlier` and `criterion = "{table.criterion}"` do not go together: choose a '
+            'criterion in units of the noise, like "d_optimal".'
         )
     total = 0.0
     for name in table.earlier:
@@ -222,12 +209,11 @@ def _earlier_information(
         if trajectory.joints != experiment.robot.joints:
             raise InputError(
                 f"`earlier`: the motion of `{name}` moves {trajectory.joints} joint(s), but the "
-                f"robot `{experiment.robot.name}` has {experiment.robot.joints}: name motions of "
-                "this robot."
+                f"robot `{experiment.robot.name}` has {experiment.robot.joints}."
             )
         times = np.arange(table.samples) * (float(trajectory.duration) / table.samples)
-        weighted = information(experiment.base, trajectory.motion(times), 1.0 / noise).weighted
-        total = total + np.asarray(weighted)
+        known = information(experiment.base, trajectory.motion(times), 1.0 / noise)
+        total = total + np.asarray(known.weighted)
     return np.asarray(total)
 
 
@@ -237,34 +223,30 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
     Raises:
         InputError: If the earlier result is of other parameters.
     """
-    if experiment.excitation.nominal is not None:
-        return _earlier_result(experiment, experiment.excitation.nominal)
-    try:
-        bodies = experiment.source.parameters(experiment.path.parent)
-    except InputError:
-        if experiment.excitation.force_margin is not None:
-            raise
-        return None  # nothing depends on it, and the robot's notes name the body that cannot exist
-    if bodies is None or not np.any(bodies):
-        return None
-    base, standard, known = experiment.base, experiment.model.parameter_names, named(bodies)
-    values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
-    leads = [standard[k] in known for k in base.indices]
-    return Nominal(base.names, np.where(leads, values, np.nan), None)
-
-
-def _earlier_result(experiment: Experiment, report: str) -> Nominal:
-    base, fit = experiment.base, read_fit(experiment.path.parent / report)
+    base, report, folder = experiment.base, experiment.excitation.nominal, experiment.path.parent
+    if report is None:
+        try:
+            bodies = experiment.source.parameters(folder)
+        except InputError:
+            if experiment.excitation.force_margin is not None:
+                raise
+            return None  # nothing depends on it, and the robot's notes name the body
+        if bodies is None or not np.any(bodies):
+            return None
+        standard, known = experiment.model.parameter_names, named(bodies)
+        values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
+        leads = [standard[k] in known for k in base.indices]
+        return Nominal(np.where(leads, values, np.nan), None)
+    fit = read_fit(folder / report)
     if fit.base.names != base.names:
         raise InputError(
-            f"`nominal`: the {fit.base.size} base parameters of `{report}` are not the "
-            f"{base.size} of this experiment: identify with the same robot and model."
+            f"`nominal`: the base parameters of `{report}` are not the {base.size} of this file."
         )
     covariance = np.array(fit.covariance)
     undetermined = ~np.isfinite(np.diag(covariance))
     covariance[undetermined | undetermined[:, None]] = 0.0
     names = tuple(n for n, u in zip(base.names, undetermined, strict=True) if u)
-    return Nominal(base.names, np.asarray(fit.parameters), covariance, names)
+    return Nominal(np.asarray(fit.parameters), covariance, names)
 
 
 def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None) -> Design:
@@ -289,18 +271,7 @@ def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | 
     if begin > 0:
         text = f"from {begin:.3f} to {end:.3f} s of {float(motion.duration):.3f} s"
         remarks.append(Remark(f"the robot starts at rest and is in the designed motion {text}"))
-    remarks += _remarks(experiment, plan)
-    remarks += force_remarks(experiment, nominal, motion)
-    sampled = motion
-    if table.sample_time is not None:
-        step = table.sample_time
-        sampled = PaddedToCycle(motion, step) if rests else motion
-    return Design(plan, motion, (begin, end), tuple(remarks), sampled, step)
-
-
-def _remarks(experiment: Experiment, plan: ExcitationPlan) -> list[Remark]:
-    table = experiment.excitation
-    count = 1 if table.chosen_leads is None else table.chosen_leads.periods
+    count = 1 if leads is None else leads.periods
     notes = {
         "the noise is assumed as 1 % of the largest forces: give `noise` if it is known": (
             table.noise is None
@@ -308,10 +279,16 @@ def _remarks(experiment: Experiment, plan: ExcitationPlan) -> list[Remark]:
         f"deviations are those together with {', '.join(table.earlier)}": table.earlier,
         f"the motion runs through {count} periods; the deviations are of one": count > 1,
         "for relative deviations, say in `excitation.nominal` where an earlier result is": (
-            plan.nominal is None
+            nominal is None
         ),
     }
-    return [Remark(text) for text, holds in notes.items() if holds]
+    remarks += [Remark(text) for text, holds in notes.items() if holds]
+    remarks += force_remarks(experiment, nominal, motion)
+    sampled = motion
+    if table.sample_time is not None:
+        step = table.sample_time
+        sampled = PaddedToCycle(motion, step) if rests else motion
+    return Design(plan, motion, tuple(remarks), sampled, step)
 
 
 def force_remarks(
@@ -323,42 +300,36 @@ def force_remarks(
     if nominal is None:
         text = (
             "forces were not checked, although they have limits, for no parameters are known: "
-            "say in `excitation.nominal` where an earlier result is, and give `force_margin` to "
-            "keep the limits"
+            "say in `excitation.nominal` where an earlier report is, and give `force_margin`"
         )
         return [Remark(text, Status.DOUBTFUL)]
     remarks = []
     if experiment.excitation.force_margin is None:
-        remarks.append(_force_use(experiment, nominal, played))
-    unknown = [n for n, p in zip(nominal.names, nominal.parameters, strict=True) if np.isnan(p)]
+        with double_precision():
+            motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
+            limits = nominal.force_limits(experiment.base, 0.0)
+            values = np.asarray(limits(experiment.robot, motion))
+        worst = max(limits.describe(experiment.robot, values), key=lambda found: found.value)
+        nearest = f"{worst.name} with {100 * worst.used:.1f} % of {worst.limit:.4g} {worst.unit}"
+        text = (
+            "forces were not part of the design; by the nominal parameters they stay within their "
+            f"limits, the nearest being {nearest} (`force_margin` keeps them with room)"
+        )
+        if worst.value > 0:
+            text = (
+                "by the nominal parameters this motion needs more than robot and motors can give: "
+                f"{nearest}; give `force_margin`, and the design keeps these limits"
+            )
+        remarks.append(Remark(text, Status.BAD if worst.value > 0 else Status.NEUTRAL))
+    names = experiment.base.names
+    unknown = [n for n, p in zip(names, nominal.parameters, strict=True) if np.isnan(p)]
     if unknown:
         text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"
         remarks.append(Remark(text, Status.DOUBTFUL))
     if nominal.undetermined:
         text = (
             f"`{experiment.excitation.nominal}` does not determine "
-            f"{', '.join(nominal.undetermined)}: the forces are computed with its estimates of "
-            "them, whose uncertainty counts as zero"
+            f"{', '.join(nominal.undetermined)}: their uncertainty counts as zero"
         )
         remarks.append(Remark(text, Status.DOUBTFUL))
     return remarks
-
-
-def _force_use(experiment: Experiment, nominal: Nominal, played: AbstractTrajectory) -> Remark:
-    robot = experiment.robot
-    with double_precision():
-        motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
-        limits = _force_limits(experiment, nominal, 0.0)
-        findings = limits.describe(robot, np.asarray(limits(robot, motion)))
-    worst = max(findings, key=lambda finding: finding.value)
-    nearest = f"{worst.name} with {100 * worst.used:.1f} % of {worst.limit:.4g} {worst.unit}"
-    if worst.value > 0:
-        return Remark(
-            "by the nominal parameters this motion needs more than robot and motors can give: "
-            f"{nearest}; give `force_margin`, and the design keeps these limits",
-            Status.BAD,
-        )
-    return Remark(
-        "forces were not part of the design; by the nominal parameters they stay within their "
-        f"limits, the nearest being {nearest} (`force_margin` keeps them with room)"
-    )

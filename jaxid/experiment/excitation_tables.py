@@ -1,14 +1,16 @@
 """The tables `[collision]` and `[excitation]` of an experiment file."""
 
 import dataclasses
+import math
+import typing
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.excitation import criteria
-from jaxid.excitation.criteria import AbstractCriterion
+from jaxid.excitation.constraints import Clearance
+from jaxid.excitation.criteria import CRITERIA, AbstractCriterion
 from jaxid.experiment.decoder import Bounds, Count, Positive, Vector
 from jaxid.experiment.robot_tables import RobotSource, joint_number
 from jaxid.robot.collision import (
@@ -28,6 +30,15 @@ from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
 
 Corner = tuple[float, float, float]
+CriterionName = Literal[
+    "condition_number",
+    "weighted_condition_number",
+    "scaled_condition_number",
+    "d_optimal",
+    "a_optimal",
+    "e_optimal",
+]
+"""Names of all criteria, in their order."""
 
 
 def capsule(
@@ -83,8 +94,8 @@ class Collision:
     boxes: tuple[Annotated[Box, box], ...] = ()
     pairs: list[tuple[str, str]] | None = None
 
-    def build(self, robot: Robot, source: RobotSource, folder: Path) -> CollisionModel:
-        """Return the collision model; the robot's source may know shapes.
+    def build(self, robot: Robot, source: RobotSource, folder: Path) -> Clearance:
+        """Return the distance that shapes must keep; the robot's source may know shapes.
 
         Raises:
             InputError: If shapes cannot be made, or a name is unknown.
@@ -96,7 +107,8 @@ class Collision:
         obstacles += self.boxes
         if self.ground is not None:
             obstacles.append(HalfSpace("ground", height=self.ground))
-        return CollisionModel(robot, capsules, obstacles, self.pairs or pairs)
+        model = CollisionModel(robot, capsules, obstacles, self.pairs or pairs)
+        return Clearance(model, self.distance)
 
     def _fitted(
         self, source: RobotSource, folder: Path
@@ -109,8 +121,7 @@ class Collision:
         moved = source.base_rotation is not None or source.base_position is not None
         if source.builtin != "tx90l_on_rail" or moved:
             raise InputError(
-                "`fit` needs `robot.urdf`, or the built-in robot tx90l_on_rail without "
-                "`robot.base_rotation` and `robot.base_position`: give `capsules` instead."
+                "`fit` needs `robot.urdf`, or tx90l_on_rail where it stands: give `capsules`."
             )
         model = tx90l_on_rail_collision()
         # New shapes are to be watched too: then all pairs are found anew.
@@ -119,20 +130,6 @@ class Collision:
         names = [s.name for s in (*model.capsules, *model.obstacles)]
         pairs = [(names[i], names[k]) for i, k in model.pairs]
         return list(model.capsules), obstacles, pairs if alone else None
-
-
-def spline_basis(
-    *,
-    points: Annotated[int, Bounds(least=4, most=100)] = 12,
-    duration: Annotated[float, Bounds(above=0.0, most=10_000.0)] = 8.0,
-) -> RestToRestSplineBasis:
-    """Return a spline from standstill to standstill.
-
-    Args:
-        points: Number of coefficients of a joint.
-        duration: Duration [s].
-    """
-    return RestToRestSplineBasis(points, duration)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,18 +182,11 @@ class Excitation:
             `[[-1.0, -1.0, 0.1], [1.0, 1.0, 1.5]]`.
     """
 
-    criterion: Literal[
-        "d_optimal",
-        "a_optimal",
-        "e_optimal",
-        "condition_number",
-        "weighted_condition_number",
-        "scaled_condition_number",
-    ] = "d_optimal"
+    criterion: CriterionName = "d_optimal"
     harmonics: Annotated[int, Bounds(least=1, most=50)] = 5
     omega: Annotated[float, Bounds(above=0.0, most=1000.0)] = 0.8
     rest: bool = False
-    spline: Annotated[RestToRestSplineBasis, spline_basis] | None = None
+    spline: RestToRestSplineBasis | None = None
     leads: bool | Leads = True
     samples: Annotated[int, Bounds(least=2, most=10_000_000)] = 800
     noise: list[Annotated[float, Bounds(above=0.0, below=1e9)]] | None = None
@@ -209,17 +199,14 @@ class Excitation:
     nominal: str | None = None
     earlier: tuple[str, ...] = ()
     force_margin: Annotated[float, Bounds(least=0.0, below=1.0)] | None = None
-    tip_speed: Positive | None = None
-    tip_acceleration: Positive | None = None
+    tip_speed: Positive = math.inf
+    tip_acceleration: Positive = math.inf
     workspace: tuple[Corner, Corner] | None = None
 
     @property
     def objective(self) -> AbstractCriterion:
-        """Criterion of that name: `d_optimal` stands for the class `DOptimal`."""
-        if self.criterion.endswith("condition_number"):
-            weighted = self.criterion != "condition_number"
-            return criteria.ConditionNumber(weighted, self.criterion.startswith("scaled"))
-        return getattr(criteria, self.criterion.title().replace("_", ""))()
+        """Criterion of that name."""
+        return CRITERIA[typing.get_args(CriterionName).index(self.criterion)]
 
     @property
     def chosen_leads(self) -> Leads | None:
@@ -243,21 +230,15 @@ class Excitation:
         leads, series = self.chosen_leads, (self.harmonics, self.omega)
         if self.rest:
             return RestToRestBasis(*series)
-        if leads is None:
-            self._check_sample_time(2 * np.pi / self.omega)
+        if leads is None and self.sample_time is not None:
+            # Samples at full speed must not end before the period or go on after it.
+            period, step = 2 * np.pi / self.omega, self.sample_time
+            count = count_cycles(period, step)
+            if abs(count * step - period) > 1e-6 * step:
+                raise InputError(
+                    f"`sample_time` must divide the period of {period:.9g} s where there are no "
+                    f"`leads`: choose `omega` = {2 * np.pi / (count * step):.9g}, or use `leads`."
+                )
         if leads is None or (not constrained and leads.time is None):
             return FourierBasis(*series)
         return LeadsBasis(*series, lead=leads.time or 0.5, periods=leads.periods)
-
-    def _check_sample_time(self, period: float) -> None:
-        """Reject samples of a motion at full speed that end before it or go on after it."""
-        step = self.sample_time
-        if step is None:
-            return
-        count = count_cycles(period, step)
-        if abs(count * step - period) > 1e-6 * step:
-            raise InputError(
-                f"`sample_time` must divide the period of {period:.9g} s where there are no "
-                f"`leads`, for the motion repeats at full speed, but is {step:g} s: choose `omega` "
-                f"= {2 * np.pi / (count * step):.9g}, or leave `leads` as they are."
-            )

@@ -14,7 +14,8 @@ from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import call, check_tables, within
+from jaxid.excitation.constraints import Clearance
+from jaxid.experiment.decoder import call, check_names, within
 from jaxid.experiment.estimator_table import Estimation, build_estimation, decode_estimator
 from jaxid.experiment.excitation_tables import Collision, Excitation
 from jaxid.experiment.method_tables import (
@@ -28,9 +29,7 @@ from jaxid.experiment.method_tables import (
 from jaxid.experiment.robot_tables import RobotSource, known_load, replace_drives, replace_limits
 from jaxid.identification.choices import FilterCandidate, essential_parameters
 from jaxid.identification.consistency import BodyBounds
-from jaxid.identification.estimators import (
-    NonlinearFriction,
-)
+from jaxid.identification.estimators import NonlinearFriction
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.nonlinear_friction import identify_nonlinear
@@ -41,7 +40,6 @@ from jaxid.measurement.log_files import estimated_rows
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import read_recording, scan_log
 from jaxid.measurement.recording import NeedsMemory, Recording, remove_delay
-from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot, Tool
 
 TABLES: dict[str, tuple[Callable, ...]] = {
@@ -72,8 +70,7 @@ class Experiment:
         source: Source of the robot.
         robot: Robot with its limits, drives and known tool.
         model: Effects whose parameters are wanted.
-        collision: Shapes that must keep a distance; None if the file has none.
-        clearance: Least distance between them [m].
+        clearance: Shapes that must keep a distance; None if the file has none.
         columns: Columns of the logs; None if the file does not say.
         logs: Sides, files and parts of the logs.
         load: Known load that is on the robot in some logs only; None if the file does not say.
@@ -92,8 +89,7 @@ class Experiment:
     source: RobotSource
     robot: Robot
     model: Model
-    collision: CollisionModel | None
-    clearance: float
+    clearance: Clearance | None
     columns: Columns | None
     logs: Logs
     load: Tool | None
@@ -117,10 +113,8 @@ class Experiment:
         if self.linear is not None:
             linear = base_parameters(Model(self.robot, self.linear))
             estimator = NonlinearFriction(chosen.plain)
-            choice = identify_nonlinear(
-                self.base, logs, estimator, linear=linear, progress=progress
-            )
-            return choice.better
+            found = identify_nonlinear(self.base, logs, estimator, linear=linear, progress=progress)
+            return found.better
         fit = fit_problem(rows, chosen.estimator, uncertainty=chosen.uncertainty)
         if chosen.essential is None:
             return fit
@@ -141,21 +135,18 @@ class Experiment:
         if recording.joints != self.robot.joints:
             raise InputError(
                 f"{self.path.name}: `recording.angles` names {recording.joints} of the "
-                f"columns of `{log.name}`, but the robot `{self.robot.name}` has "
-                f"{self.robot.joints} joints: name one column for each joint, or choose another "
-                "robot (`robot.tip`)."
+                f"columns of `{log.name}`, but `{self.robot.name}` has {self.robot.joints} joints: "
+                "name one column for each, or choose another robot (`robot.tip`)."
             )
         with within("recording", self.path.name):
             if recording.sample_time < 1e-6:
+                rate = 1 / recording.sample_time
                 raise InputError(
-                    f"`{log.name}` has {1 / recording.sample_time:.3g} samples in a second: check "
-                    "`time_unit` or `sample_time`."
+                    f"`{log.name}` has {rate:.3g} samples in a second: check its unit."
                 )
             if np.isfinite((logs.start, logs.stop)).any():
                 recording = recording.crop(logs.start, logs.stop)
-            if logs.force_delay:
-                recording = remove_delay(recording, logs.force_delay)
-        return recording
+            return remove_delay(recording, logs.force_delay) if logs.force_delay else recording
 
     def observe(self, recording: Recording) -> Observations:
         """Filter a recording and make rows of it, as the tables `[filter]` and `[rows]` say."""
@@ -192,8 +183,7 @@ class Experiment:
     def _columns_of(self, log: Path) -> Columns:
         if self.columns is None:
             raise InputError(
-                f"{self.path.name}: the table `[recording]` is missing: it says which columns of "
-                f"`{log.name}` hold angles and forces."
+                f"{self.path.name}: the table `[recording]` is missing: columns of `{log.name}`."
             )
         return self.columns
 
@@ -225,7 +215,10 @@ def load_experiment(path: str | Path) -> Experiment:
 
 def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return the fields of an experiment from the tables of its file."""
-    check_tables(content, list(TABLES))
+    check_names(content, list(TABLES))
+    for name, table in content.items():
+        if not isinstance(table, dict):
+            raise InputError(f"`{name}` must be a table, but is {table!r}.")
     if "robot" not in content:
         raise InputError("the table `[robot]` is missing: give it `urdf`, `builtin` or `dh`.")
     source = call(RobotSource, content["robot"], "robot")
@@ -236,7 +229,7 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
             robot = call(replace, content[name], name, robot)
     effects = call(Effects, content.get("model", {}), "model")
     with within("model"):
-        model = Model(robot, effects.terms(robot))
+        model = Model(robot, effects.build(robot))
     filters, filter_notes = build_filters(content.get("filter"))
     decimation, min_speed = call(build_rows, content.get("rows", {}), "rows", robot)
     columns, logs = None, Logs()
@@ -245,24 +238,25 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     given, bounds = decode_estimator(content.get("estimator", {}))
     with within("estimator"):
         estimation = build_estimation(model, source, folder, bounds, **given)
-    shapes = call(Collision, content["collision"], "collision") if "collision" in content else None
-    with within("collision"):
-        collision = None if shapes is None else shapes.build(robot, source, folder)
-    load = call(known_load, content["load"], "load") if "load" in content else None
-    with within("load"):
-        tool = None if load is None else load(robot)
-    several = len(filters) > 1
+    clearance, tool = None, None
+    if "collision" in content:
+        shapes = call(Collision, content["collision"], "collision")
+        with within("collision"):
+            clearance = shapes.build(robot, source, folder)
+    if "load" in content:
+        load = call(known_load, content["load"], "load")
+        with within("load"):
+            tool = load(robot)
     return {
         "source": source,
         "robot": robot,
         "model": model,
-        "collision": collision,
-        "clearance": 0.0 if shapes is None else shapes.distance,
+        "clearance": clearance,
         "columns": columns,
         "logs": logs,
         "load": tool,
         "filter": filters[0],
-        "candidates": tuple((f, decimation) for f in filters if several),
+        "candidates": tuple((f, decimation) for f in filters if len(filters) > 1),
         "decimation": decimation,
         "min_speed": min_speed,
         "estimation": estimation,

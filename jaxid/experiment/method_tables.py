@@ -7,21 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.dynamics.terms import (
-    AbstractTerm,
-    AbstractTransition,
-    AsymmetricCoulombFriction,
-    ConstantOffset,
-    CoulombFriction,
-    CoupledDrives,
-    HardSign,
-    LinearSpring,
-    RigidBodies,
-    RotorInertia,
-    StribeckFriction,
-    Tanh,
-    ViscousFriction,
-)
+from jaxid.dynamics import terms
 from jaxid.errors import InputError
 from jaxid.experiment.decoder import (
     Bounds,
@@ -33,24 +19,16 @@ from jaxid.experiment.decoder import (
     decode_value,
     within,
 )
+from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.filters import (
-    AbstractDecimation,
-    AbstractFilter,
-    Decimation,
-    PaperFilter,
-    PeriodicFourier,
-    Subsample,
-    ZeroPhaseButterworth,
-)
 from jaxid.measurement.units import Unit
 from jaxid.robot.joints import per_joint
 from jaxid.robot.robot import Robot
 
-FILTERS: dict[str, type[AbstractFilter]] = {
-    "butterworth": ZeroPhaseButterworth,
-    "paper": PaperFilter,
-    "periodic": PeriodicFourier,
+FILTERS: dict[str, type[filters.AbstractFilter]] = {
+    "butterworth": filters.ZeroPhaseButterworth,
+    "paper": filters.PaperFilter,
+    "periodic": filters.PeriodicFourier,
 }
 CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
@@ -78,26 +56,23 @@ class DryFriction:
     asymmetric: bool = False
     stribeck: Positive | list[Positive] | None = None
 
-    def transition(self, robot: Robot) -> AbstractTransition:
+    def transition(self, robot: Robot) -> terms.AbstractTransition:
         """Return the transition between the directions."""
         dead_zone = _speed(robot, "coulomb.dead_zone", self.dead_zone)
         if self.hard:
-            return HardSign(dead_zone)
-        return Tanh(_speed(robot, "coulomb.epsilon", self.epsilon), dead_zone)
+            return terms.HardSign(dead_zone)
+        return terms.Tanh(_speed(robot, "coulomb.epsilon", self.epsilon), dead_zone)
 
-    def term(self, robot: Robot) -> AbstractTerm:
+    def term(self, robot: Robot) -> terms.AbstractTerm:
         """Return the term of the model."""
         transition = self.transition(robot)
         if self.stribeck is None:
-            kind = AsymmetricCoulombFriction if self.asymmetric else CoulombFriction
+            kind = terms.AsymmetricCoulombFriction if self.asymmetric else terms.CoulombFriction
             return kind(transition)
         if self.asymmetric:
-            raise InputError(
-                "give `coulomb.stribeck` or `coulomb.asymmetric`, but not both: one level for each "
-                "direction has no Stribeck effect here."
-            )
+            raise InputError("give `coulomb.stribeck` or `coulomb.asymmetric`, but not both.")
         speed = _speed(robot, "coulomb.stribeck", self.stribeck)
-        return StribeckFriction(speed=speed, transition=transition)
+        return terms.StribeckFriction(speed=speed, transition=transition)
 
 
 def _speed(
@@ -128,33 +103,33 @@ class Effects:
     offset: bool | None = None
     springs: bool = False
     coupled_drives: bool | None = None
-    coulomb: bool | DryFriction = True
+    coulomb: bool | DryFriction | None = None
 
-    def terms(self, robot: Robot) -> tuple[AbstractTerm, ...]:
+    def build(self, robot: Robot) -> tuple[terms.AbstractTerm, ...]:
         """Return the terms of the model, in the paper's order."""
-        dry = DryFriction() if isinstance(self.coulomb, bool) else self.coulomb
+        dry = self.coulomb if isinstance(self.coulomb, DryFriction) else DryFriction()
         # An offset is half of what two levels of dry friction can express already.
         offset = not dry.asymmetric if self.offset is None else self.offset
         coupled = self.coupled_drives
         if coupled is None:
-            coupled = bool(CoupledDrives().couplings(robot))
-        terms = (
-            RigidBodies(principal_axes=self.principal_axes),
-            self.viscous and ViscousFriction(),
+            coupled = bool(terms.CoupledDrives().couplings(robot))
+        chosen = (
+            terms.RigidBodies(principal_axes=self.principal_axes),
+            self.viscous and terms.ViscousFriction(),
             self.coulomb is not False and dry.term(robot),
-            self.rotor_inertia and RotorInertia(),
-            offset and ConstantOffset(),
-            coupled and CoupledDrives(dry.transition(robot)),
-            self.springs and LinearSpring(),
+            self.rotor_inertia and terms.RotorInertia(),
+            offset and terms.ConstantOffset(),
+            coupled and terms.CoupledDrives(dry.transition(robot)),
+            self.springs and terms.LinearSpring(),
         )
-        return tuple(term for term in terms if not isinstance(term, bool))
+        return tuple(term for term in chosen if not isinstance(term, bool))
 
-    def linear_terms(self, robot: Robot) -> tuple[AbstractTerm, ...]:
+    def linear_terms(self, robot: Robot) -> tuple[terms.AbstractTerm, ...]:
         """Return the terms with Coulomb's law in place of Stribeck's."""
         if not isinstance(self.coulomb, DryFriction):
-            return self.terms(robot)
+            return self.build(robot)
         coulomb = dataclasses.replace(self.coulomb, stribeck=None)
-        return dataclasses.replace(self, coulomb=coulomb).terms(robot)
+        return dataclasses.replace(self, coulomb=coulomb).build(robot)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,46 +175,37 @@ def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, Logs]:
     given, reading = decode([Columns, Logs], table, "recording", skip=SIDES)
     with within("recording"):
         logs = Logs(**reading)
-        on_motor_side = (logs.side == "motor", (logs.forces_side or logs.side) == "motor")
-        columns = Columns(**given, **dict(zip(SIDES, on_motor_side, strict=True)))
+        motors, motor_forces = logs.side == "motor", (logs.forces_side or logs.side) == "motor"
+        columns = Columns(**given, **dict(zip(SIDES, (motors, motor_forces), strict=True)))
         still = np.zeros((1, robot.joints))
         columns.to_si(still, still, still)  # refuses lists that do not fit the robot
-        for name, motors in (
-            ("angle_unit", on_motor_side[0]),
-            ("velocity_unit", on_motor_side[0]),
-            ("force_unit", on_motor_side[1]),
-        ):
-            if name in given and not motors:
-                _refuse_mixed(robot, name, given[name])
+        checked = [] if motors else ["angle_unit", "velocity_unit"]
+        for name in (*checked, *([] if motor_forces else ["force_unit"])):
+            units = given.get(name, ())
+            units = [units] * robot.joints if isinstance(units, Unit) else units
+            for label, turns, one in zip(robot.joint_names, robot.revolute, units, strict=False):
+                foreign = ("mm", "mm/s", "N") if turns else ("deg", "rev", "deg/s", "rpm", "N m")
+                if one.symbol in foreign:
+                    raise InputError(
+                        f'`{name}` of joint `{label}` is "{one.symbol}", but the joint '
+                        f"{'turns' if turns else 'slides'}: give a list of units."
+                    )
     return columns, logs
 
 
-def _refuse_mixed(robot: Robot, name: str, value: Unit | tuple[Unit, ...]) -> None:
-    """Reject degrees or N m for a joint that slides, and millimetres or N for one that turns."""
-    units = (value,) * robot.joints if isinstance(value, Unit) else value
-    for label, turns, one in zip(robot.joint_names, robot.revolute, units, strict=True):
-        foreign = ("mm", "mm/s", "N") if turns else ("deg", "rev", "deg/s", "rpm", "N m")
-        if one.symbol in foreign:
-            raise InputError(
-                f'`{name}` of joint `{label}` is "{one.symbol}", but the joint '
-                f"{'turns' if turns else 'slides'}: give a list with one unit for each joint."
-            )
-
-
-def build_filters(table: dict[str, Any] | None) -> tuple[list[AbstractFilter], list[str]]:
+def build_filters(table: dict[str, Any] | None) -> tuple[list[filters.AbstractFilter], list[str]]:
     """Return the filter, or several to choose from, and what is assumed without a table."""
     if table is None:
         note = (
             f"no table `[filter]`: a Butterworth low-pass at {CUTOFF:g} Hz is assumed; choose "
             "about five times the highest frequency of the motion."
         )
-        return [ZeroPhaseButterworth(CUTOFF)], [note]
+        return [filters.ZeroPhaseButterworth(CUTOFF)], [note]
     kind = decode_value(table.get("kind", ""), FilterKind, "filter.kind")
     keys = {name: value for name, value in table.items() if name != "kind"}
-    cutoffs = keys.get("cutoff")
     tables = [keys]
-    if isinstance(cutoffs, list):
-        tables = [{**keys, "cutoff": cutoff} for cutoff in cutoffs]
+    if isinstance(keys.get("cutoff"), list):
+        tables = [{**keys, "cutoff": cutoff} for cutoff in keys["cutoff"]]
     if not tables:
         raise InputError("`filter.cutoff` must be a number, or a list to choose from.")
     return [call(FILTERS[kind], one, "filter") for one in tables], []
@@ -251,7 +217,7 @@ def build_rows(
     step: Count | None = None,
     factors: list[Count] | None = None,
     min_speed: Magnitude | list[Magnitude] | None = None,
-) -> tuple[AbstractDecimation, Float[np.ndarray, " joints"] | None]:
+) -> tuple[filters.AbstractDecimation, Float[np.ndarray, " joints"] | None]:
     """Rows of the least-squares problem, and samples that become rows.
 
     Args:
@@ -265,11 +231,10 @@ def build_rows(
         InputError: If two ways are asked for, or a factor is too large.
     """
     if step is not None and factors is not None:
-        raise InputError(
-            "give `step` (takes every n-th sample) or `factors` (low-pass filters before every "
-            "stage), but not both."
-        )
+        raise InputError("give `step` or `factors`, which also low-pass filter, but not both.")
     speed = None
     if min_speed is not None:
         speed = np.broadcast_to(_speed(robot, "min_speed", min_speed), (robot.joints,)) + 0.0
-    return Subsample(step or 1) if factors is None else Decimation(tuple(factors)), speed
+    if factors is not None:
+        return filters.Decimation(tuple(factors)), speed
+    return filters.Subsample(step or 1), speed

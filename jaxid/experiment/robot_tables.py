@@ -14,7 +14,7 @@ from jaxid.robot import library
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.joints import Limits, per_joint, range_fault
 from jaxid.robot.library import from_dh
-from jaxid.robot.robot import GRAVITY, Robot, Tool
+from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 
@@ -173,45 +173,28 @@ class RobotSource:
 
     def build(self, folder: Path) -> Robot:
         """Return the robot; paths are relative to the folder of the experiment file."""
-        robot = self._build(folder)
-        if self.name is not None:
-            robot = robot.replace(name=self.name)
-        return robot if self.tool is None else robot.replace(tool=self.tool(robot))
-
-    def _build(self, folder: Path) -> Robot:
-        gravity = self.gravity or GRAVITY
         if self.urdf is not None:
             path = folder / self.urdf
             if not path.is_file():
-                raise InputError(
-                    f"`urdf`: `{path}` is no file: paths in an experiment file are relative to its "
-                    "folder; mend the path, or put the file there."
-                )
-            return load_urdf(path, gravity=gravity, **self.chain, **self.placement)
-        if self.dh is not None:
-            return self._from_dh(self.dh, gravity)
-        robot = getattr(library, cast(str, self.builtin))()
+                raise InputError(f"`urdf`: `{path}` is no file: paths are relative to this file.")
+            robot = load_urdf(path, **self.chain, **self.placement)
+        elif self.dh is not None:
+            robot = from_dh(
+                [numbers for _, _, numbers in self.dh],
+                convention=self.convention or "",
+                revolute=tuple(not slides for _, slides, _ in self.dh),
+                joint_names=tuple(name or f"joint{i}" for i, (name, *_) in enumerate(self.dh, 1)),
+                snap_tolerance=self.chain["snap_tolerance"],
+                source="Denavit-Hartenberg table of the experiment file",
+                **self.placement,
+            )
+        else:
+            robot = getattr(library, cast(str, self.builtin))().mounted(*self.placement.values())
         if self.gravity is not None:
             robot = robot.replace(gravity=np.array(self.gravity))
-        return robot.mounted(*self.placement.values())
-
-    def _from_dh(self, rows: list[DhRow], gravity: Vector) -> Robot:
-        if self.convention is None:
-            raise InputError(
-                '`convention` is needed with `dh`: "modified" lists alpha and a of the link before '
-                'each joint, "standard" those of the link after it.'
-            )
-        return from_dh(
-            [numbers for _, _, numbers in rows],
-            convention=self.convention,
-            name=self.name or "robot",
-            revolute=tuple(not slides for _, slides, _ in rows),
-            joint_names=tuple(name or f"joint{i + 1}" for i, (name, _, _) in enumerate(rows)),
-            gravity=gravity,
-            snap_tolerance=self.chain["snap_tolerance"],
-            source="Denavit-Hartenberg table of the experiment file",
-            **self.placement,
-        )
+        if self.name is not None:
+            robot = robot.replace(name=self.name)
+        return robot if self.tool is None else robot.replace(tool=self.tool(robot))
 
     def parameters(self, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
         """Return the bodies' parameters that the URDF file claims; None if there is no such file.
@@ -266,21 +249,10 @@ def replace_limits(
         fields[name] = np.where(known, getattr(robot.limits, name), new)
         told += [f"{name} of {j}" for j, k in zip(robot.joint_names, known, strict=True) if not k]
         told += [] if known.any() else [name]
-    _check_limits(robot, fields)
-    assumed = tuple(name for name in robot.limits.assumed if name not in told)
-    limits = Limits(robot.joints, **fields, assumed=assumed)
-    return robot.replace(limits=limits)
-
-
-def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
-    return np.where(np.array(robot.revolute) & (unit == "deg"), np.pi / 180, 1.0)
-
-
-def _check_limits(robot: Robot, fields: dict[str, np.ndarray]) -> None:
-    """Reject forces that no joint has, so that weights stay finite, and ranges in other units."""
-    force = fields["force"]
-    if ((force > 0) & (force < 1e-9)).any() or (np.isfinite(force) & (force >= 1e9)).any():
-        raise InputError(f"`force` must lie between 1e-9 and 1e9 N m or N, but is {force}.")
+    # Forces that no joint has would make weights infinite.
+    most = np.asarray(fields["force"])
+    if ((most > 0) & (most < 1e-9)).any() or (np.isfinite(most) & (most >= 1e9)).any():
+        raise InputError(f"`force` must lie between 1e-9 and 1e9 N m or N, but is {most}.")
     for j, name in enumerate(robot.joint_names):
         low, high = fields["position_min"][j], fields["position_max"][j]
         if why := range_fault(low, high, robot.revolute[j]):
@@ -288,6 +260,13 @@ def _check_limits(robot: Robot, fields: dict[str, np.ndarray]) -> None:
             if robot.revolute[j]:
                 cure = 'for degrees add `angle_unit = "deg"`, and inf means no limit'
             raise InputError(f"joint `{name}` {why}: {cure}.")
+    assumed = tuple(name for name in robot.limits.assumed if name not in told)
+    limits = Limits(robot.joints, **fields, assumed=assumed)
+    return robot.replace(limits=limits)
+
+
+def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
+    return np.where(np.array(robot.revolute) & (unit == "deg"), np.pi / 180, 1.0)
 
 
 def replace_drives(
@@ -321,11 +300,8 @@ def replace_drives(
     n = robot.joints
     if matrix is not None and {len(matrix), *map(len, matrix)} != {n}:
         raise InputError(f"`matrix` must hold {n} rows of {n} numbers.")
-    new: dict[str, Any] = {
-        "max_torques": max_torques,
-        "rotor_inertia": rotor_inertia,
-        "reduction": matrix,
-    }
+    new: dict[str, Any] = {"max_torques": max_torques, "rotor_inertia": rotor_inertia}
+    new["reduction"] = matrix
     if gear_ratios is not None:
         new["reduction"] = per_joint("gear_ratios", gear_ratios, n, 1.0)
     if zero is not None:

@@ -5,13 +5,13 @@ import functools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 
 from jaxid.diagnosis import Diagnosis, diagnose
 from jaxid.diagnosis.diagnosis import mistakes_in_logs
-from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
 from jaxid.experiment.decoder import within
@@ -69,7 +69,18 @@ def load_log(
     notes = ()
     if experiment.is_long(path):
         try:
-            return _scan_log(experiment, path, stage, name)
+            stage(f"opening {path.name}")
+            log = experiment.open(path)
+            log = log if name is None else log.replace(name=name)
+            stage(f"looking through {path.name}")
+            robot, min_speed = experiment.robot, experiment.min_speed
+            diagnosis = diagnose(log, robot, min_speed=min_speed, progress=stage.through)
+            notes, step = (*log.notes, *diagnosis.notes), comparison_step(log)
+            if step > 1:
+                what = f"one of every {step} of its {log.rows} rows"
+                notes = (*notes, f"{log.name}: torque errors and figures take {what}")
+            log = log.replace(notes=notes)
+            return log, log, diagnosis
         except NeedsMemory as why:
             notes = (f"{path.name} is long, but was read as a whole: {why}",)
     stage(f"reading {path.name}")
@@ -80,30 +91,6 @@ def load_log(
     observations = experiment.observe(recording)
     diagnosis = diagnose(recording, experiment.robot, observations=observations)
     return recording, observations.replace(notes=(*observations.notes, *notes)), diagnosis
-
-
-def _scan_log(experiment: Experiment, path: Path, stage: Stages, name: str | None) -> LoadedLog:
-    stage(f"opening {path.name}")
-    log = experiment.open(path)
-    log = log if name is None else log.replace(name=name)
-    stage(f"looking through {path.name}")
-    robot, min_speed = experiment.robot, experiment.min_speed
-    diagnosis = diagnose(log, robot, min_speed=min_speed, progress=stage.through)
-    notes, step = [*log.notes, *diagnosis.notes], comparison_step(log)
-    if step > 1:
-        what = f"one of every {step} of its {log.rows} rows"
-        notes.append(f"{log.name}: torque errors and figures take {what}")
-    log = log.replace(notes=tuple(notes))
-    return log, log, diagnosis
-
-
-def load_logs(experiment: Experiment, paths: Sequence[Path], stage: Stages) -> list[LoadedLog]:
-    """Read and diagnose logs; equal names are preceded by their folders."""
-    stems = [p.stem for p in paths]
-    names = (
-        f"{p.resolve().parent.name}/{p.stem}" if stems.count(p.stem) > 1 else None for p in paths
-    )
-    return [load_log(experiment, p, stage, n) for p, n in zip(paths, names, strict=True)]
 
 
 def _findings(logs: Sequence[LoadedLog]) -> list[str]:
@@ -126,7 +113,7 @@ def select_filter(
     if long:
         raise InputError(
             f"{experiment.path.name}: `filter.cutoff` is a list, but `{long[0]}` is long: choose "
-            "with a short part of it, and give that one number for the whole."
+            "with a short part of it."
         )
     recordings = []
     for log in logs:
@@ -173,8 +160,7 @@ def read_runs(
     if experiment.linear is not None:
         raise InputError(
             f"{experiment.path.name}: `estimator.nonlinear_friction` would find other shapes of "
-            "friction in each run: leave it out, and give both runs the shapes that `jaxid "
-            "identify` finds, as `epsilon` and `stribeck` of `model.coulomb`."
+            "friction in each run: leave it out, and give their `epsilon` and `stribeck`."
         )
     estimation, doubts = experiment.estimation, []
     complete = isinstance(estimation.plain.solution, Complete)
@@ -200,8 +186,7 @@ def read_runs(
     return runs, doubts
 
 
-@dataclasses.dataclass(frozen=True)
-class Identification:
+class Identification(NamedTuple):
     """Result of the command `jaxid identify`.
 
     Attributes:
@@ -241,7 +226,12 @@ def identify_logs(
     logs = [p for p in paths if not p.is_dir()]
     reports = [p for p in paths if p.is_dir()]
     experiment, choice = select_filter(experiment, logs, stage, split)
-    loaded = load_logs(experiment, [*logs, *verify], stage)
+    loaded, stems = [], [path.stem for path in (*logs, *verify)]
+    for path in (*logs, *verify):
+        # Equal names are preceded by their folders.
+        folder = path.resolve().parent.name
+        name = f"{folder}/{path.stem}" if stems.count(path.stem) > 1 else None
+        loaded.append(load_log(experiment, path, stage, name))
     observations = [log for _, log, _ in loaded]
     fitted, unseen = observations[: len(logs)], observations[len(logs) :]
     if split is not None:
@@ -254,8 +244,7 @@ def identify_logs(
     rows = RegressionProblem(base, fitted, stage.through)
     fit = experiment.fit(rows, stage.through)
     if reports:
-        fit = _add_reports(experiment, reports, fit)
-        _refuse_seen(fit, base, unseen)
+        fit = _add_reports(experiment, reports, fit, unseen)
     stage("predicting torques")
     every = [*fitted, *unseen]
     validation = validate(fit, every, progress=stage.through)
@@ -266,8 +255,10 @@ def identify_logs(
     )
 
 
-def _add_reports(experiment: Experiment, reports: Sequence[Path], fit: Fit) -> Fit:
-    """Return a fit to all logs, those of earlier reports included."""
+def _add_reports(
+    experiment: Experiment, reports: Sequence[Path], fit: Fit, unseen: Sequence[Observations]
+) -> Fit:
+    """Return a fit to all logs, those of earlier reports included, which must not be unseen."""
     if fit.base.names != experiment.base.names or not fit.is_least_squares:
         essential = experiment.estimation.essential is not None
         kind = "for essential parameters" if essential else fit.estimator
@@ -275,13 +266,11 @@ def _add_reports(experiment: Experiment, reports: Sequence[Path], fit: Fit) -> F
             f"{experiment.path.name}: earlier reports can be added to plain least squares only, "
             f"but the estimator is {kind}: leave `[estimator]` out, or give the logs themselves."
         )
-    return functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), fit])
-
-
-def _refuse_seen(fit: Fit, base: BaseParameters, unseen: Sequence[Observations]) -> None:
+    fit = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), fit])
     for log in unseen:
-        if fit.blocks is not None and share_rows(fit.blocks, RegressionProblem(base, [log]).blocks):
+        rows = RegressionProblem(experiment.base, [log])
+        if fit.blocks is not None and share_rows(fit.blocks, rows.blocks):
             raise InputError(
-                f"a report that was given has seen the data of `{log.name}`: a model that has seen "
-                "a log is not verified by it; verify with another."
+                f"a report that was given has seen the data of `{log.name}`: verify with another."
             )
+    return fit

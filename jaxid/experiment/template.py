@@ -11,13 +11,13 @@ import os
 import re
 import textwrap
 import typing
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from jaxid.experiment.decoder import Key, keys_of, table_of
+from jaxid.experiment.decoder import Key, keys_of
 from jaxid.experiment.estimator_table import KINDS
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.method_tables import CUTOFF, FILTERS, SIDES, DryFriction
@@ -47,6 +47,10 @@ SUMMARIES = {
     '("{}" stands for the joint\'s number), a list of names, or positions from 0.',
 }
 """Descriptions of tables where the docstring of their function says something else."""
+INNER = {"robot": ("robot.tool", known_load), "model": ("model.coulomb", DryFriction)}
+"""Tables within others, and their functions."""
+OF_KINDS = {name for keys in KINDS.values() for name in keys} - {*KINDS["weighted"]}
+"""Keys of other kinds of estimators, which are commented out."""
 
 
 def write_template(
@@ -70,113 +74,79 @@ def write_template(
     """
     robot = load_urdf(urdf, tip=tip, base=base)
     path = Path(os.path.relpath(Path(urdf).resolve(), Path(folder).resolve()))
-    source = {"urdf": path.as_posix(), "tip": tip, "base": base}
     limits = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")
+    joints = range(robot.joints)
+    angles, forces = [*map(robot.joint_unit, joints)], [*map(robot.force_unit, joints)]
     values = {
-        "robot": {key: value for key, value in source.items() if value},
+        "robot": {"urdf": path.as_posix(), "tip": tip, "base": base},
         "limits": {name: np.asarray(getattr(robot.limits, name)).tolist() for name in limits},
         "drives": {"gear_ratios": [1.0] * robot.joints},
         "model": {"offset": True},
-        "recording": _recording(robot),
+        "recording": {
+            "angles": "q{}",
+            "forces": "tau{}",
+            "time": "time",
+            "angle_unit": angles if len({*angles}) > 1 else angles[0],
+            "force_unit": forces if len({*angles}) > 1 else forces[0],
+        },
         "filter": {"kind": "butterworth", "cutoff": CUTOFF},
         "estimator": {"kind": "weighted"},
     }
-    commented = {name for keys in KINDS.values() for name in keys} - {*KINDS["weighted"]}
     sections = [HEAD.format(name=robot.name)]
     for name, functions in TABLES.items():
-        functions = functions[:1] if name == "filter" else functions
-        table = _table(
-            name,
-            functions,
-            robot.joints,
-            values.get(name, {}),
-            commented if name == "estimator" else (),
-            active=name not in ("load", "collision"),
-        )
-        if name == "robot":
-            table += "\n" + _table("robot.tool", (known_load,), robot.joints, active=False)
-        if name == "limits":
-            table = _joints(robot) + table
-        if name == "model":
-            table += "\n" + _table("model.coulomb", (DryFriction,), robot.joints)
-        sections.append(table + (_other_filters(robot.joints) if name == "filter" else ""))
+        table = _table(name, functions, robot.joints, values.get(name, {}))
+        sections.append(_joints(robot) + table if name == "limits" else table)
+        if name in INNER:
+            inner, function = INNER[name]
+            sections.append(_table(inner, (function,), robot.joints, {}))
     return "\n".join(sections)
 
 
 def _table(
-    name: str,
-    functions: tuple[Callable, ...],
-    joints: int,
-    values: Mapping[str, Any] | None = None,
-    commented: Collection[str] = (),
-    *,
-    active: bool = True,
+    name: str, functions: tuple[Callable, ...], joints: int, values: Mapping[str, Any]
 ) -> str:
     """Return a table with all keys of some functions; some or all of them are commented out."""
-    values = values or {}
+    active = name not in ("load", "collision", "robot.tool")
     lines = _comment(SUMMARIES.get(name) or _summary(functions[0]))
     lines.append(f"{'' if active else '# '}[{name}]")
     if name == "filter":
         lines += _entry("kind", json.dumps(values["kind"]), "", True)
-    for key in (key for function in functions for key in keys_of(function).values()):
-        if key.name not in (*SIDES, "tool"):
-            shown = active and key.name not in commented
-            lines += _key(key, joints, values.get(key.name), shown)
-    return "\n".join(lines) + "\n"
-
-
-def _other_filters(joints: int) -> str:
-    """Return the keys of the other kinds of filters, as comments."""
-    lines, known = [], {*keys_of(FILTERS["butterworth"])}
-    for kind, function in list(FILTERS.items())[1:]:
-        lines += ["#", *_entry("kind", json.dumps(kind), _summary(function), False)]
+    known = {*SIDES, "tool"}
+    for number, function in enumerate(functions):
+        if name == "filter" and number > 0:
+            # Keys of the other kinds of filters are comments.
+            active, kind = False, list(FILTERS)[number]
+            lines += ["#", *_entry("kind", json.dumps(kind), _summary(function), False)]
         for key in keys_of(function).values():
             if key.name not in known:
-                lines += _key(key, joints, None, False)
+                shown = active and key.name not in OF_KINDS
+                lines += _key(key, joints, values.get(key.name), shown)
         known |= {*keys_of(function)}
     return "\n".join(lines) + "\n"
 
 
 def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
-    text, example = _split_example(key.text)
+    # The description as users of the file need it, and the example in it.
+    text = re.sub(r"[;,] (?:or )?None(?: if [^;.]*)?", "", key.text)
+    text = text.replace(" if None", " by default")
+    found = re.search(r",? like `([^`]+)`", text)
+    text, example = (text.replace(found[0], "", 1), found[1]) if found else (text, "")
     needed = key.default is inspect.Parameter.empty
-    if value is None and not (needed or _holds_table(key.hint) or (example and not active)):
+    if value is None and not (needed or (example and not active) or "=" in example):
         value = key.default
     shown = _toml(value)
     if shown is None:
-        active, shown = False, _example(key, joints, example)
+        # An example of the right type: a value for each joint where a list is needed.
+        active, option = False, union_members(key.hint)[0]
+        while typing.get_origin(option) is Annotated:
+            option = typing.get_args(option)[0]
+        kind, words = typing.get_origin(option), {int: "1", float: "1.0"}
+        if kind in (list, tuple) and not example.startswith("["):
+            example = f"[{', '.join([example or '1.0'] * joints)}]"
+        if kind is Literal:
+            words[option] = json.dumps(typing.get_args(option)[0])
+        shown = example or words.get(option, "true")
     yield from _entry(key.name, shown, text, active)
-
-
-def _holds_table(hint: Any) -> bool:
-    """Whether a value may hold tables."""
-    options = union_members(hint)
-    inner = [
-        x for o in options if typing.get_origin(o) in (list, tuple) for x in typing.get_args(o)
-    ]
-    return any(table_of(o) for o in options) or any(x is not ... and _holds_table(x) for x in inner)
-
-
-def _split_example(text: str) -> tuple[str, str]:
-    """Return a description as users of the file need it, and the example in it."""
-    text = re.sub(r"[;,] (?:or )?None(?: if [^;.]*)?", "", text).replace(" if None", " by default")
-    found = re.search(r",? like `([^`]+)`", text)
-    if found is None:
-        return text, ""
-    return text.replace(found[0], "", 1), found[1]
-
-
-def _example(key: Key, joints: int, example: str) -> str:
-    """Return a value of the right type; one for each joint where a list is needed."""
-    option = union_members(key.hint)[0]
-    while typing.get_origin(option) is Annotated:
-        option = typing.get_args(option)[0]
-    if typing.get_origin(option) in (list, tuple):
-        one = example or "1.0"
-        return one if one.startswith("[") else f"[{', '.join([one] * joints)}]"
-    if typing.get_origin(option) is Literal:
-        example = example or json.dumps(typing.get_args(option)[0])
-    return example or {int: "1", float: "1.0"}.get(option, "true")
 
 
 def _toml(value: Any) -> str | None:
@@ -223,18 +193,6 @@ def _summary(function: Callable) -> str:
     """Return the first sentence of a docstring, without formulas."""
     text = (inspect.getdoc(function) or "").split("\n\n")[0].replace("\n", " ")
     return re.sub(r" \$[^$]*\$", "", text)
-
-
-def _recording(robot: Robot) -> dict[str, Any]:
-    joints = range(robot.joints)
-    angles, forces = [*map(robot.joint_unit, joints)], [*map(robot.force_unit, joints)]
-    return {
-        "angles": "q{}",
-        "forces": "tau{}",
-        "time": "time",
-        "angle_unit": angles[0] if len(set(angles)) == 1 else angles,
-        "force_unit": forces[0] if len(set(angles)) == 1 else forces,
-    }
 
 
 def _joints(robot: Robot) -> str:

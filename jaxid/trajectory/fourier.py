@@ -198,14 +198,9 @@ def random_fourier_series(
     rows, factor = basis.envelope(512)
     q, qd, qdd = (x @ part.T for part in rows[:3])
     middle, swing = 0.5 * (q.max(1) + q.min(1)), 0.5 * factor * np.ptp(q, axis=1)
-    scale = np.min(
-        [
-            half / swing,
-            reach * limits.velocity / (factor * np.abs(qd).max(1)),
-            reach * limits.acceleration / (factor * np.abs(qdd).max(1)),
-        ],
-        axis=0,
-    )
+    scale = half / swing
+    for peaks, most in ((qd, limits.velocity), (qdd, limits.acceleration)):
+        scale = np.minimum(scale, reach * most / (factor * np.abs(peaks).max(1)))
     left = np.maximum(half - scale * swing, 0.0)
     x *= scale[:, None]
     x[:, 0] = centre - scale * middle + random.uniform(-1.0, 1.0, robot.joints) * left

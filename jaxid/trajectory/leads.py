@@ -71,14 +71,15 @@ class LeadsBasis(PeriodsBasis):
 
     def rows(self, t: Float[AnyArray, " samples"]) -> Float[AnyArray, "4 samples variables"]:
         """Return the series, or the polynomials that lead into it and out of it."""
-        return stand_outside(self._rows, t, self.duration)
 
-    def _rows(self, t: AnyArray) -> AnyArray:
-        xp = namespace(t, self.omega, self.lead)
-        early, late = t < self.lead, t > self.duration - self.lead
-        inner = self.series.rows(t - self.lead)
-        outer = xp.where(late[None, :, None], self._lead_rows(self.duration - t, -1), inner)
-        return xp.where(early[None, :, None], self._lead_rows(t, 1), outer)
+        def inside(t: AnyArray) -> AnyArray:
+            xp = namespace(t, self.omega, self.lead)
+            early, late = t < self.lead, t > self.duration - self.lead
+            inner = self.series.rows(t - self.lead)
+            outer = xp.where(late[None, :, None], self._lead_rows(self.duration - t, -1), inner)
+            return xp.where(early[None, :, None], self._lead_rows(t, 1), outer)
+
+        return stand_outside(inside, t, self.duration)
 
     def _lead_rows(self, x: AnyArray, sign: int) -> AnyArray:
         """Return the rows of the lead-in (1) or lead-out (-1) at times from standstill."""
@@ -98,10 +99,9 @@ class LeadsBasis(PeriodsBasis):
         to_points = np.linalg.inv(
             binomials * u[:, None] ** order * (1 - u[:, None]) ** (degree - order)
         )
-        leads = []
-        for start in self.lead / pieces * np.arange(pieces):
-            t = start + self.lead / pieces * u
-            leads += [to_points @ self._lead_rows(t, sign) for sign in (1, -1)]
+        starts = self.lead / pieces * np.arange(pieces)[:, None]
+        t = starts + self.lead / pieces * u
+        leads = [to_points @ self._lead_rows(x, sign) for x in t for sign in (1, -1)]
         return tuple(np.concatenate(parts) for parts in zip(rows, *leads, strict=True)), factor
 
     def times(self, samples: int) -> Float[np.ndarray, " samples"]:
@@ -202,8 +202,7 @@ def with_leads(series: AbstractTrajectory, robot: Robot, *, periods: int = 1) ->
         raise InputError(
             "no instant of the period can be reached from standstill within the limits: at best "
             f"joint `{robot.joint_names[joint]}` exceeds one of them by "
-            f"{100 * excess[nearest, joint]:.3g} %: take a motion that uses less of the limits, or "
-            "one that starts and ends at rest."
+            f"{100 * excess[nearest, joint]:.3g} %: take a motion that uses less of the limits."
         )
     return WithLeads(series, phases[best], periods * period, lead_in[best], lead_out[best])
 

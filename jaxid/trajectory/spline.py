@@ -84,8 +84,8 @@ class RestToRestSplineBasis(AbstractBasis):
         InputError: If there are fewer than two points, or the duration is not positive.
     """
 
-    points: int = eqx.field(static=True)
-    duration: Float[AnyArray, ""] = eqx.field(converter=as_scalar)
+    points: int = eqx.field(static=True, default=12)
+    duration: Float[AnyArray, ""] = eqx.field(converter=as_scalar, default=8.0)
 
     def __check_init__(self):
         if self.points < 2:
@@ -133,8 +133,7 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
     way = np.asarray(as_array("points", points), np.float64)
     if way.ndim != 2 or len(way) < 2 or not np.isfinite(way).all():
         raise InputError(
-            "`points` must hold at least two rows of finite numbers, one column for each joint, "
-            f"but has shape {way.shape}."
+            f"`points` must hold two or more rows of finite numbers, but has shape {way.shape}."
         )
     rest = [(order, np.zeros(way.shape[1])) for order in (1, 2)]
     spline = make_interp_spline(np.linspace(0.0, 1.0, len(way)), way, DEGREE, bc_type=(rest, rest))

@@ -1,6 +1,7 @@
 """Paths of the end-effector in space, the path of ISO 9283, and the joints' motion along a path."""
 
 import itertools
+from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -19,8 +20,10 @@ class Line(eqx.Module):
     Attributes:
         start: Start of the line [m].
         end: End of the line [m].
+        radius: Radius of curvature: infinite [m].
     """
 
+    radius: ClassVar[float] = np.inf
     start: Float[AnyArray, "3"]
     end: Float[AnyArray, "3"]
 
@@ -28,11 +31,6 @@ class Line(eqx.Module):
     def length(self) -> float:
         """Length of the line [m]."""
         return float(np.linalg.norm(np.asarray(self.end) - np.asarray(self.start)))
-
-    @property
-    def radius(self) -> float:
-        """Radius of curvature: infinite [m]."""
-        return np.inf
 
     def at(self, fraction: Float[AnyArray, " samples"]) -> Float[np.ndarray, "samples 3"]:
         """Return places at fractions of the length, from 0 to 1 [m]."""
@@ -105,8 +103,7 @@ class TipPath(eqx.Module):
             gap = float(np.linalg.norm(ends[k][0] - ends[k - 1][1])) if k else 0.0
             if gap > 1e-9:
                 raise InputError(
-                    f"piece {k + 1} of `pieces` must start where the one before it ends, but lies "
-                    f"{gap:.3g} m from it."
+                    f"piece {k + 1} of `pieces` starts {gap:.3g} m from where the one before ends."
                 )
             if not 0 < piece.length < np.inf:
                 raise InputError(
@@ -137,10 +134,8 @@ class TipPath(eqx.Module):
         starts = np.concatenate([[0.0], np.cumsum(self.durations)[:-1]])
         piece = np.clip(np.searchsorted(starts, t, side="right") - 1, 0, len(starts) - 1)
         places = np.empty((len(t), 3))
-        for k, (curve, start, time) in enumerate(
-            zip(self.pieces, starts, self.durations, strict=True)
-        ):
-            u = np.clip((t[piece == k] - start) / time, 0.0, 1.0)
+        for k, curve in enumerate(self.pieces):
+            u = np.clip((t[piece == k] - starts[k]) / self.durations[k], 0.0, 1.0)
             places[piece == k] = curve.at(u**3 * (10.0 + u * (6.0 * u - 15.0)))
         return places
 
@@ -221,10 +216,8 @@ def joint_path(
         raise InputError(f"`spacing` must be positive [s], but is {spacing:g}.")
     counts = [max(12, int(np.ceil(time / spacing))) for time in path.durations]
     ends = np.concatenate([[0.0], np.cumsum(path.durations)])
-    instants = [
-        np.linspace(a, b, count + 1)
-        for a, b, count in zip(ends[:-1], ends[1:], counts, strict=True)
-    ]
+    pairs = zip(itertools.pairwise(ends), counts, strict=True)
+    instants = [np.linspace(a, b, count + 1) for (a, b), count in pairs]
     times = np.concatenate([*(t[:-1] for t in instants), ends[-1:]])
     q = inverse_kinematics_along(robot, path.positions(times), path.rotation, posture)
     rest = [(order, np.zeros(robot.joints)) for order in (1, 2)]
@@ -236,14 +229,9 @@ def joint_path(
         polynomials.append(spline_polynomials(spline))
         begin += count
     coefficients = np.concatenate(polynomials, axis=1)
-    _check_rates(robot, path, coefficients[-2], 2 * coefficients[-3])
-    return PiecewisePolynomial(np.concatenate([*knots, ends[-1:]]), coefficients)
-
-
-def _check_rates(robot: Robot, path: TipPath, qd: np.ndarray, qdd: np.ndarray) -> None:
-    """Raise an error if velocities or accelerations at the knots exceed their limits."""
-    speed = np.abs(qd).max(axis=0) / np.asarray(robot.limits.velocity)
-    acceleration = np.abs(qdd).max(axis=0) / np.asarray(robot.limits.acceleration)
+    # Velocities and accelerations at the knots are coefficients.
+    speed = np.abs(coefficients[-2]).max(axis=0) / np.asarray(robot.limits.velocity)
+    acceleration = np.abs(2 * coefficients[-3]).max(axis=0) / np.asarray(robot.limits.acceleration)
     # A path that is run f times slower needs a fraction 1/f of speeds and 1/f² of accelerations.
     slower = np.maximum(speed, np.sqrt(acceleration))
     j = int(slower.argmax())
@@ -255,3 +243,4 @@ def _check_rates(robot: Robot, path: TipPath, qd: np.ndarray, qdd: np.ndarray) -
             f"its largest {name}: give the path a `speed` of {path.speed / f:.3g} m/s and an "
             f"`acceleration` of {path.acceleration / f**2:.3g} m/s², or choose another posture."
         )
+    return PiecewisePolynomial(np.concatenate([*knots, ends[-1:]]), coefficients)

@@ -50,7 +50,8 @@ class AbstractTrajectory(Hashable):
 
     def jerk(self, t: Float[AnyArray, "*batch"] | float | int) -> Float[Array, "*batch joints"]:
         """Return the rate of change of the accelerations [rad/s³ or m/s³] at times [s]."""
-        return _jerk(self, jnp.asarray(t, float))
+        times = jnp.asarray(t, float)
+        return jax.jvp(lambda t: self.motion(t).qdd, (times,), (jnp.ones_like(times),))[1]
 
     def sample(self, sample_time: float) -> tuple[Float[np.ndarray, " samples"], Motion]:
         """Return times [s] from the start to the end, both included, and the motion at them.
@@ -78,11 +79,6 @@ def _motion(trajectory: AbstractTrajectory, t: Array) -> Motion:
     return Motion(*(x.reshape(*t.shape, -1) for x in states))
 
 
-@eqx.filter_jit
-def _jerk(trajectory: AbstractTrajectory, times: Float[Array, "*batch"]) -> Array:
-    return jax.jvp(lambda t: trajectory.motion(t).qdd, (times,), (jnp.ones_like(times),))[1]
-
-
 class Segments(AbstractTrajectory):
     """Trajectories that follow one another without a pause.
 
@@ -106,17 +102,13 @@ class Segments(AbstractTrajectory):
         for k, (before, after) in enumerate(itertools.pairwise(self.members), 1):
             end, start = before.motion(before.duration), after.motion(0.0)
             if end.joints != start.joints:
-                raise InputError(
-                    f"`members` {k} and {k + 1} must move the same joints, but have "
-                    f"{end.joints} and {start.joints}."
-                )
+                raise InputError(f"`members` {k} and {k + 1} must move the same joints.")
             for name, field in (("coordinate", "q"), ("velocity", "qd"), ("acceleration", "qdd")):
                 jump = np.abs(np.subtract(getattr(start, field), getattr(end, field)))
                 if jump.max() > 1e-6:
                     raise InputError(
                         f"the {name} of joint {int(jump.argmax()) + 1} jumps by {jump.max():.3g} "
-                        f"between `members` {k} and {k + 1}: start the second as the first ends, "
-                        "or put a spline between them."
+                        f"between `members` {k} and {k + 1}: put a spline between them."
                     )
 
     @property
@@ -248,11 +240,6 @@ class LinearTrajectory(AbstractTrajectory):
 
     basis: AbstractBasis
     coefficients: Float[AnyArray, "joints variables"]
-
-    @property
-    def joints(self) -> int:
-        """Number of joints."""
-        return self.coefficients.shape[0]
 
     @property
     def duration(self) -> Float[AnyArray, ""] | float:

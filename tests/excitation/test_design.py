@@ -8,15 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.excitation.constraints import AbstractConstraint, Clearance, Finding
+from jaxid.excitation.constraints import AbstractConstraint, Finding
 from jaxid.excitation.criteria import ConditionNumber, DOptimal, information
 from jaxid.excitation.design import design_excitation, minimise
 from jaxid.excitation.problem import ExcitationProblem
-from jaxid.excitation.search import Search
-from jaxid.robot.collision import GROUND, Capsule, CollisionModel
 from jaxid.trajectory.fourier import FourierBasis
 
-EFFORT = {"starts": 3, "generations": 2, "polish": 1}
+EFFORT = {"starts": 3, "generations": 1, "polish": 1}
 BASIS = FourierBasis(2, 1.1)
 
 
@@ -160,24 +158,3 @@ def test_earlier_information_is_added(pendulum):
 def test_refuses_what_makes_no_sense(pendulum, name, value):
     with pytest.raises(ValueError, match=f"`{name}`"):
         design_excitation(pendulum, **{name: value})
-
-
-def test_a_state_belongs_to_the_pairs_that_are_watched(pendulum, tmp_path):
-    """They are no arrays, and decide all the same."""
-    shapes = (
-        Capsule("hand", 0, start=(0.2, 0, 0), end=(1.0, 0, 0), radius=0.05),
-        Capsule("post", GROUND, start=(2.0, 0, 0), end=(2.0, 0, 1.0), radius=0.05),
-        Capsule("far", GROUND, start=(9.0, 0, 0), end=(9.0, 0, 1.0), radius=0.05),
-    )
-
-    def search(name):
-        model = CollisionModel(pendulum.model.robot, shapes, (), (("hand", name),))
-        problem = ExcitationProblem(pendulum, BASIS, constraints=(Clearance(model),))
-        return Search(problem, jax.random.key(0), 1, 0, 0)
-
-    far, file = search("far"), tmp_path / "state"
-    search("post").save(file)
-    with pytest.raises(ValueError, match="other settings"):
-        far.resume(file)
-    far.save(file)
-    search("far").resume(file)

@@ -68,48 +68,39 @@ FAMILY = {
 
 
 @pytest.mark.parametrize("name", FAMILY)
-def test_derivatives_are_those_of_the_position(name):
-    trajectory = FAMILY[name]
-    duration = float(trajectory.duration)
-    t = np.random.default_rng(0).uniform(0.01 * duration, 0.99 * duration, 400)
-    h = 1e-5
-    ahead, behind, now = trajectory.motion(t + h), trajectory.motion(t - h), trajectory.motion(t)
-    for x, derivative in (("q", now.qd), ("qd", now.qdd), ("qdd", trajectory.jerk(t))):
-        quotient = (getattr(ahead, x) - getattr(behind, x)) / (2 * h)
-        near = np.abs(quotient - derivative) <= 1e-5 * (1 + np.abs(derivative).max())
-        # The jerk of leads and segments jumps where they meet.
-        assert near.mean() > (0.999 if x != "qdd" else 0.98), (x, near.mean())
-
-
-@pytest.mark.parametrize("name", FAMILY)
-def test_nothing_jumps_and_ends_are_at_rest(name):
-    trajectory = FAMILY[name]
-    times, m = trajectory.sample(2e-3)
+def test_derivatives_belong_together_nothing_jumps_and_ends_are_at_rest(name):
+    trajectory, h = FAMILY[name], 1e-5
+    times, now = trajectory.sample(2e-3)
     assert times[0] == 0.0
     assert times[-1] == float(trajectory.duration)
-    for x, rate in ((m.q, m.qd), (m.qd, m.qdd), (m.qdd, trajectory.jerk(times))):
-        step = np.abs(np.diff(x, axis=0)).max()
+    ahead, behind = trajectory.motion(times + h), trajectory.motion(times - h)
+    for x, rate in (("q", now.qd), ("qd", now.qdd), ("qdd", trajectory.jerk(times))):
+        quotient = (getattr(ahead, x) - getattr(behind, x)) / (2 * h)
+        near = np.abs(quotient - rate)[5:-5] <= 1e-5 * (1 + np.abs(rate).max())
+        # The jerk of leads and segments jumps where they meet.
+        assert near.mean() > (0.999 if x != "qdd" else 0.98), (x, near.mean())
+        step = np.abs(np.diff(getattr(now, x), axis=0)).max()
         assert step <= 1.5 * np.diff(times).max() * np.abs(rate).max() + 1e-12
     if name != "series":
-        ends = trajectory.motion(times[[0, -1]])
-        np.testing.assert_allclose(ends.qd, 0.0, atol=1e-9)
-        np.testing.assert_allclose(ends.qdd, 0.0, atol=1e-7)
+        np.testing.assert_allclose(now.qd[[0, -1]], 0.0, atol=1e-9)
+        np.testing.assert_allclose(now.qdd[[0, -1]], 0.0, atol=1e-7)
+
+
+def test_any_shape_of_times_and_jit():
+    trajectory, t = FAMILY["with leads"], np.linspace(0.0, 3.0, 6)
+    assert trajectory.motion(0.5).q.shape == (trajectory.joints,)
+    folded = jax.jit(lambda x: trajectory.motion(x).qdd)(t.reshape(2, 3))
+    np.testing.assert_allclose(folded.reshape(6, -1), trajectory.motion(t).qdd, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", FAMILY)
-def test_any_shape_of_times_jit_and_files(name, tmp_path):
+def test_files_keep_every_bit(name, tmp_path):
     trajectory = FAMILY[name]
-    t = np.linspace(0.0, float(trajectory.duration), 6)
-    flat = trajectory.motion(t)
-    assert trajectory.motion(0.5).q.shape == (trajectory.joints,)
-    folded = jax.jit(lambda x: trajectory.motion(x).qdd)(t.reshape(2, 3))
-    np.testing.assert_allclose(folded.reshape(6, -1), flat.qdd, atol=1e-9)
     save_trajectory(trajectory, tmp_path / "t.json")
     loaded = load_trajectory(tmp_path / "t.json")
     assert jax.tree.structure(loaded) == jax.tree.structure(trajectory)
     for x, y in zip(jax.tree.leaves(loaded), jax.tree.leaves(trajectory), strict=True):
         np.testing.assert_array_equal(x, y)
-    np.testing.assert_array_equal(loaded.motion(t).qdd, flat.qdd)
 
 
 def test_splines_pass_their_points_and_keep_to_the_range_of_their_handles():
@@ -152,10 +143,10 @@ def test_unknown_limits_are_assumed_as_documented():
 
 def test_leads_keep_the_limits_and_follow_the_series_between():
     robot = PANDA
-    for seed in range(3):
+    for seed in range(2):
         inner = series(robot, seed)
         led = with_leads(inner, robot, periods=2)
-        times = np.linspace(0.0, float(led.duration), 10_000)
+        times = np.linspace(0.0, float(led.duration), 5_000)
         m, lim = jax.tree.map(np.asarray, led.motion(times)), robot.limits
         assert np.max([m.q - lim.position_max, lim.position_min - m.q]) <= 1e-8
         assert np.max(np.abs([m.qd / lim.velocity, m.qdd / lim.acceleration])) <= 1 + 1e-8
