@@ -189,7 +189,13 @@ class Table:
         A style is a `Status`, `title`, `header`, `dim`, or empty.
         """
         width = shutil.get_terminal_size((100, 24)).columns if width is None else width
-        groups = (self._facts(width), self._grid(width), self._remarks(width))
+        indent = max((len(word) for word, _ in self.facts), default=0) + 2
+        facts = [(word.ljust(indent), "dim", text) for word, text in self.facts]
+        remarks = [
+            (f"{r.status.value}  ", r.status, f"{r.text} ({r.detail})" if r.detail else r.text)
+            for r in self.remarks
+        ]
+        groups = (_hanging(facts, width), self._grid(width), _hanging(remarks, width))
         filled = [lines for lines in map(list, groups) if lines]
         for line in _wrapped(self.title, width) if self.title else ():
             yield [(line, "title")]
@@ -197,12 +203,6 @@ class Table:
             if k:
                 yield []
             yield from lines
-
-    def _facts(self, width: int) -> Lines:
-        indent = max((len(word) for word, _ in self.facts), default=0) + 2
-        for word, text in self.facts:
-            for k, line in enumerate(_wrapped(text, width - indent)):
-                yield [(_padded("" if k else word, indent), "dim"), (line, "")]
 
     def _grid(self, width: int) -> Lines:
         if not self.columns:
@@ -226,14 +226,15 @@ class Table:
             mark = self.status[k] if self.status else Status.NEUTRAL
             yield [(f"{mark.value}  "[:margin], mark), (line(row), "")]
 
-    def _remarks(self, width: int) -> Lines:
-        for remark in self.remarks:
-            text = f"{remark.text} ({remark.detail})" if remark.detail else remark.text
-            for k, line in enumerate(_wrapped(text, width - 3)):
-                yield [("   " if k else f"{remark.status.value}  ", remark.status), (line, "")]
+
+def _hanging(entries: Iterable[tuple[str, Any, str]], width: int) -> Lines:
+    """Yield texts, each beside its head of some style."""
+    for head, style, text in entries:
+        for k, line in enumerate(_wrapped(text, width - len(head))):
+            yield [(" " * len(head) if k else head, style), (line, "")]
 
 
-def _padded(text: str, width: int, right: bool = False) -> str:
+def _padded(text: str, width: int, right: bool) -> str:
     """Return a text that takes so many places, shortened if it is longer."""
     text = shortened(text, width)
     return text.rjust(width) if right else text.ljust(width)

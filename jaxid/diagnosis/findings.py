@@ -82,15 +82,13 @@ def limit_findings(
         findings += _joint_findings(robot, j, s, not angles, not forces)
         if log.velocities is not None and abs(ratio[j] - 1.0) > 0.2:
             findings.append(
-                f"the measured velocities of joint `{name}` are {ratio[j]:.3g} times the "
-                "derivatives of its angles: check `recording.velocity_unit` and the order of the "
-                "columns."
+                f"the velocities of joint `{name}` are {ratio[j]:.3g} times the derivatives of its "
+                "angles: check `recording.velocity_unit` and the order of the columns."
             )
     # Over a whole log, friction makes a robot consume energy.
     if not faulty and s.power < -0.05:
         findings.append(
-            "the robot gives off energy over the whole log: check the signs of its angles and "
-            "forces (`recording.angle_signs`, `force_signs`)."
+            "the robot gives off energy: check `recording.angle_signs` and `force_signs`."
         )
     standing = float(s.stands.all(axis=1).mean())
     if standing > 0.5:
@@ -111,21 +109,16 @@ def _joint_findings(
     slack = 0.02 * (high - low) if np.isfinite(high - low) else 0.0
     if with_range and not low - slack <= a <= b <= high + slack:
         yield (
-            f"joint `{name}` moves from {a:.3g} to {b:.3g} {unit}, outside its range from "
-            f"{low:.3g} to {high:.3g} {unit}: check `recording.angle_unit`, `side`, `angle_signs` "
-            "and `angle_offsets`."
+            f"joint `{name}` moves from {a:.3g} to {b:.3g}, its range is {low:.3g} to {high:.3g} "
+            f"{unit}: check `recording.angle_unit`, `side`, `angle_signs` and `angle_offsets`."
         )
     if statistics.speed[j] > 1.1 * limits.velocity[j]:
         yield (
             f"joint `{name}` reaches {statistics.speed[j]:.3g} {unit}/s, but its limit is "
-            f"{float(limits.velocity[j]):.3g} {unit}/s: check the units of angles and time, or "
-            "lower the filter's cut-off."
+            f"{float(limits.velocity[j]):.3g} {unit}/s: check the units, or lower the cut-off."
         )
     if b - a < 0.02:
-        yield (
-            f"joint `{name}` moves by {b - a:.2g} {unit} only: its parameters cannot be told from "
-            "this log; is it the right column and unit?"
-        )
+        yield (f"joint `{name}` moves by {b - a:.2g} {unit} only: is it the right column and unit?")
     if force == 0.0:
         yield f"the forces of joint `{name}` are zero throughout: is it the right column?"
     known, unit = float(robot.known_max_forces[j]), robot.force_unit(j)
@@ -236,10 +229,7 @@ def _spikes(x: np.ndarray, time: np.ndarray, segments: Sequence[tuple[int, int]]
         return ""
     others = int(np.count_nonzero(np.diff(places) > 1))
     more = f", and {others} more" if others else ""
-    return (
-        f"jumps by {sizes[0]:.3g} and back at {time[places[0]]:.6g} s{more}: no robot moves like "
-        "that; repair or remove such rows."
-    )
+    return f"jumps by {sizes[0]:.3g} and back at {time[places[0]]:.6g} s{more}: remove such rows."
 
 
 def _held_angles(
@@ -350,7 +340,6 @@ def stuck_findings(robot: Robot, recording: Recording, faulty: Collection[int] =
             if on > 0.005 * len(f) and on > 3.0 * beside.sum():
                 findings.append(
                     f"the forces of joint `{name}` stay at {end:.3g} in {on} samples in which it "
-                    "moves: a drive or a sensor is at its limit there; leave that part out "
-                    "(`recording.start`, `recording.stop`), or move more gently."
+                    "moves: a drive or sensor is at its limit (`recording.stop` leaves that out)."
                 )
     return findings

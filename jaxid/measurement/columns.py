@@ -79,8 +79,7 @@ class Columns(eqx.Module):
         """Refuse contradictions."""
         if (self.time is None) == (self.sample_time is None):
             raise InputError(
-                "`Columns` needs either `time` (the column of the time stamps) or `sample_time` "
-                "[s] (rows are equally far apart), but has neither or both."
+                "`Columns` needs either `time` (a column) or `sample_time` [s], and not both."
             )
         if self.sample_time is not None:
             positive_time(self.sample_time)
@@ -95,8 +94,7 @@ class Columns(eqx.Module):
         current = any(u.quantity is Quantity.CURRENT for u in _each(self.force_unit))
         if current != (self.torque_constants is not None):
             raise InputError(
-                "`torque_constants` [N m/A] are needed when `force_unit` is a current, and only "
-                "then: set both, or neither."
+                "`torque_constants` [N m/A] and a current as `force_unit` need each other."
             )
 
     def _require_unit(self, name: str, *allowed: Quantity) -> None:
@@ -194,10 +192,10 @@ def open_log(
         if selection is not None:
             files.setdefault(Path(own or path), {})[channel] = selection
     tables = tuple(open_table(file, chosen, on_disk) for file, chosen in files.items())
-    for table in tables:
-        if table.rows != tables[0].rows:
+    first, *others = tables
+    for table in others:
+        if table.rows != first.rows:
             raise InputError(
-                f"`{table.source}` has {table.rows} rows, but `{tables[0].source}` has "
-                f"{tables[0].rows}: they must be of one run, row by row."
+                f"`{table.source}` has {table.rows} rows, but `{first.source}` has {first.rows}."
             )
     return Log(tables, columns)

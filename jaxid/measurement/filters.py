@@ -120,9 +120,8 @@ def _require_cutoff(name: str, cutoff: float, sample_time: float) -> None:
     rate = 1 / sample_time
     if not 1e-5 * rate <= cutoff < 0.5 * rate:
         raise InputError(
-            f"`{name}` of {cutoff:.6g} Hz must be at least {1e-5 * rate:.2g} Hz and below half of "
-            f"the sampling rate of {rate:.6g} Hz: take another one (about five times the highest "
-            f"frequency of the motion), log faster than {2 * cutoff:.6g} Hz, or check `time_unit`."
+            f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of {rate:.6g} Hz "
+            f"(and above 1e-5 of it): log faster than {2 * cutoff:.6g} Hz, or check `time_unit`."
         )
 
 
@@ -314,9 +313,8 @@ class PeriodicFourier(AbstractFilter):
         if wrong.size:
             j = int(wrong[0])
             raise InputError(
-                f"the angles of joint {j + 1} leave a Fourier series of period {self.period:g} s "
-                f"and {self.harmonics} harmonics by {100 * left[j] / moved[j]:.0f} % of their "
-                "motion (RMS): correct `period` or `harmonics`, or crop what is not periodic."
+                f"the angles of joint {j + 1} leave a Fourier series by {left[j] / moved[j]:.0%} "
+                "of their motion (RMS): correct `period` or `harmonics`, or crop the log."
             )
         a, b = series[1 : self.harmonics + 1], series[self.harmonics + 1 :]
         W = w[:, None]
@@ -427,10 +425,9 @@ class Subsample(AbstractDecimation):
         rate = 1.0 / (sample_time * self.step)
         if self.step > 1 and cutoff > 0.5 * rate:
             raise InputError(
-                f"`Subsample({self.step})` leaves {rate:.6g} Hz, but the filter lets forces and "
-                f"columns pass up to {cutoff:.6g} Hz, which must be below half of that: take "
-                f"one of {max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, a "
-                "lower cut-off, or `Decimation`."
+                f"`Subsample({self.step})` leaves {rate:.6g} Hz, not {2 * cutoff:.6g} Hz: "
+                f"take one of {max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, "
+                "a lower cut-off, or `Decimation`."
             )
 
 
@@ -454,8 +451,7 @@ class Decimation(AbstractDecimation):
     def __check_init__(self) -> None:
         if not self.factors or min(self.factors) < 1 or max(self.factors) > 13:
             raise InputError(
-                "`factors` must be from 1 to 13 each, or the filters lose their accuracy, but are "
-                f"{self.factors}: decimate in several stages."
+                f"`factors` must be from 1 to 13 each, but are {self.factors}: take several stages."
             )
 
     @property

@@ -63,7 +63,7 @@ class LogTable:
                 if (own := len(self.columns[name])) != rows:
                     raise InputError(
                         f"`{name}` of `{self.source}` has {own} samples, but `{first}` has {rows}: "
-                        "transpose arrays, so that there is one row for each sample."
+                        "one row for each sample is needed."
                     )
         if rows == 0:
             raise InputError(f"`{self.source}` has no rows: is the log cut?")
@@ -105,8 +105,7 @@ class LogTable:
         block = self.numbers(name)
         if block.shape[1] != 1:
             raise InputError(
-                f"`{name}` of `{self.source}` must be one column of time stamps, "
-                f"but is an array of {block.shape[1]} columns."
+                f"`{name}` of `{self.source}` must be one column, but has {block.shape[1]}."
             )
         return block[:, 0], False
 
@@ -122,8 +121,8 @@ class LogTable:
             array = np.zeros(0)
         if array.size == 0:
             raise InputError(
-                f"`{name}` of `{self.source}` must be an array of real numbers of one or two "
-                f"axes, but holds {column.dtype} of shape {column.shape}."
+                f"`{name}` of `{self.source}` must hold columns of real numbers, but holds "
+                f"{column.dtype} of shape {column.shape}."
             )
         array = np.array(array.reshape(len(array), -1), np.float64)
         size = np.abs(array).max(axis=1)
@@ -138,8 +137,7 @@ class LogTable:
                 numbers = column.str.strip_chars().cast(pl.Float64, strict=False)
         except pl.exceptions.PolarsError as error:
             raise InputError(
-                f"column `{name}` of `{self.source}` holds {column.dtype} and no numbers: "
-                "write it as floating-point numbers, or name another column."
+                f"column `{name}` of `{self.source}` holds {column.dtype}: name one of numbers."
             ) from error
         self._refuse_first(name, column.is_null().to_numpy(), column, "is empty")
         self._refuse_first(name, numbers.is_null().to_numpy(), column, "is `{}`, no number")
@@ -173,8 +171,7 @@ def open_table(path: Path, selections: Mapping[str, Selection], on_disk: bool) -
         columns = names = _read_mat(path)
     else:
         raise InputError(
-            f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet, .npz or .mat, to be read "
-            "as a log: convert it to one of them."
+            f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet, .npz or .mat: convert it."
         )
     return LogTable(path.name, columns, _Layout(path.name, tuple(names)).channels(selections))
 
@@ -233,8 +230,7 @@ class _Layout(NamedTuple):
         if numbers != list(range(first, first + len(numbers))):
             raise InputError(
                 f"the columns of `{self.source}` for `{channel}`, `{'`, `'.join(columns[:20])}`, "
-                f"must have the numbers from {first} to {first + len(numbers) - 1}: name the "
-                "columns one by one."
+                f"must have the numbers from {first} to {first + len(numbers) - 1}: name each."
             )
         return tuple(columns)
 
@@ -264,8 +260,7 @@ class _Layout(NamedTuple):
             for index, text in enumerate(rows.split(b"\n")):
                 if text.count(b'"') % 2:
                     raise InputError(
-                        f"line {index + line} of `{self.source}` opens a quotation that does not "
-                        "end in that line: remove the quotation mark, or close it there."
+                        f"line {index + line} of `{self.source}` opens a quotation: close it there."
                     )
         try:
             frame = pl.read_csv(
@@ -277,8 +272,7 @@ class _Layout(NamedTuple):
             )
         except pl.exceptions.PolarsError as error:
             raise InputError(
-                f"`{self.source}` is no table with {len(self.names)} columns in every line: "
-                "repair or remove the lines that differ."
+                f"`{self.source}` must have {len(self.names)} columns in every line."
             ) from error
         if self.decimal_comma:
             frame = frame.select(pl.all().str.replace(",", ".", literal=True))
@@ -381,8 +375,7 @@ def _read_mat(path: Path) -> dict[str, np.ndarray]:
         content = loadmat(path, simplify_cells=True)
     except NotImplementedError as error:
         raise InputError(
-            f"`{path.name}` is a MAT file of version 7.3, which cannot be read: save it with "
-            "`save(name, ..., '-v7')`, or as CSV."
+            f"`{path.name}` is a MAT file of version 7.3: save it with `save(name, ..., '-v7')`."
         ) from error
     except Exception as error:  # of many kinds: it depends on which bytes are damaged
         raise InputError(f"`{path.name}` is no MAT file, or is damaged: {_said(error)}.") from error
@@ -409,8 +402,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
             return _named_arrays({name: archive[name] for name in archive.files})
     except Exception as error:  # some ten kinds: it depends on which bytes are damaged
         raise InputError(
-            f"`{path.name}` is no NPZ file of plain arrays ({_said(error)}): save the log with "
-            "`numpy.savez` and without objects."
+            f"`{path.name}` is no NPZ file of plain arrays: {_said(error)}."
         ) from error
 
 
@@ -432,7 +424,6 @@ def _map_arrays(path: Path) -> dict[str, np.ndarray] | None:
                 arrays[entry.filename.removesuffix(".npy")] = array
     except Exception as error:  # of many kinds: it depends on which bytes are damaged
         raise InputError(
-            f"`{path.name}` is no NPZ file of numbers, or is damaged ({_said(error)}): write it "
-            "again."
+            f"`{path.name}` is no NPZ file of numbers, or is damaged: {_said(error)}."
         ) from error
     return _named_arrays(arrays) or None

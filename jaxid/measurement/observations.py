@@ -147,8 +147,7 @@ class Observations(eqx.Module):
         counted = np.ones((rows, shape[1]), bool) if mask is None else np.asarray(mask, bool)
         if counted.shape != (rows, shape[1]):
             raise InputError(
-                f"`mask` must have one entry for each row and joint, {(rows, shape[1])}, but has "
-                f"shape {counted.shape}."
+                f"`mask` must have the shape {(rows, shape[1])}, but has {counted.shape}."
             )
         motion = Motion(data["q"], data["qd"], data["qdd"])
         return cls(
@@ -293,8 +292,7 @@ class Observations(eqx.Module):
         masks = np.asarray(self.mask) & early, np.asarray(self.mask) & ~early
         if not all(mask.any(axis=0).all() for mask in masks):
             raise InputError(
-                f"`fraction` of {fraction:g} leaves a part of `{self.name}` without rows of some "
-                "joint: take another one."
+                f"`fraction` of {fraction:g} leaves no rows of some joint of `{self.name}`."
             )
         return self.replace(mask=masks[0]), self.replace(mask=masks[1])
 
@@ -396,9 +394,8 @@ def prepare(
         longest = max(b - a for a, b in grid.ranges)
         raise InputError(
             f"the longest segment of `{name}` has {longest} samples at {1 / dt:.6g} Hz, "
-            f"but {edge} at each end are lost to the filter and {FEWEST_ROWS} rows of "
-            f"{factor} are needed: record longer, close the gaps (`largest_gap`), set a "
-            "smaller `margin`, or check `time_unit`."
+            f"but the filter takes {edge} at each end, and {FEWEST_ROWS * factor} more are needed: "
+            "record longer, raise `largest_gap`, lower `margin`, or check `time_unit`."
         )
     if short := len(grid.ranges) - len(used):
         notes.append(f"{short} segment(s), shorter than the filter's edges, were left out")

@@ -195,8 +195,7 @@ def filter_memory(filter: AbstractFilter, sample_time: float, measured: bool) ->
         NeedsMemory: If the memory is not finite.
     """
     refusal = (
-        f"`{type(filter).__name__}` needs the whole log at once: take another filter, or a log "
-        "that fits into memory (`read_recording`)."
+        f"`{type(filter).__name__}` needs the whole log: take another filter, or `read_recording`."
     )
     half = 4096
     while half <= 2**20:

@@ -111,8 +111,7 @@ class Recording(eqx.Module):
             stamps = np.array(time, np.float64)
             if stamps.shape != (samples,) or not np.isfinite(stamps).all():
                 raise InputError(
-                    f"`time` of `{name}` must hold one finite stamp for each of the {samples} "
-                    f"samples, but has shape {stamps.shape}."
+                    f"`time` of `{name}` must hold {samples} finite stamps: shape {stamps.shape}."
                 )
             dt, times, added, resample = _resampling(stamps, name, largest_gap, first_row)
             data = {key: None if x is None else resample(x) for key, x in data.items()}
@@ -194,9 +193,8 @@ def finite_channel(
     if bad.size:
         row, joint = (int(i) for i in bad[0])
         raise InputError(
-            f"`{key}` of `{name}` must be finite and of a size that sensors measure, but are "
-            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: check their "
-            "unit, or repair or remove the row."
+            f"`{key}` of `{name}` must be finite and below {LARGEST:g}, but are "
+            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: remove it."
         )
     return array
 
@@ -341,8 +339,7 @@ def find_grid(
         if in_parts and repeated.size:
             raise NeedsMemory(
                 f"rows of `{source}` repeat the time stamp of the row before, first at row "
-                f"{row + int(repeated[0]) + 1 + first_row}: remove them, or give `sample_time` if "
-                "every row is a sample."
+                f"{row + int(repeated[0]) + 1 + first_row}: remove them, or give `sample_time`."
             )
         gaps = np.flatnonzero(steps > limit)
         starts += (row + gaps + 1).tolist()
@@ -380,8 +377,7 @@ def find_grid(
     if in_parts and not grid.is_exact:
         raise NeedsMemory(
             f"time stamps of `{source}` leave a uniform grid of {sample_time:.6g} s by "
-            f"{grid.deviation:.6g} s: give `sample_time` if the robot samples uniformly and only "
-            "the stamps are late."
+            f"{grid.deviation:.6g} s: give `sample_time` if only the stamps are late."
         )
     return grid
 

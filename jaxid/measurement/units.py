@@ -39,8 +39,7 @@ class Unit:
         """Refuse factors that cannot be inverted."""
         if not np.isfinite(self.factor) or self.factor == 0:
             raise InputError(
-                f"`factor` of the unit `{self.symbol}` must be finite and not zero, "
-                f"but is {self.factor}."
+                f"`factor` of `{self.symbol}` must be finite and not zero, but is {self.factor}."
             )
 
 

@@ -121,8 +121,7 @@ def read_fit(report: Path) -> Fit:
     path = report if report.is_file() else report / MODEL
     if not path.is_file():
         raise InputError(
-            f"`{report}` must be a folder that `jaxid identify` has written, but holds no "
-            f"`{MODEL}`."
+            f"`{report}` must be a folder of `jaxid identify`, but holds no `{MODEL}`."
         )
     return load(path)
 

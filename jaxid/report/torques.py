@@ -113,8 +113,7 @@ def require_joints(errors: TorqueErrors, robot: Robot) -> None:
     """Reject errors of another robot."""
     if errors.measured.shape[1] != robot.joints:
         raise InputError(
-            f"`errors` of `{errors.name}` belong to {errors.measured.shape[1]} joints, but the "
-            f"robot `{robot.name}` has {robot.joints}."
+            f"`errors` of `{errors.name}` must be of the {robot.joints} joints of `{robot.name}`."
         )
 
 

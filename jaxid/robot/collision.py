@@ -176,8 +176,7 @@ def _indices(names: list[str], capsules: int, pair: tuple[str, str]) -> tuple[in
     i, k = sorted(names.index(name) for name in pair)
     if i >= capsules or i == k:
         raise InputError(
-            f"`{pair[0]}` and `{pair[1]}` cannot meet: pair two different shapes, one "
-            "of them a capsule."
+            f"`{pair[0]}` and `{pair[1]}` cannot meet: pair a capsule with another shape."
         )
     return i, k
 
@@ -305,8 +304,7 @@ def _enclose_geometry(
         return enclose(_vertices(tree, packages, shape) * scale)
     if shape.tag not in ("sphere", "cylinder", "capsule"):
         raise InputError(
-            f"{tree.place(shape)}: a collision geometry must be a box, cylinder, sphere, capsule "
-            f"or mesh, but is `{shape.tag}`."
+            f"{tree.place(shape)}: `{shape.tag}` is no box, cylinder, sphere, capsule or mesh."
         )
     length = 0.0 if shape.tag == "sphere" else tree.numbers(shape, "length", (0.0,))[0]
     half = np.array([0.0, 0.0, 0.5 * length])
@@ -318,8 +316,7 @@ def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndar
         import trimesh
     except ImportError as error:
         raise ImportError(
-            f"`{tree.path}` has collision meshes, which need the package trimesh: install the "
-            'extra `meshes` (`pip install "jaxid-robotics[meshes]"`).'
+            f'`{tree.path}` has meshes: install trimesh (`pip install "jaxid-robotics[meshes]"`).'
         ) from error
     path, name = Path(tree.path), mesh.get("filename") or ""
     scheme, _, rest = name.rpartition("://")
@@ -334,8 +331,7 @@ def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndar
     file = next(filter(Path.is_file, places), None)
     if file is None:
         raise FileNotFoundError(
-            f"{tree.place(mesh)}: the mesh `{name}` does not exist; give by `packages` the folder "
-            "that holds its package."
+            f"{tree.place(mesh)}: the mesh `{name}` is not there: give its folder by `packages`."
         )
     try:
         loaded = trimesh.load(str(file), force="mesh")

@@ -4,7 +4,6 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
-from jaxid.errors import InputError
 from jaxid.robot.joints import FAR, FARTHEST
 
 AXES = "xyz"
@@ -99,15 +98,9 @@ class Inertia(eqx.Module):
         if low < -slack or high > low + middle + slack:
             return (
                 f"its `inertia` has the principal moments {low:.3g}, {middle:.3g}, {high:.3g} "
-                "kg m², but none may be negative or larger than the sum of the others: is it about "
-                "the centre of mass?"
+                "kg m², of which one is negative, or larger than the sum of the others"
             )
         return ""
-
-    def check(self, owner: str) -> None:
-        """Raise an error if this single body, the `owner` of a sentence, cannot exist."""
-        if reason := self.fault():
-            raise InputError(f"{owner} cannot exist: {reason}.")
 
 
 def inertia_tensor(j: Float[AnyArray, "*batch 6"]) -> Float[AnyArray, "*batch 3 3"]:

@@ -71,8 +71,7 @@ class Limits(eqx.Module):
         if isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and (low >= high).any():
             j = int(np.flatnonzero(low >= high)[0])
             raise InputError(
-                f"`position_min` must be below `position_max`, but joint {j + 1} ranges "
-                f"from {low[j]:g} to {high[j]:g}."
+                f"`position_min` of joint {j + 1} must be below {high[j]:g}, but is {low[j]:g}."
             )
 
 
@@ -116,15 +115,11 @@ class Drives(Hashable):
             matrix = np.diag(matrix) if matrix.shape == (n,) else matrix
             if matrix.shape != (n, n) or not np.isfinite(matrix).all():
                 raise InputError(
-                    f"`reduction` must be {n} gear ratios or a {n} x {n} matrix of finite "
-                    f"numbers, but has shape {matrix.shape}."
+                    f"`reduction` must hold {n} or {n} x {n} finite ratios, not {matrix.shape}."
                 )
             largest = np.abs(matrix).max(axis=1)
             if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
-                raise InputError(
-                    "`reduction` must be invertible, but some joint is moved by no motor of its "
-                    "own: is a gear ratio zero?"
-                )
+                raise InputError("`reduction` must be invertible: is a gear ratio zero?")
         self.reduction = matrix
         self.zero = per_joint("zero", zero, n, 0.0)
         _require("zero", self.zero, np.isfinite, "finite")

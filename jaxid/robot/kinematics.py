@@ -191,8 +191,7 @@ def _task(robot: Robot, posture: Numbers | None) -> _Task:
         middle = np.asarray(as_array("posture", posture))
         if middle.shape != (robot.joints,):
             raise InputError(
-                f"`posture` must hold one number for each joint ({robot.joints}), but has "
-                f"shape {middle.shape}."
+                f"`posture` must hold {robot.joints} numbers, but has shape {middle.shape}."
             )
     begin = np.random.default_rng(0).uniform(-1.0, 1.0, (_STARTS, robot.joints))
     begin[0] = 0.0

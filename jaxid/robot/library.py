@@ -68,15 +68,12 @@ def from_dh(
     """
     if convention not in ("modified", "standard"):
         raise InputError(
-            f'`convention` must be "modified" or "standard", but is "{convention}": the modified '
-            "one lists alpha and a of the link before the joint, the standard one of the link "
-            "after it."
+            f'`convention` must be "modified" (Craig) or "standard", but is "{convention}".'
         )
     table = np.array(rows, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] not in (3, 4) or not np.isfinite(table).all():
         raise InputError(
-            "`rows` must hold 3 or 4 finite numbers (alpha, a, d, theta) for each joint, "
-            f"but has shape {table.shape}."
+            f"`rows` must hold rows of finite (alpha, a, d, theta), but has shape {table.shape}."
         )
     n = len(table)
     table = np.column_stack([table, np.zeros(n)])[:, :4]

@@ -50,7 +50,8 @@ class Tool(eqx.Module):
         self.inertia = _checked("`inertia` of the tool", tensor, (3, 3))
         if not is_traced(self.mass) and self.mass <= 0:
             raise InputError(f"`mass` of the tool must be positive, but is {self.mass:g} kg.")
-        self.body_inertia.check("the tool")
+        if reason := self.body_inertia.fault():
+            raise InputError(f"the tool cannot exist: {reason}.")
 
     @property
     def body_inertia(self) -> Inertia:
@@ -166,8 +167,7 @@ class Robot(eqx.Module):
         n = len(self.revolute)
         if len(self.parent) != n or any(not -1 <= p < i for i, p in enumerate(self.parent)):
             raise InputError(
-                f"`parent` must hold for each of the {n} bodies the index of an earlier one (or -1 "
-                f"for the ground), but is {self.parent}."
+                f"`parent` must hold an earlier body, or -1, for each of {n}, but is {self.parent}."
             )
         if len(self.joint_names) != n or len(set(self.joint_names)) != n:
             raise InputError(

@@ -74,9 +74,9 @@ def snap_directions(
 ) -> tuple[Float[np.ndarray, "*shape 3"], Notes]:
     """Make a unit vector or a rotation exact if all entries are within `tolerance` of 0, 1, -1."""
     signs = np.round(values)
-    if np.abs(values - signs).max() > tolerance:
-        return _without_rounding(values), ()
     change = float(np.abs(values - signs).max())
+    if change > tolerance:
+        return _without_rounding(values), ()
     note = f"joint `{joint}`: {name} snapped to the coordinate axes (by {change:.2g})."
     return signs + 0.0, (note,) if change > 1e-12 else ()
 

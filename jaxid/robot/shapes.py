@@ -117,7 +117,9 @@ class Box(eqx.Module):
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments' deepest or nearest points [m]."""
         start, end = jnp.asarray(start), jnp.asarray(end)
-        first, along = self._local(start), (end - start) @ jnp.asarray(self.rotation)
+        R = jnp.asarray(self.rotation)
+        centre = jnp.broadcast_to(self.centre @ self.rotation, start.shape)
+        first, along = start @ R - centre, (end - start) @ R
         # The distance is convex along the segment. Its minimum is found without derivatives: those
         # of the place add nothing to that of the distance.
         origin, direction = jax.lax.stop_gradient((first, along))
@@ -140,10 +142,6 @@ class Box(eqx.Module):
         share = jnp.clip(rising / jnp.where(turns > 0, turns, 1.0), 0.0, 1.0)[..., 0]
         before, after = (self._signed(first + place * along) for place in (low, high))
         return share * before + (1.0 - share) * after
-
-    def _local(self, point: Array) -> Array:
-        R = jnp.asarray(self.rotation)
-        return point @ R - jnp.broadcast_to(self.centre @ self.rotation, point.shape)
 
     def _signed(self, point: Array) -> Array:
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)

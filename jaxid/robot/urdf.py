@@ -121,8 +121,7 @@ def urdf_parameters(
         inertia, fault = inertial
         if check and fault:
             raise InputError(
-                f"`{tree.path}`: the inertial of link `{name}` belongs to no body: {fault}; "
-                "correct the file, or do without its inertias."
+                f"`{tree.path}`: the inertial of link `{name}` belongs to no body: {fault}."
             )
         parameters[body] += inertia.moved(R, r).parameters
     return parameters.ravel()
@@ -192,8 +191,7 @@ class UrdfTree:
         if child in self._above:
             raise self.error(
                 joint,
-                f"moves link `{child}`, which joint `{self._above[child].get('name')}` moves as "
-                "well: open the closed loop by removing one of the two",
+                f"moves link `{child}`, as `{self._above[child].get('name')}` does: remove one",
             )
         self._above[child] = joint
         self._below[parent].append(joint)
@@ -207,8 +205,7 @@ class UrdfTree:
         if link := next((link for link in self.links if link not in reached), None):
             raise self.error(
                 self._above[link],
-                f"is part of a closed loop: no path leads from a root link to `{link}`; "
-                "remove one joint of the loop",
+                "is part of a closed loop: remove one joint of the loop",
             )
         if len(roots) != 1:
             raise InputError(
@@ -281,8 +278,7 @@ class UrdfTree:
             fault = f"is {kind}" if mimic is None else f"mimics joint `{mimic.get('joint')}`"
             raise self.error(
                 joint,
-                f"{fault}, but only free revolute, continuous and prismatic joints can be used: "
-                "choose `tip` (or `base`) so that the chain avoids it, or make it fixed",
+                f"{fault}, but must turn or slide: avoid it by `tip` or `base`, or make it fixed",
             )
         axis = self.numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
         length = np.linalg.norm(axis)
@@ -388,8 +384,7 @@ def _inertial_notes(tree: UrdfTree) -> Iterator[str]:
     for i, joint in enumerate(tree.joints):
         if i not in massive:
             yield (
-                f"joint `{joint.get('name')}`: the file gives its body no mass; `urdf_parameters` "
-                "takes zero."
+                f"joint `{joint.get('name')}`: its body has no mass; `urdf_parameters` takes zero."
             )
     for name, inertial in inertials.items():
         if inertial is not None and inertial[1]:
@@ -415,8 +410,7 @@ def _read_xml(path: str | Path) -> Any:
     robot = document.getroot()
     if any("ros.org/" in str(e.tag) and "xacro" in str(e.tag) for e in robot.iter()):
         raise InputError(
-            f"`{path}` is a xacro file: expand it first, for example with "
-            "`xacro arm.urdf.xacro -o arm.urdf`."
+            f"`{path}` is a xacro file: expand it (`xacro arm.urdf.xacro -o arm.urdf`)."
         )
     if robot.tag != "robot":
         raise InputError(f"`{path}` is no URDF: its root is `<{robot.tag}>`, not `<robot>`.")
