@@ -129,9 +129,7 @@ def read_json(path: str | Path) -> Any:
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
-    except RecursionError as error:
-        raise InputError("its brackets are nested too deeply") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(str(error)) from error
 
 

@@ -129,11 +129,9 @@ def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         return Remark("This motion does not determine all base parameters.", Status.BAD)
     if not plan.feasible:
         return Remark("This motion does not keep all limits.", Status.BAD)
+    text, status = "A motion that keeps all limits, and determines all parameters.", Status.GOOD
     if plan.interrupted:
-        text = "A motion that can be recorded, but its design was stopped."
-        return Remark(text, Status.DOUBTFUL)
-    if any(remark.status is Status.BAD for remark in remarks):
-        text = "This motion determines all base parameters, but read the remarks below first."
-        return Remark(text, Status.DOUBTFUL)
-    text = "A motion that keeps all given limits, and determines all base parameters."
-    return Remark(text, Status.GOOD)
+        text, status = "The design of this motion was stopped.", Status.DOUBTFUL
+    elif any(remark.status is Status.BAD for remark in remarks):
+        text, status = "Read the remarks below before you record this motion.", Status.DOUBTFUL
+    return Remark(text, status)
