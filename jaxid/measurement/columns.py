@@ -192,8 +192,8 @@ def open_log(
         if selection is not None:
             files.setdefault(Path(own or path), {})[channel] = selection
     tables = tuple(open_table(file, chosen, on_disk) for file, chosen in files.items())
-    first, *others = tables
-    for table in others:
+    first = tables[0]
+    for table in tables:
         if table.rows != first.rows:
             raise InputError(
                 f"`{table.source}` has {table.rows} rows, but `{first.source}` has {first.rows}."
