@@ -165,23 +165,19 @@ def _estimate_each(
 
     cases = itertools.product(range(len(Q)), range(Q.shape[1]))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        fit = _stacked(list(pool.map(one, cases)))
-    return jax.tree.map(
-        lambda x: x.reshape(*Q.shape[:2], -1) if x.ndim > 1 else x[:: Q.shape[1]], fit
-    )
-
-
-def _stacked(fits: list[Fit]) -> BatchFit:
-    """Return some fits as one; only those that determine all have a condition number."""
+        fits = list(pool.map(one, cases))
     known = np.array([np.isfinite(fit.naive_standard_deviations).all() for fit in fits])
     condition = np.array([fit.condition_numbers.scaled for fit in fits])
     names = ("parameters", "standard_deviations", "residual_rms", "naive_standard_deviations")
-    return BatchFit(
+    fit = BatchFit(
         **{name: jnp.stack([getattr(fit, name) for fit in fits]) for name in names},
+        # Only those that determine all have a condition number.
         condition_numbers=jnp.asarray(np.where(known, condition, np.inf)),
         determined=jnp.asarray(known),
         dof=jnp.stack([fit.uncertainty.dof for fit in fits]),
     )
+    draws = Q.shape[1]
+    return jax.tree.map(lambda x: x.reshape(len(Q), draws, -1) if x.ndim > 1 else x[::draws], fit)
 
 
 class RobotFamily(eqx.Module):

@@ -26,9 +26,7 @@ from jaxid.identification.uncertainty.blocks import solve_blocks
 
 
 def require_same_base(fits: Sequence[Fit]) -> None:
-    """Check that there are fits, and that they have the same base parameters."""
-    if not fits:
-        raise InputError("`fits` must hold at least one fit, but is empty.")
+    """Check that fits have the same base parameters."""
     first, a = fits[0], fits[0].base
     for fit in fits[1:]:
         b = fit.base

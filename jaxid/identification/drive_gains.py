@@ -78,13 +78,11 @@ def identify_drive_gains(
     A = np.asarray(robot.drives.reduction)
     if np.count_nonzero(A - np.diag(np.diag(A))):
         raise InputError(
-            f"motors of `{robot.name}` turn more than one axis, so that joints have no gains of "
-            "their own: gains can be identified for independent drives only."
+            f"motors of `{robot.name}` turn more than one axis: only independent drives have gains."
         )
     if robot.tool is not None:
         raise InputError(
-            f"`{robot.name}` has a known tool, whose forces were subtracted from those of nominal "
-            "gains: leave it out of the robot (`tool=None`), for its mass is found with the others."
+            f"`{robot.name}` has a known tool: leave it out (`tool=None`), its mass is found too."
         )
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
     maps = state_maps(base.size, varying_parameters(base, varying), 2)

@@ -190,9 +190,7 @@ class Fit(eqx.Module):
         """
         if self.full_parameters is not None:
             return np.asarray(self.full_parameters)
-        full = np.zeros(self.base.model.size)
-        full[list(self.base.indices)] = np.asarray(self.parameters)
-        return full
+        return np.asarray(self.base.to_standard(np.asarray(self.parameters)))
 
     @property
     def facts(self) -> list[tuple[str, str]]:

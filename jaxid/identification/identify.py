@@ -173,6 +173,5 @@ def _shrinkage_notes(
         return ()
     return (
         f"the solution pulls {pulled} of {len(s)} directions of the parameters to less than half "
-        "of what the data say: standard deviations tell how estimates scatter, not how far this "
-        "pull takes them from the truth, and look too good where logs leave parameters open.",
+        "of what the data say: standard deviations do not tell how far from the truth this is.",
     )

@@ -134,13 +134,13 @@ def identify_states(fits: Sequence[Fit], varying: Sequence[str] | None = None) -
         InputError: If there are fewer than two fits, two have the same name, base parameters
             differ, or there is no such base parameter.
     """
-    require_same_base(fits)
     states = [fit.name for fit in fits]
     if len(states) < 2 or len(set(states)) < len(states):
         raise InputError(
             "`fits` must be two or more with different names, but are "
             f"{', '.join(states)}: name them by their states."
         )
+    require_same_base(fits)
     fits = tuple(map(as_least_squares, fits))
     base = fits[0].base
     own = varying_parameters(base, varying)

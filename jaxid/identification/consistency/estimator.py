@@ -45,9 +45,8 @@ from jaxid.identification.estimators import (
 )
 
 UNPROVED = (
-    "the search ended before its error bound fell below its tolerance: the data are scaled badly, "
-    "or bounds nearly contradict each other; widen the bounds, or pass `throw=False` to accept the "
-    "estimate with its error bound."
+    "the search ended before its error bound fell below its tolerance: widen the bounds, or pass "
+    "`throw=False` to accept the estimate with its error bound."
 )
 """What a user reads where the optimum was not proved."""
 
@@ -249,11 +248,9 @@ def consistent_body(
         not unusual); bound of half the squared distance's distance to the optimum.
 
     Raises:
-        InputError: If the covariance is not positive definite, or the bounds are not of one body.
+        InputError: If the covariance is not positive definite.
         RuntimeError: If the optimum was not proved and `throw` is set.
     """
-    if len(bounds.radius) != 1:
-        raise InputError(f"`bounds` must be those of one body, but are of {len(bounds.radius)}.")
     C = np.asarray(covariance, np.float64)
     size = np.sqrt(np.abs(np.diag(C)))
     size = np.where(size > 0, size, 1.0)

@@ -144,11 +144,8 @@ def row_spectra(
 
 def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
     """Return how often a line counts: for itself, and for its mirror image."""
-    m = np.full(length // 2 + 1, 2.0)
-    m[0] = 1.0
-    if length % 2 == 0:
-        m[-1] = 1.0
-    return m
+    k = np.arange(length)
+    return np.bincount(np.minimum(k, length - k)).astype(float)
 
 
 def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> Lines:
