@@ -46,9 +46,7 @@ def test_random_and_restored_motions_keep_limits_and_use_them(limits):
 
 
 def test_unknown_limits_are_assumed_and_known_jerks_are_kept(arm):
-    free = JointLimits(arm, BASES[0], Limits(2))
-    assert np.isfinite(free.limits.acceleration).all()
-    assert len(free.grid(64).kinds) == 3
+    assert len(JointLimits(arm, BASES[0], Limits(2)).grid(64).kinds) == 3
     jerky = JointLimits(arm, BASES[0], Limits(2, jerk=[5.0, np.inf]))
     grid = jerky.grid(64)
     assert len(grid.kinds) == 4
