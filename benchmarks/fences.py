@@ -8,10 +8,8 @@ fences; with `--check` it fails if they have no effect. Ratios count; absolute t
 machine.
 """
 
-import statistics
 import sys
 import time
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,15 +17,12 @@ import numpy as np
 import timing
 from timing import Row, hand_over
 
-from jaxid.program import lower, sine_cosine, trace  # private: the compiler itself
+from jaxid.program import lower, trace  # private: the compiler itself
 
 JOINTS = 7
 FENCES = (False, True)
-PAIRS = {"polynomial": sine_cosine, "library": lambda x: (jnp.sin(x), jnp.cos(x))}
-HOLDS_FROM = {"polynomial": 2.5, "library": 10.0}
-"""Required speed of a fenced program relative to the unfenced one, by its sine and cosine."""
-
-NUMBERS = {"library": "5a", "polynomial": "5b"}
+HOLDS_FROM = 2.5
+"""Required speed of a fenced program relative to the unfenced one."""
 
 TURNS = np.pi / 2 * np.array([0, -1, 1, 1, -1, 1, 1])
 LENGTHS = np.array([0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088])
@@ -90,109 +85,43 @@ def compiled(lowered, inputs):
     return run, time.perf_counter() - start
 
 
-class Measured(NamedTuple):
-    """Times with or without fences, with one of the two pairs of sine and cosine.
-
-    Attributes:
-        fence: Whether there are fences.
-        pair: Name of the pair.
-        nanoseconds: Time for each sample, of all turns.
-        compiling: Compile time [s].
-        ratio: Speed relative to none.
-    """
-
-    fence: bool
-    pair: str
-    nanoseconds: list[float]
-    compiling: float
-    ratio: float
-
-    @property
-    def name(self):
-        """Name of the case."""
-        return "division" if self.fence else "none"
-
-    @property
-    def median(self):
-        """Median of all turns."""
-        return statistics.median(self.nanoseconds)
-
-    @property
-    def lost(self):
-        """Whether the fences have no effect."""
-        return self.fence and self.ratio < HOLDS_FROM[self.pair]
-
-
-def measure(samples, turns, pairs):
-    """Time the regressor with and without fences, with each pair of sine and cosine."""
+def measure(samples, turns):
+    """Return times for each sample [ns] of all turns and compile times [s], without and with."""
     program = trace(regressor, (JOINTS,), (JOINTS,), (JOINTS,))
     generator = np.random.default_rng(0)
     inputs = [jnp.asarray(x) for x in generator.uniform(-1, 1, (3, JOINTS, samples))]
     print(f"seven-joint regressor: {program.counts}")
-    cases = [(fence, pair) for pair in pairs for fence in FENCES]
-    runs, compiling = {}, {}
-    for fence, pair in cases:
-        lowered = lower(program, fence, PAIRS[pair])
-        runs[fence, pair], compiling[fence, pair] = compiled(lowered, inputs)
-    expected = runs[cases[-1]](*inputs)
-    times = {case: [] for case in cases}
-    for run in runs.values():
-        for got, want in zip(run(*inputs), expected, strict=True):
-            np.testing.assert_allclose(got, want, rtol=1e-11, atol=1e-11)
+    runs, compiling = zip(*(compiled(lower(program, x), inputs) for x in FENCES), strict=True)
+    for plain, fenced in zip(*(run(*inputs) for run in runs), strict=True):
+        np.testing.assert_allclose(fenced, plain, rtol=1e-11, atol=1e-11)
+    times = []
     for _ in range(turns):
-        for case, run in runs.items():
+        for run in runs:
             start = time.perf_counter()
             jax.block_until_ready(run(*inputs))
-            times[case].append((time.perf_counter() - start) / samples * 1e9)
-    found = []
-    for fence, pair in cases:
-        own, without = times[fence, pair], times[FENCES[0], pair]
-        ratio = statistics.median(a / b for a, b in zip(without, own, strict=True))
-        found.append(Measured(fence, pair, own, compiling[fence, pair], ratio))
-    return found
-
-
-def row(case, without, recipe):
-    """Return the row of the fences with one pair of sine and cosine."""
-    said = f"{case.ratio:.1f}x ({case.median:.0f} ns against {without.median:.0f} ns)"
-    if case.lost:
-        said = f"{case.name} DOES NOT HOLD: {said}"
-    return Row(
-        NUMBERS[case.pair],
-        f"regressor, {case.name} against none, {case.pair} sine and cosine",
-        recipe,
-        f">= {HOLDS_FROM[case.pair]:g}x",
-        said,
-        not case.lost,
-    )
+            times.append((time.perf_counter() - start) / samples * 1e9)
+    return np.reshape(times, (turns, 2)), compiling
 
 
 def main():
     """Time both."""
-    parser = timing.parser(__doc__, "fewer samples, only the polynomial sine and cosine")
+    parser = timing.parser(__doc__, "fewer samples")
     parser.add_argument("--check", action="store_true", help="fail if the fence is lost")
     options = parser.parse_args()
     timing.pin_to(2)
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_enable_x64", True)
     samples, turns = (2048, 5) if options.quick else (16384, 9)
-    found = measure(samples, turns, ("polynomial",) if options.quick else tuple(PAIRS))
-    print(f"\n{'sine, cosine':<13}{'fence':<15}{'median':>8}{'best':>8}{'compile':>9}{'ratio':>7}")
-    print(f"{'':<28}{'[ns per sample]':>16}{'[s]':>9}")
-    for case in found:
-        print(
-            f"{case.pair:<13}{case.name:<15}{case.median:>8.0f}{min(case.nanoseconds):>8.0f}"
-            f"{case.compiling:>9.1f}{case.ratio:>7.1f}"
-        )
-    without = {case.pair: case for case in found if not case.fence}
+    times, compiling = measure(samples, turns)
+    ratio = np.median(times[:, 0] / times[:, 1])
+    plain, fenced = np.median(times, axis=0)
+    said = f"{ratio:.1f}x ({fenced:.0f} ns against {plain:.0f} ns)"
+    print(f"{said}; compiled in {compiling[1]:.1f} s against {compiling[0]:.1f} s")
     recipe = f"Panda, 70 columns, jax {jax.__version__}, two cores, N = {samples}, {turns} turns"
-    fenced = [case for case in found if case.fence]
-    rows = [row(case, without[case.pair], recipe) for case in fenced]
-    lost = [case for case in fenced if case.lost]
-    for case in lost:
-        print(f"DOES NOT HOLD: {case.name} with {case.pair} sine and cosine")
-    hand_over(sorted(rows, key=lambda r: r.number), options.json)
-    if options.check and lost:
+    holds, wanted = bool(ratio >= HOLDS_FROM), f">= {HOLDS_FROM:g}x"
+    rows = [Row("5b", "regressor, division against no fence", recipe, wanted, said, holds)]
+    hand_over(rows, options.json)
+    if options.check and not holds:
         sys.exit(f"LOST FENCE: jax {jax.__version__} computes shared values again")
 
 

@@ -274,15 +274,8 @@ def base_parameters(
     kappa = kappa * scale[first][:, None] / scale[second]
     weakest = model.parameter_names[first[np.argmin(new)]] if len(new) else ""
     notes = _doubts(found, other, left, weakest)
-    return BaseParameters(
-        model,
-        found.independent,
-        found.dependent,
-        kappa,
-        found.smallest_independent,
-        found.largest_dependent,
-        notes,
-    )
+    independent, dependent, smallest, largest = found
+    return BaseParameters(model, independent, dependent, kappa, smallest, largest, notes)
 
 
 def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> tuple[str, ...]:

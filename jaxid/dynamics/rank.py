@@ -119,13 +119,9 @@ def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6)
         Q = np.linalg.qr(pivot[:, None], mode="complete").Q
         null = (Q.T @ null)[1:]
     independent = tuple(k for k in range(columns) if k not in set(dependent))
-    small = s[rank] if rank < columns else 0.0
-    return Dependence(
-        independent,
-        tuple(sorted(dependent)),
-        float(s[rank - 1]) if rank else np.inf,
-        float(small),
-    )
+    smallest = float(s[rank - 1]) if rank else np.inf
+    largest = float(s[rank]) if rank < columns else 0.0
+    return Dependence(independent, tuple(sorted(dependent)), smallest, largest)
 
 
 def regrouping(

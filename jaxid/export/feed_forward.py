@@ -22,7 +22,7 @@ import numpy as np
 from jax import export
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision
+from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics import projection
 from jaxid.dynamics.model import Model
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
@@ -213,18 +213,12 @@ def exported_function(fit: Fit) -> export.Exported:
     lowered = lower(torque_program(fit))
     joints = fit.base.model.robot.joints
 
-    def on_samples(
-        q: Float[Array, "samples joints"],
-        qd: Float[Array, "samples joints"],
-        qdd: Float[Array, "samples joints"],
-    ) -> Float[Array, "samples joints"]:
-        # One sample at a time, since the number of samples is not known here.
-        return jax.vmap(lambda *sample: jnp.asarray(lowered.dense(*sample)))(q, qd, qdd)
-
+    # One sample at a time, since the number of samples is not known here.
+    on_samples = jax.jit(jax.vmap(lambda *sample: lowered.dense(*sample)))
     with double_precision():
         (samples,) = export.symbolic_shape("samples")
         shape = jax.ShapeDtypeStruct((samples, joints), np.float64)
-        return export.export(jax.jit(on_samples), platforms=("cpu", "cuda"))(shape, shape, shape)
+        return export.export(on_samples, platforms=("cpu", "cuda"))(shape, shape, shape)
 
 
 def export_jax(fit: Fit, path: str | Path) -> Path:

@@ -118,8 +118,7 @@ class Program:
     def nonzeros(self) -> Any:
         """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
         varies = [not (isinstance(x, float) and x == 0) for x in self.outputs]
-        leaves = zip(self.split(varies), self.output_shapes, strict=True)
-        return jax.tree.unflatten(self.structure, [np.array(x, bool).reshape(s) for x, s in leaves])
+        return self.unpack(varies, (), np)
 
     def split(self, packed: Sequence) -> list[Sequence]:
         """Split values of the packed entries into those of each output."""

@@ -18,13 +18,12 @@ from jaxid.arrays import AnyArray, Array
 from jaxid.errors import InputError
 from jaxid.program.program import Program
 from jaxid.program.scalar import Operation
-from jaxid.program.sincos import sine_cosine as polynomial_sine_cosine
+from jaxid.program.sincos import sine_cosine
 
 ELEMENTWISE: dict[Operation, Callable] = {
     o: getattr(jnp, o.numpy.__name__) for o in Operation if o is not Operation.INPUT
 }
 CIRCULAR = (Operation.SINE, Operation.COSINE)
-SineCosine = Callable[[Array], tuple[Array, Array]]
 Groups = tuple[tuple[int, ...], ...]
 Values = tuple[list[Array], dict[int, tuple[Array, Array]], Array]
 """Array of each node, sines and cosines by the positions of their angles, and the fences' one."""
@@ -73,13 +72,11 @@ class Lowered(eqx.Module):
         program: Program made by `trace`.
         fence: Whether fences stand behind shared values.
         fenced: Positions of these nodes.
-        sine_cosine: Function from angles to their sines and cosines.
     """
 
     program: Program = eqx.field(static=True)
     fence: bool = eqx.field(static=True)
     fenced: frozenset[int] = eqx.field(static=True)
-    sine_cosine: SineCosine = eqx.field(static=True)
 
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
         """Compute the packed result.
@@ -136,13 +133,12 @@ class Lowered(eqx.Module):
         dtype = entries[0].dtype if entries else jnp.result_type(float)
         source = next((x for x in entries if x.size), jnp.zeros((1,), dtype))
         anchor = hidden_one(source[(0,) * source.ndim]) if self.fence else jnp.ones((), dtype)
-        circular = _fenced(self.sine_cosine)
         pairs = {}
         angles = {n.uses[0]: None for n in nodes if n.operation in CIRCULAR}
         angles = [k for k in angles if nodes[k].operation is Operation.INPUT]
         if angles:
             rows = [entries[number][entry] for number, entry in (nodes[k].place for k in angles)]
-            sines, cosines = circular(jnp.stack(rows), anchor)
+            sines, cosines = _circular(jnp.stack(rows), anchor)
             pairs = {k: (sines[row], cosines[row]) for row, k in enumerate(angles)}
         values: list[Array] = []
         for position, node in enumerate(nodes):
@@ -152,7 +148,7 @@ class Lowered(eqx.Module):
             elif node.operation in CIRCULAR:
                 (angle,) = node.uses
                 if angle not in pairs:
-                    pairs[angle] = circular(values[angle], anchor)
+                    pairs[angle] = _circular(values[angle], anchor)
                 values.append(pairs[angle][node.operation is Operation.COSINE])
             else:
                 operands = [values[x] if isinstance(x, int) else x for x in node.operands]
@@ -193,39 +189,31 @@ def primitives(like: Array) -> dict[Operation, Callable]:
 
 
 @functools.lru_cache(maxsize=64)
-def lower(
-    program: Program,
-    fence: bool | None = None,
-    sine_cosine: SineCosine = polynomial_sine_cosine,
-) -> Lowered:
+def lower(program: Program, fence: bool | None = None) -> Lowered:
     """Prepare a program for JAX arrays.
 
     Args:
         program: Program made by `trace`.
         fence: Whether fences stand behind shared values; by default on a CPU. On a GPU they would
             break the program into many kernels, and float64 divisions are slow.
-        sine_cosine: Function from angles to their sines and cosines.
     """
     if fence is None:
         fence = jax.default_backend() == "cpu"
-    return Lowered(program, fence, fenced_nodes(program), sine_cosine)
+    return Lowered(program, fence, fenced_nodes(program))
 
 
-def _fenced(sine_cosine: SineCosine) -> Callable:
-    """Fence the pair, and make its derivative from the fenced values."""
+@jax.custom_jvp
+def _circular(x: Array, anchor: Array) -> tuple[Array, Array]:
+    """Return sine and cosine behind fences; their derivatives are made from the fenced values."""
+    sine, cosine = sine_cosine(x)
+    return sine / anchor, cosine / anchor
 
-    @jax.custom_jvp
-    def circular(x: Array, anchor: Array) -> tuple[Array, Array]:
-        sine, cosine = sine_cosine(x)
-        return sine / anchor, cosine / anchor
 
-    @circular.defjvp
-    def _jvp(primals, tangents):
-        dx, _ = tangents
-        sine, cosine = circular(*primals)
-        return (sine, cosine), (cosine * dx, -sine * dx)
-
-    return circular
+@_circular.defjvp
+def _circular_jvp(primals, tangents):
+    dx, _ = tangents
+    sine, cosine = _circular(*primals)
+    return (sine, cosine), (cosine * dx, -sine * dx)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))

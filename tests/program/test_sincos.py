@@ -38,13 +38,13 @@ def errors(x):
 
 @pytest.mark.parametrize("limit", [0.8, 7.0, 1e3, 1e5, 3e9])
 def test_double_precision_is_exact_to_the_last_bit_or_so(limit):
-    x = np.random.default_rng(0).uniform(-limit, limit, 400)
+    x = np.random.default_rng(0).uniform(-limit, limit, 150)
     assert errors(x) < 1.5e-16
 
 
 @pytest.mark.parametrize("limit", [0.8, 7.0, 1e3, 1e5])
 def test_single_precision(limit):
-    x = np.random.default_rng(1).uniform(-limit, limit, 400).astype(np.float32)
+    x = np.random.default_rng(1).uniform(-limit, limit, 150).astype(np.float32)
     assert errors(x) < 1e-7
 
 
