@@ -29,6 +29,9 @@ from jaxid.errors import InputError
 AnyArray = jax.Array | np.ndarray
 """A JAX array, or a NumPy array: what stays in NumPy stays a constant when JAX traces."""
 
+Joints = Float[AnyArray, " joints"]
+"""One number for each joint."""
+
 # NumPy's own `ArrayLike` turns tuples away when types are checked at run time.
 Numbers = AnyArray | Sequence[Any] | float | int
 """Array argument of a user: an array, nested lists or tuples, or one number."""

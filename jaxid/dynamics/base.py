@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Numbers, as_array
+from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, as_array
 from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
 from jaxid.dynamics.dispatch import in_numpy, on_samples, program_of
 from jaxid.dynamics.model import Coordinates, Model
@@ -96,7 +96,7 @@ class BaseParameters(Hashable):
         """Return the base regressor of one sample by definition (Eq. 23)."""
         return self.model.columns(q, qd, qdd)[:, np.array(self.indices)]
 
-    def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
+    def forces(self, p, q, qd, qdd) -> Joints:
         """Return the generalised forces of one sample by definition (Eq. 39)."""
         return self.model.forces(self.to_standard(p), q, qd, qdd)
 

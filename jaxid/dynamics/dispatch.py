@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Numbers, as_array, content, is_traced
+from jaxid.arrays import AnyArray, Array, Float, Joints, Numbers, as_array, content, is_traced
 from jaxid.errors import InputError
 from jaxid.program import Program, evaluate, lower, trace
 
@@ -116,9 +116,7 @@ def in_numpy(
     return np.moveaxis(np.broadcast_to(out, (*out.shape[:-1], len(samples[0]))), -1, 0)
 
 
-def solve_symmetric(
-    A: Float[AnyArray, "joints joints"], b: Float[AnyArray, " joints"]
-) -> Float[AnyArray, " joints"]:
+def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
     r"""Solve $A x = b$ by $A = L D L^T$, without square roots or pivoting, entry by entry.
 
     Only the lower triangle is read. A program has no loops, and a robot has few joints.

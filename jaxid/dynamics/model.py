@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, as_array, namespace
+from jaxid.arrays import AnyArray, Float, Hashable, Joints, as_array, namespace
 from jaxid.dynamics import projection
 from jaxid.dynamics.dispatch import on_samples, solve_symmetric
 from jaxid.dynamics.motion import Motion
@@ -97,7 +97,7 @@ class Model(Hashable):
         r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
         return jnp.concatenate([t.columns(self.robot, q, qd, qdd) for t in self.terms], axis=1)
 
-    def forces(self, p, q, qd, qdd) -> Float[AnyArray, " joints"]:
+    def forces(self, p, q, qd, qdd) -> Joints:
         """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
         return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in self.split(p)))
 
@@ -105,11 +105,11 @@ class Model(Hashable):
         """Return the mass matrix of one sample by definition (Eq. 38)."""
         return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in self.split(p)))
 
-    def bias(self, p, q, qd) -> Float[AnyArray, " joints"]:
+    def bias(self, p, q, qd) -> Joints:
         """Return the bias forces of one sample by definition (Eq. 38)."""
         return self.forces(p, q, qd, jnp.zeros_like(q))
 
-    def acceleration(self, p, q, qd, forces) -> Float[AnyArray, " joints"]:
+    def acceleration(self, p, q, qd, forces) -> Joints:
         """Return the accelerations of one sample that forces cause (Eq. 38)."""
         return solve_symmetric(self.inertia(p, q), forces - self.bias(p, q, qd))
 
@@ -117,7 +117,7 @@ class Model(Hashable):
         """Return the potential energy of one sample by definition."""
         return reduce(add, (t.potential_columns(self.robot, q) @ x for t, x in self.split(p)))
 
-    def known_forces(self, q, qd, qdd) -> Float[AnyArray, " joints"]:
+    def known_forces(self, q, qd, qdd) -> Joints:
         """Return the generalised forces of the known tool at one sample [N m or N]."""
         tool = self.robot.tool
         if tool is None:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Joints
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.kinematics import placement_in_parent, placements
 from jaxid.robot.robot import Robot
@@ -22,10 +22,7 @@ Vector = Float[AnyArray, "3"]
 
 
 def body_motions(
-    robot: Robot,
-    q: Float[AnyArray, " joints"],
-    qd: Float[AnyArray, " joints"],
-    qdd: Float[AnyArray, " joints"],
+    robot: Robot, q: Joints, qd: Joints, qdd: Joints
 ) -> list[tuple[Vector, Vector, Vector]]:
     r"""Return the motion of every body in its own frame: $(a, \omega, \dot\omega)$ (Eqs. 6, 8).
 
@@ -55,12 +52,7 @@ def body_motions(
     return motions
 
 
-def partial_velocities(
-    robot: Robot,
-    q: Float[AnyArray, " joints"],
-    qd: Float[AnyArray, " joints"],
-    qdd: Float[AnyArray, " joints"],
-):
+def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):
     r"""Return the map $\ddot q \to (a, \dot\omega)$, whose slope is $F_{o,i}$ (Eqs. 5, 7)."""
 
     def accelerations(x):
@@ -93,10 +85,7 @@ def body_regressor(a: Vector, w: Vector, wd: Vector) -> Float[AnyArray, "6 10"]:
 
 
 def rigid_body_regressor(
-    robot: Robot,
-    q: Float[AnyArray, " joints"],
-    qd: Float[AnyArray, " joints"],
-    qdd: Float[AnyArray, " joints"],
+    robot: Robot, q: Joints, qd: Joints, qdd: Joints
 ) -> Float[AnyArray, "joints joints 10"]:
     r"""Return $\Theta_i = F_{o,i}^T \bar\Theta_i$ of every body (Eq. 11).
 
@@ -109,12 +98,8 @@ def rigid_body_regressor(
 
 
 def rigid_body_forces(
-    robot: Robot,
-    p: Float[AnyArray, "joints 10"],
-    q: Float[AnyArray, " joints"],
-    qd: Float[AnyArray, " joints"],
-    qdd: Float[AnyArray, " joints"],
-) -> Float[AnyArray, " joints"]:
+    robot: Robot, p: Float[AnyArray, "joints 10"], q: Joints, qd: Joints, qdd: Joints
+) -> Joints:
     r"""Return the generalised forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11).
 
     The projection is the transpose of the map that gives the accelerations: it is applied, and the
@@ -127,7 +112,7 @@ def rigid_body_forces(
 
 
 def rigid_body_mass_matrix(
-    robot: Robot, p: Float[AnyArray, "joints 10"], q: Float[AnyArray, " joints"]
+    robot: Robot, p: Float[AnyArray, "joints 10"], q: Joints
 ) -> Float[AnyArray, "joints joints"]:
     r"""Return the mass matrix $\sum_i F_{o,i}^T M_i F_{o,i}$ (Eq. 38) by composite bodies.
 
@@ -166,9 +151,7 @@ def rigid_body_mass_matrix(
     return jnp.stack([jnp.stack([jnp.asarray(x) for x in row]) for row in M])
 
 
-def potential_energy_columns(
-    robot: Robot, q: Float[AnyArray, " joints"]
-) -> Float[AnyArray, "joints 10"]:
+def potential_energy_columns(robot: Robot, q: Joints) -> Float[AnyArray, "joints 10"]:
     r"""Return the potential energy $-g^T (m r_o + R m r_c)$ of unit parameters [J]."""
     rotations, origins = placements(robot, q)
     mass = -origins @ robot.gravity

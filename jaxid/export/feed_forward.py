@@ -22,7 +22,7 @@ import numpy as np
 from jax import export
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, double_precision
+from jaxid.arrays import AnyArray, Float, Joints, double_precision
 from jaxid.dynamics import projection
 from jaxid.dynamics.model import Model
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
@@ -57,7 +57,7 @@ class Description:
         frames = 4 * present.any(axis=1).sum() + 6 * present.sum() - 3 * ones.sum()
         return int(frames + np.count_nonzero(self.bodies))
 
-    def forces(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> Float[AnyArray, " joints"]:
+    def forces(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> Joints:
         """Return the generalised forces of the bodies at one sample [N m or N] (Eq. 11)."""
         scale = np.where(self.robot.revolute, 1.0, 1.0 / self.unit)
         p = inertial_parameters(self.bodies)

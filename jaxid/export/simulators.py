@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, double_precision
+from jaxid.arrays import AnyArray, Float, Joints, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.export.feed_forward import body_parameters
@@ -232,7 +232,7 @@ def export_mjcf(fit: Fit, path: str | Path) -> Path:
 def mjcf_text(
     robot: Robot,
     bodies: Float[AnyArray, "joints 10"],
-    dynamics: Mapping[str, Float[AnyArray, " joints"]],
+    dynamics: Mapping[str, Joints],
     timestep: float = 0.001,
     comment: str = "",
 ) -> str:

@@ -13,11 +13,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable
+from jaxid.arrays import Float, Hashable, Joints
 from jaxid.dynamics.terms import AbstractTerm, CoulombFriction, Tanh, ViscousFriction
 from jaxid.robot.robot import Robot
 
-Joints = Float[AnyArray, " joints"]
 EPSILON = 0.01
 """Width of the smooth sign in the model's columns of dry friction [rad/s or m/s]."""
 
@@ -182,9 +181,9 @@ class FrictionTemperature(eqx.Module):
         ambient: Temperature $T_a$ of the air [°C].
     """
 
-    viscous_rate: Float[AnyArray, " joints"]
-    dry_rate: Float[AnyArray, " joints"]
-    resistance: Float[AnyArray, " joints"]
+    viscous_rate: Joints
+    dry_rate: Joints
+    resistance: Joints
     time: float = 600.0
     reference: float = 20.0
     ambient: float = 20.0
@@ -242,9 +241,9 @@ class CableForce(AbstractDisturbance):
         speed: Speed from which on friction has its full size [rad/s or m/s].
     """
 
-    stiffness: Float[AnyArray, " joints"]
-    rest: Float[AnyArray, " joints"]
-    friction: Float[AnyArray, " joints"]
+    stiffness: Joints
+    rest: Joints
+    friction: Joints
     speed: float = 0.02
 
     def forces(self, robot, q, qd):

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable
+from jaxid.arrays import AnyArray, Float, Hashable, Joints
 from jaxid.dynamics import projection
 from jaxid.dynamics.dispatch import program_of, solve_symmetric
 from jaxid.dynamics.model import Model
@@ -15,8 +15,6 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.program import to_python
 from jaxid.simulation.friction import AbstractDisturbance, AbstractGearFriction
-
-Joints = Float[AnyArray, " joints"]
 
 
 class RigidGear(Hashable):

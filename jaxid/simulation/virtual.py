@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from scipy import signal
 
-from jaxid.arrays import AnyArray, Float, Hashable, require_float64
+from jaxid.arrays import AnyArray, Float, Hashable, Joints, require_float64
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
@@ -35,9 +35,7 @@ from jaxid.trajectory.trajectory import AbstractTrajectory
 
 
 def random_bodies(
-    robot: Robot,
-    masses: Float[AnyArray, " joints"],
-    random: np.random.Generator,
+    robot: Robot, masses: Joints, random: np.random.Generator
 ) -> Float[np.ndarray, "joints 10"]:
     """Draw inertial parameters of bodies that can exist: clouds of point masses along the links.
 
@@ -74,8 +72,8 @@ class Sensors(eqx.Module):
     """
 
     encoder_step: float
-    white_noise: Float[AnyArray, " joints"]
-    coloured_noise: Float[AnyArray, " joints"]
+    white_noise: Joints
+    coloured_noise: Joints
     memory: float = 0.02
     motor_side: bool = eqx.field(static=True, default=False)
 
@@ -136,7 +134,7 @@ class Tracking(eqx.Module):
     actual: Motion
     forces: Float[AnyArray, "samples joints"]
     recording: Recording
-    saturated: Float[AnyArray, " joints"]
+    saturated: Joints
 
     @property
     def tracking_error(self) -> Float[np.ndarray, "samples joints"]:
@@ -170,7 +168,7 @@ class VirtualRobot(Hashable):
     gear: RigidGear = RigidGear()
     disturbances: tuple[AbstractDisturbance, ...] = ()
     heating: FrictionTemperature | None = None
-    temperature: Float[AnyArray, " joints"] | None = None
+    temperature: Joints | None = None
 
     def __check_init__(self):
         size, shape = self.bodies.size, None if self.heating is None else (self.robot.joints,)
@@ -224,7 +222,7 @@ class VirtualRobot(Hashable):
         plain = SmoothFriction(self.friction.viscous, self.friction.coulomb)
         return self.replace(friction=plain, gear=RigidGear(), disturbances=())
 
-    def at(self, temperature: Float[AnyArray, " joints"] | float) -> "VirtualRobot":
+    def at(self, temperature: Joints | float) -> "VirtualRobot":
         """Return the same robot with gears of another temperature.
 
         Args:
@@ -279,9 +277,7 @@ class VirtualRobot(Hashable):
         """
         return self.replace(temperature=self.warming(trajectory, duration=duration)[1][-1])
 
-    def resistance(
-        self, q: Float[AnyArray, " joints"], qd: Float[AnyArray, " joints"]
-    ) -> Float[AnyArray, " joints"]:
+    def resistance(self, q: Joints, qd: Joints) -> Joints:
         """Return friction less disturbances of one sample, at constant speeds [N m or N]."""
         forces = self.present_friction.steady(qd)
         for disturbance in self.disturbances:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, matching, one_or_each
+from jaxid.arrays import AnyArray, Float, Hashable, Joints, matching, one_or_each
 from jaxid.dynamics import projection
 from jaxid.dynamics.terms.term import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
@@ -23,7 +23,7 @@ class AbstractTransition(Hashable):
     """Transition of dry friction from one direction of motion to the other."""
 
     @abstractmethod
-    def __call__(self, qd: Float[AnyArray, " joints"]) -> Float[AnyArray, " joints"]:
+    def __call__(self, qd: Joints) -> Joints:
         """Return a number between -1 and 1 for each speed [rad/s or m/s]."""
 
     @property
@@ -90,7 +90,7 @@ class Reversal(AbstractTransition):
 
     own: AbstractTransition
     side: float
-    width: Float[AnyArray, " joints"]
+    width: Joints
 
     def __call__(self, qd):
         """Return the other transition, drawn to the side."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, matching, one_or_each
+from jaxid.arrays import AnyArray, Float, Joints, matching, one_or_each
 from jaxid.dynamics import projection
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot
@@ -71,35 +71,24 @@ class AbstractTerm(eqx.Module):
 
     @abstractmethod
     def columns(
-        self,
-        robot: Robot,
-        q: Float[AnyArray, " joints"],
-        qd: Float[AnyArray, " joints"],
-        qdd: Float[AnyArray, " joints"],
+        self, robot: Robot, q: Joints, qd: Joints, qdd: Joints
     ) -> Float[AnyArray, "joints columns"]:
         """Return the generalised forces [N m or N] of unit parameters, for one sample."""
 
     def forces(
-        self,
-        robot: Robot,
-        p: Float[AnyArray, " columns"],
-        q: Float[AnyArray, " joints"],
-        qd: Float[AnyArray, " joints"],
-        qdd: Float[AnyArray, " joints"],
-    ) -> Float[AnyArray, " joints"]:
+        self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints, qd: Joints, qdd: Joints
+    ) -> Joints:
         """Return the generalised forces [N m or N] of given parameters, for one sample."""
         return self.columns(robot, q, qd, qdd) @ p
 
     def mass_matrix(
-        self, robot: Robot, p: Float[AnyArray, " columns"], q: Float[AnyArray, " joints"]
+        self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints
     ) -> Float[AnyArray, "joints joints"]:
         """Return the factor of the accelerations in these forces (Eq. 38)."""
         rest = jnp.zeros_like(q)
         return jax.jacfwd(lambda qdd: self.forces(robot, p, q, rest, qdd))(rest)
 
-    def potential_columns(
-        self, robot: Robot, q: Float[AnyArray, " joints"]
-    ) -> Float[AnyArray, " columns"]:
+    def potential_columns(self, robot: Robot, q: Joints) -> Float[AnyArray, " columns"]:
         """Return the potential energy [J] of unit parameters; zero unless energy is stored."""
         return jnp.zeros(len(self.parameters(robot)), q.dtype)
 
@@ -215,7 +204,7 @@ class LinearSpring(AbstractTerm):
         rest: Position without force [rad or m]; an unknown one appears as a `ConstantOffset`.
     """
 
-    rest: float | Float[AnyArray, " joints"] = eqx.field(converter=one_or_each, default=0.0)
+    rest: float | Joints = eqx.field(converter=one_or_each, default=0.0)
     symbols = (("ks", "N m/rad", "N/m"),)
 
     def columns(self, robot, q, qd, qdd):
