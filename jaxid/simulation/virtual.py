@@ -411,11 +411,10 @@ class VirtualRobot(Hashable):
         actual, motors, forces = follow(
             plant, servo, desired, forward, limits, resolution, substeps
         )
-        mean_forces = 0.5 * (forces + np.concatenate([forces[:1], forces[:-1]]))
         saturated = (np.abs(forces) >= limits).mean(axis=0)
         kept = slice(None, None, every)
-        time, desired, actual, felt = (x[kept] for x in (time, desired, actual, mean_forces))
+        forces = 0.5 * (forces + np.concatenate([forces[:1], forces[:-1]]))[kept]
         log = self.sensors.record(
-            self.robot, motors[kept], felt, sample_time=every * tick, seed=seed, name=name
+            self.robot, motors[kept], forces, sample_time=every * tick, seed=seed, name=name
         )
-        return Tracking(time, desired, actual, felt, log, saturated)
+        return Tracking(time[kept], desired[kept], actual[kept], forces, log, saturated)

@@ -55,29 +55,13 @@ def alone():
     return trees.compiled(methods)
 
 
-SHAPES = {
-    "regressor": (N, MODEL.size),
-    "inverse_dynamics": (N,),
-    "mass_matrix": (N, N),
-    "bias_forces": (N,),
-    "kinetic_energy": (),
-    "potential_energy": (),
-}
-
-
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (0,), (2, 1, 0)])
-def test_shapes_follow_the_batch(batch):
-    motion = Motion(*np.zeros((3, *batch, N)))
-    found = jax.eval_shape(_all_methods, motion)
-    assert {k: x.shape for k, x in found.items()} == {k: (*batch, *s) for k, s in SHAPES.items()}
-    assert {x.dtype for x in found.values()} == {np.dtype("float64")}
-
-
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (2, 0)])
 def test_batch_axes_lead(batch, alone):
     """Every instant as if it were alone, by the definition itself."""
     motion = Motion(*trees.random_motion(np.random.default_rng(63), *batch, N))
     found = _all_methods(motion)
+    assert {x.shape[: len(batch)] for x in found.values()} == {batch}
+    assert {x.dtype for x in found.values()} == {np.dtype("float64")}
     for index in np.ndindex(*batch):
         one = Motion(*(x[index] for x in (motion.q, motion.qd, motion.qdd)))
         for name, value in alone(one).items():

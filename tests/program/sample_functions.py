@@ -50,6 +50,20 @@ def random_functions(draw, smooth=False):
     return function
 
 
+def every_operation(a, b):
+    """All operations of two numbers, without division by zero."""
+    inside = 0.9 * jnp.sin(a)
+    return jnp.stack(
+        [
+            jnp.tan(inside), jnp.arcsin(inside), jnp.arccos(inside), jnp.arctan(a), jnp.sinh(a),
+            jnp.cosh(a), jnp.tanh(a), jnp.sqrt(a * a), jnp.cbrt(a), jnp.exp(a), jnp.log(a * a),
+            jnp.expm1(a), jnp.log1p(b * b), jnp.abs(a) ** 0.3, jnp.sign(b), jnp.arctan2(a, b),
+            1.0 / a, jnp.minimum(a, b), jnp.maximum(a, b), -a, a**5, a - 1e-7 * b, 1e20 * a,
+            jnp.where((a > 0) & (b < 1) | ~(b != 0.5), a, -b),
+        ]
+    )  # fmt: skip
+
+
 def samples(seed, batch, shape=(SIZE,), count=2):
     return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, *shape, *batch))
 

@@ -1,6 +1,6 @@
 """Simplification of expressions: while they are built, and with all uses known."""
 
-import importlib.util
+import importlib
 import math
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from jaxid.program.scalar import (
     select,
 )
 
-FENCES = Path(__file__).resolve().parents[2] / "benchmarks" / "fences.py"
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 @pytest.fixture
@@ -150,10 +150,8 @@ def test_sums_of_products_keep_their_value(terms, split):
 
 def test_operations_of_a_seven_joint_regressor(monkeypatch):
     """Exact numbers, which show a careless change of the compiler, or of JAX."""
-    monkeypatch.syspath_prepend(FENCES.parent)
-    specification = importlib.util.spec_from_file_location("fences", FENCES)
-    benchmark = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(benchmark)
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    benchmark = importlib.import_module("fences")
     n = (benchmark.JOINTS,)
     program = trace(benchmark.regressor, n, n, n)
     assert (program.counts.multiplications, program.counts.additions) == (842, 640)
