@@ -15,7 +15,7 @@ from jaxid.arrays import AnyArray, Array, Float, is_traced
 from jaxid.dynamics.dispatch import FEW, KEPT, program_of
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.program import Lowered, Program, evaluate_packed, lower
+from jaxid.program import Program, evaluate_packed, lower
 
 
 class JointRegressor(eqx.Module):
@@ -27,19 +27,18 @@ class JointRegressor(eqx.Module):
         shapes: Shapes of the method's arguments.
 
     Attributes:
-        lowered: Program of the regressor.
+        program: Program of the regressor.
         columns: For each joint the columns that can act on it.
         size: Number of columns.
     """
 
-    lowered: Lowered
+    program: Program = eqx.field(static=True)
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     size: int = eqx.field(static=True)
 
     def __init__(self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]):
-        program = program_of(owner, definition, *shapes)
-        self.lowered = lower(program)
-        rows = np.asarray(program.nonzeros)
+        self.program = program_of(owner, definition, *shapes)
+        rows = np.asarray(self.program.nonzeros)
         self.columns = tuple(tuple(np.flatnonzero(row).tolist()) for row in rows)
         self.size = rows.shape[1]
 
@@ -50,12 +49,12 @@ class JointRegressor(eqx.Module):
             arrays: Arguments of the definition, batch and samples last.
         """
         groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
-        return self.lowered.stacked(groups, *arrays)
+        return lower(self.program).stacked(groups, *arrays)
 
     def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
         """Return the columns of each joint, evaluated in NumPy."""
         batch = np.shape(arrays[0])[1:]
-        packed = evaluate_packed(self.lowered.program, *arrays)
+        packed = evaluate_packed(self.program, *arrays)
         found = []
         for joint, own in enumerate(self.columns):
             rows = np.empty((len(own), *batch))
