@@ -76,8 +76,8 @@ def matching(name: str, value: AnyArray | float, qd: AnyArray) -> AnyArray | flo
     shape = np.shape(value)
     if shape and shape != qd.shape[-1:]:
         raise InputError(
-            f"`{name}` must be one number for all joints or one for each ({qd.shape[-1]}), but "
-            f"has shape {shape}."
+            f"`{name}` must be one number, or one for each of {qd.shape[-1]} joints, but has shape "
+            f"{shape}."
         )
     return value
 

@@ -234,8 +234,7 @@ def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch param
     p = as_array("p", p)
     if p.shape[-1:] != (size,):
         raise InputError(
-            f"`p` must hold one number for each {kind} parameter ({size}) along its last axis, but "
-            f"has shape {p.shape}."
+            f"`p` must have {size} {kind} parameters along its last axis, but has shape {p.shape}."
         )
     return p
 
@@ -287,15 +286,13 @@ def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> 
         )
     if found.smallest_independent < 1e-4:
         notes.append(
-            f"`{weakest}` is barely a base parameter of its own: only "
-            f"{found.smallest_independent:.1e} of its column is new. Lengths that are almost zero, "
-            "or rounded angles such as 1.5708, do that; forces cannot determine it well."
+            f"`{weakest}` is barely a base parameter: only {found.smallest_independent:.1e} of its "
+            "column is new, because of a length near zero or a rounded angle such as 1.5708."
         )
     if found.dependent and found.gap < 1e3:
         notes.append(
-            f"independent and dependent columns are not clearly apart: the smallest independent "
-            f"share is {found.smallest_independent:.1e}, the largest dependent one "
-            f"{found.largest_dependent:.1e}."
+            "independent and dependent columns are not clearly apart: their new parts are "
+            f"{found.smallest_independent:.1e} and {found.largest_dependent:.1e}."
         )
     if left > 1e-9:
         notes.append(f"a dependent column is explained only to {left:.1e} of its size.")

@@ -87,8 +87,7 @@ class Model(Hashable):
         sizes = [len(term.parameters(self.robot)) for term in self.terms]
         if p.shape != (sum(sizes),):
             raise InputError(
-                f"`p` must hold one number for each standard parameter ({sum(sizes)}), "
-                f"but has shape {p.shape}."
+                f"`p` must hold {sum(sizes)} standard parameters, but has shape {p.shape}."
             )
         ends = np.cumsum(sizes)
         return [(t, p[e - s : e]) for t, s, e in zip(self.terms, sizes, ends, strict=True)]
@@ -227,7 +226,7 @@ class Model(Hashable):
         q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
             raise InputError(
-                f"`motion` must have one coordinate for each joint ({self.robot.joints}) along "
-                f"its last axis, but has shape {q.shape}."
+                f"`motion` must have {self.robot.joints} joints along its last axis, but has shape "
+                f"{q.shape}."
             )
         return q

@@ -100,8 +100,7 @@ class PackedRegressor(eqx.Module):
             )
         if is_traced(owner):
             raise InputError(
-                "a packed regressor needs a robot whose geometry is known, but JAX is tracing it: "
-                "use `regressor` there."
+                "a packed regressor needs a robot whose geometry is known: use `regressor`."
             )
         program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
         varying, self.places = _layout(program)

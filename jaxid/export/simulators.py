@@ -82,8 +82,7 @@ def _feasible_bodies(fit: Fit, target: str) -> Float[np.ndarray, "joints 10"]:
     )
     if fit.full_parameters is None:
         raise InputError(
-            f"{target} needs the parameters of all bodies, but this fit knows only base "
-            f"parameters: {cure}."
+            f"{target} needs all parameters, but the fit knows only base parameters: {cure}."
         )
     bodies = body_parameters(fit.base.model, fit.standard_parameters)
     # Rounding may reach slightly below zero.
@@ -95,8 +94,7 @@ def _feasible_bodies(fit: Fit, target: str) -> Float[np.ndarray, "joints 10"]:
         if (values < 0).any():
             joint = fit.base.model.robot.joint_names[int(np.argmin(values))]
             raise InputError(
-                f"{target} needs inertia and friction that are not negative, but `{quantity}` of "
-                f"the joint `{joint}` is {values.min():g}: {cure}."
+                f"{target} needs `{quantity}` >= 0, but `{joint}` has {values.min():g}: {cure}."
             )
     return bodies
 
@@ -178,9 +176,8 @@ def export_urdf(
 def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
     if robot.joint_names != described.joint_names:
         raise InputError(
-            f"`{source}` has the joints {', '.join(described.joint_names)}, but the fit of "
-            f"`{robot.name}` has {', '.join(robot.joint_names)}: give the file of this robot, or "
-            "its `tip`."
+            f"`{source}` has the joints {', '.join(described.joint_names)}, but the fit has "
+            f"{', '.join(robot.joint_names)}: give the file of this robot, or its `tip`."
         )
     # The file does not say how the robot is mounted on the ground.
     inner = [i for i, parent in enumerate(robot.parent) if parent >= 0]
@@ -188,8 +185,8 @@ def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
         one, other = (np.asarray(getattr(r, quantity))[rows] for r in (robot, described))
         if not np.allclose(one, other, rtol=0.0, atol=1e-3):
             raise InputError(
-                f"`{source}` has another geometry than the robot `{robot.name}` of the fit "
-                f"(`{quantity}` differs): give the file with which the model was identified."
+                f"`{source}` has another `{quantity}` than the robot of the fit: give the file with "
+                "which the model was identified."
             )
 
 

@@ -137,17 +137,13 @@ class Program:
                 not begin with its input's.
         """
         if len(arrays) != len(self.input_shapes):
-            raise InputError(
-                f"The program takes {len(self.input_shapes)} arrays (of shapes "
-                f"{', '.join(map(str, self.input_shapes))} and batch axes behind), "
-                f"but got {len(arrays)}."
-            )
+            wanted = len(self.input_shapes)
+            raise InputError(f"The program takes {wanted} arrays, but got {len(arrays)}.")
         batches = []
         for k, (x, expected) in enumerate(zip(arrays, self.input_shapes, strict=True)):
             if x.shape[: len(expected)] != expected:
                 raise InputError(
-                    f"Input {k} of the program must have shape {expected} with batch axes behind, "
-                    f"but has shape {x.shape}: put the batch last."
+                    f"Input {k} must have shape {expected}, but has {x.shape}: put the batch last."
                 )
             batches.append(x.shape[len(expected) :])
         batch = np.broadcast_shapes(*batches) if batches else ()

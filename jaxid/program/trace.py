@@ -254,8 +254,7 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
         carriers = _INDEXED[name]
         if any(_is_symbolic(x) for k, x in enumerate(operands) if k not in carriers):
             raise InputError(
-                f"`trace` cannot translate `{name}` with an index that depends on the inputs: "
-                "index with constant integers."
+                f"`trace` cannot translate `{name}` with a variable index: use constant integers."
             )
         if "add" in name:
             return [_scatter_add(equation, operands)]
@@ -278,8 +277,7 @@ def _translate(equation: JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
 def _known(constant: object) -> np.ndarray:
     if isinstance(constant, Tracer):
         raise InputError(
-            "The function given to `trace` closes over a value that JAX is tracing, which a "
-            f"program cannot hold ({constant}): pass it as an input, or trace outside of `jit`."
+            "`trace`: the function closes over a value that JAX is tracing: pass it as an input."
         )
     return np.asarray(constant)
 

@@ -134,8 +134,7 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
             present, content = folder / file, (staging / file).read_bytes()
             if present.exists() and (not present.is_file() or present.read_bytes() != content):
                 raise InputError(
-                    f"`{present}` exists already with other content: choose another folder for "
-                    "the example, or remove it."
+                    f"`{present}` exists with other content: choose another folder, or remove it."
                 )
     return [folder / file for file in FILES]
 

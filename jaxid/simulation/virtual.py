@@ -174,13 +174,11 @@ class VirtualRobot(Hashable):
         size, shape = self.bodies.size, None if self.heating is None else (self.robot.joints,)
         if self.values.shape != (size,):
             raise InputError(
-                f"`values` must hold one number for each parameter of `terms` ({size}), but has "
-                f"shape {self.values.shape}."
+                f"`values` must hold {size} numbers for `terms`, but has shape {self.values.shape}."
             )
         if (None if self.temperature is None else self.temperature.shape) != shape:
             raise InputError(
-                "`temperature` must hold one number for each gear if there is `heating`, and be "
-                "None otherwise."
+                "`temperature` must hold one number for each gear with `heating`, else None."
             )
 
     @property
@@ -344,8 +342,7 @@ class VirtualRobot(Hashable):
         elastic = np.asarray(self.gear.twist(np.ones(self.robot.joints))) != 0.0
         if (elastic & ~(self.rotors > 0)).any():
             raise InputError(
-                "an elastic gear needs a motor with inertia: give `terms` a `RotorInertia` with "
-                "positive `values`."
+                "an elastic gear needs a motor with inertia: give `terms` a `RotorInertia`."
             )
         friction = self.present_friction
         drives = DriveTrain(self.bodies, self.rotors, friction, self.gear, self.disturbances, step)
@@ -402,8 +399,8 @@ class VirtualRobot(Hashable):
             forward = np.asarray(feed_forward(desired), np.float64)
             if forward.shape != desired.q.shape or not np.isfinite(forward).all():
                 raise InputError(
-                    "`feed_forward` must give one finite force for each sample and joint "
-                    f"{desired.q.shape}, but gives shape {forward.shape}."
+                    f"`feed_forward` must give finite forces of shape {desired.q.shape}, but gives "
+                    f"shape {forward.shape}."
                 )
         limits = np.asarray(self.robot.known_max_forces)
         resolution = self.sensors.resolution(self.robot)

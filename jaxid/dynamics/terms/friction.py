@@ -47,8 +47,7 @@ class Tanh(AbstractTransition):
     def __check_init__(self):
         if not isinstance(self.epsilon, jax.Array) and not np.all(np.asarray(self.epsilon) > 0):
             raise InputError(
-                f"`epsilon` must be a positive speed, but is {self.epsilon}: "
-                "use `HardSign` for a transition without width."
+                f"`epsilon` must be positive, but is {self.epsilon}: `HardSign` has no width."
             )
 
     def __call__(self, qd):
@@ -255,10 +254,10 @@ class LoadFriction(AbstractDryFriction):
 
     def _bodies(self, robot: Robot) -> AnyArray:
         size = robot.joints * len(INERTIAL_NAMES)
-        if np.size(self.bodies) < size:
+        given = np.size(self.bodies)
+        if given < size:
             raise InputError(
-                f"`bodies` must begin with ten numbers for each body ({size}), but has shape "
-                f"{np.shape(self.bodies)}."
+                f"`bodies` must begin with ten numbers for each body, but holds only {given}."
             )
         return self.bodies.ravel()[:size].reshape(robot.joints, -1)
 
@@ -343,8 +342,7 @@ class CoupledDrives(AbstractTerm):
         if not np.diag(A).all():
             motor = int(np.flatnonzero(np.diag(A) == 0)[0]) + 1
             raise InputError(
-                f"`drives.reduction` of `{robot.name}` must name the motors in the order of their "
-                f"joints, but motor {motor} does not turn joint {motor}: reorder its rows."
+                f"`drives.reduction`: motor {motor} does not turn joint {motor}: reorder its rows."
             )
         return tuple(
             (i, A[i] / A[i, i])
@@ -359,7 +357,7 @@ class CoupledDrives(AbstractTerm):
         if not couplings:
             raise InputError(
                 f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` out, or give "
-                "`drives.reduction` as a matrix with entries beside its diagonal."
+                "`drives.reduction` entries beside its diagonal."
             )
         return tuple(
             (f"{name}{i + 1}", unit_r if robot.revolute[i] else unit_p)
