@@ -185,8 +185,7 @@ def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
         one, other = (np.asarray(getattr(r, quantity))[rows] for r in (robot, described))
         if not np.allclose(one, other, rtol=0.0, atol=1e-3):
             raise InputError(
-                f"`{source}` has another `{quantity}` than the robot of the fit: give the file with "
-                "which the model was identified."
+                f"`{source}` has another `{quantity}` than the robot of the fit: give its own file."
             )
 
 

@@ -149,7 +149,6 @@ def test_what_has_no_short_form_is_a_number():
 
 MODELS = {
     "paper": lambda: Model(library.tx90l_on_rail(), (SEVEN, *DRIVES)),
-    "ten": lambda: Model(library.tx90l_on_rail(), (TEN, *DRIVES)),
     "ur10": lambda: Model(library.ur10(), (TEN, *DRIVES, ConstantOffset())),
     "coupled": lambda: Model(library.tx40(), (TEN, *DRIVES, CoupledDrives())),
     "kr300": lambda: Model(library.kr300(), (TEN, *DRIVES)),
@@ -177,7 +176,7 @@ def stretched(robot: Robot, lengths: dict[str, float], seed: int) -> tuple[Robot
     return changed, values
 
 
-SQUARE = ("paper", "ten", "ur10", "coupled", "kr300", "panda")
+SQUARE = ("paper", "ur10", "coupled", "kr300", "panda")
 """Robots whose axes stand square: every coefficient has a short form."""
 
 
