@@ -10,7 +10,7 @@ import jax
 import pytest
 
 from jaxid.program import cache
-from jaxid.program.cache import keep_compiled, user_cache
+from jaxid.program.cache import keep_compiled
 
 SCRIPT = """
 import jax, numpy as np
@@ -98,19 +98,3 @@ def test_the_least_recently_used_go_first(tmp_path, monkeypatch):
         os.utime(tmp_path / name, (now - 1000 * age, now - 1000 * age))
     keep_compiled(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "e"]
-
-
-@pytest.mark.parametrize(
-    ("platform", "parts"),
-    [
-        ("linux", (".cache", "jaxid")),
-        ("darwin", ("Library", "Caches", "jaxid")),
-        ("win32", ("Local", "jaxid", "Cache")),
-    ],
-)
-def test_places_by_platform(monkeypatch, tmp_path, platform, parts):
-    monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    monkeypatch.setattr(sys, "platform", platform)
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "Local"))
-    assert user_cache() == tmp_path.joinpath(*parts)
