@@ -81,7 +81,8 @@ class Diagnosis:
         if self.faulty or o is None:
             return ()
         step = -(-o.rows // 300)
-        motion, forces = o.motion[o.instants[::step]], o.reduced_forces[::step]
+        motion = o.motion[o.instants[::step]]
+        forces = o.reduced_forces[::step]
         left = _unexplained(fit.base, motion, forces)
         if left < BAD:
             return ()
@@ -113,7 +114,9 @@ class Diagnosis:
     def summary(self) -> Table:
         """Return a table: motion and forces of each joint beside its limits, and the findings."""
         robot, log, s = self.robot, self.log, self.statistics
-        limits, gaps, joints = robot.limits, len(log.segments) - 1, range(robot.joints)
+        limits = robot.limits
+        gaps = len(log.segments) - 1
+        joints = range(robot.joints)
         return Table(
             f"log {log.name} (limits of the robot in brackets)",
             Column("joint", robot.joint_names),
@@ -185,7 +188,8 @@ def diagnose(
         try:
             observations = observe(part, robot, log.filter, log.decimation, min_speed)
         except InputError as error:
-            observations, why = None, f" of single channels only: {error}"
+            observations = None
+            why = f" of single channels only: {error}"
         if why or part.samples < log.samples:
             examined = f"{part.samples} of the {log.samples} samples"
             notes = (f"{examined} were examined for mistakes{why}",)
@@ -236,7 +240,8 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
     parts, times = [], []
     for start in np.linspace(0, log.samples - length, count).astype(int).tolist():
         for (first, last), time in zip(log.segments, log.start_times, strict=True):
-            a, b = max(first, start), min(last, start + length)
+            a = max(first, start)
+            b = min(last, start + length)
             if b - a >= FEWEST:
                 parts.append(source.read_rows(slice(a, b)))
                 times.append(time + dt * (np.arange(a, b) - first))
@@ -258,9 +263,12 @@ def _corrected(
     robot: Robot, motion: Motion, forces: np.ndarray, sides: tuple[bool, bool]
 ) -> Iterator[tuple[str, Motion, np.ndarray]]:
     """Yield possible mistakes, as clauses, each with the motion and forces without it."""
-    drives, names, n = robot.drives, robot.joint_names, robot.joints
+    drives = robot.drives
+    names = robot.joint_names
+    n = robot.joints
     eye = np.eye(n)
-    columns, torques = [motion.q, motion.qd, motion.qdd], forces
+    columns = [motion.q, motion.qd, motion.qdd]
+    torques = forces
     if sides[0]:
         columns = [drives.motor_angles(motion.q), *map(drives.motor_velocities, columns[1:])]
     if sides[1]:

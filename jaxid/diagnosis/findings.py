@@ -25,7 +25,8 @@ class LogStatistics:
     """
 
     def __init__(self, joints: int, samples: int):
-        self.lowest, self.highest = np.full(joints, np.inf), np.full(joints, -np.inf)
+        self.lowest = np.full(joints, np.inf)
+        self.highest = np.full(joints, -np.inf)
         self.speed, self.force = np.zeros((2, joints))
         self._energies = np.zeros(3)
         self._derivatives, self._products = np.zeros((2, joints))
@@ -103,9 +104,14 @@ def _joint_findings(
     robot: Robot, j: int, statistics: LogStatistics, with_range: bool, with_force: bool
 ) -> Iterator[str]:
     """Compare the range, speed and force of a joint with its limits."""
-    name, unit, limits = robot.joint_names[j], robot.joint_unit(j), robot.limits
-    low, high = float(limits.position_min[j]), float(limits.position_max[j])
-    a, b, force = statistics.lowest[j], statistics.highest[j], statistics.force[j]
+    name = robot.joint_names[j]
+    unit = robot.joint_unit(j)
+    limits = robot.limits
+    low = float(limits.position_min[j])
+    high = float(limits.position_max[j])
+    a = statistics.lowest[j]
+    b = statistics.highest[j]
+    force = statistics.force[j]
     slack = 0.02 * (high - low) if np.isfinite(high - low) else 0.0
     if with_range and not low - slack <= a <= b <= high + slack:
         yield (
@@ -121,7 +127,8 @@ def _joint_findings(
         yield (f"joint `{name}` moves by {b - a:.2g} {unit} only: is it the right column and unit?")
     if force == 0.0:
         yield f"the forces of joint `{name}` are zero throughout: is it the right column?"
-    known, unit = float(robot.known_max_forces[j]), robot.force_unit(j)
+    known = float(robot.known_max_forces[j])
+    unit = robot.force_unit(j)
     if with_force and force > 1.2 * known:
         yield (
             f"joint `{name}` needs {force:.3g} {unit}, but its limit is {known:.3g} {unit}: check "
@@ -168,7 +175,8 @@ def unit_findings(
     ends = np.stack([lowest, highest])
     if used_fraction(ends) > 0.02:
         return []
-    degrees, radians = 'degrees (`recording.angle_unit = "deg"`)', "radians (`recording.angle_unit`"
+    degrees = 'degrees (`recording.angle_unit = "deg"`)'
+    radians = "radians (`recording.angle_unit`"
     corrected = {
         degrees: np.where(known, np.deg2rad(ends), ends),
         f'{radians} is "deg")': np.where(known, np.rad2deg(ends), ends),
@@ -188,7 +196,9 @@ def channel_findings(robot: Robot, recording: Recording) -> list[tuple[int, str]
     angles, forces, time = (np.asarray(x) for x in (r.angles, r.forces, r.time))
     owner = "the motor of joint" if r.angles_on_motor_side else "joint"
     for j, name in enumerate(robot.joint_names):
-        angle, x, others = f"the angle of {owner} `{name}`", angles[:, j], np.delete(angles, j, 1)
+        angle = f"the angle of {owner} `{name}`"
+        x = angles[:, j]
+        others = np.delete(angles, j, 1)
         text = _wrapped(x, time) if robot.revolute[j] else ""
         text = text or _spikes(x, time, r.segments) or _held_angles(x, others, time, r.segments)
         held = _held_forces(forces[:, j], x, time, r.segments)
@@ -320,10 +330,13 @@ def stuck_findings(robot: Robot, recording: Recording, faulty: Collection[int] =
     Forces are cut off if many samples lie on the largest value, and few on the values beside it.
     Joints in `faulty` have known faults, and are left out.
     """
-    forces, angles = np.asarray(recording.forces), np.asarray(recording.angles)
+    forces = np.asarray(recording.forces)
+    angles = np.asarray(recording.angles)
     findings = []
     for j in (j for j in range(robot.joints) if j not in faulty):
-        name, f, speed = robot.joint_names[j], forces[:, j], np.abs(np.gradient(angles[:, j]))
+        name = robot.joint_names[j]
+        f = forces[:, j]
+        speed = np.abs(np.gradient(angles[:, j]))
         low, high = float(f.min()), float(f.max())
         if low == high != 0.0:
             findings.append(
@@ -336,7 +349,8 @@ def stuck_findings(robot: Robot, recording: Recording, faulty: Collection[int] =
         for end, near in ((high, moving > high - band), (low, moving < low + band)):
             values, counts = np.unique(moving[near], return_counts=True)
             nearest = np.argsort(np.abs(values - end))
-            on, beside = int(np.count_nonzero(moving == end)), counts[nearest][1:4]
+            on = int(np.count_nonzero(moving == end))
+            beside = counts[nearest][1:4]
             if on > 0.005 * len(f) and on > 3.0 * beside.sum():
                 findings.append(
                     f"the forces of joint `{name}` stay at {end:.3g} in {on} samples in which it "

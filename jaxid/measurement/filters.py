@@ -308,7 +308,8 @@ class PeriodicFourier(AbstractFilter):
         basis = np.hstack([np.ones((len(t), 1)), s, c])
         series = np.linalg.lstsq(basis, angles - angles[0], rcond=None)[0]
         q = angles[0] + basis @ series
-        moved, left = angles.std(axis=0), np.sqrt(np.mean((angles - q) ** 2, axis=0))
+        moved = angles.std(axis=0)
+        left = np.sqrt(np.mean((angles - q) ** 2, axis=0))
         wrong = np.flatnonzero(left > 0.05 * np.maximum(moved, 0.05 * moved.max()))
         if wrong.size:
             j = int(wrong[0])
@@ -316,7 +317,8 @@ class PeriodicFourier(AbstractFilter):
                 f"the angles of joint {j + 1} leave a Fourier series by {left[j] / moved[j]:.0%} "
                 "of their motion (RMS): correct `period` or `harmonics`, or crop the log."
             )
-        a, b = series[1 : self.harmonics + 1], series[self.harmonics + 1 :]
+        a = series[1 : self.harmonics + 1]
+        b = series[self.harmonics + 1 :]
         W = w[:, None]
         return Motion(q, c @ (W * a) - s @ (W * b), -s @ (W**2 * a) - c @ (W**2 * b))
 

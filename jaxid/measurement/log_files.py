@@ -225,7 +225,8 @@ class _Layout(NamedTuple):
         )
         if not found:
             return (self._name(channel, selection.replace("{}", "1")),)
-        numbers, columns = [number for number, _ in found], [column for _, column in found]
+        numbers = [number for number, _ in found]
+        columns = [column for _, column in found]
         first = min(numbers[0], 1)
         if numbers != list(range(first, first + len(numbers))):
             raise InputError(

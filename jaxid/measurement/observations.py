@@ -225,7 +225,8 @@ class Observations(eqx.Module):
 
     def _times(self, samples: Sequence[range]) -> np.ndarray:
         """Return the times of samples of each segment [s]."""
-        dt, parts = self.sample_time, zip(samples, self.segments, self.start_times, strict=True)
+        dt = self.sample_time
+        parts = zip(samples, self.segments, self.start_times, strict=True)
         return np.concatenate([t + dt * (np.asarray(own) - a) for own, (a, _), t in parts])
 
     def read(self, samples: slice) -> tuple[Motion, Float[AnyArray, "samples joints"]]:
@@ -253,9 +254,11 @@ class Observations(eqx.Module):
         `read(slice(*chunk.samples))`, and `chunk.reduce` gives the rows `slice(*chunk.rows)` of
         `reduce`, up to rounding.
         """
-        factor, edge = self.decimation.factor, self.filter.edge(self.sample_time)
+        factor = self.decimation.factor
+        edge = self.filter.edge(self.sample_time)
         low_pass = self.filter.low_pass(self.sample_time)
-        before, after = self.decimation.memory(), low_pass.memory()
+        before = self.decimation.memory()
+        after = low_pass.memory()
         chunks, step = [], max(1, samples // factor)
         for (a, b), (r0, r1) in zip(self.segments, self.row_segments, strict=True):
             first, last = a + edge, b - edge
@@ -265,7 +268,8 @@ class Observations(eqx.Module):
                 skipped = max(0, start - r0 - -(-before // factor))
                 low = first + skipped * factor
                 high = min(last, first + (stop - 1 - r0) * factor + before + 1)
-                begin, end = max(a, low - after), min(b, high + after)
+                begin = max(a, low - after)
+                end = min(b, high + after)
                 kept = slice(low - begin, high - begin)
                 wanted = slice(start - r0 - skipped, stop - r0 - skipped)
                 reduce = functools.partial(self._reduce, kept, wanted)
@@ -355,7 +359,8 @@ def observe(
             parts.append((filter.motion(q[a:b], measured, r.sample_time), forces[a:b]))
         return SamplesInMemory(*joined(parts))
 
-    name, measured = r.name if name is None else name, r.velocities is not None
+    name = r.name if name is None else name
+    measured = r.velocities is not None
     return prepare(load, r.grid, r.joints, measured, robot, filter, decimation, min_speed, name)
 
 
@@ -381,7 +386,9 @@ def prepare(
             "choose the columns of its joints, or the robot of this log."
         )
     decimation = Subsample(1) if decimation is None else decimation
-    dt, factor, notes = grid.sample_time, decimation.factor, [*grid.notes]
+    dt = grid.sample_time
+    factor = decimation.factor
+    notes = [*grid.notes]
     decimation.check(filter.low_pass(dt).cutoff, dt)
     edge = filter.edge(dt)
     fewest = 2 * edge + (FEWEST_ROWS - 1) * factor + 1

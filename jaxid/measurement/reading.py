@@ -88,7 +88,8 @@ class SamplesOnDisk(AbstractSamples):
     def read(self, samples: slice) -> tuple[Motion, np.ndarray]:
         """Return motion and forces of some samples of one segment, joint side."""
         begin, end = self.segments[self._segment(samples)]
-        a, b = max(begin, samples.start - self.overlap), min(end, samples.stop + self.overlap)
+        a = max(begin, samples.start - self.overlap)
+        b = min(end, samples.stop + self.overlap)
         rows = self.read_rows(slice(a, b))
         angles, velocities, forces = joint_side(self.robot, self.log.columns, *rows)
         motion = self.filter.motion(angles, velocities, self.sample_time)
@@ -153,8 +154,10 @@ def scan_log(
             columns would be aliased, or no samples are left.
     """
     log = open_log(path, columns, forces_path, velocities_path, on_disk=True)
-    rows, first_row = log.tables[0].rows, log.tables[0].first_row
-    source, measured = Path(path), columns.velocities is not None
+    rows = log.tables[0].rows
+    first_row = log.tables[0].first_row
+    source = Path(path)
+    measured = columns.velocities is not None
     name = source.stem if name is None else name
     if columns.sample_time is not None:
         grid = TimeGrid(columns.sample_time, ((0, rows),))

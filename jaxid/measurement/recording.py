@@ -346,7 +346,8 @@ def find_grid(
         start_times += t[gaps + 1].tolist()
         pauses += steps[gaps].tolist()
         regular = steps[steps < 1.5 * typical + 8.0 * spread]
-        total, count = total + float(regular.sum()), count + len(regular)
+        total = total + float(regular.sum())
+        count = count + len(regular)
         rows = row + len(t)
     # Stamps are rounded numbers: a round sample time that fits them as well is the true one.
     sample_time = total / count
@@ -432,7 +433,9 @@ def _resampling(
         kept = kept[np.append(True, steps > REPEATED * float(np.median(steps)))]
     t = stamps[kept]
     grid = find_grid(lambda: [t], source, largest_gap, first_row)
-    t, dt, notes = t - stamps[0], grid.sample_time, list(grid.notes)
+    t = t - stamps[0]
+    dt = grid.sample_time
+    notes = list(grid.notes)
     if removed := len(stamps) - len(kept):
         notes.insert(
             0,

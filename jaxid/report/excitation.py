@@ -51,7 +51,8 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         f"({float(getattr(limits, name)[j]):.4g} {robot.joint_unit(j)}{rates.get(name, '')})"
         for name, j in plan.limits.assumed
     )
-    published, vague = ", ".join(limits.assumed), ", ".join(plan.vague)
+    published = ", ".join(limits.assumed)
+    vague = ", ".join(plan.vague)
     doubts = (
         published and f"Limits that nobody published, assumed: {published}",
         assumed and f"Assumed, because not given: {assumed}",
@@ -91,7 +92,8 @@ def write_excitation(
     The motion with its leads is drawn where there is one. `settings` tell the origin of the design
     as in `provenance`.
     """
-    robot, shown = plan.base.model.robot, plan.trajectory if played is None else played
+    robot = plan.base.model.robot
+    shown = plan.trajectory if played is None else played
     with double_precision():
         time = np.linspace(0.0, float(shown.duration), 801)
         motion = shown.motion(time)
@@ -129,9 +131,12 @@ def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         return Remark("This motion does not determine all base parameters.", Status.BAD)
     if not plan.feasible:
         return Remark("This motion does not keep all limits.", Status.BAD)
-    text, status = "A motion that keeps all limits, and determines all parameters.", Status.GOOD
+    text = "A motion that keeps all limits, and determines all parameters."
+    status = Status.GOOD
     if plan.interrupted:
-        text, status = "The design of this motion was stopped.", Status.DOUBTFUL
+        text = "The design of this motion was stopped."
+        status = Status.DOUBTFUL
     elif any(remark.status is Status.BAD for remark in remarks):
-        text, status = "Read the remarks below before you record this motion.", Status.DOUBTFUL
+        text = "Read the remarks below before you record this motion."
+        status = Status.DOUBTFUL
     return Remark(text, status)

@@ -50,7 +50,8 @@ def parameter_figure(fit: Fit) -> Figure:
     finite = relative[np.isfinite(relative) & (relative > 0)]
     least = max(1e-5, float(finite.min())) if len(finite) else 1e-2
     low = min(10.0 ** math.floor(math.log10(least) - 0.1), 1e-2)
-    good, name = fit.trust.count(Status.GOOD), fit.base.model.robot.name
+    good = fit.trust.count(Status.GOOD)
+    name = fit.base.model.robot.name
     title = f"{name}: {good} of {len(relative)} base parameters are known to 10 %"
     with drawing(title) as figure:
         for axes, shown in _list_panels(figure, order, 0.19, 1.35):
@@ -74,7 +75,8 @@ def comparison_figure(comparison: Comparison) -> Figure:
         comparison: Comparison of two fits.
     """
     first, second = comparison.first, comparison.second
-    changed, size = comparison.verdicts.count(Verdict.CHANGED), len(comparison.indices)
+    changed = comparison.verdicts.count(Verdict.CHANGED)
+    size = len(comparison.indices)
     title = f"{changed} of {size} parameters have changed"
     with drawing(title) as figure:
         for axes, shown in _list_panels(figure, np.arange(size), 0.21, 1.5):
@@ -164,7 +166,8 @@ def _draw_intervals(axes: Axes, comparison: Comparison, shown: np.ndarray) -> No
     axes.axvline(0.0, color=GREY, lw=0.7, zorder=1)
     axes.set_xlim(-1.08, 1.08)
     axes.set_xlabel("estimate / farthest end of both intervals")
-    verdicts, difference = comparison.verdicts, np.asarray(comparison.difference)
+    verdicts = comparison.verdicts
+    difference = np.asarray(comparison.difference)
     numbers = with_deviations(difference[shown], comparison.half_widths[shown])
     units = [comparison.units[i] for i in shown]
     texts = [
@@ -242,7 +245,8 @@ def _joint_panels(figure: Figure, n: int, height: float) -> list[Axes]:
 
 
 def _draw_spectrum(axes: Axes, spectra: ResidualSpectra, j: int, robot: Robot) -> None:
-    frequency, density = np.asarray(spectra.frequency), np.asarray(spectra.density)[j]
+    frequency = np.asarray(spectra.frequency)
+    density = np.asarray(spectra.density)[j]
     gain = np.asarray(spectra.gain) ** 2
     shown = (frequency > 0) & (gain > 1e-4)
     level = np.sum(density[shown]) / np.sum(gain[shown])
@@ -253,7 +257,8 @@ def _draw_spectrum(axes: Axes, spectra: ResidualSpectra, j: int, robot: Robot) -
         logarithmic(axes, "y")
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("(N m)²/Hz" if robot.force_unit(j) == "N m" else "N²/Hz")
-    verdict, low = "white" if spectra.white[j] else "not white", float(spectra.low_frequency[j])
+    verdict = "white" if spectra.white[j] else "not white"
+    low = float(spectra.low_frequency[j])
     text = f"{verdict}: {percent(low)} % of the power below {0.1 * spectra.band:.2g} Hz"
     caption(axes, shortened(robot.joint_names[j], 24), text)
 
@@ -298,7 +303,8 @@ def autocorrelation_figure(
         ]
         if spectra is not None:
             # Autocorrelation of white noise behind the filters.
-            f, power = np.asarray(spectra.frequency), np.asarray(spectra.gain) ** 2
+            f = np.asarray(spectra.frequency)
+            power = np.asarray(spectra.gain) ** 2
             weights = np.gradient(f) * power
             filtered = np.cos(2.0 * np.pi * np.outer(lags, f)) @ weights / weights.sum()
             for axes in panels:
@@ -315,7 +321,8 @@ def autocorrelation(errors: TorqueErrors, lags: int) -> Float[np.ndarray, "lags 
     """
     e = errors.errors
     e = e - np.nanmean(e, axis=0)
-    counted, e = np.isfinite(e).astype(float), np.nan_to_num(e)
+    counted = np.isfinite(e).astype(float)
+    e = np.nan_to_num(e)
 
     def correlate(x: np.ndarray) -> np.ndarray:
         return fftconvolve(x, x[::-1], axes=0)[len(x) - 1 :][:lags]

@@ -89,7 +89,8 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
     blocks: list[Figure | str] = [figures[name] for name in names[:shown]]
     if others := ", ".join(f"{name}.png" for name in names[shown:]):
         blocks.append(f"Figures of more recordings lie beside this page: {others}.")
-    about, gravity = robot.summary(), ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
+    about = robot.summary()
+    gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
     assumed = ", ".join(robot.limits.assumed) or "nothing"
     facts = [*about.facts, ("gravity [m/s²]", gravity), ("assumed", assumed)]
     sections = [
@@ -159,7 +160,8 @@ def parameter_table(fit: Fit) -> Table:
 
 def motor_tables(robot: Robot) -> list[Table]:
     """Return the motors of a robot, if it has gears or couplings: their joints and properties."""
-    drives, A = robot.drives, np.asarray(robot.drives.reduction)
+    drives = robot.drives
+    A = np.asarray(robot.drives.reduction)
     if drives.is_direct:
         return []
     turns = [
@@ -208,7 +210,8 @@ def residual_table(spectra: ResidualSpectra, robot: Robot) -> Table:
 
 def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
     """Return mass, centre of mass and margin of each body, and the effect of the bounds."""
-    mass, bounded = np.asarray(consistency.bodies)[:, 0], consistency.masses_from_bounds
+    mass = np.asarray(consistency.bodies)[:, 0]
+    bounded = consistency.masses_from_bounds
     centre = np.asarray(consistency.bodies)[:, 1:4] / mass[:, None]
     axes = [
         Column(f"{axis} of\ncentre", centre[:, k], "m", lambda x: significant(x, 2))
@@ -236,7 +239,8 @@ def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
 def verdict(report: Report) -> list[Remark]:
     """Return the verdict on a model: one sentence for everything, then one for each criterion."""
     fit, definiteness = report.fit, report.definiteness
-    condition, eigenvalue = fit.condition_numbers.scaled, significant(definiteness.smallest)
+    condition = fit.condition_numbers.scaled
+    eigenvalue = significant(definiteness.smallest)
     bodies = []
     if fit.consistency is not None:
         active = "; ".join(fit.consistency.active) or "none"
@@ -339,7 +343,8 @@ def _judge_residuals(fit: Fit) -> list[Remark]:
         "for correlated residuals."
     )
     nearly = float(np.max(np.asarray(spectra.departure))) <= 2.0 * spectra.limit
-    status, doubt = Status.NEUTRAL if nearly else Status.DOUBTFUL, ""
+    status = Status.NEUTRAL if nearly else Status.DOUBTFUL
+    doubt = ""
     if white == joints:
         status = Status.GOOD
     elif not nearly:

@@ -50,7 +50,8 @@ def joint_figure(
         time: Instants of the samples [s].
         motion: Motion at the samples.
     """
-    speed, acceleration = np.asarray(limits.velocity), np.asarray(limits.acceleration)
+    speed = np.asarray(limits.velocity)
+    acceleration = np.asarray(limits.acceleration)
     kinds = (
         ("", motion.q, limits.position_min, limits.position_max),
         ("/s", motion.qd, -speed, speed),
@@ -112,7 +113,8 @@ def filtered_figure(
         filtered: Motion that the filter makes of measured positions.
         joint: Index of the joint, from 0.
     """
-    unit, title = robot.joint_unit(joint), f"{robot.name}: {robot.joint_names[joint]}"
+    unit = robot.joint_unit(joint)
+    title = f"{robot.name}: {robot.joint_names[joint]}"
     with drawing(f"{title}, desired and filtered", WIDTH, 4.5) as figure:
         panels = figure.subplots(2, 1, sharex=True)
         for axes, name, rate, *pair in (
@@ -224,7 +226,8 @@ def animation(
         collision: Collision model, whose capsules are drawn.
         frames: Number of pictures, two at least.
     """
-    t, q = np.asarray(time, np.float64), np.asarray(q, np.float64)
+    t = np.asarray(time, np.float64)
+    q = np.asarray(q, np.float64)
     instants = np.linspace(t[0], t[-1], frames)
     shown = np.stack([np.interp(instants, t, column) for column in q.T], axis=1)
     view = _project(robot, shown, collision)
@@ -265,7 +268,8 @@ def _project(robot: Robot, q: np.ndarray, collision: CollisionModel | None) -> _
     bones = [np.stack([p, origins[:, i]], axis=1) for i, p in enumerate(starts)]
     bones.append(np.stack([origins[:, robot.tip_body], tips], axis=1))
     points = np.stack(bones, axis=1)
-    low, high = points.min(axis=(0, 1, 2)), points.max(axis=(0, 1, 2))
+    low = points.min(axis=(0, 1, 2))
+    high = points.max(axis=(0, 1, 2))
     margin = 0.1 * np.max(high - low)
     x, y = (MaxNLocator(12).tick_values(low[k] - margin, high[k] + margin) for k in range(2))
     across = [[[u, y[0], 0.0], [u, y[-1], 0.0]] for u in x]
@@ -315,7 +319,9 @@ def _pose_artists(
     view: _View, k: int, strength: float
 ) -> Iterator[PolyCollection | LineCollection]:
     """Yield one pose: its capsules, those in front last, then its lines and joints above them."""
-    z, capsules, lines = 2.0 + strength, view.moving[k], view.bones[k][..., :2]
+    z = 2.0 + strength
+    capsules = view.moving[k]
+    lines = view.bones[k][..., :2]
     shapes = [
         _outline(capsules[i, :, :2], float(view.radii[i]))
         for i in np.argsort(capsules[:, :, 2].mean(axis=1), kind="stable")
@@ -336,7 +342,8 @@ def _pose_artists(
 
 def _draw_scene(figure: Figure, view: _View) -> Axes:
     """Draw the grid on the ground and fixed capsules, with room for all poses."""
-    shapes, reach = view.moving[..., :2].reshape(-1, 2), view.radii.max(initial=0.0)
+    shapes = view.moving[..., :2].reshape(-1, 2)
+    reach = view.radii.max(initial=0.0)
     lines = view.floor.reshape(-1, 2), view.bones[..., :2].reshape(-1, 2)
     points = np.concatenate([*lines, shapes - reach, shapes + reach])
     low, (width, height) = points.min(axis=0), np.ptp(points, axis=0)

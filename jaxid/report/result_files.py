@@ -68,7 +68,8 @@ def write_report(folder: Path, report: Report, pdf: bool = False) -> list[Path]:
 
 def _draw(report: Report) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
-    robot, spectra = report.fit.base.model.robot, report.fit.residual_spectra
+    robot = report.fit.base.model.robot
+    spectra = report.fit.residual_spectra
     figures = {
         "errors": error_figure(report.identification, report.verification, robot),
         "parameters": parameter_figure(report.fit),
@@ -130,7 +131,9 @@ def write_comparison(
     folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
 ) -> list[Path]:
     """Write `comparison.json`, `comparison.csv` and `comparison.png`; return the files."""
-    first, second, k = comparison.first, comparison.second, list(comparison.indices)
+    first = comparison.first
+    second = comparison.second
+    k = list(comparison.indices)
     rows = _rows(
         name=comparison.names,
         expression=[first.base.expressions[i] for i in k],
@@ -168,7 +171,8 @@ def write_estimates(
     """Write a payload, gains or states as `{kind}.json` and `{kind}.csv`; return the files."""
     rows = []
     for names, units, values, uncertainty in estimates:
-        deviations, halves = uncertainty.standard_deviations, uncertainty.half_widths()
+        deviations = uncertainty.standard_deviations
+        halves = uncertainty.half_widths()
         rows += _rows(
             name=names,
             unit=units,
@@ -249,7 +253,9 @@ def _rows(**columns: Any) -> list[dict[str, Any]]:
 def _record(report: Report) -> dict[str, Any]:
     """Return the content of `result.json`."""
     fit, definiteness = report.fit, report.definiteness
-    base, model, robot = fit.base, fit.base.model, fit.base.model.robot
+    base = fit.base
+    model = fit.base.model
+    robot = fit.base.model.robot
     return plain(
         {
             **header("result.json"),

@@ -84,7 +84,8 @@ def torque_figure(
 def _draw_joint(
     upper: Axes, lower: Axes, errors: TorqueErrors, robot: Robot, j: int, window: slice
 ) -> None:
-    unit, time = robot.force_unit(j), np.asarray(errors.time)[window]
+    unit = robot.force_unit(j)
+    time = np.asarray(errors.time)[window]
     difference = errors.errors[window, j]
     for axes, values, colour, width in (
         (upper, np.asarray(errors.measured)[window, j], MEASURED, 1.9),
@@ -133,7 +134,8 @@ def decimate(
     place = np.minimum((bins * ((t - t[0]) / (t[-1] - t[0]))).astype(int), bins - 1)
     first = np.flatnonzero(np.diff(place, prepend=-1))
     last = np.append(first[1:], len(t)) - 1
-    least, largest = np.fmin.reduceat(y, first), np.fmax.reduceat(y, first)
+    least = np.fmin.reduceat(y, first)
+    largest = np.fmax.reduceat(y, first)
     rising = ~(y[last] < y[first])
     points = np.stack([np.where(rising, least, largest), np.where(rising, largest, least)], axis=1)
     times = np.stack([t[first], t[last]], axis=1)
@@ -186,7 +188,8 @@ def bar_figure(groups: Sequence[tuple[str, Sequence[TorqueErrors]]], robot: Robo
     everything = [errors for _, recordings in filled for errors in recordings]
     for errors in everything:
         require_joints(errors, robot)
-    largest, n = np.asarray(everything[0].max_forces), robot.joints
+    largest = np.asarray(everything[0].max_forces)
+    n = robot.joints
     known = bool(np.isfinite(largest).all())
     width = min(0.36, 0.72 / len(filled))
     figure_width = max(7.6, min(2.0 + 1.1 * n, 1.4 * WIDTH))
@@ -227,7 +230,8 @@ def _pool(recordings: Sequence[TorqueErrors]) -> tuple[np.ndarray, np.ndarray, n
     counted = np.concatenate([np.asarray(r.counted) for r in recordings])
     forces = np.concatenate([np.asarray(r.measured) for r in recordings])
     rows = np.maximum(counted.sum(axis=0), 1)
-    e, forces = np.where(counted, e, 0.0), np.where(counted, forces, 0.0)
+    e = np.where(counted, e, 0.0)
+    forces = np.where(counted, forces, 0.0)
     mean = np.abs(e).sum(axis=0) / rows
     rms, force_rms = (np.sqrt((x**2).sum(axis=0) / rows) for x in (e, forces))
     return mean, rms, force_rms

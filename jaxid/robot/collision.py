@@ -63,7 +63,8 @@ class CollisionModel(Hashable):
         obstacles: Sequence[HalfSpace | Box] = (),
         pairs: Sequence[tuple[str, str]] | None = None,
     ):
-        self.capsules, self.obstacles = tuple(capsules), tuple(obstacles)
+        self.capsules = tuple(capsules)
+        self.obstacles = tuple(obstacles)
         names = [shape.name for shape in (*capsules, *obstacles)]
         for name in names:
             if names.count(name) > 1:
@@ -143,7 +144,8 @@ class CollisionModel(Hashable):
 
 def _always_overlapping(robot: Robot, model: CollisionModel) -> list[str]:
     """Return the names of the pairs that overlap in each of 200 random poses."""
-    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
+    low = np.asarray(robot.limits.position_min)
+    high = np.asarray(robot.limits.position_max)
     low = np.where(np.isfinite(low), low, -np.pi)
     high = np.where(np.isfinite(high), high, np.pi)
     random = np.random.default_rng(0)

@@ -53,7 +53,8 @@ class Inertia(eqx.Module):
         """Ten parameters $(m, m r_c, A, B, C, D, E, F)$ about the frame's origin (Eqs. 8, 9)."""
         m = self.mass[..., None]
         J = self.tensor + m[..., None] * _moments_of_points(self.centre)
-        squares, products = J[..., (0, 1, 2), (0, 1, 2)], -J[..., (1, 0, 0), (2, 2, 1)]
+        squares = J[..., (0, 1, 2), (0, 1, 2)]
+        products = -J[..., (1, 0, 0), (2, 2, 1)]
         parts = [m, m * self.centre, squares, products]
         return namespace(self.mass, self.centre, self.tensor).concatenate(parts, axis=-1)
 
@@ -80,7 +81,9 @@ class Inertia(eqx.Module):
         """
         if is_traced(self):
             return ""
-        m, r, J = float(self.mass), np.asarray(self.centre), np.asarray(self.tensor)
+        m = float(self.mass)
+        r = np.asarray(self.centre)
+        J = np.asarray(self.tensor)
         if not (np.isfinite(m) and np.isfinite(r).all() and np.isfinite(J).all()):
             return "its `mass`, `centre_of_mass` or `inertia` is not finite"
         if not 0.0 <= m <= HEAVIEST:

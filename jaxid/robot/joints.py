@@ -230,7 +230,9 @@ def far_notes(owner: str, lengths: Numbers) -> tuple[str, ...]:
 
 def limit_notes(names: Sequence[str], revolute: Sequence[bool], limits: Limits) -> Iterator[str]:
     """Yield notes on limits that may be in millimetres or in degrees per second."""
-    low, high, speeds = limits.position_min, limits.position_max, limits.velocity
+    low = limits.position_min
+    high = limits.position_max
+    speeds = limits.velocity
     if not all(isinstance(x, np.ndarray) and x.ndim == 1 for x in (low, high, speeds)):
         return
     for name, turns, speed, *ends in zip(names, revolute, speeds, low, high, strict=True):

@@ -34,7 +34,9 @@ def placement_in_parent(
     robot: Robot, body: int, q: Float[AnyArray, ""]
 ) -> tuple[Float[AnyArray, "3 3"], Float[AnyArray, "3"]]:
     """Return attitude and origin [m] of a body in its parent, moved by its joint's coordinate."""
-    R, r, axis = robot.rotation[body], robot.offset[body], robot.axis[body]
+    R = robot.rotation[body]
+    r = robot.offset[body]
+    axis = robot.axis[body]
     if robot.revolute[body]:
         return R @ rotation_about(axis, q), r
     return R, r + R @ axis * q
@@ -49,7 +51,8 @@ def placements(
     for i, parent in enumerate(robot.parent):
         R, r = placement_in_parent(robot, i, q[i])
         if parent >= 0:
-            R, r = rotations[parent] @ R, origins[parent] + rotations[parent] @ r
+            R = rotations[parent] @ R
+            r = origins[parent] + rotations[parent] @ r
         rotations.append(R)
         origins.append(r)
     return jnp.stack(rotations), jnp.stack(origins)
@@ -70,7 +73,8 @@ def tip_jacobian(robot: Robot, q: Float[np.ndarray, "poses joints"]) -> tuple[np
     The derivatives are velocities of the origin and angular velocities by the rates of the joints.
     """
     poses, n = q.shape
-    R, r = np.broadcast_to(np.eye(3), (poses, 3, 3)), np.zeros((poses, 3))
+    R = np.broadcast_to(np.eye(3), (poses, 3, 3))
+    r = np.zeros((poses, 3))
     turn, slide, origin = (np.zeros((poses, n, 3)) for _ in range(3))
     offset, rotation, axes = (np.asarray(x) for x in (robot.offset, robot.rotation, robot.axis))
     for i in robot.ancestors[robot.tip_body]:
@@ -145,7 +149,8 @@ def inverse_kinematics_along(
     Raises:
         InputError: If a pose cannot be reached, or only with a jump or beyond the limits.
     """
-    task, goals = _task(robot, posture), _goals(positions, rotation)
+    task = _task(robot, posture)
+    goals = _goals(positions, rotation)
     count, faults = len(goals), []
     for start in _candidates(task, goals[:1], f"pose 1 of {count}")[:8]:
         q = _follow(task, goals, start)
@@ -156,7 +161,8 @@ def inverse_kinematics_along(
         failed = np.flatnonzero(missed | jumps | outside)
         if not len(failed):
             return np.clip(q, task.low, task.high)
-        k, reason = int(failed[0]), "the joints would have to jump, for the pose is singular"
+        k = int(failed[0])
+        reason = "the joints would have to jump, for the pose is singular"
         if outside[k] and not missed[k]:
             reason = f"joint `{robot.joint_names[int(beyond[k].argmax())]}` leaves its range"
         faults.append((k, reason))
@@ -182,7 +188,8 @@ class _Task(NamedTuple):
 
 def _task(robot: Robot, posture: Numbers | None) -> _Task:
     """Return the checked task of a robot; joints without limits get a range of their own."""
-    low, high = np.asarray(robot.limits.position_min), np.asarray(robot.limits.position_max)
+    low = np.asarray(robot.limits.position_min)
+    high = np.asarray(robot.limits.position_max)
     known = np.isfinite(low) & np.isfinite(high)
     with np.errstate(invalid="ignore"):
         half = np.where(known, (high - low) / 2, np.where(robot.revolute, np.pi, 1.0))
@@ -222,7 +229,8 @@ def _linearise(task: _Task, goals: np.ndarray, q: np.ndarray) -> tuple[np.ndarra
     e, J = r - goals[:, :, 0], shift
     if goals.shape[2] > 1:
         away = Rotation.from_matrix(R @ np.swapaxes(goals[:, :, 1:], 1, 2)).as_rotvec()
-        e, J = np.concatenate([e, away], axis=1), np.concatenate([J, turn], axis=2)
+        e = np.concatenate([e, away], axis=1)
+        J = np.concatenate([J, turn], axis=2)
     return e, np.swapaxes(J, 1, 2) * task.half, shift, turn
 
 
@@ -258,14 +266,16 @@ def _descend(
         slope = (q - task.posture) / task.half + np.einsum("pij,pi->pj", J, multipliers)
         step = np.linalg.solve(K, np.concatenate([slope, e], axis=1)[..., None])[..., 0]
         step /= np.maximum(1.0, np.abs(step[:, :n]).max(axis=1, keepdims=True) / _LARGEST_STEP)
-        q, multipliers = q - task.half * step[:, :n], multipliers - step[:, n:]
+        q = q - task.half * step[:, :n]
+        multipliers = multipliers - step[:, n:]
     return q, multipliers
 
 
 def _try_starts(task: _Task, goal: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return solutions from all starts: nearest to the posture, and as the search found them."""
     # Steps of Levenberg and Marquardt within limits.
-    q, eye = np.clip(task.starts, low, high), np.eye(task.robot.joints)
+    q = np.clip(task.starts, low, high)
+    eye = np.eye(task.robot.joints)
     damping = np.full(len(q), 1e-2)
     e, J, _, _ = _linearise(task, goal, q)
     for _ in range(80):
@@ -275,7 +285,8 @@ def _try_starts(task: _Task, goal: np.ndarray, low: np.ndarray, high: np.ndarray
         e_then, J_then, _, _ = _linearise(task, goal, then)
         better = (e_then**2).sum(axis=1) < (e**2).sum(axis=1)
         damping = np.clip(damping * np.where(better, 0.2, 4.0), 1e-12, 1e3)
-        q, e = np.where(better[:, None], then, q), np.where(better[:, None], e_then, e)
+        q = np.where(better[:, None], then, q)
+        e = np.where(better[:, None], e_then, e)
         J = np.where(better[:, None, None], J_then, J)
     none = np.zeros((len(q), 3 if goal.shape[2] == 1 else 6))
     return np.concatenate([_descend(task, goal, q, none, 60, 6)[0], q])
@@ -297,7 +308,8 @@ def _candidates(task: _Task, goal: np.ndarray, name: str) -> list[np.ndarray]:
             kept.append(np.clip(one, task.low, task.high))
     if kept:
         return kept
-    robot, free = task.robot, np.full(task.robot.joints, np.inf)
+    robot = task.robot
+    free = np.full(task.robot.joints, np.inf)
     q = _try_starts(task, goal, -free, free)
     distances = _distances(task, goal, q)
     reached = distances.max(axis=1) <= _REACHED

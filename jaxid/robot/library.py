@@ -85,7 +85,8 @@ def from_dh(
     for i, (label, (alpha, a, d, theta)) in enumerate(zip(labels, table, strict=False)):
         pair, snapped = snap_angles(label, ("alpha", "theta"), (alpha, theta), snap_tolerance)
         (alpha, theta), notes = pair, notes + snapped
-        twist, turn = axis_rotation(_X, alpha), axis_rotation(_Z, theta)
+        twist = axis_rotation(_X, alpha)
+        turn = axis_rotation(_Z, theta)
         if convention == "modified":
             rotation[i], offset[i] = twist @ turn, a * _X + d * (twist @ _Z)
         else:
@@ -149,7 +150,8 @@ def tx90l_on_rail_collision() -> CollisionModel:
     The shoulder's column moves with the rail; the wrist's capsule has a tool of 0.2 m beyond the
     flange's joint.
     """
-    robot, entry = tx90l_on_rail(), _entries()["tx90l_on_rail_collision"]
+    robot = tx90l_on_rail()
+    entry = _entries()["tx90l_on_rail_collision"]
     capsules = [Capsule(**capsule) for capsule in entry["capsules"]]
     return CollisionModel(robot, capsules, (HalfSpace("ground"),), entry["pairs"])
 

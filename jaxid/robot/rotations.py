@@ -33,7 +33,8 @@ def rotation_about(
     """
     xp = namespace(axis, angle)
     along = axis[:, None] * axis[None, :]
-    cosine, sine = xp.cos(angle)[..., None, None], xp.sin(angle)[..., None, None]
+    cosine = xp.cos(angle)[..., None, None]
+    sine = xp.sin(angle)[..., None, None]
     return along + cosine * (np.eye(3) - along) + sine * skew(axis)
 
 

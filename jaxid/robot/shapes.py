@@ -76,7 +76,9 @@ class HalfSpace(eqx.Module):
         length = np.linalg.norm(n)
         if length < 1e-9 or not np.isfinite(height).all():
             raise InputError(f"`{name}` needs a `normal` that is not zero, and a finite `height`.")
-        self.name, self.normal, self.height = name, n / length, np.array(height, np.float64)
+        self.name = name
+        self.normal = n / length
+        self.height = np.array(height, np.float64)
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""

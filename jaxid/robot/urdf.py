@@ -222,7 +222,8 @@ class UrdfTree:
         waiting = self._below[base][::-1]
         while waiting:
             joint = waiting.pop()
-            name, fixed = joint.get("name"), joint.get("type") == "fixed"
+            name = joint.get("name")
+            fixed = joint.get("type") == "fixed"
             if not fixed and chain is not None and joint not in chain:
                 continue
             parent, child = _ends(joint)
@@ -293,7 +294,8 @@ class UrdfTree:
         element = self.links[link].find("inertial")
         if element is None:
             return None
-        origin, moments = element.find("origin"), element.find("inertia")
+        origin = element.find("origin")
+        moments = element.find("inertia")
         (mass,) = self.numbers(element.find("mass"), "value", (0.0,))
         rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
         tensor = np.array([[self.numbers(moments, key, (0.0,))[0] for key in row] for row in rows])
