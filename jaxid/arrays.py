@@ -106,10 +106,9 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
         chosen = np.arange(start, start + size) % count
         return jax.block_until_ready(solve(jax.tree.map(lambda x: x[chosen], data)))
 
-    # The first part compiles for all.
-    first = part(0)
+    # The first call compiles, and the others wait for it.
     with ThreadPoolExecutor(os.cpu_count() if jax.default_backend() == "cpu" else 1) as pool:
-        found = [first, *pool.map(part, range(size, count, size))]
+        found = list(pool.map(part, range(0, count, size)))
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *found)
 
 

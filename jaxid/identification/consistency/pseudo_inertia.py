@@ -5,7 +5,8 @@ moment and mass. Ten numbers belong to some distribution of positive masses if a
 positive semidefinite (Wensing, Kim, Slotine, 2018), which includes the triangle inequality of the
 principal moments of inertia.
 
-`are_definite` and `symmetric_part` take stacks of such matrices, of NumPy and JAX alike.
+The second half of the file is arithmetic on stacks of such matrices, for NumPy and JAX alike. The
+loops over four rows are unrolled: a stack takes a few dozen array operations and no call of LAPACK.
 """
 
 from types import ModuleType
@@ -71,6 +72,23 @@ def consistency_margin(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray
     return np.linalg.eigvalsh(P * scale[..., :, None] * scale[..., None, :])[..., 0]
 
 
+def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:
+    """Return the entries of the lower triangles; NaN where a matrix is not positive definite."""
+    n = P.shape[-1]
+    L: list[list[Values]] = [[P[..., 0, 0]] * n for _ in range(n)]
+    for j in range(n):
+        pivot = P[..., j, j]
+        for k in range(j):
+            pivot = pivot - L[j][k] ** 2
+        L[j][j] = xp.sqrt(pivot)
+        for i in range(j + 1, n):
+            entry = P[..., i, j]
+            for k in range(j):
+                entry = entry - L[i][k] * L[j][k]
+            L[i][j] = entry / L[j][j]
+    return L
+
+
 def are_definite(P: Values) -> Values:
     """Return whether matrices, side by side along the last axis, are positive definite."""
     good = P[:, 0, 0] > 0
@@ -79,6 +97,32 @@ def are_definite(P: Values) -> Values:
         P = P[:, 1:, 1:] - column[:, :, None] * (column / P[:, :1, 0])[:, None]
         good = good & (P[:, 0, 0] > 0)
     return good
+
+
+def log_determinant(xp: ModuleType, P: Values) -> Values:
+    """Return the logarithms of the determinants of positive definite matrices."""
+    L = _cholesky(xp, P)
+    total = xp.log(L[0][0])
+    for j in range(1, P.shape[-1]):
+        total = total + xp.log(L[j][j])
+    return 2.0 * total
+
+
+def inverse(xp: ModuleType, P: Values) -> Values:
+    """Return the inverses of positive definite matrices."""
+    L = _cholesky(xp, P)
+    n = P.shape[-1]
+    zero = xp.zeros_like(P[..., 0, 0])
+    rows = [[zero] * n for _ in range(n)]
+    for j in range(n):
+        rows[j][j] = 1.0 / L[j][j]
+        for i in range(j + 1, n):
+            total = zero
+            for k in range(j, i):
+                total = total + L[i][k] * rows[k][j]
+            rows[i][j] = -total / L[i][i]
+    M = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+    return xp.swapaxes(M, -1, -2) @ M
 
 
 def symmetric_part(xp: ModuleType, P: Values) -> Values:

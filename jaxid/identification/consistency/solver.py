@@ -28,6 +28,8 @@ from jaxid.identification.consistency.pseudo_inertia import (
     BASIS,
     Values,
     are_definite,
+    inverse,
+    log_determinant,
     symmetric_part,
 )
 
@@ -114,7 +116,7 @@ def _solve(xp: ModuleType, p: ConeProgram, loop: Callable) -> Optimum:
         return point, best, iterations, stalled, finished
 
     S, s = p.slacks(xp, p.start)
-    inverse_S, rest = xp.linalg.inv(S), p.A @ p.start - p.b
+    inverse_S, rest = inverse(xp, S), p.A @ p.start - p.b
     # Multipliers on the start's central path, as large as its gradient.
     force = xp.linalg.norm(p.adjoint(xp, inverse_S, 1.0 / s))
     most = (0.5 * rest @ rest + TINY) / p.complementarity
@@ -143,7 +145,7 @@ def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _
     # optimum: their sum less that of one and of their logarithms.
     product = xp.sum(S * Z, axis=(-2, -1))
     gap, pulled = product[: p.bodies], p.pull > 0
-    logs = xp.linalg.slogdet(S[: p.bodies])[1] + xp.linalg.slogdet(Z[: p.bodies])[1]
+    logs = log_determinant(xp, S[: p.bodies]) + log_determinant(xp, Z[: p.bodies])
     strength = 4.0 * xp.log(xp.where(pulled, p.pull, 1.0))
     gap = xp.where(pulled, gap - 4.0 * p.pull - p.pull * (logs - strength), gap)
     gap = xp.sum(gap) + xp.sum(product[p.bodies :])
@@ -159,7 +161,7 @@ def _targets(xp: ModuleType, p: ConeProgram) -> Values:
 
 def _step(xp: ModuleType, p: ConeProgram, gram: Values, x: _Point) -> tuple[_Point, Values]:
     """Take the longer step of two correctors; return the new point and the step length."""
-    inverse_S, ratio, target = xp.linalg.inv(x.S), x.z / x.s, _targets(xp, p)
+    inverse_S, ratio, target = inverse(xp, x.S), x.z / x.s, _targets(xp, p)
     solve = _newton_solver(xp, p, gram + _barriers(xp, p, inverse_S, x.Z, ratio))
 
     def direction(rZ: Values, rz: Values, right: Values) -> _Direction:
