@@ -89,6 +89,12 @@ def load(tmp_path):
     return load
 
 
+def test_every_key_is_described():
+    functions = [f for table in TABLES.values() for f in table]
+    bare = [k.name for f in functions for k in keys_of(f).values() if not k.text]
+    assert not bare, "describe the keys in the docstring of their function or class"
+
+
 def test_defaults_are_said(load):
     experiment = load(ARM)
     assert len(experiment.model.terms) == 5

@@ -44,6 +44,10 @@ def noisy(base):
     return observations(base.model, standard_parameters(base.model), noise=NOISE)
 
 
+MEMBERS = 9
+"""Number of the estimators that `members` returns."""
+
+
 def members(o, size=1.0):
     # Standard parameters of a bad CAD model: without a ridge they do nothing.
     rough = np.linspace(-size, size, 26)
@@ -60,10 +64,23 @@ def members(o, size=1.0):
     )
 
 
-@pytest.fixture(scope="module", params=range(9))
+@pytest.fixture(scope="module", params=range(MEMBERS))
 def member(request, base, noisy):
     """Number of an estimator, and its fit."""
     return request.param, jid.identify(base, noisy, members(noisy)[request.param])
+
+
+def test_the_laws_cover_every_estimator(noisy):
+    tested = members(noisy)
+    assert len(tested) == MEMBERS
+    family = {
+        c
+        for _, c in inspect.getmembers(est, inspect.isclass)
+        if issubclass(c, est.AbstractEstimator) and not inspect.isabstract(c)
+    }
+    # Shapes of friction need a model with such friction; a description estimates nothing.
+    family -= {est.NonlinearFriction, est.EstimatorInWords}
+    assert family == {type(e) for e in tested}, "add the estimator to `members`"
 
 
 def test_every_estimator_finds_the_truth_without_noise(base, member):

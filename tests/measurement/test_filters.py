@@ -1,12 +1,15 @@
 """Filters: the laws that every member obeys, and each against its formula or scipy."""
 
+import inspect
 import math
 
 import numpy as np
 import pytest
 from scipy import signal
 
+from jaxid.measurement import filters
 from jaxid.measurement.filters import (
+    AbstractFilter,
     Decimation,
     PaperFilter,
     PeriodicFourier,
@@ -36,6 +39,15 @@ def fourier(t, seed=1, joints=3, harmonics=5):
     s, c = np.sin(t[:, None] * wl), np.cos(t[:, None] * wl)
     q = (s @ (a / wl).T) - c @ (b / wl).T + rng.uniform(-1, 1, joints)
     return q, c @ a.T + s @ b.T, -s @ (a * wl).T + c @ (b * wl).T
+
+
+def test_the_laws_cover_every_filter():
+    members = {
+        c
+        for _, c in inspect.getmembers(filters, inspect.isclass)
+        if issubclass(c, AbstractFilter) and not inspect.isabstract(c)
+    }
+    assert members == {type(f) for f in FILTERS}, "add the filter to the list `FILTERS`"
 
 
 @every
