@@ -242,7 +242,8 @@ def _module_from_json(value: dict[str, Any], options: Sequence[Any], place: str)
     named = [c for c in named if not any(b in named for b in c.__mro__[1:])]
     if not named:
         raise InputError(
-            f"`{place or 'the model'}` is a `{kind}`, which is not known: import its module"
+            f"`{place or 'the model'}` is a `{kind}`, which is not known: import the "
+            "module that defines it, or use a newer version of jaxid"
         )
     hints = {f.name: f.type for f in dataclasses.fields(named[-1]) if f.init}
     entries = {

@@ -277,8 +277,14 @@ class ForceLimits(AbstractConstraint):
                 f"`parameters` must hold one finite number for each base parameter ({size}), "
                 f"but has shape {p.shape}: `base.from_standard` makes them of standard ones."
             )
-        if C is not None and (C.shape != (size, size) or not np.isfinite(C).all()):
-            raise InputError(f"`covariance` must be a finite matrix of {size} rows and columns.")
+        if C is None:
+            return
+        fits = C.shape == (size, size) and np.isfinite(C).all()
+        if not fits or np.linalg.eigvalsh(C)[0] < -1e-9 * np.abs(C).max():
+            raise InputError(
+                f"`covariance` must be a finite matrix of {size} rows and columns without "
+                "negative eigenvalues."
+            )
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the relative excess over each limit."""

@@ -142,7 +142,7 @@ class Experiment:
             if recording.sample_time < 1e-6:
                 rate = 1 / recording.sample_time
                 raise InputError(
-                    f"`{log.name}` has {rate:.3g} samples in a second: check its unit."
+                    f"`{log.name}` has {rate:.3g} samples in a second: check `time_unit`."
                 )
             if np.isfinite((logs.start, logs.stop)).any():
                 recording = recording.crop(logs.start, logs.stop)
@@ -183,7 +183,8 @@ class Experiment:
     def _columns_of(self, log: Path) -> Columns:
         if self.columns is None:
             raise InputError(
-                f"{self.path.name}: the table `[recording]` is missing: columns of `{log.name}`."
+                f"{self.path.name}: the table `[recording]` is missing, which names the columns of "
+                f"`{log.name}`."
             )
         return self.columns
 

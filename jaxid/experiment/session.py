@@ -113,7 +113,7 @@ def select_filter(
     if long:
         raise InputError(
             f"{experiment.path.name}: `filter.cutoff` is a list, but `{long[0]}` is long: choose "
-            "with a short part of it."
+            "with a short part of it, and give that one number for the whole."
         )
     recordings = []
     for log in logs:
@@ -160,7 +160,7 @@ def read_runs(
     if experiment.linear is not None:
         raise InputError(
             f"{experiment.path.name}: `estimator.nonlinear_friction` would find other shapes of "
-            "friction in each run: leave it out, and give their `epsilon` and `stribeck`."
+            "friction in each run: leave it out, and give all runs one `epsilon` and `stribeck`."
         )
     estimation, doubts = experiment.estimation, []
     complete = isinstance(estimation.plain.solution, Complete)

@@ -94,7 +94,7 @@ class Columns(eqx.Module):
         current = any(u.quantity is Quantity.CURRENT for u in _each(self.force_unit))
         if current != (self.torque_constants is not None):
             raise InputError(
-                "`torque_constants` [N m/A] and a current as `force_unit` need each other."
+                "`torque_constants` [N m/A] are needed if `force_unit` is a current, and only then."
             )
 
     def _require_unit(self, name: str, *allowed: Quantity) -> None:
@@ -196,6 +196,7 @@ def open_log(
     for table in tables:
         if table.rows != first.rows:
             raise InputError(
-                f"`{table.source}` has {table.rows} rows, but `{first.source}` has {first.rows}."
+                f"`{table.source}` has {table.rows} rows, but `{first.source}` has {first.rows}: "
+                "files of one run must agree row by row."
             )
     return Log(tables, columns)

@@ -427,8 +427,9 @@ class Subsample(AbstractDecimation):
         rate = 1.0 / (sample_time * self.step)
         if self.step > 1 and cutoff > 0.5 * rate:
             raise InputError(
-                f"`Subsample({self.step})` leaves {rate:.6g} Hz, not {2 * cutoff:.6g} Hz: "
-                f"take one of {max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, "
+                f"`Subsample({self.step})` leaves {rate:.6g} Hz, but a cut-off of {cutoff:.6g} Hz "
+                f"needs more than {2 * cutoff:.6g} Hz: take one of "
+                f"{max(1, math.floor(0.5 / (cutoff * sample_time)))} samples at most, "
                 "a lower cut-off, or `Decimation`."
             )
 

@@ -403,7 +403,8 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
             return _named_arrays({name: archive[name] for name in archive.files})
     except Exception as error:  # some ten kinds: it depends on which bytes are damaged
         raise InputError(
-            f"`{path.name}` is no NPZ file of plain arrays: {_said(error)}."
+            f"`{path.name}` is no NPZ file of plain arrays ({_said(error)}): save it by "
+            "`numpy.savez`, without objects."
         ) from error
 
 

@@ -111,7 +111,8 @@ class Recording(eqx.Module):
             stamps = np.array(time, np.float64)
             if stamps.shape != (samples,) or not np.isfinite(stamps).all():
                 raise InputError(
-                    f"`time` of `{name}` must hold {samples} finite stamps: shape {stamps.shape}."
+                    f"`time` of `{name}` must hold {samples} finite stamps, but has shape "
+                    f"{stamps.shape} or stamps that are not finite."
                 )
             dt, times, added, resample = _resampling(stamps, name, largest_gap, first_row)
             data = {key: None if x is None else resample(x) for key, x in data.items()}
@@ -194,7 +195,8 @@ def finite_channel(
         row, joint = (int(i) for i in bad[0])
         raise InputError(
             f"`{key}` of `{name}` must be finite and below {LARGEST:g}, but are "
-            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: remove it."
+            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: check the "
+            "unit, or repair or remove that row."
         )
     return array
 

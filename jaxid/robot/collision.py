@@ -318,7 +318,8 @@ def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndar
         import trimesh
     except ImportError as error:
         raise ImportError(
-            f'`{tree.path}` has meshes: install trimesh (`pip install "jaxid-robotics[meshes]"`).'
+            f"`{tree.path}` has collision meshes, which trimesh reads: "
+            'install it (`pip install "jaxid-robotics[meshes]"`).'
         ) from error
     path, name = Path(tree.path), mesh.get("filename") or ""
     scheme, _, rest = name.rpartition("://")

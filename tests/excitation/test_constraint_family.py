@@ -173,6 +173,7 @@ def test_the_tip_moves_as_its_difference_quotients():
     [
         (lambda: ForceLimits(BASE, NOMINAL[:3]), "`parameters`"),
         (lambda: ForceLimits(BASE, NOMINAL, np.eye(3)), "`covariance`"),
+        (lambda: ForceLimits(BASE, NOMINAL, -np.eye(BASE.size)), "`covariance`"),
         (lambda: TipLimits(0.0), "`speed`"),
         (lambda: TipLimits(low=(0, 0, 0), high=(1, 0, 1)), "`low`"),
         (lambda: TipLimits(low=(0, 0), high=(1, 1)), "`low`"),
