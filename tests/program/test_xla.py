@@ -42,6 +42,7 @@ def test_values_derivatives_and_batches():
     def loss(f, a, b):
         return jnp.sum(jnp.sin(f(a, b)))
 
+    @jax.jit
     def original(a, b):
         return jnp.moveaxis(jax.vmap(chain, in_axes=-1)(a, b), 0, -1)
 
@@ -51,7 +52,7 @@ def test_values_derivatives_and_batches():
     close(gradient(a, b), jax.grad(lambda *x: loss(original, *x), (0, 1))(a, b))
     close(jax.jit(lambda *x: jax.jvp(lowered.dense, x, x))(a, b), jax.jvp(original, (a, b), (a, b)))
     hessian = jax.jit(jax.hessian(lambda a: loss(lowered.dense, a, b[:, :1])))(a[:, :1])
-    close(hessian, jax.hessian(lambda a: loss(original, a, b[:, :1]))(a[:, :1]))
+    close(hessian, jax.jit(jax.hessian(lambda a: loss(original, a, b[:, :1])))(a[:, :1]))
     mapped = jax.jit(jax.vmap(lowered.dense, in_axes=-1, out_axes=-1))(a, b)
     close(mapped, original(a, b))
 
