@@ -15,8 +15,8 @@ from jaxid.measurement.filters import (
     PeriodicFourier,
     Subsample,
     ZeroPhaseButterworth,
-    butterworth,
 )
+from jaxid.measurement.filters.filter import butterworth
 
 DT = 0.001
 OMEGA = 0.8

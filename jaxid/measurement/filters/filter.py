@@ -1,0 +1,178 @@
+"""The two sides that every filter has, and recursive low-passes.
+
+A regressor's columns are not band-limited (friction has edges), so the columns must be filtered
+like the forces, or parameters that are coupled with friction are biased. Hence a filter has two
+sides that belong together: `motion` for the angles, `smooth` for forces and columns.
+"""
+
+import abc
+import math
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from scipy import signal
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
+
+SETTLED = 1e-4
+"""Fraction of the impulse response's peak below which the start of a log no longer matters."""
+
+
+def optional(value: float | int | None) -> float | None:
+    """Convert a number, unless it is None."""
+    return None if value is None else float(value)
+
+
+def integer(name: str) -> Callable[[float | int], int]:
+    """Return a converter that accepts integers only, as `int` or `float`."""
+
+    def convert(value: float | int) -> int:
+        if not float(value).is_integer():
+            raise InputError(f"`{name}` must be a whole number, but is {value:g}.")
+        return int(value)
+
+    return convert
+
+
+class LowPass(eqx.Module):
+    """Recursive filter that runs forward and backward: no phase, gain one for constants.
+
+    Attributes:
+        sections: Second-order sections of one direction, as in scipy; everything passes if empty.
+        cutoff: Frequency at which the gain of both directions falls below 1/2 [Hz].
+    """
+
+    sections: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+    cutoff: float = eqx.field(static=True)
+
+    def __call__(
+        self, x: Float[AnyArray, "samples *columns"]
+    ) -> Float[np.ndarray, "samples *columns"]:
+        """Filter along the first axis, by blocks of columns that keep scipy's copies small."""
+        x = np.asarray(x, np.float64)
+        if not self.sections or x.size == 0:
+            return x
+        sos = np.array(self.sections)
+        flat = x.reshape(len(x), -1)
+        padding = min(3 * (2 * len(sos) + 1), len(x) - 1)
+        out = np.empty_like(flat)
+        width = max(1, 2**22 // len(flat))
+        for start in range(0, flat.shape[1], width):
+            block = np.ascontiguousarray(flat[:, start : start + width].T)
+            block = signal.sosfiltfilt(sos, block, axis=1, padtype="odd", padlen=padding)
+            out[:, start : start + width] = block.T
+        return out.reshape(x.shape)
+
+    def gain(self, frequency: Float[AnyArray, " lines"], sample_time: float) -> np.ndarray:
+        """Return the gain for sinusoids of some frequencies [Hz]."""
+        if not self.sections:
+            return np.ones_like(frequency)
+        angular = 2 * math.pi * np.asarray(frequency) * sample_time
+        return np.abs(signal.sosfreqz(np.array(self.sections), angular)[1]) ** 2
+
+    def memory(self, tolerance: float = 1e-14) -> int:
+        """Return after how many samples the impulse response stays below a fraction of its peak."""
+        if not self.sections:
+            return 0
+        sos = np.array(self.sections)
+        slowest = max(np.abs(np.roots(s[3:])).max(initial=0.0) for s in sos)
+        if slowest == 0:
+            return 2 * len(sos)
+        if tolerance > 1e-6:
+            samples = math.ceil(math.log(1e-3 * tolerance) / math.log(slowest)) + 4 * len(sos)
+            impulse = np.zeros(samples)
+            impulse[0] = 1.0
+            one_way = signal.sosfilt(sos, impulse)
+            two_way = np.abs(signal.correlate(one_way, one_way, method="fft"))[samples - 1 :]
+            return int(np.flatnonzero(two_way > tolerance * two_way[0])[-1]) + 1
+        # Rounding hides smaller tails: continue the slowest pole (multiplied by the time it lasts).
+        near = self.memory(2e-6)
+        return near + math.ceil(1.1 * math.log(tolerance / 2e-6) / math.log(slowest))
+
+
+def butterworth(cutoff: float, order: int, sample_time: float, name: str = "cutoff") -> LowPass:
+    """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's.
+
+    Raises:
+        InputError: If the cut-off does not suit the sampling rate.
+    """
+    if math.isinf(cutoff):
+        return LowPass((), math.inf)
+    require_cutoff(name, cutoff, sample_time)
+    sos = signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
+    return LowPass(unit_gain_sections(np.asarray(sos, np.float64)), cutoff)
+
+
+def unit_gain_sections(sos: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    """Return second-order sections scaled to gain one for constants, hashable."""
+    gain = np.prod(sos[:, :3].sum(axis=1) / sos[:, 3:].sum(axis=1))
+    sos = sos.copy()
+    sos[0, :3] /= gain
+    return tuple(tuple(float(c) for c in row) for row in sos)
+
+
+def require_cutoff(name: str, cutoff: float, sample_time: float) -> None:
+    """Refuse a cut-off [Hz] that does not suit the sampling rate."""
+    rate = 1 / sample_time
+    if not 1e-5 * rate <= cutoff < 0.5 * rate:
+        raise InputError(
+            f"`{name}` of {cutoff:.6g} Hz must be below half of the sampling rate of {rate:.6g} Hz "
+            f"(and above 1e-5 of it): log faster than {2 * cutoff:.6g} Hz, or check `time_unit`."
+        )
+
+
+class AbstractFilter(eqx.Module):
+    """Filter of a log: motion from the angles, and the band of forces and columns.
+
+    Attributes:
+        uses_velocities: Whether measured velocities, if there are any, enter the motion.
+    """
+
+    uses_velocities: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def motion(
+        self,
+        angles: Float[np.ndarray, "samples joints"],
+        velocities: Float[np.ndarray, "samples joints"] | None,
+        sample_time: float,
+    ) -> Motion:
+        """Return the motion at every sample of a segment; `velocities` are None if not measured."""
+
+    @abc.abstractmethod
+    def low_pass(self, sample_time: float) -> LowPass:
+        """Return the zero-phase filter of forces and columns."""
+
+    @abc.abstractmethod
+    def edge(self, sample_time: float) -> int:
+        """Return the number of samples to drop at both ends of a segment, until filters settle."""
+
+    def smooth(
+        self, x: Float[AnyArray, "samples *columns"], sample_time: float
+    ) -> Float[np.ndarray, "samples *columns"]:
+        """Filter forces or columns of one segment: linear, without phase, constants unchanged."""
+        return self.low_pass(sample_time)(x)
+
+
+def check_settings(filter: AbstractFilter, *positive: str) -> None:
+    """Check the settings that filters share, and that others are positive."""
+    owner = type(filter).__name__
+    rules: dict[str, tuple[Callable[[float], bool], str]]
+    rules = dict.fromkeys(positive, (lambda x: x > 0, "positive"))
+    rules["order"] = lambda x: 0 < x <= 20, "between 1 and 20 (2 to 8 are usual)"
+    rules["margin"] = lambda x: 0 <= x < math.inf, "a time [s] of zero or more"
+    for name, (rule, words) in rules.items():
+        value = getattr(filter, name, None)
+        if value is not None and not rule(value):
+            raise InputError(f"`{name}` of `{owner}` must be {words}, but is {value:g}.")
+
+
+def settled_edge(margin: float | None, sample_time: float, *filters: LowPass) -> int:
+    """Return the samples to drop at both ends: those within `margin` [s], or until all settle."""
+    if margin is None:
+        return max(f.memory(SETTLED) for f in filters)
+    return round(margin / sample_time)
