@@ -37,8 +37,10 @@ import numpy as np
 import timing
 
 import jaxid as jid
-from jaxid.dynamics.projection import partial_velocities  # private: Eq. 38 as the paper forms M
-from jaxid.export.feed_forward import body_parameters, torque_program  # private: counts, timing
+from jaxid.dynamics.projection_equation import (
+    partial_velocities,
+)  # private: Eq. 38 as the paper forms M
+from jaxid.export.torque_program import body_parameters, torque_program  # private: counts, timing
 from jaxid.program import trace  # private: other forms of the same torques
 from jaxid.program.c import CWriter  # private: C of other forms
 from jaxid.program.scalar import Operation  # private: number of angles

@@ -60,16 +60,16 @@ from .measurement.filters import (
 from .measurement.observations import Observations as Observations, observe as observe
 from .measurement.reading import read_recording as read_recording, scan_log as scan_log
 from .measurement.recording import Recording as Recording
+from .model_validation import validate as validate
 from .program.cache import keep_compiled as keep_compiled
 from .robot import (
     collision as collision,
     library as robots,  # noqa: F401
 )
-from .robot.joints import Drives as Drives, Limits as Limits
 from .robot.kinematics import inverse_kinematics as inverse_kinematics
 from .robot.library import from_dh as from_dh
+from .robot.limits_and_drives import Drives as Drives, Limits as Limits
 from .robot.robot import Robot as Robot, Tool as Tool
 from .robot.urdf import load_urdf as load_urdf, urdf_parameters as urdf_parameters
 from .simulation.virtual import VirtualRobot as VirtualRobot
 from .trajectory import random_fourier_series as random_fourier_series
-from .validation import validate as validate

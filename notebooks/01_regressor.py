@@ -44,7 +44,7 @@ for kind in ("RigidBodies", "ViscousFriction", "CoulombFriction", "RotorInertia"
 # moments (they cause moments); its moments of inertia have no effect until it rotates.
 
 # %%
-from jaxid.dynamics.projection import body_regressor
+from jaxid.dynamics.projection_equation import body_regressor
 
 at_rest = body_regressor(a=np.array([0, 0, 9.81]), w=np.zeros(3), wd=np.zeros(3))
 turning = body_regressor(

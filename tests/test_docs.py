@@ -25,9 +25,9 @@ from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.method_tables import FILTERS, SIDES
 from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import DOUBTFUL, TRUSTED
+from jaxid.model_validation import POSES
 from jaxid.report.identification import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO
 from jaxid.simulation.virtual import random_bodies
-from jaxid.validation import POSES
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

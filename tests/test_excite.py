@@ -18,8 +18,8 @@ import pytest
 
 from jaxid import cli
 from jaxid.errors import InputError
+from jaxid.excitation.coefficient_limits import JointLimits
 from jaxid.excitation.criteria import CRITERIA
-from jaxid.excitation.limits import JointLimits
 from jaxid.experiment.decoder import keys_of
 from jaxid.experiment.excitation import (
     design_motion,

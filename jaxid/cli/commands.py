@@ -17,8 +17,8 @@ from jaxid.experiment.excitation import compare_criteria, design_motion, write_d
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
 from jaxid.export.c_code import export_c
-from jaxid.export.feed_forward import export_jax
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
+from jaxid.export.torque_program import export_jax
 from jaxid.identification.comparison import compare as compare_fits
 from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit import Fit

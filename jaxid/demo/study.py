@@ -11,8 +11,8 @@ import numpy as np
 import jaxid as jid
 from jaxid.arrays import Float
 from jaxid.identification.comparison import Comparison
+from jaxid.model_validation import Validation
 from jaxid.simulation.virtual import Tracking
-from jaxid.validation import Validation
 
 HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800
 """Fourier series of the paper: order, fundamental frequency [rad/s], samples of a period."""

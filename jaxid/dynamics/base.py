@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, as_array
-from jaxid.dynamics.closed_forms import ClosedForms, closed_forms
 from jaxid.dynamics.dispatch import in_numpy, on_samples, program_of
 from jaxid.dynamics.model import Coordinates, Model
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.packed_regressor import JointRegressor, PackedRegressor
 from jaxid.dynamics.rank import (
     Dependence,
     gram_schmidt,
@@ -22,7 +22,7 @@ from jaxid.dynamics.rank import (
     regrouping,
     singular_values,
 )
-from jaxid.dynamics.regressor import JointRegressor, PackedRegressor
+from jaxid.dynamics.symbolic_base_parameters import ClosedForms, closed_forms
 from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
 from jaxid.table import MISSING, Column, Remark, Status, Table

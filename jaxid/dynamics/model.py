@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, as_array, namespace
-from jaxid.dynamics import projection
 from jaxid.dynamics.dispatch import on_samples, solve_symmetric
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.regressor import PackedRegressor
+from jaxid.dynamics.packed_regressor import PackedRegressor
 from jaxid.dynamics.terms import (
     AbstractTerm,
     CoulombFriction,

@@ -15,7 +15,7 @@ from jaxid.excitation.criteria import AbstractCriterion
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.problem import ExcitationProblem
 from jaxid.excitation.search import Search
-from jaxid.robot.joints import Limits
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
+from jaxid.excitation.coefficient_limits import JointLimits
 from jaxid.excitation.constraints import Finding
 from jaxid.excitation.criteria import (
     CRITERIA,
@@ -18,7 +19,6 @@ from jaxid.excitation.criteria import (
     Information,
     standard_deviations,
 )
-from jaxid.excitation.limits import JointLimits
 from jaxid.table import MISSING, Column, Remark, Status, Table, percent, significant
 from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.trajectory import LinearTrajectory

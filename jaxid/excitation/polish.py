@@ -12,7 +12,7 @@ import numpy as np
 import scipy.optimize
 
 from jaxid.arrays import AnyArray, Array, Bool, Float
-from jaxid.excitation.limits import scale_samples
+from jaxid.excitation.coefficient_limits import scale_samples
 from jaxid.excitation.problem import (
     CHECKED,
     MARGIN,

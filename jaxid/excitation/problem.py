@@ -12,11 +12,11 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation import criteria
+from jaxid.excitation.coefficient_limits import JointLimits, scale_samples
 from jaxid.excitation.constraints import AbstractConstraint, Finding
 from jaxid.excitation.criteria import AbstractCriterion, Information, Sharpness
 from jaxid.excitation.interior_point import Evaluation, map_starts
-from jaxid.excitation.limits import JointLimits, scale_samples
-from jaxid.robot.joints import Limits
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory

@@ -20,8 +20,8 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.errors import InputError
 from jaxid.excitation import interior_point
+from jaxid.excitation.coefficient_limits import scale_samples
 from jaxid.excitation.interior_point import Stage, State
-from jaxid.excitation.limits import scale_samples
 from jaxid.excitation.polish import polish
 from jaxid.excitation.problem import (
     PENALTY,

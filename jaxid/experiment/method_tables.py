@@ -22,7 +22,7 @@ from jaxid.experiment.decoder import (
 from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.units import Unit
-from jaxid.robot.joints import per_joint
+from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
 FILTERS: dict[str, type[filters.AbstractFilter]] = {

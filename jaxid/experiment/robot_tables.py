@@ -12,8 +12,8 @@ from jaxid.errors import InputError
 from jaxid.experiment.decoder import Finite, Magnitude, PerJoint, Positive, Vector
 from jaxid.robot import library
 from jaxid.robot.inertia import INERTIAL_NAMES
-from jaxid.robot.joints import Limits, per_joint, range_fault
 from jaxid.robot.library import from_dh
+from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters

@@ -24,8 +24,8 @@ from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import NeedsMemory, Recording
+from jaxid.model_validation import Validation, comparison_step, validate
 from jaxid.report.result_files import read_fit
-from jaxid.validation import Validation, comparison_step, validate
 
 LoadedLog = tuple[Recording | Observations, Observations, Diagnosis]
 """Log as it was read (of a log on disk its observations), filtered log, and diagnosis."""

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxid.arrays import AnyArray, Float, Joints, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
-from jaxid.export.feed_forward import body_parameters
+from jaxid.export.torque_program import body_parameters
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
 from jaxid.identification.fit import Fit
 from jaxid.io import json_text, write_bytes, write_text

@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxid.arrays import AnyArray, Bool, Float, in_parts, is_traced, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.regressor import JointRegressor
+from jaxid.dynamics.packed_regressor import JointRegressor
 from jaxid.errors import InputError
 from jaxid.identification.estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
 from jaxid.identification.fit import Fit

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bool, Float
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.regressor import JointRegressor
+from jaxid.dynamics.packed_regressor import JointRegressor
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
 AT_ONCE = 2048

@@ -14,7 +14,7 @@ from jaxid.measurement.filters import optional
 from jaxid.measurement.log_files import LogTable, Selection, open_table
 from jaxid.measurement.recording import positive_time
 from jaxid.measurement.units import Quantity, Unit
-from jaxid.robot.joints import per_joint
+from jaxid.robot.limits_and_drives import per_joint
 
 Units = Unit | tuple[Unit, ...]
 """One unit for all joints, or one for each."""

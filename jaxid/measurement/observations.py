@@ -28,7 +28,7 @@ from jaxid.measurement.recording import (
     finite_channel,
     positive_time,
 )
-from jaxid.robot.joints import per_joint
+from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
 FEWEST_ROWS = 4

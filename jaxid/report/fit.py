@@ -15,6 +15,7 @@ from jaxid.identification.choices import FilterChoice
 from jaxid.identification.comparison import Comparison, Verdict
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit
 from jaxid.identification.uncertainty import ResidualSpectra
+from jaxid.model_validation import TorqueErrors
 from jaxid.report.style import (
     BLUE,
     GREY,
@@ -31,7 +32,6 @@ from jaxid.report.style import (
 from jaxid.report.torques import require_joints
 from jaxid.robot.robot import Robot
 from jaxid.table import Status, percent, shortened, significant, with_deviations
-from jaxid.validation import TorqueErrors
 
 _DOTS = {"marker": "o", "ms": 5, "lw": 1.4}
 

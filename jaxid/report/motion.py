@@ -32,8 +32,8 @@ from jaxid.report.style import (
     label_time,
 )
 from jaxid.robot.collision import GROUND, CollisionModel
-from jaxid.robot.joints import Limits
 from jaxid.robot.kinematics import placements, tip_placement
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
 AZIMUTH, ELEVATION = -62.0, 22.0

@@ -20,6 +20,7 @@ from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit, load
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
+from jaxid.model_validation import TorqueErrors
 from jaxid.report.fit import (
     autocorrelation_figure,
     comparison_figure,
@@ -32,7 +33,6 @@ from jaxid.report.page import versions
 from jaxid.report.style import save
 from jaxid.report.torques import error_figure, torque_figure
 from jaxid.robot.robot import Robot
-from jaxid.validation import TorqueErrors
 
 MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""

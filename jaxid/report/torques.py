@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
+from jaxid.model_validation import TorqueErrors
 from jaxid.report.style import (
     BLUE,
     ERROR,
@@ -27,7 +28,6 @@ from jaxid.report.style import (
 )
 from jaxid.robot.robot import Robot
 from jaxid.table import percent, shortened, significant
-from jaxid.validation import TorqueErrors
 
 
 def torque_figure(

@@ -10,7 +10,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from jaxid.arrays import AnyArray, Float, Numbers
 from jaxid.errors import InputError
 from jaxid.robot.inertia import Inertia
-from jaxid.robot.joints import Limits, range_fault
+from jaxid.robot.limits_and_drives import Limits, range_fault
 from jaxid.robot.robot import GRAVITY, Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation, snap_angles, snap_directions
 

@@ -1,7 +1,6 @@
 """Virtual robots: experiments whose truth is known, on our own physics or on MuJoCo."""
 
-from .example import virtual_panda as virtual_panda, write_example as write_example
-from .friction import (
+from .disturbances import (
     AbstractDisturbance as AbstractDisturbance,
     AbstractGearFriction as AbstractGearFriction,
     CableForce as CableForce,
@@ -10,6 +9,7 @@ from .friction import (
     SmoothFriction as SmoothFriction,
     TorqueRipple as TorqueRipple,
 )
+from .example import virtual_panda as virtual_panda, write_example as write_example
 from .mechanics import (
     FlexibleGear as FlexibleGear,
     RigidGear as RigidGear,

@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from jaxid.io import atomic_folder
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
-from jaxid.simulation.friction import SmoothFriction
+from jaxid.simulation.disturbances import SmoothFriction
 from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 

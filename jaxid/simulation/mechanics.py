@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints
-from jaxid.dynamics import projection
 from jaxid.dynamics.dispatch import program_of, solve_symmetric
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.program import to_python
-from jaxid.simulation.friction import AbstractDisturbance, AbstractGearFriction
+from jaxid.simulation.disturbances import AbstractDisturbance, AbstractGearFriction
 
 
 class RigidGear(Hashable):

@@ -10,8 +10,8 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.export.feed_forward import body_parameters
 from jaxid.export.simulators import mjcf_text
+from jaxid.export.torque_program import body_parameters
 from jaxid.simulation.virtual import VirtualRobot
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
-from jaxid.robot.joints import Drives
+from jaxid.robot.limits_and_drives import Drives
 from jaxid.robot.robot import Robot
-from jaxid.simulation.friction import FrictionTemperature, LuGreFriction, TorqueRipple
+from jaxid.simulation.disturbances import FrictionTemperature, LuGreFriction, TorqueRipple
 from jaxid.simulation.virtual import Sensors, VirtualRobot
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}

@@ -18,7 +18,7 @@ from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.simulation.friction import (
+from jaxid.simulation.disturbances import (
     AbstractDisturbance,
     AbstractGearFriction,
     FrictionTemperature,

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 
 from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.joints import Limits
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import (
     AbstractBasis,

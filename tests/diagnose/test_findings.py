@@ -7,8 +7,8 @@ import pytest
 
 from jaxid.diagnosis.findings import channel_findings, stuck_findings, unit_findings
 from jaxid.measurement.recording import Recording
-from jaxid.robot.joints import Drives
 from jaxid.robot.library import panda, planar_arm
+from jaxid.robot.limits_and_drives import Drives
 from jaxid.trajectory.fourier import random_fourier_series
 
 ROBOT = panda().replace(drives=Drives(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))

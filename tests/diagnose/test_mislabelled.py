@@ -11,7 +11,7 @@ from jaxid.identification.identify import identify
 from jaxid.measurement.filters import Subsample, ZeroPhaseButterworth
 from jaxid.measurement.observations import observe
 from jaxid.measurement.recording import Recording
-from jaxid.robot.joints import Drives, Limits
+from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import random_fourier_series
 

@@ -9,8 +9,8 @@ from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import LinearSpring
-from jaxid.robot.joints import Drives
 from jaxid.robot.library import planar_arm
+from jaxid.robot.limits_and_drives import Drives
 from jaxid.trajectory.fourier import random_fourier_series
 
 ROBOT = planar_arm(2)

@@ -18,7 +18,7 @@ from jaxid.dynamics.terms import (
     Tanh,
     ViscousFriction,
 )
-from jaxid.robot.joints import Drives
+from jaxid.robot.limits_and_drives import Drives
 
 N, SAMPLES, EPSILON = 4, 6, 0.05
 TREE = trees.Tree(

@@ -20,7 +20,7 @@ from jaxid.dynamics.terms import (
 )
 from jaxid.errors import InputError
 from jaxid.robot import library as robots
-from jaxid.robot.joints import Drives
+from jaxid.robot.limits_and_drives import Drives
 
 TREE = trees.mixed_tree(51)
 MODEL = Model(TREE.robot())

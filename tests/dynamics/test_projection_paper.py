@@ -8,7 +8,6 @@ import projection_paper as paper
 import pytest
 import trees
 
-from jaxid.dynamics import projection
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.rotations import skew
 

@@ -30,8 +30,8 @@ from jaxid.dynamics.terms import (
     ViscousFriction,
 )
 from jaxid.errors import InputError
-from jaxid.robot.joints import Drives
 from jaxid.robot.library import tx40
+from jaxid.robot.limits_and_drives import Drives
 
 N = 3
 TREE = trees.Tree(

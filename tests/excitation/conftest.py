@@ -8,7 +8,7 @@ from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.excitation.problem import ExcitationProblem
 from jaxid.robot import library
-from jaxid.robot.joints import Limits
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory.fourier import FourierBasis
 
 

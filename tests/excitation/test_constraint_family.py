@@ -12,7 +12,7 @@ from jaxid.dynamics.terms import CoulombFriction, HardSign, RigidBodies
 from jaxid.excitation.constraints import Clearance, ForceLimits, TipLimits, tip_motion
 from jaxid.robot import library
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
-from jaxid.robot.joints import Drives, Limits
+from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.trajectory.fourier import random_fourier_series
 
 # Three joints in a vertical plane; the third motor turns with the second joint.

@@ -6,8 +6,8 @@ import numpy as np
 import scipy.optimize
 
 from jaxid.excitation import interior_point
+from jaxid.excitation.coefficient_limits import JointLimits
 from jaxid.excitation.interior_point import Evaluation, Stage
-from jaxid.excitation.limits import JointLimits
 from jaxid.trajectory.fourier import FourierBasis
 
 RANDOM = np.random.default_rng(0)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxid.excitation.limits import JointLimits
-from jaxid.robot.joints import Limits
+from jaxid.excitation.coefficient_limits import JointLimits
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 

@@ -13,7 +13,7 @@ from export_samples import fit_of, motion, possible
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
-from jaxid.export.feed_forward import torque_program
+from jaxid.export.torque_program import torque_program
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
 STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror", "-O1"]

@@ -7,7 +7,7 @@ import pytest
 from virtual import fit_of
 
 import jaxid as jid
-from jaxid.validation import TorqueErrors, definiteness
+from jaxid.model_validation import TorqueErrors, definiteness
 
 
 def errors(counted=None):

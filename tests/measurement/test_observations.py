@@ -14,7 +14,7 @@ from jaxid.measurement.filters import (
 )
 from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.recording import Recording
-from jaxid.robot.joints import Drives
+from jaxid.robot.limits_and_drives import Drives
 from jaxid.robot.robot import Robot
 
 DT = 0.001

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import jaxid as jid
+from jaxid.model_validation import TorqueErrors
 from jaxid.report.identification import Report
 from jaxid.report.result_files import write_report
-from jaxid.simulation.friction import SmoothFriction
+from jaxid.simulation.disturbances import SmoothFriction
 from jaxid.simulation.virtual import Sensors, random_bodies
-from jaxid.validation import TorqueErrors
 
 
 @pytest.fixture(scope="session")

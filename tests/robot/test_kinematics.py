@@ -8,7 +8,6 @@ from jax import numpy as jnp
 from scipy.spatial.transform import Rotation
 
 from jaxid.robot import library
-from jaxid.robot.joints import Limits
 from jaxid.robot.kinematics import (
     inverse_kinematics,
     inverse_kinematics_along,
@@ -17,6 +16,7 @@ from jaxid.robot.kinematics import (
     tip_jacobian,
     tip_placement,
 )
+from jaxid.robot.limits_and_drives import Limits
 
 RAIL = library.tx90l_on_rail()
 DOWN = np.diag([1.0, -1.0, -1.0])

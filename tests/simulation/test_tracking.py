@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxid.errors import InputError
-from jaxid.robot.joints import Drives, Limits
+from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.simulation.tx90l import cad_tx90l_on_rail, virtual_tx90l_on_rail
 from jaxid.simulation.virtual import Sensors, Servo
 from jaxid.trajectory.fourier import random_fourier_series

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from jaxid.robot import library
-from jaxid.robot.joints import Limits
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory import (
     FourierBasis,
     LeadsBasis,

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, matching, one_or_each
-from jaxid.dynamics import projection
 from jaxid.dynamics.terms.term import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES

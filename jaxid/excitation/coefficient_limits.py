@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.errors import InputError
-from jaxid.robot.joints import Limits
+from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import complete_limits
 from jaxid.trajectory.trajectory import AbstractBasis

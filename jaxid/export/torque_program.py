@@ -23,7 +23,6 @@ from jax import export
 from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Float, Joints, double_precision
-from jaxid.dynamics import projection
 from jaxid.dynamics.model import Model
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
 from jaxid.identification.fit import Fit
