@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, as_array, namespace
+from jaxid.dynamics import projection_equation
 from jaxid.dynamics.dispatch import on_samples, solve_symmetric
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import PackedRegressor
@@ -123,7 +124,7 @@ class Model(Hashable):
         known = tool.parameters
         bodies = range(self.robot.joints)
         p = namespace(known).stack([known if i == tool.body else np.zeros(10) for i in bodies])
-        return projection.rigid_body_forces(self.robot, p, q, qd, qdd)
+        return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints standard"]:
         r"""Return the regressor $\Theta(q, \dot q, \ddot q)$ (Eqs. 16, 18).

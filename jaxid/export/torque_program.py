@@ -23,6 +23,7 @@ from jax import export
 from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Float, Joints, double_precision
+from jaxid.dynamics import projection_equation
 from jaxid.dynamics.model import Model
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
 from jaxid.identification.fit import Fit
@@ -61,7 +62,7 @@ class Description:
         scale = np.where(self.robot.revolute, 1.0, 1.0 / self.unit)
         p = inertial_parameters(self.bodies)
         motion = (scale * q + self.turned, scale * qd, scale * qdd)
-        return scale * projection.rigid_body_forces(self.robot, p, *motion)
+        return scale * projection_equation.rigid_body_forces(self.robot, p, *motion)
 
     def carry_inward(self) -> "Description":
         """Move what moves alike with the parent to the parent: the base parameters (Eq. 22).

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints
+from jaxid.dynamics import projection_equation
 from jaxid.dynamics.dispatch import program_of, solve_symmetric
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
@@ -114,7 +115,7 @@ class DriveTrain(Hashable):
         if tool is not None:
             known = np.zeros((model.robot.joints, 10))
             known[tool.body] = tool.parameters
-            M = M + projection.rigid_body_mass_matrix(model.robot, jnp.asarray(known), q)
+            M = M + projection_equation.rigid_body_mass_matrix(model.robot, jnp.asarray(known), q)
             h = h + model.known_forces(q, qd, jnp.zeros_like(q))
         return jnp.concatenate([M.ravel(), h])
 

@@ -8,6 +8,7 @@ import projection_paper as paper
 import pytest
 import trees
 
+from jaxid.dynamics import projection_equation
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.rotations import skew
 
@@ -31,7 +32,7 @@ def case():
 def test_forces_are_the_projected_momenta(case, form):
     tree, p, centred, motion = case
     expected = trees.compiled(lambda *x: form(tree, *centred, *x))(*motion)
-    found = projection.rigid_body_forces(tree.robot(), p, *motion)
+    found = projection_equation.rigid_body_forces(tree.robot(), p, *motion)
     assert trees.relative(found, expected) < 1e-13
     literal = newton_euler.inverse_dynamics(tree, p, *(np.asarray(x) for x in motion))
     assert trees.relative(expected, literal) < 1e-13
@@ -40,7 +41,7 @@ def test_forces_are_the_projected_momenta(case, form):
 def test_regressor_is_the_sum_of_the_three_matrices(case):
     tree, _, _, motion = case
     expected = trees.compiled(lambda *x: paper.regressor(tree, *x))(*motion)
-    found = projection.rigid_body_regressor(tree.robot(), *motion)
+    found = projection_equation.rigid_body_regressor(tree.robot(), *motion)
     assert trees.relative(found.reshape(tree.joints, -1), expected) < 1e-13
 
 
@@ -49,7 +50,7 @@ def test_projection_is_the_jacobian_of_velocities_by_velocities(case):
     tree, _, _, (q, qd, qdd) = case
     robot = tree.robot()
     expected = trees.compiled(jax.jacfwd(lambda x: paper.origin_velocities(tree, q, x)))(qd)
-    slope = jnp.stack(jax.jacfwd(projection.partial_velocities(robot, q, qd, qdd))(qdd))
+    slope = jnp.stack(jax.jacfwd(projection_equation.partial_velocities(robot, q, qd, qdd))(qdd))
     assert trees.relative(slope, expected) < 1e-14
 
 
@@ -63,7 +64,7 @@ def test_body_motions_are_derivatives_of_positions(case):
         v, w = rows[:, :3], rows[:, 3:]
         return rates[:, :3] + jnp.cross(w, v) - weights, w, rates[:, 3:]
 
-    found = projection.body_motions(tree.robot(), q, qd, qdd)
+    found = projection_equation.body_motions(tree.robot(), q, qd, qdd)
     for mine, theirs in zip(
         zip(*found, strict=True), trees.compiled(all_of)(q, qd, qdd), strict=True
     ):
@@ -83,7 +84,7 @@ def test_body_regressor_is_eq_8_with_the_inertia_about_the_origin():
     weight = np.concatenate([m * g, m * np.cross(c, g)])
     expected = matrix @ [*vd, *wd] + gyration @ [*v, *w] - weight
     a, w, wd = (jnp.asarray(x) for x in (vd + np.cross(w, v) - g, w, wd))
-    found = projection.body_regressor(a, w, wd) @ body.parameters
+    found = projection_equation.body_regressor(a, w, wd) @ body.parameters
     assert trees.relative(found, expected) < 1e-14
 
 
@@ -96,7 +97,7 @@ def test_momentum_matrix_and_tensor_hold_the_products_with_a_minus():
     momentum = sum(
         m * np.cross(x, np.cross(w, x)) for m, x in zip(body.masses, body.points, strict=True)
     )
-    assert trees.relative(projection.momentum_matrix(w) @ j, momentum) < 1e-14
+    assert trees.relative(projection_equation.momentum_matrix(w) @ j, momentum) < 1e-14
     assert trees.relative(inertia_tensor(jnp.asarray(j)) @ w, momentum) < 1e-14
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, matching, one_or_each
+from jaxid.dynamics import projection_equation
 from jaxid.dynamics.terms.term import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES
@@ -264,7 +265,7 @@ class LoadFriction(AbstractDryFriction):
         """Return the diagonal matrix of loads with the signs of the speeds."""
         rest = jnp.zeros_like(q)
         bodies = jnp.asarray(self._bodies(robot), q.dtype)
-        load = projection.rigid_body_forces(robot, bodies, q, rest, rest)
+        load = projection_equation.rigid_body_forces(robot, bodies, q, rest, rest)
         return jnp.diag(jnp.abs(load) * self.transition(qd))
 
     @property

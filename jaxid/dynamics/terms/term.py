@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Joints, matching, one_or_each
+from jaxid.dynamics import projection_equation
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot
 
@@ -149,7 +150,7 @@ class RigidBodies(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         r"""Return the columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
-        theta = projection.rigid_body_regressor(robot, q, qd, qdd)
+        theta = projection_equation.rigid_body_regressor(robot, q, qd, qdd)
         return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
 
     def all_ten(self, robot: Robot, p: Float[AnyArray, " columns"]) -> Float[AnyArray, "joints 10"]:
@@ -162,15 +163,17 @@ class RigidBodies(AbstractTerm):
 
     def forces(self, robot, p, q, qd, qdd):
         """Return the projected wrenches of all bodies, without forming the regressor (Eq. 11)."""
-        return projection.rigid_body_forces(robot, self.all_ten(robot, p), q, qd, qdd)
+        return projection_equation.rigid_body_forces(robot, self.all_ten(robot, p), q, qd, qdd)
 
     def mass_matrix(self, robot, p, q):
         """Return the mass matrix of the bodies (Eq. 38)."""
-        return projection.rigid_body_mass_matrix(robot, self.all_ten(robot, p), q)
+        return projection_equation.rigid_body_mass_matrix(robot, self.all_ten(robot, p), q)
 
     def potential_columns(self, robot, q):
         """Return the potential energy of masses and first moments."""
-        return projection.potential_energy_columns(robot, q)[:, : self.body_parameters].ravel()
+        return projection_equation.potential_energy_columns(robot, q)[
+            :, : self.body_parameters
+        ].ravel()
 
 
 class RotorInertia(AbstractTerm):
