@@ -9,6 +9,7 @@ Devices: `identify` of one log with every sample a row, on several CPU devices o
 for each number, with a core for each device as far as there are cores. Medians.
 """
 
+import argparse
 import json
 import os
 import subprocess
