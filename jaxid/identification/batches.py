@@ -22,13 +22,14 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
 from jaxid.errors import InputError
-from jaxid.identification.estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
-from jaxid.identification.fit import Fit
-from jaxid.identification.identify import identify
-from jaxid.identification.normal_equations import BatchFit, DataSets, solve
-from jaxid.identification.uncertainty import IndependentRows
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
+
+from .estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
+from .fit import Fit
+from .identify import identify
+from .normal_equations import BatchFit, DataSets, solve
+from .uncertainty import IndependentRows
 
 
 def identify_batch(
@@ -74,10 +75,7 @@ def identify_batch(
     robot = base.model.robot
     _check(base, motion, forces, mask, robots)
     if estimator is not None and not (robots is None and weights is None):
-        raise InputError(
-            "`estimator` goes with neither `robots` nor `weights`: the estimator has its own "
-            "weights, and solves for one robot."
-        )
+        raise InputError("`estimator` has weights of its own: leave out `robots` and `weights`.")
     sets, draws = len(forces), forces.shape[1:-2]
     if weights is None:
         weights = np.ones(robot.joints) if estimator else 1.0 / np.asarray(robot.max_forces)
@@ -91,7 +89,8 @@ def identify_batch(
     if estimator is not None:
         fit = _estimate_each(base, batch, estimator, row_time)
     else:
-        rows, reduced = base.joint_regressor, batch
+        rows = base.joint_regressor
+        reduced = batch
         if robots is not None:
             family, numbers = _family(base, robots)
             n = (robot.joints,)
@@ -114,17 +113,15 @@ def _check(base, motion, forces, mask, robots) -> None:
     wanted = (len(forces), samples, n)
     for name, array in (("motion", motion.q), ("mask", motion.q if mask is None else mask)):
         if array.shape != wanted:
-            raise InputError(
-                f"`{name}` must have the shape [datasets, samples, joints], here {wanted} by "
-                f"`forces` and the robot, but has {array.shape}."
-            )
+            rule = f"the shape [datasets, samples, joints] {wanted} of the forces"
+            raise InputError(f"`{name}` must have {rule}, but has {array.shape}.")
     if robots is not None and len(robots) != len(forces):
         raise InputError(
-            f"`robots` must be one for each of {len(forces)} data sets, but are {len(robots)}."
+            f"`robots` must be one for each of {len(forces)} data sets: {len(robots)}."
         )
     if samples * n <= base.size:
         raise InputError(
-            f"there are {samples * n} rows for {base.size} base parameters: record longer."
+            f"{samples * n} rows are too few for {base.size} parameters: record longer."
         )
 
 
@@ -137,9 +134,8 @@ def _solve_again(base, robots, batch: DataSets, fit: BatchFit, row_time) -> Batc
             fit.parameters[k], fit.condition_numbers[k] = 0.0, np.inf
             fit.standard_deviations[k] = fit.naive_standard_deviations[k] = np.inf
             continue
-        own = base
-        if robots is not None:
-            own = eqx.tree_at(lambda b: b.model.robot, base, robots[k])
+        robot = base.model.robot if robots is None else robots[k]
+        own = eqx.tree_at(lambda b: b.model.robot, base, robot)
         estimator = WeightedLeastSquares(GivenWeights(one.weights[0]))
         again = _estimate_each(own, one, estimator, row_time)
         for x, y in zip(jax.tree.leaves(fit), jax.tree.leaves(again), strict=True):
@@ -147,9 +143,7 @@ def _solve_again(base, robots, batch: DataSets, fit: BatchFit, row_time) -> Batc
     return jax.tree.map(jnp.asarray, fit)
 
 
-def _estimate_each(
-    base: BaseParameters, batch: DataSets, estimator: AbstractEstimator, row_time: float | None
-) -> BatchFit:
+def _estimate_each(base, batch: DataSets, estimator: AbstractEstimator, row_time) -> BatchFit:
     """Return the estimates of `identify` for each data set and draw, on all cores."""
     motion, Q = jax.tree.map(np.asarray, (batch.motion, batch.forces))
     counted = np.ones(motion.q.shape, bool) if batch.mask is None else np.asarray(batch.mask) > 0
@@ -205,17 +199,14 @@ class RobotFamily(eqx.Module):
         return placed.columns(q, qd, qdd)
 
 
-def _family(
-    base: BaseParameters, robots: Sequence[Robot]
-) -> tuple[RobotFamily, Float[np.ndarray, "datasets numbers"]]:
+def _family(base: BaseParameters, robots: Sequence[Robot]) -> tuple[RobotFamily, np.ndarray]:
     """Return robots of one topology as one definition, and for each robot its own numbers."""
     own = base.model.robot
     for robot in robots:
         alike = robot.parent == own.parent and robot.revolute == own.revolute
         if not alike or robot.tool is not None:
             raise InputError(
-                f"`robots` must have the topology of `{own.name}` and no known tools, but "
-                f"`{robot.name}` differs: identify it with its own base parameters."
+                f"`{robot.name}` of `robots` must have the topology of `{own.name}`, no tool."
             )
     first, *numbers = [np.asarray(ravel_pytree(_geometry(x))[0]) for x in (own, *robots)]
     varying = tuple(np.flatnonzero((np.array(numbers) != first).any(axis=0)).tolist())

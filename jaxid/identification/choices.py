@@ -10,12 +10,6 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.estimators import AbstractEstimator, WeightedLeastSquares
-from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_problem, naive_covariance
-from jaxid.identification.problem import RegressionProblem, cross_validation_folds
-from jaxid.identification.uncertainty import AbstractUncertainty
 from jaxid.measurement.filters import (
     AbstractDecimation,
     AbstractFilter,
@@ -24,6 +18,13 @@ from jaxid.measurement.filters import (
 )
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.recording import Recording
+
+from .estimators import AbstractEstimator, WeightedLeastSquares
+from .estimators.solutions import Decomposition
+from .fit import Fit
+from .identify import fit_problem, naive_covariance
+from .problem import RegressionProblem, cross_validation_folds
+from .uncertainty import AbstractUncertainty
 
 FilterCandidate = tuple[AbstractFilter, AbstractDecimation]
 """Filter of motion, forces and columns, and decimation of forces and columns."""
@@ -55,15 +56,13 @@ class FilterChoice(eqx.Module):
     @property
     def curve(self) -> Float[np.ndarray, " candidates"]:
         """Held-out error of each candidate on the whole log."""
-        return np.sqrt(np.mean(np.asarray(self.errors) ** 2, axis=1))
+        return np.sqrt(np.mean(np.square(self.errors), axis=1))
 
     def __str__(self):
-        shown = ", ".join(
-            f"{cutoff:.3g} Hz {100 * error:.2f} %"
-            for cutoff, error in zip(np.asarray(self.cutoffs), self.curve, strict=True)
-        )
+        pairs = zip(self.cutoffs, 100 * self.curve, strict=True)
+        shown = ", ".join(f"{cutoff:.3g} Hz {error:.2f} %" for cutoff, error in pairs)
         return (
-            f"a cut-off of {np.asarray(self.cutoffs)[self.best]:.3g} Hz predicts held-out parts of "
+            f"a cut-off of {self.cutoffs[self.best]:.3g} Hz predicts held-out parts of "
             f"the log best (errors by cut-off: {shown})."
         )
 
@@ -110,7 +109,7 @@ def choose_filter(
         candidates = [(ZeroPhaseButterworth(f), Subsample(step)) for f, step in pairs]
     if not candidates:
         raise InputError("`candidates` must hold at least one filter, but is empty.")
-    estimator = WeightedLeastSquares() if estimator is None else estimator
+    estimator = estimator or WeightedLeastSquares()
     robot, dt = base.model.robot, logs[0].sample_time
     cutoffs = np.array([filter.low_pass(dt).cutoff for filter, _ in candidates])
     edge = max(filter.edge(dt) for filter, _ in candidates)
@@ -143,7 +142,8 @@ def choose_filter(
     if criterion == "whiteness":
         order = np.where(whole <= 1.05**2 * whole.min(), np.abs(correlations), np.inf)
     best = int(np.argmin(order))
-    return FilterChoice(tuple(candidates), cutoffs, np.array(errors), np.array(correlations), best)
+    found = np.array(errors), np.array(correlations)
+    return FilterChoice(tuple(candidates), cutoffs, *found, best)
 
 
 def _held_out_errors(problem, test, estimator: AbstractEstimator, squares) -> np.ndarray:
@@ -154,13 +154,13 @@ def _held_out_errors(problem, test, estimator: AbstractEstimator, squares) -> np
     errors = []
     for rest, part in pairs:
         p = estimator(RegressionProblem(problem.base, blocks=rest)).parameters
-        errors.append(np.sqrt(squares @ part.total.residual_squares(p) / total))
-    return np.array(errors)
+        errors.append(squares @ part.total.residual_squares(p) / total)
+    return np.sqrt(errors)
 
 
 def _correlation(problem: RegressionProblem, estimator: AbstractEstimator) -> float:
     """Return the correlation of neighbouring rows of the residuals, as a mean of the joints."""
-    power, product = np.zeros(problem.robot.joints), np.zeros(problem.robot.joints)
+    power, product = np.zeros((2, problem.robot.joints))
     for chunk, residuals in problem.residuals(np.asarray(estimator(problem).parameters)):
         e = np.where(chunk.mask, residuals, 0.0)
         power += np.sum(e**2, axis=0)
@@ -243,25 +243,22 @@ def essential_parameters(
     """
     if not cost >= 0:
         raise InputError(f"`cost` must be zero or more, but is {cost:g}.")
-    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
-    problem = RegressionProblem(fit.base, recordings)
+    problem = RegressionProblem(fit.base, observations)
     if [int(n) for n in problem.factors.rows] != list(fit.rows):
         raise InputError("`observations` must be those of the fit, but they have other rows.")
     path, sets = _eliminate(fit, problem)
     most = (1 + cost) * min(step.held_out for step in path)
     kept = [k for k, step in zip(sets, path, strict=True) if step.held_out <= most][-1]
-    base = dataclasses.replace(
-        fit.base,
-        indices=tuple(fit.base.indices[k] for k in kept),
-        kappa=np.asarray(fit.base.kappa)[kept],
-    )
-    reduced = fit_problem(RegressionProblem(base, recordings), fit.estimator, uncertainty)
+    indices = tuple(fit.base.indices[k] for k in kept)
+    kappa = np.asarray(fit.base.kappa)[kept]
+    base = dataclasses.replace(fit.base, indices=indices, kappa=kappa)
+    reduced = fit_problem(problem.with_base(base), fit.estimator, uncertainty)
     return EssentialParameters(reduced, tuple(path))
 
 
-def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination], list[list[int]]]:
+def _eliminate(fit: Fit, problem: RegressionProblem) -> tuple[list[Elimination], list]:
     """Return the path to a single parameter, and the remaining parameters at each step."""
-    factors, weights = problem.factors, np.asarray(fit.weights)
+    factors, weights = problem.factors, fit.weights
     squares = weights**2
     total = float(squares @ factors.force_squares)
     parts = cross_validation_folds(problem.blocks, 10)

@@ -13,16 +13,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.identification.estimators import GivenWeights, WeightedLeastSquares
-from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.factors import Blocks
-from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_problem
-from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.uncertainty import Uncertainty
-from jaxid.identification.uncertainty.blocks import solve_blocks
+
+from .estimators import GivenWeights, WeightedLeastSquares
+from .estimators.solutions import Decomposition
+from .factors import Blocks
+from .fit import Fit
+from .identify import fit_problem
+from .problem import RegressionProblem
+from .uncertainty import Uncertainty
+from .uncertainty.blocks import solve_blocks
 
 
 def require_same_base(fits: Sequence[Fit]) -> None:
@@ -34,10 +34,8 @@ def require_same_base(fits: Sequence[Fit]) -> None:
         if not same or not np.allclose(a.kappa, b.kappa, rtol=1e-6, atol=1e-9):
             others = sorted({*a.names} ^ {*b.names})
             differs = f"`{others[0]}` is in one of them only" if others else "lengths differ"
-            raise InputError(
-                f"the fits `{first.name}` and `{fit.name}` have different base parameters "
-                f"({differs}): use one robot with one geometry and the same terms for both."
-            )
+            pair = f"`{first.name}` and `{fit.name}`"
+            raise InputError(f"{pair} have different base parameters ({differs}): use one model.")
 
 
 def as_least_squares(fit: Fit) -> Fit:
@@ -49,43 +47,36 @@ def as_least_squares(fit: Fit) -> Fit:
     if fit.is_least_squares:
         return fit
     problem = RegressionProblem(fit.base, blocks=fit.blocks, names=fit.recordings)
-    plain = fit_problem(problem, WeightedLeastSquares(GivenWeights(np.asarray(fit.weights))))
+    plain = fit_problem(problem, WeightedLeastSquares(GivenWeights(fit.weights)))
     return dataclasses.replace(plain, name=fit.name)
 
 
-def replace_estimates(
-    fit: Fit, parameters: Float[AnyArray, " base"], uncertainty: Uncertainty
-) -> Fit:
+def replace_estimates(fit: Fit, parameters, uncertainty: Uncertainty) -> Fit:
     """Return a fit with estimates and an uncertainty that were computed from several fits."""
     notes = tuple(note for note in fit.notes if note not in fit.uncertainty.notes)
     return dataclasses.replace(fit, parameters=parameters, uncertainty=uncertainty, notes=notes)
 
 
-def combine(
-    fits: Sequence[Fit],
-    maps: Sequence[Float[np.ndarray, "base unknowns"]],
-    offsets: Sequence[Float[np.ndarray, " base"]] | None = None,
-) -> tuple[Float[np.ndarray, " unknowns"], Uncertainty]:
+def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncertainty]:
     """Estimate common unknowns from the factors of several fits by least squares (Eq. 33).
 
-    The base parameters of each fit are its map times the unknowns, plus its offset.
+    The base parameters of each fit are its map [base, unknowns] times the unknowns, plus its
+    offset [base], if there are any.
     """
     for one, other in itertools.combinations(fits, 2):
         if share_rows(one.time_blocks, other.time_blocks):
-            raise InputError(
-                f"the fits `{one.name}` and `{other.name}` have seen the same data, which would "
-                "count twice: give every log once, as itself or by the report that was made of it."
-            )
-    offsets = [np.zeros(fit.base.size) for fit in fits] if offsets is None else offsets
-    factors = [fit.factor for fit in fits]
-    matrix = np.vstack([R @ E for (R, _), E in zip(factors, maps, strict=True)])
-    forces = np.concatenate([z - R @ c for (R, z), c in zip(factors, offsets, strict=True)])
-    triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, forces]), mode="r"))
+            names = f"`{one.name}` and `{other.name}`"
+            raise InputError(f"{names} have seen the same data, which would count twice.")
+    offsets = offsets or [np.zeros(fit.base.size) for fit in fits]
+    factors, rows = [fit.factor for fit in fits], []
+    for (R, z), E, c in zip(factors, maps, offsets, strict=True):
+        rows.append(np.column_stack([R @ E, z - R @ c]))
+    triangle = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
     decomposition = Decomposition.of(triangle[:, :-1], triangle[:, -1])
     B = decomposition.inverse_information()
     covariance, scatter = np.zeros_like(B), np.zeros(len(B))
     for fit, (R, _), E in zip(fits, factors, maps, strict=True):
-        C, dof = np.asarray(fit.covariance), np.asarray(fit.uncertainty.dof)
+        C, dof = fit.covariance, fit.uncertainty.dof
         if not np.isfinite(C).all():
             # The fit alone does not determine everything, so not all of its estimates have a
             # variance. The effect of its errors on others follows from blocks of time.
@@ -129,7 +120,7 @@ def update(earlier: Fit, later: Fit, name: str | None = None) -> Fit:
     blocks = Blocks((*earlier.time_blocks.parts, *scaled.parts))
     names = (*earlier.recordings, *later.recordings)
     problem = RegressionProblem(earlier.base, blocks=blocks, names=names)
-    fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(np.asarray(earlier.weights))))
+    fit = fit_problem(problem, WeightedLeastSquares(GivenWeights(earlier.weights)))
     name = f"{earlier.name}, {later.name}" if name is None else name
     return replace_estimates(dataclasses.replace(fit, name=name), p, uncertainty)
 
@@ -152,6 +143,6 @@ def _column_norms(blocks: Blocks) -> Iterator[tuple[list[int], np.ndarray]]:
     """Yield the numbers of rows of each block, and the norms relative to the joint's largest."""
     for part in blocks.parts:
         if part.rows.any():
-            norms = [np.linalg.norm(np.asarray(joint.R), axis=0) for joint in part.joints]
+            norms = [np.linalg.norm(joint.R, axis=0) for joint in part.joints]
             relative = [x / max(x.max(initial=0.0), 1e-300) for x in norms]
             yield part.rows.tolist(), np.concatenate(relative)

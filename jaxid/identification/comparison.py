@@ -11,10 +11,11 @@ from scipy import special
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.combination import require_same_base
-from jaxid.identification.fit import Fit
-from jaxid.identification.uncertainty import Uncertainty
 from jaxid.table import Column, Status, Table, significant, with_deviations
+
+from .combination import require_same_base
+from .fit import Fit
+from .uncertainty import Uncertainty
 
 LEVEL = 0.95
 """Confidence of intervals and tests."""
@@ -87,14 +88,14 @@ class Comparison(eqx.Module):
     @property
     def half_widths(self) -> Float[np.ndarray, " compared"]:
         """Half the widths of the differences' intervals, each for itself."""
-        quantiles = special.stdtrit(np.asarray(self.uncertainty.dof), 0.5 + 0.5 * self.level)
+        quantiles = special.stdtrit(self.uncertainty.dof, 0.5 + 0.5 * self.level)
         return quantiles * self.standard_deviations
 
     @property
     def p_values(self) -> Float[np.ndarray, " compared"]:
         """Probability of so large a difference without any change, each for itself."""
-        size = np.abs(np.asarray(self.difference)) / self.standard_deviations
-        return 2.0 * special.stdtr(np.asarray(self.uncertainty.dof), -size)
+        size = np.abs(self.difference) / self.standard_deviations
+        return 2.0 * special.stdtr(self.uncertainty.dof, -size)
 
     @property
     def adjusted_p_values(self) -> Float[np.ndarray, " compared"]:
@@ -124,12 +125,11 @@ class Comparison(eqx.Module):
         groups = []
         for name in dict.fromkeys(kinds.tolist()):
             k = np.flatnonzero(determined & (kinds == name))
-            dof = float(np.min(np.asarray(known.dof)[k], initial=np.inf))
-            covariance = np.asarray(known.covariance)[np.ix_(k, k)]
-            statistic, p = joint_test(np.asarray(self.difference)[k], covariance, dof)
-            groups.append(
-                {"name": name, "parameters": len(k), "statistic": statistic, "p_value": p}
-            )
+            dof = float(np.min(known.dof[k], initial=np.inf))
+            covariance = known.covariance[np.ix_(k, k)]
+            statistic, p = joint_test(self.difference[k], covariance, dof)
+            found = {"parameters": len(k), "statistic": statistic, "p_value": p}
+            groups.append({"name": name, **found})
         adjusted = _holm(np.array([group["p_value"] for group in groups]))
         for group, p in zip(groups, adjusted.tolist(), strict=True):
             group["changed"] = p <= 1.0 - self.level
@@ -138,7 +138,7 @@ class Comparison(eqx.Module):
     def summary(self) -> Table:
         """Return a table of both estimates, their differences with intervals, and verdicts."""
         verdicts, kinds, half = self.verdicts, self.kinds, self.half_widths
-        a, b = (np.asarray(f.parameters)[list(self.indices)] for f in (self.first, self.second))
+        a, b = (f.parameters[list(self.indices)] for f in (self.first, self.second))
         change, width = with_deviations(self.difference, half)
         signed = [x if x.startswith("-") else f"+{x}" for x in change]
         tested, chance = len(verdicts) - verdicts.count(Verdict.UNKNOWN), 1.0 - self.level
@@ -205,8 +205,8 @@ def compare_some(first: Fit, second: Fit, indices, cross, level: float) -> Compa
     if not 0 < level < 1:
         raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
     k = list(indices)
-    A, B = (np.asarray(fit.covariance)[np.ix_(k, k)] for fit in (first, second))
-    m, n = (np.asarray(fit.uncertainty.dof)[k] for fit in (first, second))
+    A, B = (fit.covariance[np.ix_(k, k)] for fit in (first, second))
+    m, n = (fit.uncertainty.dof[k] for fit in (first, second))
     a, b = np.diag(A), np.diag(B)
     # Degrees of freedom of a sum of two variances (Welch, Satterthwaite).
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -217,7 +217,7 @@ def compare_some(first: Fit, second: Fit, indices, cross, level: float) -> Compa
         first=first,
         second=second,
         indices=tuple(k),
-        difference=np.asarray(second.parameters)[k] - np.asarray(first.parameters)[k],
+        difference=second.parameters[k] - first.parameters[k],
         uncertainty=Uncertainty(covariance, dof, covariance),
         level=level,
     )

@@ -12,14 +12,15 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.identification.comparison import joint_test
-from jaxid.identification.estimators import AbstractWeights, MaximumForces
-from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.factors import Blocks, RowChunk
-from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.uncertainty.blocks import solve_blocks
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import require_finite_delay
+
+from .comparison import joint_test
+from .estimators import AbstractWeights, MaximumForces
+from .estimators.solutions import Decomposition
+from .factors import Blocks, RowChunk
+from .problem import RegressionProblem
+from .uncertainty.blocks import solve_blocks
 
 BLOCKS = 20
 """Blocks of time of all recordings together, from which the uncertainty is computed."""
@@ -75,7 +76,7 @@ def estimate_delay(
         InputError: If weights are not known, or the search does not settle: the delay is longer
             than the motion's shortest swings.
     """
-    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    recordings = RegressionProblem(base, observations).recordings
     n, size = base.model.robot.joints, base.size
     common = linalg.block_diag(np.eye(size), np.ones((n, 1)))
     total = _add_delays(base, recordings, np.zeros(size)).total
@@ -93,7 +94,7 @@ def estimate_delay(
     else:
         raise InputError(
             f"the delay does not settle (last change {1e3 * step:.3g} ms): crop the log to where "
-            "the robot moves, check angle columns and signs, or remove most of the delay first."
+            "the robot moves, and check angle columns and signs."
         )
     x, covariance, _ = solve_blocks(parts)
     contrast = np.eye(n)[1:] - np.eye(n)[:1]
@@ -102,9 +103,7 @@ def estimate_delay(
     return Delay(seconds, deviation, dof, seconds - step + x[size:], p_value)
 
 
-def _add_delays(
-    base: BaseParameters, recordings: Sequence[Observations], p: Float[np.ndarray, " base"]
-) -> Blocks:
+def _add_delays(base: BaseParameters, recordings, p: np.ndarray) -> Blocks:
     """Return factors with a column for the delay of each joint behind the others."""
     delays = []
     for o in recordings:
@@ -140,7 +139,7 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
         mask[r0:r1] &= ((rows >= first) & (rows < last))[:, None]
     if not mask.any(axis=0).all():
         raise InputError(
-            f"the delay is {seconds:g} s, but `{observations.name}` lasts "
-            f"{time[-1] - time[0]:g} s: no rows of some joint are left."
+            f"`{observations.name}` is too short for a delay of {seconds:g} s: no rows of some "
+            "joint are left."
         )
     return observations.replace(motion=motion, mask=mask)

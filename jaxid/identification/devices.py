@@ -6,7 +6,7 @@ the same answer. The devices of one process need no function: `identify` uses al
 """
 
 import itertools
-import pickle
+import json
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,9 +18,11 @@ from jax.experimental import multihost_utils
 from jaxid.arrays import require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.factors import Blocks
-from jaxid.identification.problem import RegressionProblem
+from jaxid.io import from_json, to_json
 from jaxid.measurement.observations import Observations, Progress
+
+from .factors import Blocks
+from .problem import RegressionProblem
 
 MOST = 64
 """Largest number of blocks of time of all processes, unless there are more processes."""
@@ -86,23 +88,23 @@ def factorise_across_processes(
     try:
         _wait(patience)
         own = own.condense(max(1, MOST // processes))
-        packed = np.frombuffer(pickle.dumps(own), np.uint8)
+        # JSON is exact, and reading it runs no code.
+        packed = np.frombuffer(json.dumps(to_json(own)).encode(), np.uint8)
         head = np.array([zlib.crc32(content), len(packed)])
         heads = multihost_utils.process_allgather(head)
         if (heads[:, 0] != heads[0, 0]).any():
-            raise InputError(
-                "`base` differs between the processes: make it from the same robot, terms and "
-                "version."
-            )
+            raise InputError("`base` differs between the processes: use one robot and version.")
         filled = np.pad(packed, (0, heads[:, 1].max() - len(packed)))
         gathered = np.asarray(multihost_utils.process_allgather(filled))
-        found = zip(gathered, heads[:, 1], strict=True)
-        parts = [part for x, length in found for part in pickle.loads(x[:length]).parts]
+        parts = []
+        for x, length in zip(gathered, heads[:, 1], strict=True):
+            document = json.loads(x[:length].tobytes())
+            parts += from_json(document, Blocks).parts
         return RegressionProblem(base, blocks=Blocks(tuple(parts)))
     except jax.errors.JaxRuntimeError as error:
         raise RuntimeError(
             f"process {jax.process_index()} lost another one: look for the first error in the "
-            f"others' logs, and start all again. ({str(error).splitlines()[0]})"
+            f"others' logs. ({str(error).splitlines()[0]})"
         ) from error
 
 
@@ -112,9 +114,7 @@ def _wait(patience: float) -> None:
 
     client = distributed.global_state.client
     if client is None:
-        raise RuntimeError(
-            "several processes, but no coordinator: call `jax.distributed.initialize` first."
-        )
+        raise RuntimeError("call `jax.distributed.initialize` first: there is no coordinator.")
     try:
         client.wait_at_barrier(f"jaxid_factors_{next(_calls)}", int(1000 * patience))
     except jax.errors.JaxRuntimeError as error:

@@ -5,6 +5,7 @@ with these factors alike, so that no single run tells them; a known load does.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -12,16 +13,17 @@ from scipy import optimize
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.identification.combination import as_least_squares, combine, require_same_base
-from jaxid.identification.estimators.solutions import NUMERICAL, Decomposition
-from jaxid.identification.factors import Factors
-from jaxid.identification.fit import Fit, interval_table
-from jaxid.identification.payload import body_columns
-from jaxid.identification.states import state_maps, varying_parameters
-from jaxid.identification.uncertainty import Uncertainty
-from jaxid.identification.uncertainty.blocks import block_covariance
 from jaxid.robot.robot import Tool
 from jaxid.table import Table
+
+from .combination import as_least_squares, combine, require_same_base
+from .estimators.solutions import NUMERICAL, Decomposition
+from .factors import Factors
+from .fit import Fit, interval_table
+from .payload import body_columns
+from .states import state_maps, varying_parameters
+from .uncertainty import Uncertainty
+from .uncertainty.blocks import block_covariance
 
 LARGEST = 100.0
 """Ratio of a true to an assumed force beyond which something else is wrong."""
@@ -77,13 +79,9 @@ def identify_drive_gains(
     robot = base.model.robot
     A = np.asarray(robot.drives.reduction)
     if np.count_nonzero(A - np.diag(np.diag(A))):
-        raise InputError(
-            f"motors of `{robot.name}` turn more than one axis: only independent drives have gains."
-        )
+        raise InputError(f"motors of `{robot.name}` turn more than one axis: they have no gains.")
     if robot.tool is not None:
-        raise InputError(
-            f"`{robot.name}` has a known tool: leave it out (`tool=None`), its mass is found too."
-        )
+        raise InputError(f"`{robot.name}` has a known tool: leave it out (`tool=None`).")
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
     maps = state_maps(base.size, varying_parameters(base, varying), 2)
     offsets = (np.zeros(base.size), body_columns(base, load.body) @ load.parameters)
@@ -96,22 +94,15 @@ def identify_drive_gains(
 
     start = np.append(combine(fits, maps, offsets)[0], np.ones(robot.joints))
     settings = {"method": "lm", "x_scale": "jac", "xtol": 1e-14, "ftol": 1e-14, "gtol": 1e-14}
-    solution = optimize.least_squares(
-        lambda u: linearise(u)[0],
-        start,
-        lambda u: linearise(u)[1],  # pyright: ignore[reportArgumentType]
-        **settings,
-    )
+    functions: list[Any] = [lambda u, k=k: linearise(u)[k] for k in range(2)]
+    solution = optimize.least_squares(functions[0], start, functions[1], **settings)
     c = solution.x[size:]
     residuals, J = linearise(solution.x)
     decomposition = Decomposition.of(J, -residuals)
     B = decomposition.inverse_information()
     plausible = np.all((c > 1 / LARGEST) & (c < LARGEST))
     if decomposition.values[-1] <= NUMERICAL * decomposition.values[0] or not plausible:
-        raise InputError(
-            "the load does not tell all gains: mount a heavier one, farther from the flange, and "
-            "let every joint move it in both runs."
-        )
+        raise InputError("the load does not tell all gains: take a heavier one, move every joint.")
     blocks = []
     for fit, E, k in runs:
         for part in fit.time_blocks.parts:
@@ -132,7 +123,7 @@ def _linearise(factors: Factors, weights, E, offset, unknowns) -> tuple[np.ndarr
     p, c = E @ unknowns[:size] + offset, unknowns[size:]
     residuals, derivatives = [], []
     for j, (joint, w) in enumerate(zip(factors.joints, np.asarray(weights), strict=True)):
-        own, R = list(joint.columns), w * np.asarray(joint.R)
+        own, R = list(joint.columns), w * joint.R
         forces = R[:, :-1] @ p[own]
         J = np.zeros((len(R), len(unknowns)))
         J[:, :size] = c[j] * (R[:, :-1] @ E[own])

@@ -73,9 +73,7 @@ class RowChunk(NamedTuple):
         return [np.column_stack([theta, force])[kept] for theta, force, kept in joints]
 
 
-def row_chunks(
-    base: BaseParameters, observations: Observations, samples: int, wanted=None
-) -> Iterator[RowChunk]:
+def row_chunks(base, observations: Observations, samples: int, wanted=None) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
 
     Chunks without any of the `wanted` ranges of rows are left out.
@@ -143,9 +141,8 @@ class Factors(eqx.Module):
 
     def __add__(self, other: "Factors") -> "Factors":
         """Return the factors of both sets of rows together."""
-        joints = []
-        for a, b in zip(self.joints, other.joints, strict=True):
-            joints.append(JointFactor(a.columns, a.append(b.R).R, a.rows + b.rows))
+        pairs = zip(self.joints, other.joints, strict=True)
+        joints = (JointFactor(a.columns, a.append(b.R).R, a.rows + b.rows) for a, b in pairs)
         return Factors(tuple(joints), self.size)
 
     @property
@@ -153,32 +150,26 @@ class Factors(eqx.Module):
         """Number of rows of each joint."""
         return np.array([j.rows for j in self.joints])
 
-    def weighted(
-        self, weights: Float[AnyArray, " joints"]
-    ) -> tuple[Float[np.ndarray, "height base"], Float[np.ndarray, " height"]]:
+    def weighted(self, weights: Float[AnyArray, " joints"]) -> tuple[np.ndarray, np.ndarray]:
         r"""Return matrix and right-hand side with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
-        blocks, forces = [], []
+        blocks = []
         for joint, w in zip(self.joints, np.asarray(weights), strict=True):
-            R = w * np.asarray(joint.R)
-            block = np.zeros((len(R), self.size))
-            block[:, list(joint.columns)] = R[:, :-1]
+            block = np.zeros((len(joint.R), self.size + 1))
+            block[:, [*joint.columns, -1]] = w * joint.R
             blocks.append(block)
-            forces.append(R[:, -1])
-        stacked = np.column_stack([np.vstack(blocks), np.concatenate(forces)])
-        R = np.asarray(np.linalg.qr(stacked, mode="r"))
+        R = np.asarray(np.linalg.qr(np.vstack(blocks), mode="r"))
         return R[:, :-1], R[:, -1]
 
     def residual_squares(self, p: Float[AnyArray, " base"]) -> Float[np.ndarray, " joints"]:
         """Return the sum of the squared residuals of each joint [N² m² or N²]."""
-        p = np.asarray(p)
-        vectors = [np.append(p[list(joint.columns)], -1.0) for joint in self.joints]
-        pairs = zip(self.joints, vectors, strict=True)
-        return np.array([np.sum((np.asarray(joint.R) @ x) ** 2) for joint, x in pairs])
+        whole = np.append(p, -1.0)
+        rests = [joint.R @ whole[[*joint.columns, -1]] for joint in self.joints]
+        return np.array([np.sum(rest**2) for rest in rests])
 
     @property
     def force_squares(self) -> Float[np.ndarray, " joints"]:
         """Sum of the squared forces of each joint [N² m² or N²]."""
-        return np.array([np.sum(np.asarray(joint.R)[:, -1] ** 2) for joint in self.joints])
+        return np.array([np.sum(joint.R[:, -1] ** 2) for joint in self.joints])
 
 
 def empty_factors(columns: Columns, size: int) -> Factors:
@@ -210,7 +201,7 @@ class Blocks(eqx.Module):
         parts = []
         for part in self.parts:
             pairs = zip(part.joints, np.asarray(factors), strict=True)
-            joints = (JointFactor(j.columns, x * np.asarray(j.R), j.rows) for j, x in pairs)
+            joints = (JointFactor(j.columns, x * j.R, j.rows) for j, x in pairs)
             parts.append(Factors(tuple(joints), part.size))
         return Blocks(tuple(parts))
 

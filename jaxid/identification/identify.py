@@ -9,20 +9,21 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.estimators.estimate import AbstractEstimator
-from jaxid.identification.estimators.least_squares import WeightedLeastSquares
-from jaxid.identification.estimators.solutions import (
+from jaxid.measurement.observations import Observations, Progress
+
+from .estimators.estimate import AbstractEstimator
+from .estimators.least_squares import WeightedLeastSquares
+from .estimators.solutions import (
     NUMERICAL,
     AbstractSpectralSolution,
     Decomposition,
     undetermined,
 )
-from jaxid.identification.factors import Factors
-from jaxid.identification.fit import ConditionNumbers, Fit
-from jaxid.identification.problem import RegressionProblem
-from jaxid.identification.uncertainty.result import AbstractUncertainty
-from jaxid.identification.uncertainty.spectral import SpectralSandwich
-from jaxid.measurement.observations import Observations, Progress
+from .factors import Factors
+from .fit import ConditionNumbers, Fit
+from .problem import RegressionProblem
+from .uncertainty.result import AbstractUncertainty
+from .uncertainty.spectral import SpectralSandwich
 
 
 def identify(
@@ -54,10 +55,10 @@ def identify(
         InputError: If the observations belong to another number of joints, have fewer rows than
             there are parameters, or weights are not known.
     """
-    if isinstance(observations, RegressionProblem):
-        problem = observations
-    else:
-        recordings = tuple(observations) if isinstance(observations, Iterable) else (observations,)
+    problem = observations
+    if not isinstance(problem, RegressionProblem):
+        several = isinstance(problem, Iterable)
+        recordings = tuple(problem) if several else (problem,)
         _check(base, recordings)
         problem = RegressionProblem(base, recordings, progress)
     fit = fit_problem(problem, estimator, uncertainty)
@@ -77,10 +78,9 @@ def fit_problem(
     count = int(problem.factors.rows.sum())
     if count <= problem.base.size:
         raise InputError(
-            f"there are {count} rows for {problem.base.size} base parameters: record longer, "
-            "decimate less, or leave out fewer slow rows."
+            f"{count} rows are too few for {problem.base.size} parameters: record longer."
         )
-    estimator = WeightedLeastSquares() if estimator is None else estimator
+    estimator = estimator or WeightedLeastSquares()
     estimate = estimator(problem)
     base, blocks = estimate.base, estimate.blocks
     # Residuals are those of all rows, whatever weights the estimator gave them.
@@ -102,7 +102,7 @@ def fit_problem(
     numbers = [float(np.linalg.cond(x)) if x.any() else np.inf for x in (raw, R, scaled)]
     method = SpectralSandwich() if uncertainty is None else uncertainty
     errors, spectra = method(plain, estimate, naive)
-    shrinkage = _shrinkage_notes(decomposition, estimate.solution)
+    shrinkage = _shrinkage_notes(decomposition.values, estimate.solution)
     return Fit(
         base=base,
         parameters=p,
@@ -131,22 +131,14 @@ def _check(base: Any, recordings: Sequence[Any]) -> None:
     wanted += [("observations", o, Observations, "observe(...)") for o in recordings]
     for name, value, kind, function in wanted:
         if not isinstance(value, kind):
-            raise TypeError(
-                f"`{name}` must be `{kind.__name__}`, but holds a `{type(value).__name__}`: pass "
-                f"the result of `{function}`."
-            )
+            raise TypeError(f"`{name}` must come from `{function}`, not `{type(value).__name__}`.")
     n = base.model.robot.joints
     for o in recordings:
         if o.joints != n:
-            raise InputError(
-                f"`observations` of `{o.name}` have {o.joints} joints, but "
-                f"`{base.model.robot.name}` has {n}."
-            )
+            raise InputError(f"`observations` of `{o.name}` have {o.joints} joints, the robot {n}.")
 
 
-def naive_covariance(
-    factors: Factors, weights: np.ndarray, p: np.ndarray, B: np.ndarray, taken: float = 0.0
-) -> np.ndarray:
+def naive_covariance(factors: Factors, weights, p, B, taken: float = 0.0) -> np.ndarray:
     r"""Return the covariance for independent rows and a variance of each joint.
 
     The estimates are $B \Theta^T W^2 Q$, so their covariance is
@@ -155,20 +147,18 @@ def naive_covariance(
     """
     free = 1.0 - taken / float(factors.rows.sum())
     total = np.zeros((B.shape[1], B.shape[1]))
-    joints = zip(factors.joints, weights, factors.residual_squares(p), strict=True)
-    for joint, w, square in joints:
+    squares = factors.residual_squares(p)
+    for joint, w, square in zip(factors.joints, weights, squares, strict=True):
         gain = w**2 * np.asarray(joint.R)[:, :-1] @ B[list(joint.columns)]
         total += square / max(joint.rows * free, 1.0) * (gain.T @ gain)
     return total
 
 
-def _shrinkage_notes(
-    decomposition: Decomposition, solution: AbstractSpectralSolution
-) -> tuple[str, ...]:
+def _shrinkage_notes(s: np.ndarray, solution: AbstractSpectralSolution) -> tuple[str, ...]:
     """Return what standard deviations leave out where a solution shrinks weak directions."""
-    s = np.asarray(decomposition.values)
     live = s > NUMERICAL * s.max(initial=0.0)
-    pulled = int(np.count_nonzero(live & (solution.inverse(s) * s**2 <= 0.5)))
+    halved = solution.inverse(s) * s**2 <= 0.5
+    pulled = np.count_nonzero(live & halved)
     if not pulled:
         return ()
     return (

@@ -13,18 +13,19 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, TemperatureScaled
 from jaxid.errors import InputError
-from jaxid.identification.estimators.friction import (
+from jaxid.measurement.observations import Observations, Progress
+
+from .estimators.friction import (
     NonlinearFriction,
     SeparableProblem,
     Shapes,
     project,
     search_shapes,
 )
-from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.fit import Fit
-from jaxid.identification.identify import fit_problem
-from jaxid.identification.problem import RegressionProblem
-from jaxid.measurement.observations import Observations, Progress
+from .estimators.solutions import Decomposition
+from .fit import Fit
+from .identify import fit_problem
+from .problem import RegressionProblem
 
 
 class HeldOutErrors(eqx.Module):
@@ -116,18 +117,18 @@ def identify_nonlinear(
     Raises:
         InputError: If the model has no shapes, or the observations do not fit to it.
     """
-    recordings = (observations,) if isinstance(observations, Observations) else tuple(observations)
-    estimator = NonlinearFriction() if estimator is None else estimator
-    linear_problem = RegressionProblem(base if linear is None else linear, recordings)
+    estimator = estimator or NonlinearFriction()
+    linear_problem = RegressionProblem(linear or base, observations)
     before = fit_problem(linear_problem, estimator.linear)
     weights = np.asarray(before.weights)
-    separable, x, notes = estimator.search(RegressionProblem(base, recordings), weights)
+    problem = linear_problem.with_base(base)
+    separable, x, notes = estimator.search(problem, weights)
     shapes, size = separable.shapes, base.size
     shaped = shapes.set(base, x)
-    fit = fit_problem(RegressionProblem(shaped, recordings), estimator.linear)
+    fit = fit_problem(problem.with_base(shaped), estimator.linear)
     # Small changes of the shapes are further parameters.
     model, kappa = shaped.model, np.asarray(base.kappa)
-    p = np.asarray(shaped.to_standard(np.asarray(fit.parameters)))[shapes.columns_of_terms]
+    p = np.asarray(shaped.to_standard(fit.parameters))[shapes.columns_of_terms]
     slopes = ShapeSlopes(dataclasses.replace(shapes, model=model), x, p)
     linearised = dataclasses.replace(
         shaped,
@@ -135,12 +136,11 @@ def identify_nonlinear(
         indices=(*base.indices, *range(model.size, model.size + shapes.size)),
         kappa=np.vstack([kappa, np.zeros((shapes.size, kappa.shape[1]))]),
     )
-    both = fit_problem(RegressionProblem(linearised, recordings), estimator.linear).uncertainty
+    both = fit_problem(problem.with_base(linearised), estimator.linear).uncertainty
     uncertainty = jax.tree.map(lambda x: x[(slice(size),) * x.ndim], both)
+    changes = {"estimator": estimator, "notes": (*fit.notes, *notes)}
     return NonlinearFit(
-        fit=dataclasses.replace(
-            fit, uncertainty=uncertainty, estimator=estimator, notes=(*fit.notes, *notes)
-        ),
+        fit=dataclasses.replace(fit, uncertainty=uncertainty, **changes),
         names=tuple(name for name, _ in shapes.parameters),
         units=tuple(unit for _, unit in shapes.parameters),
         shapes=x,
@@ -152,10 +152,10 @@ def identify_nonlinear(
 
 def _held_out_errors(blocks, problem: SeparableProblem, found, weights, progress) -> HeldOutErrors:
     """Test both models on held-out blocks; searches begin at the shapes of all blocks."""
-    squares, errors, count = weights**2, [], len(blocks.parts)
-    folds = [part.tolist() for part in np.array_split(np.arange(count), min(5, count))]
+    squares, errors, every = weights**2, [], np.arange(len(blocks.parts))
+    folds = np.array_split(every, min(5, len(every)))
     for out in folds:
-        rest = [k for k in range(count) if k not in out]
+        rest = np.setdiff1d(every, out)
         p = Decomposition.of(*blocks.select(rest).total.weighted(weights)).solve()
         x, _ = search_shapes(problem, weights, problem.shapes.values, found, rest)
         shaped = problem.blocks(x)
@@ -250,7 +250,7 @@ def temperature_law(
     if len(names) != robot.joints or any(set(names) - set(fit.base.names) for fit in fits):
         raise InputError(f"`term` must have one parameter for each joint, in all fits: {names}.")
     places = [[fit.base.names.index(name) for name in names] for fit in fits]
-    f = np.array([np.asarray(fit.parameters)[k] for fit, k in zip(fits, places, strict=True)])
+    f = np.array([fit.parameters[k] for fit, k in zip(fits, places, strict=True)])
     s = np.array([fit.standard_deviations[k] for fit, k in zip(fits, places, strict=True)])
     lines = np.full((len(names), 4), np.nan)
     for j in np.flatnonzero((f > 0).all(axis=0)):

@@ -15,7 +15,8 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
-from jaxid.identification.uncertainty.spectral import sandwich_of_columns
+
+from .uncertainty.spectral import sandwich_of_columns
 
 AT_ONCE = 2048
 """Samples up to which several data sets evaluate their columns together."""
@@ -81,10 +82,8 @@ def solve(rows: JointRegressor, batch: DataSets, row_time: float | None = None) 
     calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
     group = -(-datasets // calls)
     whole = calls * group
-    more = jax.tree.map(lambda x: x[np.arange(whole - datasets)], batch)
-    groups = jax.tree.map(
-        lambda x, y: jnp.concatenate([x, y]).reshape((-1, group, *x.shape[1:])), batch, more
-    )
+    filled = np.arange(whole) % datasets
+    groups = jax.tree.map(lambda x: x[filled].reshape(-1, group, *x.shape[1:]), batch)
 
     def one(pair: tuple[DataSets, list[Array]]) -> BatchFit:
         return _solve_one(rows, *pair, row_time)
@@ -103,13 +102,11 @@ def solve(rows: JointRegressor, batch: DataSets, row_time: float | None = None) 
     return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
 
 
-def _solve_one(
-    rows: JointRegressor, one: DataSets, columns: list[Array], row_time: float | None
-) -> BatchFit:
+def _solve_one(rows: JointRegressor, one: DataSets, A: list[Array], row_time) -> BatchFit:
     """Solve one data set by the products of its rows."""
     weights, places = one.weights, [np.array(own, int) for own in rows.columns]
     length, size = len(one.motion.q), rows.size
-    A, Q = columns, list(jnp.moveaxis(one.forces, -1, 0))
+    Q = list(jnp.moveaxis(one.forces, -1, 0))
     if one.mask is not None:
         masks = one.mask.T[:, None] > 0
         A, Q = ([jnp.where(*x, 0.0) for x in zip(masks, y, strict=True)] for y in (A, Q))
@@ -156,10 +153,8 @@ def _solve_one(
     naive = jnp.sqrt(jnp.maximum(naive, 0.0))
     deviations, dof = naive, jnp.broadcast_to(count.sum() - size, naive.shape)
     if row_time is not None:
-        exposure = count / length
-        variance, dof = sandwich_of_columns(
-            rows.columns, weights, inverse, p, A, Q, exposure, row_time
-        )
+        rest = A, Q, count / length, row_time
+        variance, dof = sandwich_of_columns(rows.columns, weights, inverse, p, *rest)
         deviations = jnp.sqrt(jnp.maximum(variance, 0.0))
     return BatchFit(
         p,
@@ -178,9 +173,7 @@ def _products(columns: list[Array], forces: list[Array]) -> tuple[list[Array], A
     return [Q @ A.T for A, Q in zip(columns, forces, strict=True)], squares
 
 
-def inverse_information(
-    whole: Float[Array, "base base"],
-) -> tuple[Float[Array, "base base"], Float[Array, ""]]:
+def inverse_information(whole: Float[Array, "base base"]) -> tuple[Array, Array]:
     """Return the inverse of an information, and a bound of its root's condition number.
 
     Columns are scaled to length one, and a ridge of rounding's size keeps the factor from failing.

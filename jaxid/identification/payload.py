@@ -10,14 +10,15 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.combination import as_least_squares, combine, require_same_base
-from jaxid.identification.consistency import BodyBounds, consistency_margin, consistent_body
-from jaxid.identification.fit import Fit, interval_table
-from jaxid.identification.states import state_maps, varying_parameters
-from jaxid.identification.uncertainty import Uncertainty
 from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
 from jaxid.robot.robot import Tool
 from jaxid.table import Remark, Status, Table
+
+from .combination import as_least_squares, combine, require_same_base
+from .consistency import BodyBounds, consistency_margin, consistent_body
+from .fit import Fit, interval_table
+from .states import state_maps, varying_parameters
+from .uncertainty import Uncertainty
 
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
 CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
@@ -50,12 +51,12 @@ class Payload(eqx.Module):
     @property
     def centre_of_mass(self) -> Float[np.ndarray, "3"]:
         """Centre of mass in the frame of the body [m]."""
-        return np.asarray(self.parameters)[1:4] / self.mass
+        return np.asarray(self.parameters[1:4] / self.mass)
 
     @property
     def inertia(self) -> Float[np.ndarray, "3 3"]:
         """Inertia tensor about the centre of mass, along the body's axes [kg m²]."""
-        return np.asarray(Inertia.from_parameters(np.asarray(self.parameters)).tensor)
+        return np.asarray(Inertia.from_parameters(self.parameters).tensor)
 
     @property
     def tool(self) -> Tool:
@@ -64,9 +65,8 @@ class Payload(eqx.Module):
         Raises:
             InputError: If it is no body that can exist.
         """
-        return Tool(
-            self.body, mass=self.mass, centre_of_mass=self.centre_of_mass, inertia=self.inertia
-        )
+        centre, inertia = self.centre_of_mass, self.inertia
+        return Tool(self.body, mass=self.mass, centre_of_mass=centre, inertia=inertia)
 
     @property
     def central(self) -> tuple[Float[np.ndarray, "10"], Uncertainty]:
@@ -74,7 +74,7 @@ class Payload(eqx.Module):
         with double_precision():
             p = jnp.asarray(self.parameters)
             values, J = (np.asarray(f(p)) for f in (_about_centre, jax.jacfwd(_about_centre)))
-        C = np.asarray(self.uncertainty.covariance)
+        C = self.uncertainty.covariance
         covariance = J @ np.where(np.isfinite(C), C, 0.0) @ J.T
         lost = np.any(J[:, ~np.isfinite(np.diag(C))] != 0.0, axis=1)
         covariance[lost, lost] = np.inf
@@ -138,8 +138,8 @@ def identify_payload(
     added = body_columns(base, body)
     maps = [np.hstack([first, np.zeros_like(added)]), np.hstack([second, added])]
     x, both = combine([as_least_squares(unloaded), as_least_squares(loaded)], maps)
-    covariance = np.asarray(both.covariance)[-10:, -10:]
-    dof = np.full(10, np.min(np.asarray(both.dof)[-10:]))
+    covariance = both.covariance[-10:, -10:]
+    dof = np.full(10, np.min(both.dof[-10:]))
     estimate, uncertainty = x[-10:], Uncertainty(covariance, dof, covariance)
     known = np.isfinite(covariance).all()
     if not known or (bounds is None and consistency_margin(estimate) >= 0):
@@ -151,10 +151,7 @@ def identify_payload(
     # a relative error of one percent of half the squared distance is good enough.
     p, distance, error_bound = consistent_body(estimate, covariance, bounds, throw=False)
     if not error_bound <= 0.01 * (1.0 + distance**2):
-        raise RuntimeError(
-            "no body that could exist was proved to be the nearest to the payload's estimate, "
-            f"whose mass is {estimate[0]:.4g} kg: are the runs those of the same robot?"
-        )
+        raise RuntimeError("no body was proved to be the nearest: are both runs of one robot?")
     return Payload(body, p, estimate, uncertainty, distance)
 
 
@@ -166,10 +163,7 @@ def body_columns(base: BaseParameters, body: int) -> Float[np.ndarray, "base 10"
     ten = [f"{name}{body + 1}" for name in INERTIAL_NAMES]
     for name in ten:
         if name not in names:
-            raise InputError(
-                f"a load on body {body} has ten parameters, but the model lacks `{name}`: use "
-                "`RigidBodies()` with all ten."
-            )
+            raise InputError(f"the model lacks `{name}` of body {body}: use `RigidBodies()`.")
     unit = np.eye(base.model.size)[[names.index(name) for name in ten]]
     return np.asarray(base.from_standard(unit)).T
 

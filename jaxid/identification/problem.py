@@ -5,10 +5,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.factors import (
+from jaxid.measurement.observations import Observations, Progress
+from jaxid.robot.robot import Robot
+
+from .factors import (
     Blocks,
     Columns,
     Factors,
@@ -16,9 +18,7 @@ from jaxid.identification.factors import (
     empty_factors,
     row_chunks,
 )
-from jaxid.identification.streaming import stream_blocks, suits
-from jaxid.measurement.observations import Observations, Progress
-from jaxid.robot.robot import Robot
+from .streaming import stream_blocks, suits
 
 Span = tuple[int, int, int]
 """Index of a recording, and the half-open range of some of its rows."""
@@ -35,7 +35,7 @@ class RegressionProblem:
 
     Args:
         base: Base parameters, which are the unknowns.
-        recordings: Observations of the robot; empty where only factors are known.
+        recordings: Observations of one recording or several; none where only factors are known.
         progress: Callback, called with the completed fraction (0 to 1) of a pass over long logs.
         divisions: Number of blocks of time into which the rows of each recording are divided.
         blocks: Factors by blocks of time, if they were made before.
@@ -50,7 +50,7 @@ class RegressionProblem:
     def __init__(
         self,
         base: BaseParameters,
-        recordings: Sequence[Observations] = (),
+        recordings: Observations | Sequence[Observations] = (),
         progress: Progress | None = None,
         *,
         divisions: int = 10,
@@ -58,10 +58,12 @@ class RegressionProblem:
         names: Sequence[str] | None = None,
     ):
         self.base, self.progress = base, progress
-        self.recordings = tuple(recordings)
-        self.names = tuple(o.name for o in recordings) if names is None else tuple(names)
+        alone = isinstance(recordings, Observations)
+        self.recordings = (recordings,) if alone else tuple(recordings)
+        own = (o.name for o in self.recordings)
+        self.names = tuple(own if names is None else names)
         self._given = blocks
-        self._edges = [block_edges(o, divisions) for o in recordings]
+        self._edges = [block_edges(o, divisions) for o in self.recordings]
         self._cache: dict[int, list[RowChunk]] = {}
 
     @property
@@ -74,7 +76,7 @@ class RegressionProblem:
         """The factors by contiguous blocks of time, made by the first pass over the rows."""
         if self._given is not None:
             return self._given
-        self.require_samples("a pass over the rows")
+        self.require_samples()
         parts = []
         for number, recording in enumerate(self.recordings):
             edges, first = self._edges[number], self._first_block(number)
@@ -91,17 +93,14 @@ class RegressionProblem:
         """The factors of all rows together."""
         return self.blocks.total
 
-    def require_samples(self, task: str) -> None:
-        """Check that the rows themselves are known, for a task at the beginning of a sentence.
+    def require_samples(self) -> None:
+        """Check that the rows themselves are known.
 
         Raises:
             InputError: If only factors are known.
         """
         if not self.recordings:
-            raise InputError(
-                f"{task} needs the rows themselves, but only their factors are known: use "
-                "`identify` with the recordings."
-            )
+            raise InputError("this estimate needs the rows themselves: `identify` the recordings.")
 
     def with_base(self, base: BaseParameters) -> "RegressionProblem":
         """Return the problem of the same recordings with other base parameters.
@@ -111,7 +110,7 @@ class RegressionProblem:
         Raises:
             InputError: If only factors are known.
         """
-        self.require_samples("another model")
+        self.require_samples()
         return RegressionProblem(base, self.recordings, self.progress)
 
     def fold(
@@ -148,14 +147,12 @@ class RegressionProblem:
         Raises:
             InputError: If only factors are known.
         """
-        self.require_samples("a pass over the rows")
+        self.require_samples()
         for number in range(len(self.recordings)):
             wanted = None if spans is None else [(a, b) for k, a, b in spans if k == number]
             yield from self._chunks(number, wanted)
 
-    def _chunks(
-        self, number: int, wanted: Sequence[tuple[int, int]] | None = None
-    ) -> Iterator[RowChunk]:
+    def _chunks(self, number: int, wanted=None) -> Iterator[RowChunk]:
         """Yield the rows of one recording; keep them if they are all made and few."""
         if number in self._cache:
             yield from self._cache[number]
@@ -180,25 +177,18 @@ class RegressionProblem:
             sizes = [o.samples for o in self.recordings]
             self.progress(min(1.0, (sum(sizes[:number]) + done * sizes[number]) / sum(sizes)))
 
-    def residuals(
-        self, p: np.ndarray, spans: Sequence[Span] | None = None
-    ) -> Iterator[tuple[RowChunk, np.ndarray]]:
+    def residuals(self, p: np.ndarray, spans=None) -> Iterator[tuple[RowChunk, np.ndarray]]:
         """Yield the rows with the residuals of some parameters [rows, joints]."""
         for chunk in self.chunks(spans):
             yield chunk, chunk.residuals(p)
 
-    def reweighted(
-        self,
-        p: np.ndarray,
-        weight: Callable[[np.ndarray], np.ndarray],
-        scale: Float[np.ndarray, " joints"],
-    ) -> Blocks:
+    def reweighted(self, p: np.ndarray, weight: Callable, scale: np.ndarray) -> Blocks:
         """Return the factors of rows that have weights of their own, by the same blocks of time.
 
         Args:
             p: Base parameters, which give each row its residual.
             weight: Function from residuals, divided by their scale, to weights from 0 to 1.
-            scale: Size of each joint's residuals [N m or N].
+            scale: Size of each joint's residuals [joints], in [N m] or [N].
         """
 
         def equations(chunk: RowChunk) -> list[np.ndarray]:
@@ -227,9 +217,7 @@ def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blo
     """
     size = len(blocks.parts)
     if size < 2:
-        raise InputError(
-            "held-out errors need at least two blocks of rows, but there is one: record longer."
-        )
+        raise InputError("held-out errors need at least two blocks of rows: record longer.")
     for part in np.array_split(np.arange(size), min(count, size)):
         rest = np.setdiff1d(np.arange(size), part)
         yield blocks.select(rest), blocks.select(part)

@@ -10,16 +10,17 @@ from jaxid.arrays import AnyArray, Bool, Float, Int
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
-from jaxid.identification.combination import (
+from jaxid.table import Table
+
+from .combination import (
     as_least_squares,
     combine,
     replace_estimates,
     require_same_base,
 )
-from jaxid.identification.comparison import LEVEL, Comparison, compare_some, joint_test
-from jaxid.identification.fit import Fit, interval_table
-from jaxid.identification.uncertainty import Uncertainty
-from jaxid.table import Table
+from .comparison import LEVEL, Comparison, compare_some, joint_test
+from .fit import Fit, interval_table
+from .uncertainty import Uncertainty
 
 
 class StatesFit(eqx.Module):
@@ -76,10 +77,10 @@ class StatesFit(eqx.Module):
             InputError: If there is no such state.
         """
         k, known = self._indices(state), self.uncertainty
-        C = np.asarray(known.covariance)[np.ix_(k, k)]
+        C = known.covariance[np.ix_(k, k)]
         fit = self.fits[self.states.index(state)]
-        uncertainty = Uncertainty(C, np.asarray(known.dof)[k], fit.uncertainty.naive_covariance)
-        return replace_estimates(fit, np.asarray(self.parameters)[k], uncertainty)
+        uncertainty = Uncertainty(C, known.dof[k], fit.uncertainty.naive_covariance)
+        return replace_estimates(fit, self.parameters[k], uncertainty)
 
     def compare(self, first: str, second: str, level: float = LEVEL) -> Comparison:
         """Decide which of the parameters that vary have changed between two states.
@@ -95,7 +96,7 @@ class StatesFit(eqx.Module):
             InputError: If there is no such state, or `level` is no fraction.
         """
         a, b = (self._indices(state)[list(self.varying)] for state in (first, second))
-        cross = np.asarray(self.uncertainty.covariance)[np.ix_(a, b)]
+        cross = self.uncertainty.covariance[np.ix_(a, b)]
         return compare_some(self.fit(first), self.fit(second), self.varying, cross, level)
 
     @property
@@ -106,10 +107,10 @@ class StatesFit(eqx.Module):
         that some of them have changed after all.
         """
         k = [k for k in self.shared if all(np.isfinite(f.covariance[k, k]) for f in self.fits)]
-        p = [np.asarray(fit.parameters)[k] for fit in self.fits]
-        first, *others = [np.asarray(fit.covariance)[np.ix_(k, k)] for fit in self.fits]
+        p = [fit.parameters[k] for fit in self.fits]
+        first, *others = [fit.covariance[np.ix_(k, k)] for fit in self.fits]
         covariance = linalg.block_diag(*others) + np.tile(first, (len(others), len(others)))
-        dof = min(float(np.min(np.asarray(fit.uncertainty.dof)[k])) for fit in self.fits)
+        dof = min(float(np.min(fit.uncertainty.dof[k])) for fit in self.fits)
         return joint_test(np.concatenate([x - p[0] for x in p[1:]]), covariance, dof)
 
     def _indices(self, state: str) -> Int[np.ndarray, " base"]:
@@ -136,10 +137,7 @@ def identify_states(fits: Sequence[Fit], varying: Sequence[str] | None = None) -
     """
     states = [fit.name for fit in fits]
     if len(states) < 2 or len(set(states)) < len(states):
-        raise InputError(
-            "`fits` must be two or more with different names, but are "
-            f"{', '.join(states)}: name them by their states."
-        )
+        raise InputError(f"`fits` must be two or more with different names: {', '.join(states)}.")
     require_same_base(fits)
     fits = tuple(map(as_least_squares, fits))
     base = fits[0].base
@@ -156,10 +154,8 @@ def state_indices(size: int, varying: Sequence[int], state: int) -> Int[np.ndarr
     return indices
 
 
-def state_maps(
-    size: int, varying: Sequence[int], states: int
-) -> list[Float[np.ndarray, "base unknowns"]]:
-    """Return for each state the matrix that gives its base parameters from all unknowns."""
+def state_maps(size: int, varying: Sequence[int], states: int) -> list[np.ndarray]:
+    """Return for each state the matrix [base, unknowns] from unknowns to its base parameters."""
     unit = np.eye(size + (states - 1) * len(varying))
     return [unit[state_indices(size, varying, state)] for state in range(states)]
 
@@ -170,9 +166,7 @@ def varying_parameters(base: BaseParameters, varying: Sequence[str] | None) -> t
         return tuple(np.flatnonzero(~stores_energy(base)).tolist())
     for name in varying:
         if name not in base.names:
-            raise InputError(
-                f"`{name}` is no base parameter of `{base.model.robot.name}`: see `base.names`."
-            )
+            raise InputError(f"`{name}` is none of `base.names` of `{base.model.robot.name}`.")
     return tuple(k for k, x in enumerate(base.names) if x in varying)
 
 

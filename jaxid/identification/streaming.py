@@ -22,10 +22,11 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import program_of
-from jaxid.identification.factors import Factors, JointFactor, divide_rows, row_chunks, without_tool
 from jaxid.measurement.filters import LowPass
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.program import Program, lower
+
+from .factors import Factors, JointFactor, divide_rows, row_chunks, without_tool
 
 LONG = 100_000
 """Samples from which compiling pays."""
@@ -164,18 +165,16 @@ class _Stream:
         self._loop = _compiled(columns, tuple(base.acting_columns), self._shape)
         segments = range(len(observations.segments))
         self._pieces = [piece for k in segments for piece in self._divide(k)]
-        self._ends = list(self._reduce_ends()) if self._shape.reach else []
+        self._ends = list(self._reduce_ends())
 
     def _divide(self, segment: int) -> Iterator[Piece]:
         """Yield the pieces of the rows of a segment that do not depend on its ends."""
         o, shape, reach = self._observations, self._shape, self._shape.reach
         (a, b), (r0, r1) = o.segments[segment], o.row_segments[segment]
         factor, edge = o.decimation.factor, o.filter.edge(o.sample_time)
-        low, high = r0, r1
-        if reach:
-            away = max(reach - edge, o.decimation.memory(), 0)
-            low = r0 + -(-away // factor)
-            high = min(r0 + (b - a - 2 * edge - 1 - away) // factor + 1, r1)
+        away = max(reach - edge, o.decimation.memory(), 0)
+        low = r0 + -(-away // factor)
+        high = min(r0 + (b - a - 2 * edge - 1 - away) // factor + 1, r1)
         most = shape.iterations * shape.rows - shape.delay
         for block, rows in divide_rows(self._edges, slice(low, high)):
             for r in range(rows.start, rows.stop, most):
@@ -303,9 +302,8 @@ def _similar(total: np.ndarray, first: np.ndarray, mixing: np.ndarray, ratio: fl
     if not shown.shape[1]:
         return not total.any()
     sizes = np.linalg.eigvalsh(shown.T @ total @ shown)
-    return float(np.linalg.norm(total)) <= ratio * float(np.median(sizes)) and bool(
-        sizes[0] * ratio > np.median(sizes)
-    )
+    middle = np.median(sizes)
+    return bool(np.linalg.norm(total) <= ratio * middle and sizes[0] * ratio > middle)
 
 
 def _root(G: np.ndarray) -> np.ndarray:
@@ -372,9 +370,8 @@ def _compiled(program: Program, acting: tuple[tuple[int, ...], ...], shape: Loop
             return left, sums
 
         nothing = [jnp.zeros(shape.samples)] * height
-        carried = [
-            jnp.zeros((height, d * f)) for d, f in zip(shape.delays, shape.factors, strict=True)
-        ]
+        sizes = zip(shape.delays, shape.factors, strict=True)
+        carried = [jnp.zeros((height, delay * factor)) for delay, factor in sizes]
         grams = [jnp.zeros((len(own), len(own))) for own in places]
         return jax.lax.fori_loop(0, count, iteration, (carried, grams))[1]
 

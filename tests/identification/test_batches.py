@@ -131,6 +131,8 @@ def test_data_sets_that_determine_too_little_are_marked_and_solved_like_alone(ba
     known = np.isfinite(one.naive_standard_deviations)
     assert 0 < known.sum() < base.size
     np.testing.assert_array_equal(np.isfinite(fit.standard_deviations[1]), known)
+    honest = identify_batch(base, *stacked(weak), row_time=sets[0].sample_time)
+    np.testing.assert_allclose(honest.standard_deviations[1], one.standard_deviations, rtol=1e-6)
 
 
 def test_nearly_dependent_columns_are_as_accurate_as_alone(base):

@@ -178,7 +178,7 @@ ONES = np.ones((3, 20, 3))
 identify = inspect.unwrap(jid.identify)  # tests check annotations first, users do not
 REFUSALS = [
     (lambda base, o: jid.identify(base, o, weighted([np.nan, 1.0])), "`weights`"),
-    (lambda base, o: jid.identify(base, o, weighted(np.ones(3))), "`weights`.*2 joints"),
+    (lambda base, o: jid.identify(base, o, weighted(np.ones(3))), "`weights` must be 2 numbers"),
     (lambda base, o: est.Truncated(2.0), "`rcond`"),
     (lambda base, o: est.Ridge(np.nan), "`strength`"),
     (lambda base, o: est.Tukey(0.0), "`limit`"),
@@ -187,7 +187,7 @@ REFUSALS = [
     (lambda base, o: identify(base, o.motion), "`observations`"),
     (lambda base, o: identify(base.model, o), "`base`"),
     (lambda base, o: jid.identify(base, o, LINEAR[0]).predict(jid.Motion(*ONES)), "`motion`"),
-    *[(lambda base, o, k=k: alone(base, o, k), "only their factors") for k in range(3, 8)],
+    *[(lambda base, o, k=k: alone(base, o, k), "the rows themselves") for k in range(3, 8)],
 ]
 
 

@@ -170,7 +170,7 @@ def test_cross_validation_pulls_only_where_data_are_poor(base, p):
 @pytest.mark.parametrize(
     ("joints", "force", "samples", "message"),
     [
-        (3, [40.0, 5.0, 2.0], 40, "have 2 joints, but `planar arm, 3 joints` has 3"),
+        (3, [40.0, 5.0, 2.0], 40, "have 2 joints, the robot 3"),
         (2, [40.0, 5.0], 5, "10 rows for 12 base parameters: record longer"),
         (2, [40.0, np.inf], 40, "largest force of joint `joint2` .* is not known"),
     ],

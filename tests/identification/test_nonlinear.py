@@ -53,6 +53,15 @@ def test_shapes_are_found_again_through_filters():
     np.testing.assert_allclose(fit.parameters, START.from_standard(P), rtol=2e-3, atol=2e-3)
 
 
+def test_shapes_are_found_by_name():
+    o = virtual.observations(model(TRUE_EPSILON, TRUE_SPEED, 1.5), P, samples=1500)
+    base = jid.base_parameters(model(TRUE_EPSILON, TRUE_SPEED, 2.0))
+    fit = jid.identify(base, o, NonlinearFriction(WLS, ("delta",)))
+    stribeck = fit.base.model.terms[2]
+    np.testing.assert_allclose(stribeck.exponent, 1.5, rtol=1e-3)
+    np.testing.assert_array_equal(stribeck.speed, TRUE_SPEED)
+
+
 def test_factors_are_those_of_the_model_with_these_shapes():
     """Fixed columns once and friction anew is the same as everything at once; masks count."""
     mask = np.random.default_rng(5).random((375, 3)) < 0.7
@@ -127,6 +136,8 @@ def test_what_cannot_be_searched_is_rejected():
     hard = jid.CoulombFriction(jid.terms.HardSign())
     with pytest.raises(ValueError, match="`StribeckFriction`"):
         select_shapes(jid.base_parameters(jid.Model(ROBOT, (jid.RigidBodies(), hard))))
+    with pytest.raises(ValueError, match="`shapes`"):
+        select_shapes(START, ("vs", "rate"))
     zero = dataclasses.replace(START, model=model(0.04, np.array([0.1, 0.0, 0.1])))
     with pytest.raises(ValueError, match="`vs2`"):
         _ = select_shapes(zero).values

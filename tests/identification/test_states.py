@@ -168,7 +168,7 @@ def test_other_estimates_are_solved_again_from_their_factors(base, logs, fits):
     ("chosen", "message"),
     [
         ((0, 0), "different names"),
-        ((0, 1, ["fv9"]), "`fv9` is no base"),
+        ((0, 1, ["fv9"]), "`fv9` is none of"),
     ],
 )
 def test_refusals(fits, found, chosen, message):

@@ -27,7 +27,7 @@ class NonlinearParameter(NamedTuple):
         name: Name without the joint's number.
         units: Units for a revolute and a prismatic joint.
         path: Attributes that lead to it, from the term (or transition) that declares it.
-        default: Whether it is identified unless a user chooses otherwise.
+        default: Whether it is identified unless `NonlinearFriction` names others.
     """
 
     name: str

@@ -5,8 +5,9 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float, Numbers
 from jaxid.errors import InputError
-from jaxid.identification.consistency.pseudo_inertia import consistency_margin
 from jaxid.robot.robot import Robot
+
+from .pseudo_inertia import consistency_margin
 
 
 class BodyBounds(eqx.Module):
@@ -60,7 +61,8 @@ class BodyBounds(eqx.Module):
                 raise InputError(f"`{name}` must be for all or each of {bodies} bodies: {value}.")
             return np.broadcast_to(array, (bodies, *shape)).copy()
 
-        self.mass_max, self.radius = each("mass_max", mass_max), each("radius", radius)
+        self.mass_max = each("mass_max", mass_max)
+        self.radius = each("radius", radius)
         self.mass_min = each("mass_min", mass_min)
         self.centre_min = each("centre_min", centre_min, 3)
         self.centre_max = each("centre_max", centre_max, 3)
@@ -77,15 +79,13 @@ class BodyBounds(eqx.Module):
         )
         for name, rule, good in rules:
             if not good.all():
-                k = int(np.argwhere(~good)[0, 0])
-                value = np.asarray(getattr(self, name))[k]
+                k = np.argwhere(~good)[0, 0]
+                value = getattr(self, name)[k]
                 raise InputError(f"`{name}` must be {rule}, but body {k + 1} has {value}.")
         total = self.total_mass
         if total is not None and not low.sum() < total < high.sum():
-            raise InputError(
-                f"`total_mass` must lie between the sums of the bodies' bounds, {low.sum():g} and "
-                f"{high.sum():g} kg, but is {total:g} kg."
-            )
+            span = f"{low.sum():g} to {high.sum():g} kg"
+            raise InputError(f"`total_mass` must be from {span}, but is {total:g} kg.")
         _ = self.inner_centres
 
     @classmethod
@@ -149,11 +149,9 @@ class BodyBounds(eqx.Module):
         radius, known = self.radius[:, None], self.has_ellipsoid[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
-        ellipsoid = (
-            np.where(known, self.ellipsoid_centre, 0.0),
-            np.where(known, self.ellipsoid_axes, radius),
-        )
-        regions = ellipsoid, (0.0, radius)
+        middle = np.where(known, self.ellipsoid_centre, 0.0)
+        axes = np.where(known, self.ellipsoid_axes, radius)
+        regions = (middle, axes), (0.0, radius)
         point, edge = 0.5 * (low + high), 0.1 * (high - low)
         # Alternating projections onto the ellipsoid, the sphere and the box, each a little smaller.
         for _ in range(200):
@@ -167,10 +165,7 @@ class BodyBounds(eqx.Module):
             inside &= np.linalg.norm((point - middle) / axes, axis=1) < 0.99
         if not inside.all():
             k = int(np.argmin(inside))
-            raise InputError(
-                f"no centre of mass of body {k + 1} lies well within its box, its ellipsoid and "
-                f"its sphere of {float(self.radius[k]):.3g} m: widen one of them."
-            )
+            raise InputError(f"no centre of mass of body {k + 1} fits its bounds: widen them.")
         return point
 
 

@@ -21,9 +21,17 @@ from jaxid.arrays import (
 )
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
-from jaxid.identification.consistency import solver
-from jaxid.identification.consistency.bounds import BodyBounds, EntropicPull, ParameterPrior
-from jaxid.identification.consistency.program import (
+
+from ..estimators import (
+    AbstractEstimator,
+    AbstractWeights,
+    Complete,
+    Estimate,
+    MaximumForces,
+)
+from . import solver
+from .bounds import BodyBounds, EntropicPull, ParameterPrior
+from .program import (
     ConeProgram,
     FeasibleSet,
     ScaledRows,
@@ -32,17 +40,7 @@ from jaxid.identification.consistency.program import (
     nominal_bodies,
     scaled_rows,
 )
-from jaxid.identification.consistency.pseudo_inertia import (
-    consistency_margin,
-    pseudo_inertia,
-)
-from jaxid.identification.estimators import (
-    AbstractEstimator,
-    AbstractWeights,
-    Complete,
-    Estimate,
-    MaximumForces,
-)
+from .pseudo_inertia import consistency_margin, pseudo_inertia
 
 UNPROVED = (
     "the search ended before its error bound fell below its tolerance: widen the bounds, or pass "
@@ -144,33 +142,32 @@ class PhysicallyConsistent(AbstractEstimator):
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))
-        ours, best = (float(np.sum((R @ x - z) ** 2)) for x in (parameters, free.parameters))
+        ours = float(np.linalg.norm(R @ parameters - z))
+        best = float(np.linalg.norm(R @ free.parameters - z))
         determined = np.array([x is Identifiability.ALONE for x in base.identifiability])
+        lost = (k for k, own in enumerate(feasible.bodies) if not determined[own[0]])
         found = Consistency(
             bodies=bodies,
             margins=consistency_margin(bodies),
             bounds=feasible.bounds,
-            residual_increase=float(np.sqrt(ours / best) - 1.0) if best > 0 else np.inf,
+            residual_increase=ours / best - 1.0 if best > 0 else np.inf,
             error_bound=error_bound,
             certified=bool(optimum.certified),
             iterations=int(optimum.iterations),
             determined=determined,
-            masses_from_bounds=tuple(
-                k for k, own in enumerate(feasible.bodies) if not determined[own[0]]
-            ),
+            masses_from_bounds=tuple(lost),
             active=_active_bounds(base, feasible, program, optimum, bodies),
         )
-        notes = [
+        notes = (
             *free.notes,
             f"physically consistent: {feasible.bounds}.",
             *found.findings,
             "standard deviations are those of the estimate without bounds: where bounds are "
             "active, estimates scatter less.",
-        ]
-        if not optimum.certified:
-            notes.append(UNPROVED)
+            *([] if optimum.certified else [UNPROVED]),
+        )
         changes = {"parameters": parameters, "standard": p, "consistency": found}
-        return dataclasses.replace(free, **changes, notes=tuple(notes))
+        return dataclasses.replace(free, **changes, notes=notes)
 
     def feasible_set(self, base: BaseParameters) -> FeasibleSet:
         """Return the feasible set of a model.
@@ -195,13 +192,13 @@ class PhysicallyConsistent(AbstractEstimator):
             data = data._replace(A=A, b=xp.concatenate([data.b, more]))
         if self.pull is None:
             return data, cone_program(xp, feasible, data)
-        bodies = self.pull.bodies
+        bodies, count = self.pull.bodies, len(feasible.bodies)
         if bodies is None:
             prior = nominal_bodies(feasible.bounds)
-        else:
-            if len(bodies) != len(feasible.bodies):
-                raise InputError(f"`bodies` of a prior must be the model's {len(feasible.bodies)}.")
+        elif len(bodies) == count:
             prior = pseudo_inertia(bodies)
+        else:
+            raise InputError(f"`bodies` of a prior must be the model's {count}.")
         return data, cone_program(xp, feasible, data, self.pull.strength, prior)
 
 
@@ -251,7 +248,7 @@ def consistent_body(
         InputError: If the covariance is not positive definite.
         RuntimeError: If the optimum was not proved and `throw` is set.
     """
-    C = np.asarray(covariance, np.float64)
+    C = np.asarray(covariance)
     size = np.sqrt(np.abs(np.diag(C)))
     size = np.where(size > 0, size, 1.0)
     try:
@@ -259,7 +256,7 @@ def consistent_body(
     except np.linalg.LinAlgError as error:
         raise InputError("`covariance` must be positive definite, but is not.") from error
     A = np.linalg.inv(L) / size
-    b = A @ np.asarray(estimate, np.float64)
+    b = A @ estimate
     feasible = FeasibleSet((tuple(range(10)),), (), (), bounds, np.zeros((1, 4, 4)), ())
     data = ScaledRows(A, b, np.float64(len(b)))
     program = cone_program(np, feasible, data)
@@ -268,7 +265,8 @@ def consistent_body(
     if throw and not optimum.certified:
         raise RuntimeError(f"no consistent body with a proof: {UNPROVED}")
     parameters = feasible.standard_parameters(np, data, optimum.y)
-    return parameters, float(np.sqrt(2.0 * optimum.value)), float(optimum.error)
+    distance = float(np.sqrt(2.0 * optimum.value))
+    return parameters, distance, float(optimum.error)
 
 
 class ConsistentBatch(eqx.Module):
@@ -328,16 +326,18 @@ class ConsistentSolver(Hashable):
             InputError: If the bounds do not fit the model.
         """
         require_float64("a physically consistent estimate")
-        R, z, feasible = jnp.asarray(R), jnp.asarray(z), self.estimator.feasible_set(self.base)
+        R, z = jnp.asarray(R), jnp.asarray(z)
+        feasible = self.estimator.feasible_set(self.base)
         data, program = self.estimator.program(jnp, self.base, feasible, R, z, rows)
         optimum = solver.solve_compiled(program)
         p = feasible.standard_parameters(jnp, data, optimum.y)
-        own = slice(len(z))  # The rows of a prior come behind.
-        free, bounded = data.b[self.base.size : len(z)], data.A[own] @ p - data.b[own]
+        # The rows of a prior come behind.
+        rest = (data.b - data.A @ p)[: len(z)]
+        free = data.b[self.base.size : len(z)]
         return ConsistentBatch(
             p,
             self.base.from_standard(p),
-            jnp.sqrt(bounded @ bounded / jnp.maximum(free @ free, 1e-300)) - 1.0,
+            jnp.sqrt(rest @ rest / jnp.maximum(free @ free, 1e-300)) - 1.0,
             optimum.error / jnp.maximum(optimum.value, program.scale),
             jnp.asarray(optimum.certified),
             jnp.asarray(optimum.iterations),
@@ -373,9 +373,10 @@ def consistent_batch(
             f"`R`, `z` and `rows` must have the shapes [datasets, height, {base.size}], [datasets, "
             f"height] and [datasets], but have {R.shape}, {z.shape} and {rows.shape}."
         )
-    arrays = np.asarray(R, np.float64), np.asarray(z, np.float64), np.asarray(rows, np.int64)
-    estimator = PhysicallyConsistent() if estimator is None else estimator
-    first, feasible = (x[0] for x in arrays), estimator.feasible_set(base)
+    arrays = np.asarray(R), np.asarray(z), np.asarray(rows)
+    estimator = estimator or PhysicallyConsistent()
+    first = (x[0] for x in arrays)
+    feasible = estimator.feasible_set(base)
     estimator.program(np, base, feasible, *first)[1].require_interior()
     one = ConsistentSolver(base, estimator)
     # An accelerator takes all data sets at once.

@@ -16,14 +16,10 @@ from jaxid.arrays import AnyArray, Float, Int
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
-from jaxid.identification.consistency.bounds import BodyBounds
-from jaxid.identification.consistency.pseudo_inertia import (
-    BASIS,
-    Values,
-    ball,
-    inertial_parameters,
-)
 from jaxid.robot.inertia import AXES
+
+from .bounds import BodyBounds
+from .pseudo_inertia import BASIS, Values, ball, inertial_parameters
 
 Number = Float[AnyArray, "*batch"] | np.floating
 """One number of a problem, or one for each of a batch."""
@@ -262,11 +258,9 @@ class ConeProgram(eqx.Module):
             InputError: If it does not.
         """
         S, s = self.slacks(np, np.asarray(self.start))
-        if not (np.linalg.eigvalsh(S)[:, 0].min(initial=1.0) > 0 and s.min(initial=1.0) > 0):
-            raise InputError(
-                "no ball-shaped body lies within all bounds: make `margin` smaller, or widen the "
-                "bounds of masses, spheres and centres of mass."
-            )
+        smallest = np.linalg.eigvalsh(S).min()
+        if not (smallest > 0 and s.min() > 0):
+            raise InputError("no ball lies within all bounds: widen them, or lower `margin`.")
 
     def slacks(self, xp: ModuleType, y: Values) -> tuple[Values, Values]:
         """Return the semidefinite matrices and the nonnegative functions of variables."""
@@ -304,9 +298,7 @@ def indicators(places: Values, size: int) -> Values:
     return (places[..., None] == np.arange(size)[None, None]).astype(float)
 
 
-def cone_program(
-    xp, feasible: FeasibleSet, data: ScaledRows, strength=0.0, prior=None
-) -> ConeProgram:
+def cone_program(xp, feasible, data: ScaledRows, strength=0.0, prior=None) -> ConeProgram:
     """Return the convex program of least squares, with a pull towards the bodies of a prior."""
     bounds, units = feasible.bounds, feasible.scales(xp, data)
     K, w, n = len(feasible.bodies), feasible.width, len(feasible.drives)
@@ -371,8 +363,10 @@ def _coupled(xp: ModuleType, feasible: FeasibleSet, largest: Values):
     if not matrices:
         return np.zeros((0, 0, 4, 4)), np.zeros((0, 0), int), np.zeros((0, 4, 4))
     longest = max(len(m) for m in members)
-    matrices = [xp.pad(x, ((0, longest - len(x)), (0, 0), (0, 0))) for x in matrices]
-    members = [[*m, *[0] * (longest - len(m))] for m in members]
+    for k, own in enumerate(members):
+        missing = longest - len(own)
+        matrices[k] = xp.pad(matrices[k], ((0, missing), (0, 0), (0, 0)))
+        members[k] = [*own, *[0] * missing]
     return xp.stack(matrices), np.array(members), np.array(fillings)
 
 
@@ -381,11 +375,13 @@ def _start(xp: ModuleType, feasible: FeasibleSet, A, b, prior) -> Values:
 
     Where a prior's bodies satisfy all bounds the start lies close to them.
     """
-    bounds, K, w, n = feasible.bounds, len(feasible.bodies), feasible.width, len(feasible.drives)
+    bounds, w = feasible.bounds, feasible.width
+    K, n = len(feasible.bodies), len(feasible.drives)
     most = bounds.mass_max
     centre = bounds.inner_centres / bounds.radius[:, None]
     room = 1.0 - np.sum(centre**2, axis=1)
-    balls = inertial_parameters(ball(np.ones(K), centre, np.sqrt(0.5 * room * 5.0 / 3.0)))[:, :w]
+    unit = ball(np.ones(K), centre, np.sqrt(0.5 * room * 5.0 / 3.0))
+    balls = inertial_parameters(unit)[:, :w]
     floor = inertial_parameters(feasible.floors)[:, :w] / feasible.body_scales
     low = np.maximum(bounds.mass_min / most, floor[:, 0])
     if bounds.total_mass is None:

@@ -23,8 +23,9 @@ import numpy as np
 import scipy.linalg
 
 from jaxid.arrays import AnyArray, Bool, Float, Int
-from jaxid.identification.consistency.program import ConeProgram, Number, indicators
-from jaxid.identification.consistency.pseudo_inertia import (
+
+from .program import ConeProgram, Number, indicators
+from .pseudo_inertia import (
     BASIS,
     Values,
     are_definite,

@@ -10,14 +10,15 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.estimators.solutions import (
+
+from ..factors import Blocks, RowChunk
+from ..problem import RegressionProblem
+from .solutions import (
     AbstractSolution,
     AbstractSpectralSolution,
     Complete,
     Decomposition,
 )
-from jaxid.identification.factors import Blocks, RowChunk
-from jaxid.identification.problem import RegressionProblem
 
 
 class Channel(NamedTuple):
@@ -44,9 +45,7 @@ Influence = Callable[[RowChunk, np.ndarray], list[Channel]]
 """Function from rows and their residuals [rows, joints], in [N m] or [N], to weighted equations."""
 
 
-def weighted_joints(
-    chunk: RowChunk, weights: Float[AnyArray, " joints"]
-) -> Iterator[tuple[tuple[int, ...], np.ndarray, np.ndarray, int]]:
+def weighted_joints(chunk: RowChunk, weights: AnyArray) -> Iterator[tuple]:
     """Yield parameters, weighted columns, weights of the rows, and count of each joint."""
     joints = zip(chunk.indices, chunk.columns, chunk.mask.T, np.asarray(weights), strict=True)
     for own, theta, mask, weight in joints:
@@ -138,7 +137,7 @@ class AbstractEstimator(eqx.Module):
       for least squares with weights of the joints; `problem.blocks`: the same by contiguous blocks
       of time, for cross-validation;
     * `problem.chunks()`, `problem.residuals(p)`, `problem.fold(...)`, `problem.reweighted(...)`:
-      passes over the rows, where these are known (`problem.require_samples(...)`);
+      passes over the rows, where these are known (else an `InputError`);
     * `problem.with_base(base)`: the same recordings with other columns.
 
     `Estimate.solve` returns the estimate of weighted least squares; use `dataclasses.replace` where
@@ -167,10 +166,7 @@ class EstimatorInWords(AbstractEstimator):
 
     def __call__(self, problem):
         """Reject the problem: only a description is left."""
-        raise InputError(
-            "the `estimator` of this model file held recordings or functions and is only "
-            f"described: create it again to estimate again. It was {self.words:.200}"
-        )
+        raise InputError(f"the `estimator` is only described, create it again: {self.words:.200}")
 
     def __str__(self):
         return self.words

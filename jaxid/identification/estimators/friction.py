@@ -23,13 +23,14 @@ from jaxid.dynamics.dispatch import program_of
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
-from jaxid.identification.estimators.estimate import AbstractEstimator
-from jaxid.identification.estimators.least_squares import WeightedLeastSquares
-from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.factors import Blocks, Factors, JointFactor, RowChunk
-from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations
 from jaxid.program import evaluate_packed
+
+from ..factors import Blocks, Factors, JointFactor, RowChunk
+from ..problem import RegressionProblem
+from .estimate import AbstractEstimator
+from .least_squares import WeightedLeastSquares
+from .solutions import Decomposition
 
 
 class NonlinearFriction(AbstractEstimator):
@@ -42,9 +43,12 @@ class NonlinearFriction(AbstractEstimator):
 
     Attributes:
         linear: Estimator of the linear parameters.
+        shapes: Names of the shapes that are identified, such as `("vs", "delta")`; by default
+            those that the terms propose. The others keep their values.
     """
 
     linear: AbstractEstimator = WeightedLeastSquares()
+    shapes: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __call__(self, problem):
         """Search for the shapes, and estimate with them."""
@@ -55,10 +59,12 @@ class NonlinearFriction(AbstractEstimator):
 
     def search(self, problem: RegressionProblem, weights: np.ndarray):
         """Return the separable problem, the shapes found, and notes about the search."""
-        separable = SeparableProblem(problem, select_shapes(problem.base))
+        shapes = select_shapes(problem.base, self.shapes)
+        separable = SeparableProblem(problem, shapes)
         start = separable.shapes.values
         begin = _best_multiples(separable, weights, start)
-        return separable, *search_shapes(separable, weights, start, begin)
+        x, notes = search_shapes(separable, weights, start, begin)
+        return separable, x, notes
 
 
 class Shapes(eqx.Module):
@@ -131,17 +137,19 @@ class Shapes(eqx.Module):
         return jnp.concatenate([self.columns(x, q, qd, qdd)[..., None], slopes], axis=-1)
 
 
-def select_shapes(base: BaseParameters) -> Shapes:
-    """Return the shapes that are identified: epsilons, Stribeck speeds and others of the terms.
+def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
+    """Return the shapes of these names; without names, those that the terms propose.
 
     Raises:
         InputError: If there are none.
     """
-    terms = enumerate(base.model.terms)
-    members = [(i, s) for i, term in terms for s in term.nonlinear_parameters if s.default]
-    names = [shape.name for _, shape in members]
-    if not names:
-        raise InputError("the `model` has no friction with a shape: use `StribeckFriction`.")
+    members = []
+    for i, term in enumerate(base.model.terms):
+        for shape in term.nonlinear_parameters:
+            chosen = shape.name in names if names else shape.default
+            members += [(i, shape)] * chosen
+    if not members or not {shape.name for _, shape in members} >= set(names):
+        raise InputError("the `model` has no friction with such `shapes`: use `StribeckFriction`.")
     return Shapes(base.model, tuple(members))
 
 
@@ -160,7 +168,6 @@ class SeparableProblem:
     """
 
     def __init__(self, problem: RegressionProblem, shapes: Shapes):
-        problem.require_samples("nonlinear friction")
         base, n = problem.base, (problem.robot.joints,)
         self._problem, self.base, self.shapes = problem, base, shapes
         shaped = shapes.columns_of_terms
@@ -169,18 +176,19 @@ class SeparableProblem:
         self._varying = {place for place, _ in varying}
         self._program = program_of(shapes, shapes.columns_and_slopes, (shapes.size,), n, n, n)
         acts = np.asarray(self._program.nonzeros)
-        pairs = [
-            (k, c, int(i)) for k, c in varying for i in np.flatnonzero(acts[:, c, 1:].any(axis=0))
-        ]
+        pairs = []
+        for k, c in varying:
+            changing = np.flatnonzero(acts[:, c, 1:].any(axis=0))
+            pairs += [(k, c, i) for i in changing.tolist()]
         self.pairs = [(k, i) for k, _, i in pairs]
         self.size = base.size + len(pairs)
         # For each joint the columns that vary, with their places in the output of the program.
         columns = [(k, c, 0) for k, c in varying]
         columns += [(base.size + place, c, 1 + i) for place, (_, c, i) in enumerate(pairs)]
         at = np.arange(acts.size).reshape(acts.shape)
-        self._entries = [
-            [(k, int(at[j, c, i])) for k, c, i in columns if acts[j, c, i]] for j in range(n[0])
-        ]
+        self._entries = []
+        for own, acting in zip(at, acts, strict=True):
+            self._entries.append([(k, int(own[c, i])) for k, c, i in columns if acting[c, i]])
         self._pieces = [self._factor(chunk) for chunk in problem.chunks()]
 
     def _factor(self, chunk: RowChunk) -> tuple[RowChunk, list[np.ndarray], list[np.ndarray]]:
@@ -230,9 +238,7 @@ class SeparableProblem:
         return np.split(rows, np.cumsum([len(own) for own in self._entries])[:-1], axis=1)
 
 
-def search_shapes(
-    problem: SeparableProblem, weights, start, begin, blocks: Sequence[int] | None = None
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def search_shapes(problem: SeparableProblem, weights, start, begin, blocks=None):
     """Search for shapes by Levenberg-Marquardt over their logarithms; return notes as well.
 
     Where the rows of some blocks of time (by default all) hardly determine a shape, a weak pull

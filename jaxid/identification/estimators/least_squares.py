@@ -12,14 +12,19 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.identification.estimators.estimate import (
+from jaxid.measurement.observations import Observations, SamplesInMemory
+from jaxid.trajectory.trajectory import AbstractTrajectory
+
+from ..factors import Blocks, JointFactor, RowChunk
+from ..problem import RegressionProblem, Span
+from .estimate import (
     AbstractEstimator,
     Channel,
     Estimate,
     Influence,
     weighted_joints,
 )
-from jaxid.identification.estimators.solutions import (
+from .solutions import (
     NUMERICAL,
     AbstractSolution,
     AbstractWeights,
@@ -29,10 +34,6 @@ from jaxid.identification.estimators.solutions import (
     MaximumForces,
     ResidualVariances,
 )
-from jaxid.identification.factors import Blocks, JointFactor, RowChunk
-from jaxid.identification.problem import RegressionProblem, Span
-from jaxid.measurement.observations import Observations, SamplesInMemory
-from jaxid.trajectory.trajectory import AbstractTrajectory
 
 
 class LeastSquares(AbstractEstimator):
@@ -82,7 +83,6 @@ class GeneralisedLeastSquares(AbstractEstimator):
 
     def __call__(self, problem):
         """Estimate covariance and parameters in turn."""
-        problem.require_samples("least squares with the full covariance of the joints")
         weights = ResidualVariances()(problem.robot, problem.factors)
         estimate = Estimate.solve(problem, weights, self.solution)
         size, n = problem.base.size, problem.robot.joints
@@ -232,7 +232,6 @@ class IterativelyReweighted(AbstractEstimator):
 
     def __call__(self, problem):
         """Reweight and solve until nothing changes."""
-        problem.require_samples("an iteratively reweighted estimate")
         weights = self.weights(problem.robot, problem.factors)
         p = np.asarray(Estimate.solve(problem, weights, self.solution).parameters)
         change = np.inf
@@ -316,7 +315,6 @@ class InstrumentalVariables(AbstractEstimator):
 
     def __call__(self, problem):
         """Solve with the references' columns."""
-        problem.require_samples("an estimate with instrumental variables")
         weights = self.weights(problem.robot, problem.factors)
         recordings, size = problem.recordings, problem.base.size
         given = {"references": self.references, "starts": self.starts}

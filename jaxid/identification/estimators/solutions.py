@@ -8,9 +8,10 @@ import numpy as np
 from jaxid.arrays import AnyArray, Bool, Float, one_or_each
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.identification.factors import Blocks, Factors
-from jaxid.identification.problem import cross_validation_folds
 from jaxid.robot.robot import Robot
+
+from ..factors import Blocks, Factors
+from ..problem import cross_validation_folds
 
 NUMERICAL = 1e-11
 """Relative singular value below which a direction is only rounding."""
@@ -79,9 +80,7 @@ class AbstractSolution(eqx.Module):
     """A solution of a weighted least-squares system (Eq. 33)."""
 
     @abstractmethod
-    def choose(
-        self, blocks: Blocks, weights: Float[AnyArray, " joints"]
-    ) -> "AbstractSpectralSolution":
+    def choose(self, blocks: Blocks, weights: AnyArray) -> "AbstractSpectralSolution":
         """Return the solution for these observations, all its settings determined."""
 
 
@@ -198,11 +197,10 @@ class GivenWeights(AbstractWeights):
     def __call__(self, robot, factors):
         """Return the weights; reject those that are not one number for each joint."""
         w = np.asarray(self.weights)
-        if w.shape != (robot.joints,) or not (np.isfinite(w).all() and w.min() >= 0 and w.any()):
-            raise InputError(
-                f"`weights` must be one finite number for each of the {robot.joints} joints of "
-                f"`{robot.name}`, none below zero and not all zero, but are {w}."
-            )
+        good = w.shape == (robot.joints,) and np.isfinite(w).all()
+        if not good or w.min() < 0 or not w.any():
+            rule = f"{robot.joints} numbers from 0, not all zero"
+            raise InputError(f"`weights` must be {rule}, but are {w}.")
         return w
 
 
@@ -265,9 +263,7 @@ class UndeterminedDirection(eqx.Module):
         return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
 
 
-def undetermined(
-    blocks: Blocks, weights: Float[AnyArray, " joints"], decomposition: Decomposition
-) -> tuple[UndeterminedDirection, ...]:
+def undetermined(blocks: Blocks, weights, decomposition: Decomposition):
     r"""Return the directions in which the data leave more open than they tell.
 
     Scale the parameters so that each of them alone makes forces of its own column's length. A step
@@ -291,10 +287,11 @@ def undetermined(
     uncertainty = np.where(inverse > 0, np.maximum(deviations, floor) / forces, np.inf)
     found = []
     for k in np.flatnonzero(uncertainty > LARGEST_UNCERTAINTY)[::-1]:
-        share = V[k] / np.abs(V[k]).max()
+        order = np.argsort(-np.abs(V[k]), kind="stable")
+        share = V[k, order] / V[k, order[0]]
         # Parameters below 0.3 of the largest one are left out.
-        order = [int(i) for i in np.argsort(-np.abs(share), kind="stable") if abs(share[i]) >= 0.3]
-        shares = tuple(float(share[i] * np.sign(share[order[0]])) for i in order)
+        large = np.abs(share) >= 0.3
+        parts = tuple(order[large].tolist()), tuple(share[large].tolist())
         numbers = float(s[k] / s[0]), float(uncertainty[k])
-        found.append(UndeterminedDirection(tuple(order), shares, *numbers))
+        found.append(UndeterminedDirection(*parts, *numbers))
     return tuple(found)

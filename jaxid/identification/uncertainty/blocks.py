@@ -8,10 +8,11 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, require_float64
 from jaxid.errors import InputError
-from jaxid.identification.estimators.estimate import Estimate
-from jaxid.identification.estimators.solutions import Decomposition
-from jaxid.identification.factors import Blocks
-from jaxid.identification.uncertainty.result import AbstractUncertainty, Uncertainty
+
+from ..estimators.estimate import Estimate
+from ..estimators.solutions import Decomposition
+from ..factors import Blocks
+from .result import AbstractUncertainty, Uncertainty
 
 Block = tuple[Float[np.ndarray, "_ unknowns"], Float[np.ndarray, " _"]]
 """Derivatives of a block's weighted residuals by the unknowns, and the residuals."""
@@ -111,7 +112,7 @@ def bootstrap(
         InputError: If there are fewer than two blocks, or draws do not determine all parameters.
         RuntimeError: If JAX's 64-bit mode is off.
     """
-    from jaxid.identification.normal_equations import RIDGE, inverse_information
+    from ..normal_equations import RIDGE, inverse_information
 
     require_float64("a bootstrap")
     count = len(blocks.parts)
@@ -132,8 +133,5 @@ def bootstrap(
     step = jnp.einsum("dij,dj->di", inverse, counts @ np.array(gradients))
     poor = int(np.sum(~(np.asarray(condition) < 1 / np.sqrt(RIDGE))))
     if poor:
-        raise InputError(
-            f"{poor} of {draws} draws from {count} `blocks` do not determine all parameters: take "
-            "longer blocks, in each of which every joint moves."
-        )
+        raise InputError(f"{poor} of {draws} draws leave parameters open: take longer `blocks`.")
     return jnp.asarray(start)[None] + step / whole.scale[None]

@@ -8,8 +8,9 @@ from scipy import special
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.identification.estimators.estimate import Estimate
-from jaxid.identification.problem import RegressionProblem
+
+from ..estimators.estimate import Estimate
+from ..problem import RegressionProblem
 
 
 class Uncertainty(eqx.Module):
@@ -58,7 +59,7 @@ class Uncertainty(eqx.Module):
         """
         if not 0 < level < 1:
             raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
-        dof = np.clip(np.asarray(self.dof), 1.0, 1e6)
+        dof = np.clip(self.dof, 1.0, 1e6)
         return self.standard_deviations * special.stdtrit(dof, 0.5 + 0.5 * level)
 
 
@@ -90,7 +91,7 @@ class ResidualSpectra(eqx.Module):
     @property
     def white(self) -> tuple[bool, ...]:
         """Whether the residuals of each joint cannot be told from white noise."""
-        return tuple(bool(x <= self.limit) for x in np.asarray(self.departure))
+        return tuple(bool(x <= self.limit) for x in self.departure)
 
 
 class AbstractUncertainty(eqx.Module):

@@ -15,16 +15,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float
-from jaxid.identification.estimators.estimate import Estimate
-from jaxid.identification.factors import RowChunk
-from jaxid.identification.problem import RegressionProblem, Span
-from jaxid.identification.uncertainty.blocks import BlockJackknife, jackknife
-from jaxid.identification.uncertainty.result import (
-    AbstractUncertainty,
-    ResidualSpectra,
-    Uncertainty,
-)
+from jaxid.arrays import AnyArray, Float
+
+from ..estimators.estimate import Estimate
+from ..factors import RowChunk
+from ..problem import RegressionProblem, Span
+from .blocks import BlockJackknife, jackknife
+from .result import AbstractUncertainty, ResidualSpectra, Uncertainty
 
 MAX_ROWS = 2**15
 """Largest number of rows of a stretch; longer parts of a log are divided."""
@@ -50,10 +47,7 @@ class SpectralSandwich(AbstractUncertainty):
         """Return the sandwich, with the jackknife as a cross-check."""
         if not problem.recordings:
             found, _ = BlockJackknife()(problem, estimate, naive)
-            note = (
-                "standard deviations come from the block jackknife: only factors of the rows were "
-                "given, and no spectrum of the residuals can be computed."
-            )
+            note = "standard deviations come from the block jackknife: only factors were given."
             return dataclasses.replace(found, notes=found.notes or (note,)), None
         lines, correlated, complete = row_spectra(problem, estimate)
         covariance, dof, white = sandwich(lines, correlated)
@@ -101,9 +95,7 @@ class Lines(NamedTuple):
         return self._replace(**{x: getattr(self, x) + getattr(other, x) for x in names})
 
 
-def row_spectra(
-    problem: RegressionProblem, estimate: Estimate
-) -> tuple[list[Lines], np.ndarray, bool]:
+def row_spectra(problem: RegressionProblem, estimate: Estimate):
     """Transform every stretch of the rows in one pass.
 
     Returns:
@@ -302,7 +294,8 @@ def sandwich(lines: Sequence[Lines], correlated: np.ndarray):
     rows = sum(x.length * x.exposure for x in lines)
     explained = sum(np.sum(x.multiplicity * x.leverage, axis=1) for x in lines)
     level = sum(np.sum(x.multiplicity * x.power, axis=1) for x in lines)
-    level = level / np.maximum(rows * (1.0 - np.sum(explained) / max(np.sum(rows), 1.0)), 1.0)
+    free = 1.0 - np.sum(explained) / max(np.sum(rows), 1.0)
+    level = level / np.maximum(rows * free, 1.0)
     white = np.sum([np.einsum("icf,c->i", x.energy, level) for x in lines], axis=0)
     return covariance, np.maximum(dof, 1.0), white
 
@@ -338,9 +331,7 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     )
 
 
-def sandwich_of_columns(
-    own, weights, inverse, p, columns, forces, exposure, row_time: float
-) -> tuple[Array, Array]:
+def sandwich_of_columns(own, weights, inverse, p, columns, forces, exposure, row_time: float):
     """Return variances and degrees of freedom of estimates `p` [draws, base], in JAX.
 
     Columns [columns, rows] and forces [draws, rows] of each joint are zero where a row does not
@@ -359,8 +350,8 @@ def sandwich_of_columns(
         leverage.append(jnp.sum(both, axis=0) / length)
         power.append((r.real**2 + r.imag**2) / length)
     leverage = jnp.stack(leverage)
-    sums = jnp.stack(energy, axis=1), leverage, jnp.broadcast_to(exposure[:, None], leverage.shape)
-    variance, dof = SpectralTable(jnp, frequency, m, *sums, length * row_time)(
-        jnp.stack(power, axis=1)
-    )
+    exposures = jnp.broadcast_to(exposure[:, None], leverage.shape)
+    sums = jnp.stack(energy, axis=1), leverage, exposures
+    table = SpectralTable(jnp, frequency, m, *sums, length * row_time)
+    variance, dof = table(jnp.stack(power, axis=1))
     return jnp.asarray(variance), jnp.maximum(dof, 1.0)

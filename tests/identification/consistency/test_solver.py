@@ -74,6 +74,26 @@ def test_the_bound_holds_on_the_way(name, strength, monkeypatch):
         assert not early.certified
 
 
+def test_coupled_drives_in_jax_are_those_in_numpy():
+    drives = jid.Drives(reduction=[[50.0, 0.0], [-50.0, 60.0]])
+    base, feasible = case(PLANAR.replace(drives=drives), (*TERMS, jid.terms.CoupledDrives()))
+    assert len(feasible.couplings) == 2
+    R, z, rows = arms.factor(base, 3, 0.2, 100)
+    one = jid.consistency.ConsistentSolver(base)
+    compiled = one(R, z, rows)
+    data, program = one.estimator.program(np, base, feasible, R, z, rows)
+    optimum = solver.solve_in_numpy(program)
+    p = feasible.standard_parameters(np, data, optimum.y)
+    assert compiled.certified
+    assert optimum.certified
+    np.testing.assert_allclose(data.A @ compiled.standard, data.A @ p, atol=1e-3)
+    np.testing.assert_allclose(compiled.parameters, base.from_standard(p), rtol=1e-3, atol=1e-4)
+    for own, beside in (("Ia", "Iam"), ("fv", "fvm")):
+        found = dict(zip(base.model.parameter_names, compiled.standard, strict=True))
+        matrix = [[found[f"{own}1"], found[f"{beside}2"]], [found[f"{beside}2"], found[f"{own}2"]]]
+        assert np.linalg.eigvalsh(matrix)[0] >= 0
+
+
 def test_a_batch_is_its_data_sets_one_by_one():
     """In NumPy, and compiled."""
     base, feasible = case(PLANAR, TERMS[:2], margin=0.1)
