@@ -120,9 +120,7 @@ def _check(base, motion, forces, mask, robots) -> None:
             f"`robots` must be one for each of {len(forces)} data sets: {len(robots)}."
         )
     if samples * n <= base.size:
-        raise InputError(
-            f"{samples * n} rows are too few for {base.size} parameters: record longer."
-        )
+        raise InputError(f"{samples * n} rows for {base.size} base parameters: record longer.")
 
 
 def _solve_again(base, robots, batch: DataSets, fit: BatchFit, row_time) -> BatchFit:

@@ -77,9 +77,7 @@ def fit_problem(
     """
     count = int(problem.factors.rows.sum())
     if count <= problem.base.size:
-        raise InputError(
-            f"{count} rows are too few for {problem.base.size} parameters: record longer."
-        )
+        raise InputError(f"{count} rows for {problem.base.size} base parameters: record longer.")
     estimator = estimator or WeightedLeastSquares()
     estimate = estimator(problem)
     base, blocks = estimate.base, estimate.blocks
