@@ -89,8 +89,7 @@ def identify_batch(
     if estimator is not None:
         fit = _estimate_each(base, batch, estimator, row_time)
     else:
-        rows = base.joint_regressor
-        reduced = batch
+        rows, reduced = base.joint_regressor, batch
         if robots is not None:
             family, numbers = _family(base, robots)
             n = (robot.joints,)

@@ -57,8 +57,7 @@ def identify(
     """
     problem = observations
     if not isinstance(problem, RegressionProblem):
-        several = isinstance(problem, Iterable)
-        recordings = tuple(problem) if several else (problem,)
+        recordings = tuple(problem) if isinstance(problem, Iterable) else (problem,)
         _check(base, recordings)
         problem = RegressionProblem(base, recordings, progress)
     fit = fit_problem(problem, estimator, uncertainty)

@@ -199,8 +199,7 @@ class GivenWeights(AbstractWeights):
         w = np.asarray(self.weights)
         good = w.shape == (robot.joints,) and np.isfinite(w).all()
         if not good or w.min() < 0 or not w.any():
-            rule = f"{robot.joints} numbers from 0, not all zero"
-            raise InputError(f"`weights` must be {rule}, but are {w}.")
+            raise InputError(f"`weights` must be {robot.joints} numbers from 0, not all zero: {w}.")
         return w
 
 
