@@ -29,7 +29,8 @@ import timing
 from scipy import signal
 
 import jaxid as jid
-from jaxid.identification.comparison import (  # private: levels, kinds of parameters
+from jaxid.identification.operating_states import stores_energy  # private: kinds of parameters
+from jaxid.identification.parameter_changes import (  # private: levels, kinds of parameters
     LEVEL,
     Verdict,
     parameter_kinds,
@@ -39,7 +40,6 @@ from jaxid.identification.payload import (  # private: a known payload
     CENTRAL_UNITS,
     Payload,
 )
-from jaxid.identification.states import stores_energy  # private: kinds of parameters
 from jaxid.identification.uncertainty import Uncertainty  # private: a known payload
 from jaxid.measurement.recording import remove_delay  # private: mend a log
 

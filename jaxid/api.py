@@ -29,26 +29,26 @@ from .identification import (
     estimators as estimators,
     uncertainty as uncertainty,
 )
-from .identification.batches import identify_batch as identify_batch
 from .identification.choices import (
     choose_filter as choose_filter,
     essential_parameters as essential_parameters,
 )
 from .identification.combination import update as update
-from .identification.comparison import compare as compare
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from .identification.delay import estimate_delay as estimate_delay
 from .identification.drive_gains import identify_drive_gains as identify_drive_gains
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
 from .identification.fit import Fit as Fit, load as load
 from .identification.identify import identify as identify
+from .identification.many_data_sets import identify_batch as identify_batch
 from .identification.nonlinear_friction import (
     identify_nonlinear as identify_nonlinear,
     temperature_law as temperature_law,
 )
+from .identification.operating_states import identify_states as identify_states
+from .identification.parameter_changes import compare as compare
 from .identification.payload import identify_payload as identify_payload
 from .identification.problem import RegressionProblem as RegressionProblem
-from .identification.states import identify_states as identify_states
 from .identification.uncertainty.blocks import bootstrap as bootstrap
 from .measurement import filters as filters, units as units
 from .measurement.columns import Columns as Columns

@@ -9,7 +9,7 @@ from golden_results import TOLERANCE, compare
 import jaxid as jid
 from jaxid.demo.results import error_table, paper_table, remarks, tables, write_study
 from jaxid.demo.study import run_study
-from jaxid.identification.comparison import Verdict
+from jaxid.identification.parameter_changes import Verdict
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

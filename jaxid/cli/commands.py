@@ -9,7 +9,6 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.cli.options import command_line, open_console
 from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.experiment import session
@@ -19,12 +18,12 @@ from jaxid.experiment.robot_tables import joint_number
 from jaxid.export.c_code import export_c
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
 from jaxid.export.torque_program import export_jax
-from jaxid.identification.comparison import compare as compare_fits
 from jaxid.identification.drive_gains import identify_drive_gains
 from jaxid.identification.fit import Fit
 from jaxid.identification.identify import identify as estimate
+from jaxid.identification.operating_states import identify_states
+from jaxid.identification.parameter_changes import compare as compare_fits
 from jaxid.identification.payload import CENTRAL_NAMES, CENTRAL_UNITS, identify_payload
-from jaxid.identification.states import identify_states
 from jaxid.io import require_writable
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import Report, body_table, motor_tables, residual_table
@@ -32,6 +31,8 @@ from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import read_fit, write_comparison, write_estimates, write_report
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.table import Remark, Status, Table, significant
+
+from .options import command_line, open_console
 
 STOPPED = 130
 """Exit code of a command that Ctrl-C has ended, as shells expect it."""

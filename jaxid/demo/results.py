@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 
 import jaxid as jid
-from jaxid.demo import study as settings
-from jaxid.demo.study import Study
 from jaxid.io import atomic_folder
 from jaxid.report.excitation import side_by_side_table
 from jaxid.report.identification import parameter_table
@@ -15,6 +13,9 @@ from jaxid.report.page import Section, folded, picture, render_page, versions
 from jaxid.report.result_files import SCHEMAS, plain, write_json
 from jaxid.simulation.tx90l import COLD, WARM
 from jaxid.table import MISSING, Column, Remark, Status, Table, significant, with_deviation
+
+from . import study as settings
+from .study import Study
 
 SHOWN = (0, 2, 4, 6)
 """Axes 1, 5 and 7 of the paper's Figs. 6, 7 and 9, and the shoulder, which holds the arm."""

@@ -10,7 +10,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.arrays import Float
-from jaxid.identification.comparison import Comparison
+from jaxid.identification.parameter_changes import Comparison
 from jaxid.model_validation import Validation
 from jaxid.simulation.virtual import Tracking
 

@@ -15,12 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.arrays import AnyArray
-from jaxid.diagnosis.findings import (
-    LogStatistics,
-    channel_findings,
-    limit_findings,
-    stuck_findings,
-)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -33,6 +27,13 @@ from jaxid.measurement.reading import AT_ONCE, SamplesOnDisk
 from jaxid.measurement.recording import FEWEST, Recording, consecutive
 from jaxid.robot.robot import Robot
 from jaxid.table import MISSING, Column, Remark, Status, Table, significant
+
+from .findings import (
+    LogStatistics,
+    channel_findings,
+    limit_findings,
+    stuck_findings,
+)
 
 BAD = 0.03
 """Fraction (0 to 1) of the forces left unexplained from which mistakes are looked for."""

@@ -11,21 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, as_array
-from jaxid.dynamics.dispatch import in_numpy, on_samples, program_of
-from jaxid.dynamics.model import Coordinates, Model
-from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.packed_regressor import JointRegressor, PackedRegressor
-from jaxid.dynamics.rank import (
+from jaxid.errors import InputError
+from jaxid.program import Program, select_outputs
+from jaxid.table import MISSING, Column, Remark, Status, Table
+
+from .dispatch import in_numpy, on_samples, program_of
+from .model import Coordinates, Model
+from .motion import Motion
+from .packed_regressor import JointRegressor, PackedRegressor
+from .rank import (
     Dependence,
     gram_schmidt,
     random_regressor,
     regrouping,
     singular_values,
 )
-from jaxid.dynamics.symbolic_base_parameters import ClosedForms, closed_forms
-from jaxid.errors import InputError
-from jaxid.program import Program, select_outputs
-from jaxid.table import MISSING, Column, Remark, Status, Table
+from .symbolic_base_parameters import ClosedForms, closed_forms
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 

@@ -9,19 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, as_array, namespace
-from jaxid.dynamics import projection_equation
-from jaxid.dynamics.dispatch import on_samples, solve_symmetric
-from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.packed_regressor import PackedRegressor
-from jaxid.dynamics.terms import (
+from jaxid.errors import InputError
+from jaxid.robot.robot import Robot
+
+from . import projection_equation
+from .dispatch import on_samples, solve_symmetric
+from .motion import Motion
+from .packed_regressor import PackedRegressor
+from .terms import (
     AbstractTerm,
     CoulombFriction,
     RigidBodies,
     RotorInertia,
     ViscousFriction,
 )
-from jaxid.errors import InputError
-from jaxid.robot.robot import Robot
 
 Coordinates = Float[AnyArray, "*batch joints"] | Sequence[Any]
 Parameters = Float[AnyArray, " standard"] | Sequence[float | int]

@@ -12,10 +12,11 @@ import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, is_traced
-from jaxid.dynamics.dispatch import FEW, KEPT, program_of
-from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.program import Program, evaluate_packed, lower
+
+from .dispatch import FEW, KEPT, program_of
+from .motion import Motion
 
 
 class JointRegressor(eqx.Module):

@@ -13,10 +13,11 @@ import numpy as np
 import scipy.linalg
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.dynamics.dispatch import in_numpy
-from jaxid.dynamics.expressions import length_power
-from jaxid.dynamics.model import Model
-from jaxid.dynamics.motion import Motion
+
+from .dispatch import in_numpy
+from .expressions import length_power
+from .model import Model
+from .motion import Motion
 
 ROUNDING = 1e-12
 """Fraction of the largest column below which a column is nothing but rounding."""

@@ -19,18 +19,19 @@ from fractions import Fraction
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.dynamics.expressions import Coefficient, Dimension, Expression, Monomial, dimension
-from jaxid.dynamics.model import Model
-from jaxid.dynamics.rank import (
+from jaxid.program import FREE, evaluate, trace
+from jaxid.robot.inertia import AXES
+from jaxid.robot.robot import Robot
+
+from .expressions import Coefficient, Dimension, Expression, Monomial, dimension
+from .model import Model
+from .rank import (
     characteristic_length,
     column_units,
     random_motion,
     regrouping,
     row_units,
 )
-from jaxid.program import FREE, evaluate, trace
-from jaxid.robot.inertia import AXES
-from jaxid.robot.robot import Robot
 
 _POWERS = np.arange(-2, 3)
 """Exponents of a length that are tried."""

@@ -10,14 +10,15 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, PRNGKeyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.excitation.constraints import AbstractConstraint
-from jaxid.excitation.criteria import AbstractCriterion
-from jaxid.excitation.plan import ExcitationPlan
-from jaxid.excitation.problem import ExcitationProblem
-from jaxid.excitation.search import Search
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis
+
+from .constraints import AbstractConstraint
+from .criteria import AbstractCriterion
+from .plan import ExcitationPlan
+from .problem import ExcitationProblem
+from .search import Search
 
 
 class DesignProgress(NamedTuple):

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bool, Float, Int
-from jaxid.excitation.coefficient_limits import Grid
+
+from .coefficient_limits import Grid
 
 STIFFNESS = 0.3  # initial curvature: small, so that first steps are large
 TO_BOUNDARY = 0.995  # fraction of the way to the next limit that a step may go

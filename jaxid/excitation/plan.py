@@ -11,17 +11,18 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.excitation.coefficient_limits import JointLimits
-from jaxid.excitation.constraints import Finding
-from jaxid.excitation.criteria import (
+from jaxid.table import MISSING, Column, Remark, Status, Table, percent, significant
+from jaxid.trajectory.files import save_trajectory
+from jaxid.trajectory.trajectory import LinearTrajectory
+
+from .coefficient_limits import JointLimits
+from .constraints import Finding
+from .criteria import (
     CRITERIA,
     AbstractCriterion,
     Information,
     standard_deviations,
 )
-from jaxid.table import MISSING, Column, Remark, Status, Table, percent, significant
-from jaxid.trajectory.files import save_trajectory
-from jaxid.trajectory.trajectory import LinearTrajectory
 
 VAGUE = 0.5
 """Relative standard deviation above which a parameter counts as hardly determined."""

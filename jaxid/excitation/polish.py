@@ -12,8 +12,9 @@ import numpy as np
 import scipy.optimize
 
 from jaxid.arrays import AnyArray, Array, Bool, Float
-from jaxid.excitation.coefficient_limits import scale_samples
-from jaxid.excitation.problem import (
+
+from .coefficient_limits import scale_samples
+from .problem import (
     CHECKED,
     MARGIN,
     PEAKS,

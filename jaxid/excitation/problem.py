@@ -11,15 +11,16 @@ from jaxid.arrays import AnyArray, Array, Float, Int, PRNGKeyArray, require_floa
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.excitation import criteria
-from jaxid.excitation.coefficient_limits import JointLimits, scale_samples
-from jaxid.excitation.constraints import AbstractConstraint, Finding
-from jaxid.excitation.criteria import AbstractCriterion, Information, Sharpness
-from jaxid.excitation.interior_point import Evaluation, map_starts
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
+
+from . import criteria
+from .coefficient_limits import JointLimits, scale_samples
+from .constraints import AbstractConstraint, Finding
+from .criteria import AbstractCriterion, Information, Sharpness
+from .interior_point import Evaluation, map_starts
 
 CHECKED = 8160
 """Instants at which constraints are checked."""

@@ -19,11 +19,13 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.errors import InputError
-from jaxid.excitation import interior_point
-from jaxid.excitation.coefficient_limits import scale_samples
-from jaxid.excitation.interior_point import Stage, State
-from jaxid.excitation.polish import polish
-from jaxid.excitation.problem import (
+from jaxid.io import write_bytes
+
+from . import interior_point
+from .coefficient_limits import scale_samples
+from .interior_point import Stage, State
+from .polish import polish
+from .problem import (
     PENALTY,
     SEARCHED,
     ExcitationProblem,
@@ -31,7 +33,6 @@ from jaxid.excitation.problem import (
     evaluate_within_limits,
     shrink_to_constraints,
 )
-from jaxid.io import write_bytes
 
 FINE = 256
 """Rows of each order by which limits are kept in the end."""

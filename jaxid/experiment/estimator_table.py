@@ -7,8 +7,6 @@ import numpy as np
 
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import Bounds, Fraction, Positive, decode, keys_of, quoted
-from jaxid.experiment.robot_tables import RobotSource, named
 from jaxid.identification import estimators
 from jaxid.identification.consistency import BodyBounds, EntropicPull, PhysicallyConsistent
 from jaxid.identification.uncertainty import (
@@ -18,6 +16,9 @@ from jaxid.identification.uncertainty import (
     SpectralSandwich,
 )
 from jaxid.trajectory.files import load_trajectory
+
+from .decoder import Bounds, Fraction, Positive, decode, keys_of, quoted
+from .robot_tables import RobotSource, named
 
 UNCERTAINTIES = {
     "spectral": SpectralSandwich,

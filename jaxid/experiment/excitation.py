@@ -15,9 +15,6 @@ from jaxid.excitation.criteria import CRITERIA, information
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.plan import ExcitationPlan
 from jaxid.excitation.problem import assumed_noise
-from jaxid.experiment.decoder import within
-from jaxid.experiment.experiment import Experiment
-from jaxid.experiment.robot_tables import named
 from jaxid.io import atomic_folder
 from jaxid.report.excitation import write_excitation
 from jaxid.report.result_files import read_fit
@@ -25,6 +22,10 @@ from jaxid.table import Remark, Status
 from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
 from jaxid.trajectory.leads import with_leads
 from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
+
+from .decoder import within
+from .experiment import Experiment
+from .robot_tables import named
 
 
 class Nominal(NamedTuple):

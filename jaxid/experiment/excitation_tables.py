@@ -11,8 +11,6 @@ import numpy as np
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
 from jaxid.excitation.criteria import CRITERIA, AbstractCriterion
-from jaxid.experiment.decoder import Bounds, Count, Positive, Vector
-from jaxid.experiment.robot_tables import RobotSource, joint_number
 from jaxid.robot.collision import (
     GROUND,
     Box,
@@ -28,6 +26,9 @@ from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
+
+from .decoder import Bounds, Count, Positive, Vector
+from .robot_tables import RobotSource, joint_number
 
 Corner = tuple[float, float, float]
 CriterionName = Literal[

@@ -15,18 +15,6 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
-from jaxid.experiment.decoder import call, check_names, within
-from jaxid.experiment.estimator_table import Estimation, build_estimation, decode_estimator
-from jaxid.experiment.excitation_tables import Collision, Excitation
-from jaxid.experiment.method_tables import (
-    FILTERS,
-    Effects,
-    Logs,
-    build_columns,
-    build_filters,
-    build_rows,
-)
-from jaxid.experiment.robot_tables import RobotSource, known_load, replace_drives, replace_limits
 from jaxid.identification.choices import FilterCandidate, essential_parameters
 from jaxid.identification.consistency import BodyBounds
 from jaxid.identification.estimators import NonlinearFriction
@@ -41,6 +29,19 @@ from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import read_recording, scan_log
 from jaxid.measurement.recording import NeedsMemory, Recording, remove_delay
 from jaxid.robot.robot import Robot, Tool
+
+from .decoder import call, check_names, within
+from .estimator_table import Estimation, build_estimation, decode_estimator
+from .excitation_tables import Collision, Excitation
+from .method_tables import (
+    FILTERS,
+    Effects,
+    Logs,
+    build_columns,
+    build_filters,
+    build_rows,
+)
+from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
 
 TABLES: dict[str, tuple[Callable, ...]] = {
     "robot": (RobotSource,),

@@ -9,7 +9,13 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics import terms
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import (
+from jaxid.measurement import filters
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.units import Unit
+from jaxid.robot.limits_and_drives import per_joint
+from jaxid.robot.robot import Robot
+
+from .decoder import (
     Bounds,
     Count,
     Magnitude,
@@ -19,11 +25,6 @@ from jaxid.experiment.decoder import (
     decode_value,
     within,
 )
-from jaxid.measurement import filters
-from jaxid.measurement.columns import Columns
-from jaxid.measurement.units import Unit
-from jaxid.robot.limits_and_drives import per_joint
-from jaxid.robot.robot import Robot
 
 FILTERS: dict[str, type[filters.AbstractFilter]] = {
     "butterworth": filters.ZeroPhaseButterworth,

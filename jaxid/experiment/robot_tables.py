@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import Finite, Magnitude, PerJoint, Positive, Vector
 from jaxid.robot import library
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.library import from_dh
@@ -17,6 +16,8 @@ from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters
+
+from .decoder import Finite, Magnitude, PerJoint, Positive, Vector
 
 AngleUnit = Literal["rad", "deg"]
 DhRow = tuple[str | None, bool, tuple[float, float, float, float]]

@@ -14,8 +14,6 @@ from jaxid.diagnosis import Diagnosis, diagnose
 from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
-from jaxid.experiment.decoder import within
-from jaxid.experiment.experiment import Experiment
 from jaxid.identification.choices import FilterChoice, choose_filter
 from jaxid.identification.combination import require_same_base, share_rows, update
 from jaxid.identification.estimators import Complete
@@ -26,6 +24,9 @@ from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import NeedsMemory, Recording
 from jaxid.model_validation import Validation, comparison_step, validate
 from jaxid.report.result_files import read_fit
+
+from .decoder import within
+from .experiment import Experiment
 
 LoadedLog = tuple[Recording | Observations, Observations, Diagnosis]
 """Log as it was read (of a log on disk its observations), filtered log, and diagnosis."""

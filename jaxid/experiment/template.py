@@ -17,15 +17,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from jaxid.experiment.decoder import Key, keys_of
-from jaxid.experiment.estimator_table import KINDS
-from jaxid.experiment.experiment import TABLES
-from jaxid.experiment.method_tables import CUTOFF, FILTERS, SIDES, DryFriction
-from jaxid.experiment.robot_tables import known_load
 from jaxid.io import union_members
 from jaxid.measurement.units import Unit
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
+
+from .decoder import Key, keys_of
+from .estimator_table import KINDS
+from .experiment import TABLES
+from .method_tables import CUTOFF, FILTERS, SIDES, DryFriction
+from .robot_tables import known_load
 
 WIDTH, COLUMN = 100, 38
 """Largest length of a line, and column in which the comments behind keys begin."""

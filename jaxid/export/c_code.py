@@ -8,11 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.export.torque_program import other_forces, torques
 from jaxid.identification.fit import Fit
 from jaxid.io import atomic_folder
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c import CWriter
+
+from .torque_program import other_forces, torques
 
 
 class CFunction(NamedTuple):

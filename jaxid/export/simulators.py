@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from jaxid.arrays import AnyArray, Float, Joints, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
-from jaxid.export.torque_program import body_parameters
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
 from jaxid.identification.fit import Fit
 from jaxid.io import json_text, write_bytes, write_text
@@ -18,6 +17,8 @@ from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE
 from jaxid.robot.urdf import UrdfTree, load_urdf
+
+from .torque_program import body_parameters
 
 _COMMENT = " Inertias and friction: model of "
 """Beginning of the comment in a URDF file that names the model."""

@@ -15,10 +15,10 @@ from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import require_finite_delay
 
-from .comparison import joint_test
 from .estimators import AbstractWeights, MaximumForces
-from .estimators.solutions import Decomposition
+from .estimators.solutions_and_weights import Decomposition
 from .factors import Blocks, RowChunk
+from .parameter_changes import joint_test
 from .problem import RegressionProblem
 from .uncertainty.blocks import solve_blocks
 

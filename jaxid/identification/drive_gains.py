@@ -17,11 +17,11 @@ from jaxid.robot.robot import Tool
 from jaxid.table import Table
 
 from .combination import as_least_squares, combine, require_same_base
-from .estimators.solutions import NUMERICAL, Decomposition
+from .estimators.solutions_and_weights import NUMERICAL, Decomposition
 from .factors import Factors
 from .fit import Fit, interval_table
+from .operating_states import state_maps, varying_parameters
 from .payload import body_columns
-from .states import state_maps, varying_parameters
 from .uncertainty import Uncertainty
 from .uncertainty.blocks import block_covariance
 

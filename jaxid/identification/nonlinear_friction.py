@@ -22,7 +22,7 @@ from .estimators.friction import (
     project,
     search_shapes,
 )
-from .estimators.solutions import Decomposition
+from .estimators.solutions_and_weights import Decomposition
 from .fit import Fit
 from .identify import fit_problem
 from .problem import RegressionProblem

@@ -17,7 +17,7 @@ from jaxid.table import Remark, Status, Table
 from .combination import as_least_squares, combine, require_same_base
 from .consistency import BodyBounds, consistency_margin, consistent_body
 from .fit import Fit, interval_table
-from .states import state_maps, varying_parameters
+from .operating_states import state_maps, varying_parameters
 from .uncertainty import Uncertainty
 
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")

@@ -18,7 +18,7 @@ from .factors import (
     empty_factors,
     row_chunks,
 )
-from .streaming import stream_blocks, suits
+from .long_logs import stream_blocks, suits
 
 Span = tuple[int, int, int]
 """Index of a recording, and the half-open range of some of its rows."""

@@ -9,12 +9,13 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.measurement import units
-from jaxid.measurement.filters import optional
-from jaxid.measurement.log_files import LogTable, Selection, open_table
-from jaxid.measurement.recording import positive_time
-from jaxid.measurement.units import Quantity, Unit
 from jaxid.robot.limits_and_drives import per_joint
+
+from . import units
+from .filters import optional
+from .log_files import LogTable, Selection, open_table
+from .recording import positive_time
+from .units import Quantity, Unit
 
 Units = Unit | tuple[Unit, ...]
 """One unit for all joints, or one for each."""

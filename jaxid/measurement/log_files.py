@@ -20,7 +20,8 @@ import numpy as np
 import polars as pl
 
 from jaxid.errors import InputError
-from jaxid.measurement.recording import LARGEST
+
+from .recording import LARGEST
 
 Selection = str | int | tuple[str | int, ...]
 """A name, a pattern with `{}` for the joint's number, a position from 0, or several."""

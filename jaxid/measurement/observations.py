@@ -15,21 +15,22 @@ from numpy.typing import ArrayLike
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.measurement.filters import (
+from jaxid.robot.limits_and_drives import per_joint
+from jaxid.robot.robot import Robot
+
+from .filters import (
     AbstractDecimation,
     AbstractFilter,
     Subsample,
     ZeroPhaseButterworth,
 )
-from jaxid.measurement.recording import (
+from .recording import (
     Recording,
     TimeGrid,
     consecutive,
     finite_channel,
     positive_time,
 )
-from jaxid.robot.limits_and_drives import per_joint
-from jaxid.robot.robot import Robot
 
 FEWEST_ROWS = 4
 """Smallest number of rows for which a segment is used."""

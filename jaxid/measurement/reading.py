@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.dynamics.motion import Motion
-from jaxid.measurement.columns import Columns, Log, open_log
-from jaxid.measurement.filters import AbstractDecimation, AbstractFilter
-from jaxid.measurement.observations import (
+from jaxid.robot.robot import Robot
+
+from .columns import Columns, Log, open_log
+from .filters import AbstractDecimation, AbstractFilter
+from .observations import (
     AbstractSamples,
     Observations,
     Progress,
@@ -18,14 +20,13 @@ from jaxid.measurement.observations import (
     joint_side,
     prepare,
 )
-from jaxid.measurement.recording import (
+from .recording import (
     NeedsMemory,
     Recording,
     TimeGrid,
     consecutive,
     find_grid,
 )
-from jaxid.robot.robot import Robot
 
 AT_ONCE = 65536
 """Samples that are read at once."""

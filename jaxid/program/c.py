@@ -14,9 +14,10 @@ from fractions import Fraction
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.program.program import Program, Reference
-from jaxid.program.scalar import Operation
-from jaxid.program.sincos import DOUBLE, SINGLE, half_pi
+
+from .program import Program, Reference
+from .scalar import Operation
+from .sincos import DOUBLE, SINGLE, half_pi
 
 _LIBRARY = {
     "sine_cosine": (Operation.SINE, Operation.COSINE),

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxid.arrays import AnyArray
-from jaxid.program.program import Program, Reference
-from jaxid.program.scalar import Operation
+
+from .program import Program, Reference
+from .scalar import Operation
 
 _BLOCK = 1024
 """Samples at a time, so that intermediate values stay in the processor's cache."""

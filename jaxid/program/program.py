@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.program.scalar import Graph, Operand, Operation, Scalar, live_scalars, rewrite
+
+from .scalar import Graph, Operand, Operation, Scalar, live_scalars, rewrite
 
 Reference = int | float
 """An operand or a result: the position of a node (int) or a constant (float)."""

@@ -17,9 +17,10 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
 from jaxid.arrays import double_precision
 from jaxid.errors import InputError
-from jaxid.program import scalar
-from jaxid.program.program import Program, assemble
-from jaxid.program.scalar import Graph, Operation
+
+from . import scalar
+from .program import Program, assemble
+from .scalar import Graph, Operation
 
 FREE = object()
 """Mark of the entries of an input that vary; numbers beside it become constants.

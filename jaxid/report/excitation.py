@@ -9,11 +9,12 @@ import numpy as np
 from jaxid.arrays import double_precision
 from jaxid.excitation.plan import VAGUE, ExcitationPlan
 from jaxid.io import atomic_folder
-from jaxid.report.motion import joint_figure, path_figure, pose_figure, tip_figure
-from jaxid.report.page import picture, provenance, render_page
-from jaxid.report.style import save
 from jaxid.table import Column, Remark, Status, Table, significant
 from jaxid.trajectory.trajectory import AbstractTrajectory
+
+from .motion import joint_figure, path_figure, pose_figure, tip_figure
+from .page import picture, provenance, render_page
+from .style import save
 
 
 def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:

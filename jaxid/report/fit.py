@@ -12,11 +12,14 @@ from scipy.signal import fftconvolve
 
 from jaxid.arrays import Float
 from jaxid.identification.choices import FilterChoice
-from jaxid.identification.comparison import Comparison, Verdict
 from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit
+from jaxid.identification.parameter_changes import Comparison, Verdict
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.model_validation import TorqueErrors
-from jaxid.report.style import (
+from jaxid.robot.robot import Robot
+from jaxid.table import Status, percent, shortened, significant, with_deviations
+
+from .style import (
     BLUE,
     GREY,
     INK,
@@ -29,9 +32,7 @@ from jaxid.report.style import (
     drawing,
     logarithmic,
 )
-from jaxid.report.torques import require_joints
-from jaxid.robot.robot import Robot
-from jaxid.table import Status, percent, shortened, significant, with_deviations
+from .torques import require_joints
 
 _DOTS = {"marker": "o", "ms": 5, "lw": 1.4}
 

@@ -9,11 +9,10 @@ from matplotlib.figure import Figure
 
 from jaxid.identification.choices import FilterChoice
 from jaxid.identification.consistency.estimator import Consistency
-from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.solutions_and_weights import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.model_validation import Definiteness, TorqueErrors
-from jaxid.report.page import provenance, render_page
 from jaxid.robot.robot import Robot
 from jaxid.table import (
     Column,
@@ -24,6 +23,8 @@ from jaxid.table import (
     significant,
     with_deviations,
 )
+
+from .page import provenance, render_page
 
 MEAN_ERROR = (1.0, 3.0)
 """Mean errors up to which forces are predicted well, and tolerably [% of the largest forces]."""

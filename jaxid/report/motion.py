@@ -17,7 +17,12 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints import tip_motion
-from jaxid.report.style import (
+from jaxid.robot.collision import GROUND, CollisionModel
+from jaxid.robot.kinematics import placements, tip_placement
+from jaxid.robot.limits_and_drives import Limits
+from jaxid.robot.robot import Robot
+
+from .style import (
     BLUE,
     GREY,
     INK,
@@ -31,10 +36,6 @@ from jaxid.report.style import (
     drawing,
     label_time,
 )
-from jaxid.robot.collision import GROUND, CollisionModel
-from jaxid.robot.kinematics import placements, tip_placement
-from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot
 
 AZIMUTH, ELEVATION = -62.0, 22.0
 

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.report.style import svg_text
 from jaxid.table import Remark, Status, Table
+
+from .style import svg_text
 
 STYLES = {
     Status.GOOD: "green",

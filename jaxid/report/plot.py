@@ -6,14 +6,14 @@ The figures of the paper: `path` (Figs. 3, 8), `joints` (Fig. 4), `filtered` (Fi
 `jaxid` loads this module, and matplotlib, when `jid.plot` is first used.
 """
 
-from jaxid.report.fit import (
+from .fit import (
     autocorrelation_figure as autocorrelation,
     comparison_figure as comparison,
     filter_figure as filter_choice,
     parameter_figure as parameters,
     residual_figure as residuals,
 )
-from jaxid.report.motion import (
+from .motion import (
     animation as animation,
     filtered_figure as filtered,
     joint_figure as joints,
@@ -21,8 +21,8 @@ from jaxid.report.motion import (
     pose_figure as poses,
     tip_figure as end_effector,
 )
-from jaxid.report.style import save as save
-from jaxid.report.torques import (
+from .style import save as save
+from .torques import (
     bar_figure as bars,
     error_figure as errors,
     torque_figure as torques,

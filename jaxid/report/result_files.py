@@ -15,24 +15,25 @@ from matplotlib.figure import Figure
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
-from jaxid.identification.comparison import LEVEL, Comparison, parameter_kinds
-from jaxid.identification.estimators.solutions import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.solutions_and_weights import LARGEST_UNCERTAINTY
 from jaxid.identification.fit import Fit, load
+from jaxid.identification.parameter_changes import LEVEL, Comparison, parameter_kinds
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.model_validation import TorqueErrors
-from jaxid.report.fit import (
+from jaxid.robot.robot import Robot
+
+from .fit import (
     autocorrelation_figure,
     comparison_figure,
     filter_figure,
     parameter_figure,
     residual_figure,
 )
-from jaxid.report.identification import Report, identification_page
-from jaxid.report.page import versions
-from jaxid.report.style import save
-from jaxid.report.torques import error_figure, torque_figure
-from jaxid.robot.robot import Robot
+from .identification import Report, identification_page
+from .page import versions
+from .style import save
+from .torques import error_figure, torque_figure
 
 MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""

@@ -11,7 +11,10 @@ from matplotlib.ticker import MaxNLocator
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 from jaxid.model_validation import TorqueErrors
-from jaxid.report.style import (
+from jaxid.robot.robot import Robot
+from jaxid.table import percent, shortened, significant
+
+from .style import (
     BLUE,
     ERROR,
     GREEN,
@@ -26,8 +29,6 @@ from jaxid.report.style import (
     caption,
     drawing,
 )
-from jaxid.robot.robot import Robot
-from jaxid.table import percent, shortened, significant
 
 
 def torque_figure(

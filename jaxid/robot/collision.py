@@ -14,17 +14,18 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxid.arrays import AnyArray, Array, Float, Hashable, Numbers, double_precision
 from jaxid.errors import InputError
-from jaxid.robot.kinematics import placements
-from jaxid.robot.robot import Robot
-from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
-from jaxid.robot.shapes import (
+
+from .kinematics import placements
+from .robot import Robot
+from .rotations import SNAP_TOLERANCE, rpy_rotation
+from .shapes import (
     GROUND as GROUND,
     Box as Box,
     Capsule as Capsule,
     HalfSpace as HalfSpace,
     segment_distance,
 )
-from jaxid.robot.urdf import UrdfTree
+from .urdf import UrdfTree
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _ZERO = (0.0, 0.0, 0.0)

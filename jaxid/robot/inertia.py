@@ -4,7 +4,8 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
-from jaxid.robot.limits_and_drives import FAR, FARTHEST
+
+from .limits_and_drives import FAR, FARTHEST
 
 AXES = "xyz"
 INERTIAL_NAMES = ("m", *(f"m{a}" for a in AXES), *"ABCDEF")

@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array
 from jaxid.errors import InputError
-from jaxid.robot.robot import Robot
-from jaxid.robot.rotations import rotation_about
+
+from .robot import Robot
+from .rotations import rotation_about
 
 _REACHED = 1e-9
 """Distance at which a pose is reached [m, and rad], and slack of a range relative to its half."""

@@ -13,10 +13,11 @@ import numpy as np
 
 from jaxid.arrays import Numbers
 from jaxid.errors import InputError
-from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
-from jaxid.robot.limits_and_drives import Drives, Limits
-from jaxid.robot.robot import Robot
-from jaxid.robot.rotations import SNAP_TOLERANCE, axis_rotation, rpy_rotation, snap_angles
+
+from .collision import Capsule, CollisionModel, HalfSpace
+from .limits_and_drives import Drives, Limits
+from .robot import Robot
+from .rotations import SNAP_TOLERANCE, axis_rotation, rpy_rotation, snap_angles
 
 _X, _, _Z = np.eye(3)
 

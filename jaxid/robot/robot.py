@@ -9,9 +9,10 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.inertia import Inertia
-from jaxid.robot.limits_and_drives import FARTHEST, Drives, Limits, far_notes, limit_notes
 from jaxid.table import Column, Table
+
+from .inertia import Inertia
+from .limits_and_drives import FARTHEST, Drives, Limits, far_notes, limit_notes
 
 GRAVITY = (0.0, 0.0, -9.81)
 

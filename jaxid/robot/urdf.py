@@ -9,10 +9,11 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxid.arrays import AnyArray, Float, Numbers
 from jaxid.errors import InputError
-from jaxid.robot.inertia import Inertia
-from jaxid.robot.limits_and_drives import Limits, range_fault
-from jaxid.robot.robot import GRAVITY, Robot
-from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation, snap_angles, snap_directions
+
+from .inertia import Inertia
+from .limits_and_drives import Limits, range_fault
+from .robot import GRAVITY, Robot
+from .rotations import SNAP_TOLERANCE, rpy_rotation, snap_angles, snap_directions
 
 _TURNING = ("revolute", "continuous")
 _ZERO = (0.0, 0.0, 0.0)

@@ -13,9 +13,10 @@ from jaxid.errors import InputError
 from jaxid.io import atomic_folder
 from jaxid.measurement.recording import Recording
 from jaxid.robot import library
-from jaxid.simulation.disturbances import SmoothFriction
-from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
+
+from .disturbances import SmoothFriction
+from .virtual import Sensors, VirtualRobot, random_bodies
 
 FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")
 

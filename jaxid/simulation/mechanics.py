@@ -14,7 +14,8 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.program import to_python
-from jaxid.simulation.disturbances import AbstractDisturbance, AbstractGearFriction
+
+from .disturbances import AbstractDisturbance, AbstractGearFriction
 
 
 class RigidGear(Hashable):

@@ -12,7 +12,8 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.export.simulators import mjcf_text
 from jaxid.export.torque_program import body_parameters
-from jaxid.simulation.virtual import VirtualRobot
+
+from .virtual import VirtualRobot
 
 
 class MujocoRobot(VirtualRobot):

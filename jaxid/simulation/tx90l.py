@@ -12,8 +12,9 @@ from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Drives
 from jaxid.robot.robot import Robot
-from jaxid.simulation.disturbances import FrictionTemperature, LuGreFriction, TorqueRipple
-from jaxid.simulation.virtual import Sensors, VirtualRobot
+
+from .disturbances import FrictionTemperature, LuGreFriction, TorqueRipple
+from .virtual import Sensors, VirtualRobot
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}
 WARM = {1: 273.62, 2: 1.65, 27: 90.19, 28: 25.65, 34: 233.00, 35: 15.07}

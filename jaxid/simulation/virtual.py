@@ -18,20 +18,21 @@ from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 from jaxid.measurement.recording import Recording
 from jaxid.robot.robot import Robot
-from jaxid.simulation.disturbances import (
+from jaxid.trajectory.trajectory import AbstractTrajectory
+
+from .disturbances import (
     AbstractDisturbance,
     AbstractGearFriction,
     FrictionTemperature,
     SmoothFriction,
 )
-from jaxid.simulation.mechanics import (
+from .mechanics import (
     DriveTrain,
     RigidGear,
     Servo,
     SimulatedPlant,
     follow,
 )
-from jaxid.trajectory.trajectory import AbstractTrajectory
 
 
 def random_bodies(

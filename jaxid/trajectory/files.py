@@ -13,7 +13,8 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.io import from_json, json_text, read_json, to_json, write_text
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.trajectory import AbstractTrajectory
+
+from .trajectory import AbstractTrajectory
 
 FORMAT, VERSION = "jaxid trajectory", 2
 

@@ -11,7 +11,8 @@ from jaxid.arrays import AnyArray, Float, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.trajectory import (
+
+from .trajectory import (
     AbstractBasis,
     Envelope,
     LinearTrajectory,

@@ -11,8 +11,9 @@ from jaxid.arrays import AnyArray, Float, double_precision, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.fourier import PeriodsBasis, complete_limits
-from jaxid.trajectory.trajectory import (
+
+from .fourier import PeriodsBasis, complete_limits
+from .trajectory import (
     AbstractTrajectory,
     Envelope,
     States,

@@ -9,7 +9,8 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.trajectory.trajectory import (
+
+from .trajectory import (
     AbstractBasis,
     AbstractTrajectory,
     Envelope,

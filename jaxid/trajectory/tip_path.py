@@ -11,7 +11,8 @@ from jaxid.arrays import AnyArray, Float, Numbers, as_array
 from jaxid.errors import InputError
 from jaxid.robot.kinematics import inverse_kinematics_along
 from jaxid.robot.robot import Robot
-from jaxid.trajectory.spline import PiecewisePolynomial, spline_polynomials
+
+from .spline import PiecewisePolynomial, spline_polynomials
 
 
 class Line(eqx.Module):

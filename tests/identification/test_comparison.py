@@ -6,7 +6,7 @@ from scipy import stats
 from virtual import fit_of, planar_base, uncertainty
 
 import jaxid as jid
-from jaxid.identification.comparison import Verdict, compare_some
+from jaxid.identification.parameter_changes import Verdict, compare_some
 
 BASE = planar_base()
 SIZE, DRAWS = BASE.size, 1500

@@ -8,8 +8,8 @@ from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.combination import combine
-from jaxid.identification.comparison import Verdict
-from jaxid.identification.states import stores_energy
+from jaxid.identification.operating_states import stores_energy
+from jaxid.identification.parameter_changes import Verdict
 
 NOISE = np.array([0.5, 0.1])
 

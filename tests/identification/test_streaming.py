@@ -6,7 +6,7 @@ import pytest
 from virtual import dense, motion, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification import streaming
+from jaxid.identification import long_logs
 from jaxid.identification.factors import Blocks
 from jaxid.identification.identify import fit_problem
 
@@ -34,7 +34,7 @@ def changed(o: jid.Observations, **fields) -> jid.Observations:
 def fast(base, o, blocks=4) -> Blocks:
     counted = np.flatnonzero(np.asarray(o.mask).any(axis=1))
     edges = [int(part[0]) for part in np.array_split(counted, blocks)]
-    return Blocks(tuple(streaming.stream_blocks(base, o, [0, *edges[1:], o.rows])))
+    return Blocks(tuple(long_logs.stream_blocks(base, o, [0, *edges[1:], o.rows])))
 
 
 def distance(a, b) -> float:
@@ -102,7 +102,7 @@ def test_filtered_and_decimated(base, fields):
 def test_nothing_depends_on_the_length_of_chunks(base, monkeypatch):
     o = observed(base, samples=30000, filter=SMOOTH, every=7)
     a = fast(base, o).total
-    monkeypatch.setattr(streaming, "CHUNK", 500)
+    monkeypatch.setattr(long_logs, "CHUNK", 500)
     assert distance(a, fast(base, o).total) < 1e-13
 
 
@@ -122,13 +122,13 @@ def test_a_prismatic_arm_against_a_dense_matrix():
 def test_long_logs_take_the_compiled_pass_by_themselves(base, monkeypatch):
     o = observed(base, mask=np.random.default_rng(3).random((6000, 2)) < 0.7)
     slow = jid.RegressionProblem(base, [o, o], divisions=5).blocks
-    monkeypatch.setattr(streaming, "LONG", 5000)
+    monkeypatch.setattr(long_logs, "LONG", 5000)
     quick = jid.RegressionProblem(base, [o, o], divisions=5).blocks
     distances = [distance(a, b) for a, b in zip(slow.parts, quick.parts, strict=True)]
     assert 0.0 < max(distances) < 1e-12
 
 
 def test_filters_with_a_long_memory_stay_in_numpy(base):
-    assert not streaming.suits(observed(base, samples=streaming.LONG, filter=SMOOTH))
-    assert streaming.suits(observed(base, samples=streaming.LONG, filter=SMOOTH, every=20))
-    assert not streaming.suits(observed(base))
+    assert not long_logs.suits(observed(base, samples=long_logs.LONG, filter=SMOOTH))
+    assert long_logs.suits(observed(base, samples=long_logs.LONG, filter=SMOOTH, every=20))
+    assert not long_logs.suits(observed(base))

@@ -7,7 +7,7 @@ from virtual import motion, standard_parameters
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.identification import streaming
+from jaxid.identification import long_logs
 from jaxid.measurement import log_files
 from jaxid.measurement.reading import scan_log
 from jaxid.measurement.recording import NeedsMemory
@@ -69,8 +69,8 @@ def agree(base, log, o):
 @pytest.mark.parametrize("long", [1000, 100_000])
 def test_parquet_compiled_and_in_numpy(base, parquet, monkeypatch, long):
     monkeypatch.setattr(jid.RegressionProblem, "samples_per_chunk", 3000)
-    monkeypatch.setattr(streaming, "LONG", long)
-    monkeypatch.setattr(streaming, "PIECE", 4096)
+    monkeypatch.setattr(long_logs, "LONG", long)
+    monkeypatch.setattr(long_logs, "PIECE", 4096)
     log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, EVERY)
     agree(base, log, in_memory(base, parquet, EVERY))
 

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from jaxid.identification.comparison import Verdict, compare
+from jaxid.identification.parameter_changes import Verdict, compare
 from jaxid.report import result_files
 from jaxid.report.identification import Report
 from jaxid.report.result_files import (

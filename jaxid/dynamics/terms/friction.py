@@ -10,10 +10,11 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, matching, one_or_each
 from jaxid.dynamics import projection_equation
-from jaxid.dynamics.terms.term import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
+
+from .term import AbstractTerm, NonlinearParameter
 
 EachJoint = float | Float[AnyArray, "..."]
 """One number for all joints, or one for each."""

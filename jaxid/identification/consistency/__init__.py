@@ -1,6 +1,6 @@
 """Physical consistency: parameters of bodies that can exist, found with a certificate."""
 
-from .bounds import (
+from .bounds_and_priors import (
     BodyBounds as BodyBounds,
     EntropicPull as EntropicPull,
     ParameterPrior as ParameterPrior,

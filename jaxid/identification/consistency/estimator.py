@@ -30,7 +30,7 @@ from ..estimators import (
     MaximumForces,
 )
 from . import solver
-from .bounds import BodyBounds, EntropicPull, ParameterPrior
+from .bounds_and_priors import BodyBounds, EntropicPull, ParameterPrior
 from .program import (
     ConeProgram,
     FeasibleSet,

@@ -18,7 +18,7 @@ from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.robot.inertia import AXES
 
-from .bounds import BodyBounds
+from .bounds_and_priors import BodyBounds
 from .pseudo_inertia import BASIS, Values, ball, inertial_parameters
 
 Number = Float[AnyArray, "*batch"] | np.floating

@@ -18,7 +18,7 @@ from .least_squares import (
     Tukey as Tukey,
     WeightedLeastSquares as WeightedLeastSquares,
 )
-from .solutions import (
+from .solutions_and_weights import (
     AbstractSolution as AbstractSolution,
     AbstractSpectralSolution as AbstractSpectralSolution,
     AbstractWeights as AbstractWeights,

@@ -10,7 +10,7 @@ from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, require_float64
 from jaxid.errors import InputError
 
 from ..estimators.estimate import Estimate
-from ..estimators.solutions import Decomposition
+from ..estimators.solutions_and_weights import Decomposition
 from ..factors import Blocks
 from .result import AbstractUncertainty, Uncertainty
 
@@ -112,7 +112,7 @@ def bootstrap(
         InputError: If there are fewer than two blocks, or draws do not determine all parameters.
         RuntimeError: If JAX's 64-bit mode is off.
     """
-    from ..normal_equations import RIDGE, inverse_information
+    from ..batch_solver import RIDGE, inverse_information
 
     require_float64("a bootstrap")
     count = len(blocks.parts)

@@ -10,7 +10,8 @@ from scipy import signal
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.measurement.filters.filter import (
+
+from .filter import (
     LowPass,
     integer,
     unit_gain_sections,

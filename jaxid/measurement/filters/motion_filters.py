@@ -10,7 +10,8 @@ from scipy import signal
 from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.measurement.filters.filter import (
+
+from .filter import (
     SETTLED,
     AbstractFilter,
     LowPass,

@@ -25,10 +25,10 @@ from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 
+from .batch_solver import BatchFit, DataSets, solve
 from .estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
 from .fit import Fit
 from .identify import identify
-from .normal_equations import BatchFit, DataSets, solve
 from .uncertainty import IndependentRows
 
 

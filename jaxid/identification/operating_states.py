@@ -18,8 +18,8 @@ from .combination import (
     replace_estimates,
     require_same_base,
 )
-from .comparison import LEVEL, Comparison, compare_some, joint_test
 from .fit import Fit, interval_table
+from .parameter_changes import LEVEL, Comparison, compare_some, joint_test
 from .uncertainty import Uncertainty
 
 
