@@ -235,7 +235,13 @@ def payload(
     show_files(console, output, [p.name for p in files])
 
 
-def gains(console: Console, path: Path, logs: list[Path], loaded: list[Path], output: Path) -> None:
+def gains(
+    console: Console,
+    path: Path,
+    logs: list[Path],
+    loaded: list[Path],
+    output: Path,
+) -> None:
     """Find the drives' true forces with a load that is known."""
     experiment = load_experiment(path)
     if experiment.load is None:

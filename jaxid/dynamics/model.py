@@ -151,7 +151,11 @@ class Model(Hashable):
         self.check(motion.q)
         return PackedRegressor(self, self.columns, motion)
 
-    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(
+        self,
+        p: Parameters,
+        motion: Motion,
+    ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
@@ -161,7 +165,11 @@ class Model(Hashable):
         self.check(motion.q)
         return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
 
-    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(
+        self,
+        p: Parameters,
+        q: Coordinates,
+    ) -> Float[AnyArray, "*batch joints joints"]:
         r"""Return the mass matrix $M(q)$, rotors included (Eq. 38).
 
         Args:

@@ -303,7 +303,12 @@ class ForceLimits(AbstractConstraint):
             size = size + self.deviations * jnp.sqrt(jnp.maximum(variance, 0.0) + smooth)
         return size / jnp.broadcast_to(limits, size.shape) - 1.0
 
-    def forces(self, q: Coordinates, qd: Coordinates, qdd: Coordinates) -> Float[Array, "3 joints"]:
+    def forces(
+        self,
+        q: Coordinates,
+        qd: Coordinates,
+        qdd: Coordinates,
+    ) -> Float[Array, "3 joints"]:
         """Return the forces of one sample: as expected, and with dry friction to either side."""
         model = self.base.model
         p = self.base.to_standard(jnp.asarray(self.parameters))

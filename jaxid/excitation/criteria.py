@@ -131,7 +131,11 @@ class AbstractCriterion(eqx.Module):
     extreme: ClassVar[bool] = True
 
     @abstractmethod
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self,
+        information: Information,
+        sharpness: Sharpness = None,
+    ) -> Float[Array, ""]:
         """Return the logarithm of the number.
 
         Args:
@@ -166,7 +170,11 @@ class ConditionNumber(AbstractCriterion):
         of = ", weighted" if self.weighted else " of Λ (Eq. 36)"
         return f"condition number{of}{', columns scaled' if self.scaled else ''}"
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self,
+        information: Information,
+        sharpness: Sharpness = None,
+    ) -> Float[Array, ""]:
         """Return the logarithm of the condition number."""
         matrix = jnp.asarray(information.weighted if self.weighted else information.plain)
         matrix = _unit_diagonal(matrix)[0] if self.scaled else matrix
@@ -183,7 +191,11 @@ class DOptimal(AbstractCriterion):
     name: ClassVar[str] = "D: mean axis of the confidence ellipsoid"
     extreme: ClassVar[bool] = False
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self,
+        information: Information,
+        sharpness: Sharpness = None,
+    ) -> Float[Array, ""]:
         """Return the logarithm of the mean axis."""
         matrix = jnp.asarray(information.weighted)
         # The determinant does not depend on the scale that makes the factor accurate.
@@ -206,7 +218,11 @@ class AOptimal(AbstractCriterion):
     extreme: ClassVar[bool] = False
     sizes: Float[AnyArray, " base"] | None = None
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self,
+        information: Information,
+        sharpness: Sharpness = None,
+    ) -> Float[Array, ""]:
         """Return the logarithm of the root mean square."""
         scaled = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_mean_inverse, scaled, None))
@@ -222,7 +238,11 @@ class EOptimal(AbstractCriterion):
     name: ClassVar[str] = "E: longest axis of the scaled ellipsoid"
     sizes: Float[AnyArray, " base"] | None = None
 
-    def __call__(self, information: Information, sharpness: Sharpness = None) -> Float[Array, ""]:
+    def __call__(
+        self,
+        information: Information,
+        sharpness: Sharpness = None,
+    ) -> Float[Array, ""]:
         """Return the logarithm of the longest axis."""
         scaled = _divide_by_sizes(information, self.sizes)
         return 0.5 * jnp.asarray(spectral(log_largest_inverse, scaled, sharpness))

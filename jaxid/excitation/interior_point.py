@@ -122,7 +122,12 @@ def begin(grid: Grid, y: Float[AnyArray, "starts scaled"], constraints: int = 0)
     )
 
 
-def run(grid: Grid, objective: Callable[[Array], Evaluation], state: State, stage: Stage) -> State:
+def run(
+    grid: Grid,
+    objective: Callable[[Array], Evaluation],
+    state: State,
+    stage: Stage,
+) -> State:
     """Move the starts inside the bound of a stage, then iterate until all have converged."""
 
     def proceed(carry: tuple[Array, State]) -> Array:
@@ -200,7 +205,12 @@ def _update(grid: Grid, stage: Stage, old: State, trial: Array, evaluation: Eval
 
 
 def _taken(
-    stage: Stage, old: State, trial: Array, slack: Array, evaluation: Evaluation, room: Inequalities
+    stage: Stage,
+    old: State,
+    trial: Array,
+    slack: Array,
+    evaluation: Evaluation,
+    room: Inequalities,
 ) -> State:
     """Return the state of one start after its step was taken."""
     barrier = jnp.where(old.length > 0.1, old.barrier * COOLING, old.barrier)

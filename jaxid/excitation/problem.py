@@ -121,7 +121,10 @@ class ExcitationProblem:
         return self.limits.random(key, 1)[0]
 
     def value(
-        self, x: Float[AnyArray, " scaled"], sharpness: Sharpness = None, samples: int | None = None
+        self,
+        x: Float[AnyArray, " scaled"],
+        sharpness: Sharpness = None,
+        samples: int | None = None,
     ) -> Float[Array, ""]:
         """Return the logarithm of the criterion of one run.
 

@@ -208,7 +208,10 @@ _watched_excess = jax.jit(ExcitationProblem.watched_excess, static_argnums=0)
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
 def crossover(
-    problem: ExcitationProblem, x: Float[Array, "starts scaled"], key: PRNGKeyArray, tries: int = 16
+    problem: ExcitationProblem,
+    x: Float[Array, "starts scaled"],
+    key: PRNGKeyArray,
+    tries: int = 16,
 ) -> Float[Array, "starts scaled"]:
     """Return one child of each motion with another one: the most promising of several.
 

@@ -359,7 +359,14 @@ def checksum_of(content: Any) -> str:
     return f"sha256:{hashlib.sha256(plain.encode()).hexdigest()}"
 
 
-def interval_table(title: str, names, units, values, uncertainty: Uncertainty, remarks=()) -> Table:
+def interval_table(
+    title: str,
+    names,
+    units,
+    values,
+    uncertainty: Uncertainty,
+    remarks=(),
+) -> Table:
     """Return a table of estimates with their 95 % intervals."""
     estimates, half_widths = with_deviations(values, uncertainty.half_widths())
     return Table(

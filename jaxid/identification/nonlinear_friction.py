@@ -150,7 +150,13 @@ def identify_nonlinear(
     )
 
 
-def _held_out_errors(blocks, problem: SeparableProblem, found, weights, progress) -> HeldOutErrors:
+def _held_out_errors(
+    blocks,
+    problem: SeparableProblem,
+    found,
+    weights,
+    progress,
+) -> HeldOutErrors:
     """Test both models on held-out blocks; searches begin at the shapes of all blocks."""
     squares, errors, every = weights**2, [], np.arange(len(blocks.parts))
     folds = np.array_split(every, min(5, len(every)))

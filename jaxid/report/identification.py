@@ -306,7 +306,12 @@ def _judge_forces(recordings: Sequence[TorqueErrors], unseen: bool) -> Remark:
     )
 
 
-def _grade(value: float, limits: tuple[float, float], unit: str, more: str) -> tuple[Status, str]:
+def _grade(
+    value: float,
+    limits: tuple[float, float],
+    unit: str,
+    more: str,
+) -> tuple[Status, str]:
     """Return whether a value is good, tolerable or bad, and the limits in words."""
     good, tolerable = limits
     status = Status.GOOD if value <= good else Status.DOUBTFUL if value <= tolerable else Status.BAD

@@ -32,7 +32,12 @@ Section = tuple[str, Sequence[Any]]
 """Title, which the table of contents shows, and blocks as `render_page` takes them."""
 
 
-def render_page(title: str, sections: Sequence[Section], lead: str = "", footer: str = "") -> str:
+def render_page(
+    title: str,
+    sections: Sequence[Section],
+    lead: str = "",
+    footer: str = "",
+) -> str:
     """Return a page: readable without network and script, on a phone, on a desk and on paper.
 
     Blocks of a section are texts (paragraphs), tables, figures, a remark (the headline), lists of

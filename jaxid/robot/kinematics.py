@@ -246,7 +246,12 @@ def _beyond(task: _Task, q: np.ndarray) -> np.ndarray:
 
 
 def _descend(
-    task: _Task, goals: np.ndarray, q: np.ndarray, multipliers: np.ndarray, gauss: int, newton: int
+    task: _Task,
+    goals: np.ndarray,
+    q: np.ndarray,
+    multipliers: np.ndarray,
+    gauss: int,
+    newton: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Go to the coordinates nearest to the posture, and to the multipliers of their poses.
 
