@@ -18,6 +18,7 @@ import pytest
 
 from jaxid import cli
 from jaxid.errors import InputError
+from jaxid.excitation import search
 from jaxid.excitation.coefficient_limits import JointLimits
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.experiment.decoder import keys_of
@@ -58,12 +59,28 @@ acceleration = [4]
 [excitation]
 harmonics = 2
 starts = 2
-generations = 1
+generations = 0
 polish = 1
 samples = 100
 seed = 5
 """
-FAST = EXPERIMENT.replace("generations = 1\npolish = 1", "generations = 0\npolish = 0")
+FAST = EXPERIMENT.replace("polish = 1", "polish = 0")
+STAGES = {"SCHEDULE": search.SCHEDULE, "SETTLING": search.SETTLING}
+LAST_STAGE_ALONE = """
+import jaxid.excitation.search as search
+search.SCHEDULE = search.SETTLING = ()
+from jaxid.cli import main
+main()
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def last_stage_alone():
+    """Designs without the stages before the last one, whose programs take long to compile."""
+    with pytest.MonkeyPatch.context() as patch:
+        for stages in STAGES:
+            patch.setattr(search, stages, ())
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -102,11 +119,9 @@ def designed(written, run):
 
 @pytest.fixture(scope="module")
 def excited(written):
-    """A motion as fast as it can be had, by the last stage alone, for what is said of it."""
+    """A motion as fast as it can be had, for what is said of it."""
     experiment = load_experiment(written / "fast.toml")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxid.excitation.search.SCHEDULE", ())
-        return design_motion(experiment, lambda _: None, written / "fast.npz", False)
+    return design_motion(experiment, lambda _: None, written / "fast.npz", False)
 
 
 @pytest.fixture
@@ -169,7 +184,7 @@ def test_a_killed_design_goes_on_to_the_same_motion(designed, run):
     written = designed
     arguments = ["excite", "experiment.toml", "-o", "killed/motion.csv"]
     process = subprocess.Popen(
-        [sys.executable, "-c", "from jaxid.cli import main; main()", *arguments],
+        [sys.executable, "-c", LAST_STAGE_ALONE, *arguments],
         cwd=written,
         stdout=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -192,9 +207,11 @@ def test_a_killed_design_goes_on_to_the_same_motion(designed, run):
 
 
 def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
-    designed, run, no_pictures
+    designed, run, no_pictures, monkeypatch
 ):
     written = designed
+    for name, stages in STAGES.items():  # a force that only few motions keep needs them all
+        monkeypatch.setattr(search, name, stages)
 
     # The angle turns about y: the rod points ahead at zero, and holding it there takes 7.8 N m.
     def largest_force(folder):

@@ -25,21 +25,14 @@ P_BASE = jnp.linspace(1.0, 2.0, BASE.size)
 METHODS = {
     "model.regressor": (MODEL.regressor, (MOTION,)),
     "model.inverse_dynamics": (MODEL.inverse_dynamics, (P, MOTION)),
-    "model.mass_matrix": (MODEL.mass_matrix, (P, Q)),
     "model.kinetic_energy": (MODEL.kinetic_energy, (P, Q, QD)),
-    "model.potential_energy": (MODEL.potential_energy, (P, Q)),
     "model.tool_forces": (MODEL.tool_forces, (MOTION,)),
     "base.regressor": (BASE.regressor, (MOTION,)),
-    "base.inverse_dynamics": (BASE.inverse_dynamics, (P_BASE, MOTION)),
     "base.mass_matrix": (BASE.mass_matrix, (P_BASE, Q)),
     "base.from_standard": (BASE.from_standard, (P,)),
     "base.to_standard": (BASE.to_standard, (P_BASE,)),
     "series.motion": (SERIES.motion, (Q[:, 0],)),
     "drives.joint_angles": (DRIVES.joint_angles, (Q,)),
-    "drives.joint_velocities": (DRIVES.joint_velocities, (Q,)),
-    "drives.joint_forces": (DRIVES.joint_forces, (Q,)),
-    "drives.motor_angles": (DRIVES.motor_angles, (Q,)),
-    "drives.motor_velocities": (DRIVES.motor_velocities, (Q,)),
     "drives.motor_torques": (DRIVES.motor_torques, (Q,)),
 }
 

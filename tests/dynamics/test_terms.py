@@ -236,16 +236,6 @@ def test_coupled_drives_of_the_tx40_are_the_published_columns():
     assert [slide[name] for name in ("Iam2", "fvm2", "fcm2")] == ["kg", "N s/m", "N"]
 
 
-def test_asymmetric_friction_vanishes_in_its_dead_zone():
-    robot = TREE.robot()
-    term = AsymmetricCoulombFriction(Tanh(0.01, dead_zone=0.1))
-    qd = np.full(robot.joints, 0.05)
-    columns = term.columns(robot, qd, qd, qd)
-    np.testing.assert_array_equal(columns, 0.0)
-    fast = np.asarray(term.columns(robot, qd, qd + 1.0, qd))
-    np.testing.assert_allclose(fast[:, : robot.joints], np.eye(robot.joints), atol=1e-12)
-
-
 def test_stribeck_friction_falls_from_its_static_level(robot):
     """At a few epsilons the sum of both levels, at the Stribeck speed what is left of it."""
     speeds = np.array([0.1, 0.2, 0.4])

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -86,7 +87,8 @@ def test_peaks_between_the_checked_instants_count(problem, pendulum):
     x = problem.random(jax.random.key(5))
     motion = problem.trajectory(x).motion(np.linspace(0.0, BASIS.duration, 20 * CHECKED))
     robot = pendulum.model.robot
-    finer = np.concatenate([np.asarray(c(robot, motion)).max(axis=0) for c in problem.constraints])
+    finer = jax.jit(lambda m: [c(robot, m) for c in problem.constraints])(motion)
+    finer = np.concatenate([np.asarray(values).max(axis=0) for values in finer])
     found = np.array([f.value for f in problem.findings(x)])
     assert (found >= problem.checked(x).max(axis=0)).all()
     np.testing.assert_allclose(found, finer, atol=2e-7)
@@ -118,15 +120,24 @@ def test_limits_of_force_are_those_that_were_given(problem, pendulum, constraint
     np.testing.assert_allclose(given.checked(x)[:, 0].max() + 1.0, 9.0 * highest, rtol=1e-6)
 
 
-def test_a_design_with_leads_keeps_all_constraints(problem, constraints, shapes, excess):
+def test_a_design_with_leads_keeps_all_constraints(
+    problem, constraints, shapes, excess, monkeypatch
+):
+    for stages in ("SCHEDULE", "SETTLING"):  # the last stage alone has all to keep as well
+        monkeypatch.setattr(f"jaxid.excitation.search.{stages}", ())
     plan = minimise(problem, starts=2, generations=0, polish=0)
     assert plan.feasible
     assert excess(plan) <= 0.0
     robot, end = problem.base.model.robot, float(plan.trajectory.duration)
     motion = plan.trajectory.motion(np.linspace(0.0, end, 8000))
-    values = [float(np.max(c(robot, motion))) for c in constraints]
-    assert -0.05 < max(values) <= 0.0, "something binds"
-    assert float(np.min(shapes.clearance(robot, motion.q))) >= 0.02
+
+    @jax.jit
+    def judged(m):
+        return [jnp.max(c(robot, m)) for c in constraints], shapes.clearance(robot, m.q)
+
+    values, clearance = judged(motion)
+    assert -0.05 < max(map(float, values)) <= 0.0, "something binds"
+    assert float(np.min(clearance)) >= 0.02
     ends = plan.trajectory.motion(np.array([0.0, end]))
     np.testing.assert_allclose(ends.qd, 0.0, atol=1e-12)
     np.testing.assert_allclose(ends.qdd, 0.0, atol=1e-12)

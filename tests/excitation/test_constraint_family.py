@@ -1,5 +1,7 @@
 """Every constraint: derivatives, one sample like many, words; and each one's own oracle."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,6 +69,12 @@ def limited(forces):
     return np.concatenate([np.asarray(forces), torques], axis=-1)[..., [0, 2, 3, 5]]
 
 
+@cache
+def judged(name):
+    """The compiled values of a constraint at the samples of the motion."""
+    return np.asarray(jax.jit(lambda m: FAMILY[name](ROBOT, m))(MOTION))
+
+
 @pytest.mark.parametrize("name", ["forces", "tip", "clearance"])
 def test_derivatives_are_central_differences(name):
     constraint = FAMILY[name]
@@ -89,9 +97,10 @@ def test_derivatives_are_central_differences(name):
 @pytest.mark.parametrize("name", FAMILY)
 def test_a_sample_is_judged_by_itself_and_under_jit_and_vmap(name):
     constraint = FAMILY[name]
-    many = np.asarray(constraint(ROBOT, MOTION))
+    many = judged(name)
     assert many.shape == (40, len(constraint.entries(ROBOT)))
-    np.testing.assert_allclose(constraint(ROBOT, MOTION[7]), many[7], atol=1e-10)
+    alone = jax.jit(lambda m: constraint(ROBOT, m))(MOTION[7])
+    np.testing.assert_allclose(alone, many[7], atol=1e-10)
     folded = Motion(*(x.reshape(4, 10, 3) for x in (MOTION.q, MOTION.qd, MOTION.qdd)))
     mapped = jax.jit(jax.vmap(lambda m: constraint(ROBOT, m)))(folded)
     np.testing.assert_allclose(mapped.reshape(many.shape), many, atol=1e-9)
@@ -100,7 +109,7 @@ def test_a_sample_is_judged_by_itself_and_under_jit_and_vmap(name):
 @pytest.mark.parametrize("name", FAMILY)
 def test_words_name_what_is_exceeded(name):
     constraint = FAMILY[name]
-    entries, values = constraint.entries(ROBOT), np.asarray(constraint(ROBOT, MOTION))
+    entries, values = constraint.entries(ROBOT), judged(name)
     assert len({(e.name, e.least) for e in entries}) == len(entries)
     for f, peak in zip(constraint.describe(ROBOT, values), values.max(axis=0), strict=True):
         assert f.excess == pytest.approx(peak * f.size)

@@ -71,7 +71,8 @@ def samples(seed, batch, shape=(SIZE,), count=2):
 def reference(function, *arrays):
     """The function on batch-last arrays by `vmap`, which shares nothing with a program."""
     first = [jnp.moveaxis(jnp.asarray(x), -1, 0) for x in arrays]
-    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1), jax.vmap(function)(*first))
+    found = jax.jit(jax.vmap(function))(*first)
+    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1), found)
 
 
 def chain(angles, rates):

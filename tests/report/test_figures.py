@@ -13,15 +13,7 @@ from PIL import Image
 import jaxid as jid
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.fit import autocorrelation
-from jaxid.report.style import (
-    BLUE,
-    ERROR,
-    GREY,
-    MEASURED,
-    ORANGE,
-    PREDICTED,
-    plain_number,
-)
+from jaxid.report.style import BLUE, ERROR, GREY, MEASURED, ORANGE, PREDICTED
 from jaxid.report.torques import decimate
 
 T = np.linspace(0.0, 2.0, 101)
@@ -113,18 +105,6 @@ def test_residuals_stand_beside_white_ones(fit):
         assert axes.get_ylabel() == ("N²/Hz", "(N m)²/Hz")[j]
         assert ("not white" in axes.get_title(loc="right")) != spectra.white[j]
     require_everything_inside(figure)
-
-
-@pytest.mark.parametrize(
-    ("name", "draw"),
-    [
-        ("errors", lambda e: jid.plot.torques(e(3), arm_of(2))),
-        ("groups", lambda e: jid.plot.bars((), arm_of(2))),
-    ],
-)
-def test_refusals(name, draw, errors_of):
-    with pytest.raises(jid.InputError, match=f"`{name}`"):
-        draw(errors_of)
 
 
 def test_bars_are_percents_of_the_largest_forces(errors_of):
@@ -307,11 +287,3 @@ def test_files_are_the_same_each_time_and_leave_figure_and_settings_alone(errors
     assert dict(matplotlib.rcParams) == before
     if "matplotlib.pyplot" in sys.modules:
         assert sys.modules["matplotlib.pyplot"].get_fignums() == []
-
-
-@pytest.mark.parametrize(
-    ("value", "label"),
-    [(0.01, "0.01"), (1000.0, "1000"), (1e-5, "10⁻⁵"), (2e-7, "2·10⁻⁷"), (1e6, "10⁶")],
-)
-def test_labels_of_logarithmic_scales_are_plain_letters(value, label):
-    assert plain_number(value) == label
