@@ -347,16 +347,29 @@ def load(path: str | Path) -> Fit:
     if document.get("checksum") != checksum_of(content):
         raise InputError(f"`{path}` is damaged or was changed by hand: save the model again.")
     try:
-        return from_json(content, Fit)
+        fit = from_json(content, Fit)
+        _check(fit)
     except (ValueError, TypeError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"`{path}` holds no model that can be used: {reason}.") from error
+    return fit
 
 
 def checksum_of(content: Any) -> str:
     """Return the SHA-256 of plain JSON values, whatever their layout in a file."""
     plain = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return f"sha256:{hashlib.sha256(plain.encode()).hexdigest()}"
+
+
+def _check(fit: Fit) -> None:
+    """Reject arrays of a file that do not belong to its robot."""
+    n, joints = fit.base.size, fit.base.model.robot.joints
+    found = {"parameters": fit.parameters, "covariance": fit.covariance, "weights": fit.weights}
+    for (name, array), shape in zip(found.items(), ((n,), (n, n), (joints,)), strict=True):
+        if np.shape(array) != shape:
+            raise InputError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")
+    if not np.isfinite(fit.parameters).all():
+        raise InputError("`parameters` must hold finite numbers")
 
 
 def interval_table(

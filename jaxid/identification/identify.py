@@ -76,7 +76,10 @@ def fit_problem(
     """
     count = int(problem.factors.rows.sum())
     if count <= problem.base.size:
-        raise InputError(f"{count} rows for {problem.base.size} base parameters: record longer.")
+        raise InputError(
+            f"there are {count} rows for {problem.base.size} base parameters: record longer, or "
+            "leave out fewer rows."
+        )
     estimator = estimator or WeightedLeastSquares()
     estimate = estimator(problem)
     base, blocks = estimate.base, estimate.blocks

@@ -203,7 +203,7 @@ def _family(base: BaseParameters, robots: Sequence[Robot]) -> tuple[RobotFamily,
         alike = robot.parent == own.parent and robot.revolute == own.revolute
         if not alike or robot.tool is not None:
             raise InputError(
-                f"`{robot.name}` of `robots` must have the topology of `{own.name}`, no tool."
+                f"`{robot.name}` of `robots` must have the topology of `{own.name}`, and no tool."
             )
     first, *numbers = [np.asarray(ravel_pytree(_geometry(x))[0]) for x in (own, *robots)]
     varying = tuple(np.flatnonzero((np.array(numbers) != first).any(axis=0)).tolist())

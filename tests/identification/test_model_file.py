@@ -108,6 +108,8 @@ def test_an_estimator_with_functions_is_kept_in_words(fit, tmp_path):
         (lambda d: d.update(format="arm"), "is no model file"),
         (lambda d: d.pop("model"), "damaged"),
         (lambda d: d.update(checksum="sha256:0"), "changed by hand"),
+        (lambda d: d["model"]["parameters"]["float64"].append(1.0), "shape"),
+        (lambda d: d["model"].update(parameters={"float64": ["inf"] * 14}), "`parameters`"),
         (lambda d: d["model"].update(extra=1), "other keys: .*'extra'"),
         (lambda d: d["model"].pop("base"), "other keys: .*'base'"),
         (lambda d: d["model"].update(kind="BaseParameters"), "not known"),
