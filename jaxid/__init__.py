@@ -10,13 +10,13 @@ import typing as _typing
 
 if _typing.TYPE_CHECKING:
     from jaxid.api import *  # noqa: F403
-    from jaxid.report import plot as plot
+    from jaxid.report import public_figures as plot  # noqa: F401
 else:
 
     def __getattr__(name):
         """Load the public names when one of them is first used, and matplotlib for `plot`."""
         if name == "plot":
-            return _importlib.import_module("jaxid.report.plot")
+            return _importlib.import_module("jaxid.report.public_figures")
         if not name.startswith("_"):
             api = vars(_importlib.import_module("jaxid.api"))
             globals().update({k: v for k, v in api.items() if not k.startswith("_")})

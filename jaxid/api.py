@@ -19,26 +19,26 @@ from .dynamics.terms import (
 from .errors import InputError as InputError
 from .excitation import constraints as constraints, criteria as criteria
 from .excitation.design import design_excitation as design_excitation
-from .excitation.plan import ExcitationPlan as ExcitationPlan
+from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
 from .export.c_code import export_c as export_c
 from .export.simulators import export_mjcf as export_mjcf, export_urdf as export_urdf
 from .identification import (
     consistency as consistency,
-    devices as devices,
     estimators as estimators,
+    many_processes as devices,  # noqa: F401
     uncertainty as uncertainty,
-)
-from .identification.choices import (
-    choose_filter as choose_filter,
-    essential_parameters as essential_parameters,
 )
 from .identification.combination import update as update
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from .identification.delay import estimate_delay as estimate_delay
 from .identification.drive_gains import identify_drive_gains as identify_drive_gains
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
-from .identification.fit import Fit as Fit, load as load
+from .identification.filter_and_parameter_selection import (
+    choose_filter as choose_filter,
+    essential_parameters as essential_parameters,
+)
+from .identification.fit_result import Fit as Fit, load as load
 from .identification.identify import identify as identify
 from .identification.many_data_sets import identify_batch as identify_batch
 from .identification.nonlinear_friction import (
@@ -66,7 +66,7 @@ from .robot import (
     collision as collision,
     library as robots,  # noqa: F401
 )
-from .robot.kinematics import inverse_kinematics as inverse_kinematics
+from .robot.forward_and_inverse_kinematics import inverse_kinematics as inverse_kinematics
 from .robot.library import from_dh as from_dh
 from .robot.limits_and_drives import Drives as Drives, Limits as Limits
 from .robot.robot import Robot as Robot, Tool as Tool

@@ -7,9 +7,9 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.dispatch import in_numpy
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit_result import Fit
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.table import Column, Remark, Status, Table, percent, significant
+from jaxid.result_table import Column, Remark, Status, Table, percent, significant
 
 POSES = 2000
 """Random poses in which the mass matrix is evaluated."""

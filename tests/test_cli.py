@@ -277,7 +277,7 @@ def test_after_a_failure_nothing_is_half_written(folder, first, run, monkeypatch
 
 def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch):
     monkeypatch.setattr(
-        "jaxid.experiment.session.validate", lambda *_, **__: np.zeros(3) + np.zeros(4)
+        "jaxid.experiment.identify_logs.validate", lambda *_, **__: np.zeros(3) + np.zeros(4)
     )
     monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
     with pytest.raises(ValueError, match="broadcast"):

@@ -32,7 +32,7 @@ from jaxid.experiment.excitation import (
 from jaxid.experiment.excitation_tables import Excitation, Leads
 from jaxid.experiment.experiment import load_experiment
 from jaxid.report.excitation import plan_remarks
-from jaxid.table import Status
+from jaxid.result_table import Status
 from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.fourier import FourierBasis, fourier_series
 from jaxid.trajectory.leads import LeadsBasis

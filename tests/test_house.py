@@ -14,7 +14,7 @@ import pytest
 import typer.main
 
 import jaxid
-import jaxid.cli
+import jaxid.cli.app
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = sorted((ROOT / "jaxid").rglob("*.py"))
@@ -169,7 +169,7 @@ def test_ci_runs_what_the_readme_promises():
 
 
 def test_commands_in_the_readme_exist():
-    group = typer.main.get_command(jaxid.cli.app)
+    group = typer.main.get_command(jaxid.cli.app.app)
     named = re.findall(r"\bjaxid (?!_)([a-z]+)\b", "\n".join(_commands()))
     assert named
     assert set(named) <= set(group.commands), sorted(set(named) - set(group.commands))

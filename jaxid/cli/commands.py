@@ -11,7 +11,7 @@ from rich.text import Text
 
 from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
-from jaxid.experiment import session
+from jaxid.experiment import identify_logs
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
@@ -19,7 +19,7 @@ from jaxid.export.c_code import export_c
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
 from jaxid.export.torque_program import export_jax
 from jaxid.identification.drive_gains import identify_drive_gains
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import identify as estimate
 from jaxid.identification.operating_states import identify_states
 from jaxid.identification.parameter_changes import compare as compare_fits
@@ -29,8 +29,8 @@ from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import Report, body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import read_fit, write_comparison, write_estimates, write_report
+from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
-from jaxid.table import Remark, Status, Table, significant
 
 from .options import command_line, open_console
 
@@ -43,12 +43,12 @@ UNLIKELY = 0.01
 def inspect(console: Console, path: Path, logs: list[Path]) -> None:
     """Show what can be identified, and if logs are sane."""
     experiment, examined = load_experiment(path), []
-    with session.stages(open_console(stderr=True)) as stage:
+    with identify_logs.stages(open_console(stderr=True)) as stage:
         stage("finding base parameters")
         _ = experiment.base.expressions
-        experiment, _ = session.select_filter(experiment, logs, stage)
+        experiment, _ = identify_logs.select_filter(experiment, logs, stage)
         for log in logs:
-            _, observations, diagnosis = session.load_log(experiment, log, stage)
+            _, observations, diagnosis = identify_logs.load_log(experiment, log, stage)
             stage(f"factorising {log.name}")
             estimator = experiment.estimation.plain
             fit = estimate(experiment.base, observations, estimator, stage.through)
@@ -91,8 +91,8 @@ def identify(
     """Estimate the parameters and write a report."""
     _check_logs(logs, verify, split)
     experiment = load_experiment(path)
-    with session.stages(open_console(stderr=True)) as stage:
-        result = session.identify_logs(experiment, logs, verify, split, stage)
+    with identify_logs.stages(open_console(stderr=True)) as stage:
+        result = identify_logs.identify_logs(experiment, logs, verify, split, stage)
         stage("writing the report")
         settings = {
             "experiment": str(path),
@@ -148,7 +148,7 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
     if resume and not state.exists():
         show_remarks(console, _doubts([f"`{state}` is not there: the design begins anew"]))
     try:
-        with session.stages(errors) as stage:
+        with identify_logs.stages(errors) as stage:
             design = design_motion(experiment, stage.design, state, resume)
     except KeyboardInterrupt:
         cure = "start again, and give it more time"
@@ -164,7 +164,7 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
     show_remarks(console, ordered((*plan_remarks(design.plan), *design.remarks)))
     show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in written])
     if all_criteria and not design.plan.interrupted:
-        with session.stages(errors) as stage:
+        with identify_logs.stages(errors) as stage:
             plans = compare_criteria(experiment, stage.design)
         if plans:
             show(console, side_by_side_table(plans))
@@ -276,8 +276,8 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
         raise InputError(
             "give one log or report for each of two or more states, with different names."
         )
-    with session.stages(open_console(stderr=True)) as stage:
-        runs, doubts = session.read_runs(experiment, [[log] for log in logs], names, stage)
+    with identify_logs.stages(open_console(stderr=True)) as stage:
+        runs, doubts = identify_logs.read_runs(experiment, [[log] for log in logs], names, stage)
     found = identify_states(runs)
     chance = found.sharing[1]
     content = {
@@ -309,8 +309,8 @@ def _pair(
         raise InputError(
             f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
         )
-    with session.stages(open_console(stderr=True)) as stage:
-        return session.read_runs(experiment, [logs, loaded], ["unloaded", "loaded"], stage)
+    with identify_logs.stages(open_console(stderr=True)) as stage:
+        return identify_logs.read_runs(experiment, [logs, loaded], ["unloaded", "loaded"], stage)
 
 
 def _show_lines(console: Console, text: str, lines: list[str]) -> None:

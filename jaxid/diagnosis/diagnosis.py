@@ -20,15 +20,15 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.delay import estimate_delay
 from jaxid.identification.estimators import GivenWeights
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit_result import Fit
 from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import AT_ONCE, SamplesOnDisk
 from jaxid.measurement.recording import FEWEST, Recording, consecutive
+from jaxid.result_table import MISSING, Column, Remark, Status, Table, significant
 from jaxid.robot.robot import Robot
-from jaxid.table import MISSING, Column, Remark, Status, Table, significant
 
-from .findings import (
+from .checks_without_model import (
     LogStatistics,
     channel_findings,
     limit_findings,

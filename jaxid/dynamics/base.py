@@ -13,8 +13,9 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, as_array
 from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
-from jaxid.table import MISSING, Column, Remark, Status, Table
+from jaxid.result_table import MISSING, Column, Remark, Status, Table
 
+from .closed_form_coefficients import ClosedForms, closed_forms
 from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion
@@ -26,7 +27,6 @@ from .rank import (
     regrouping,
     singular_values,
 )
-from .symbolic_base_parameters import ClosedForms, closed_forms
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 

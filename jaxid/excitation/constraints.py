@@ -18,7 +18,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
 from jaxid.robot.collision import CollisionModel
-from jaxid.robot.kinematics import tip_placement
+from jaxid.robot.forward_and_inverse_kinematics import tip_placement
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import complete_limits
 

@@ -16,7 +16,7 @@ from jaxid.trajectory.trajectory import AbstractBasis
 
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
-from .plan import ExcitationPlan
+from .design_result import ExcitationPlan
 from .problem import ExcitationProblem
 from .search import Search
 

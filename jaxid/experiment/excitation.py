@@ -13,12 +13,12 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, ForceLimits, TipLimits
 from jaxid.excitation.criteria import CRITERIA, information
 from jaxid.excitation.design import DesignProgress, design_excitation
-from jaxid.excitation.plan import ExcitationPlan
+from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.excitation.problem import assumed_noise
 from jaxid.io import atomic_folder
 from jaxid.report.excitation import write_excitation
 from jaxid.report.result_files import read_fit
-from jaxid.table import Remark, Status
+from jaxid.result_table import Remark, Status
 from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
 from jaxid.trajectory.leads import with_leads
 from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle

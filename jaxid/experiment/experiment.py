@@ -15,10 +15,13 @@ from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
-from jaxid.identification.choices import FilterCandidate, essential_parameters
 from jaxid.identification.consistency import BodyBounds
 from jaxid.identification.estimators import NonlinearFriction
-from jaxid.identification.fit import Fit
+from jaxid.identification.filter_and_parameter_selection import (
+    FilterCandidate,
+    essential_parameters,
+)
+from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.nonlinear_friction import identify_nonlinear
 from jaxid.identification.problem import RegressionProblem
@@ -33,7 +36,7 @@ from jaxid.robot.robot import Robot, Tool
 from .decoder import call, check_names, within
 from .estimator_table import Estimation, build_estimation, decode_estimator
 from .excitation_tables import Collision, Excitation
-from .method_tables import (
+from .model_and_log_tables import (
     FILTERS,
     Effects,
     Logs,

@@ -25,7 +25,7 @@ from jaxid.robot.urdf import load_urdf
 from .decoder import Key, keys_of
 from .estimator_table import KINDS
 from .experiment import TABLES
-from .method_tables import CUTOFF, FILTERS, SIDES, DryFriction
+from .model_and_log_tables import CUTOFF, FILTERS, SIDES, DryFriction
 from .robot_tables import known_load
 
 WIDTH, COLUMN = 100, 38

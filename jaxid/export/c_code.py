@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import Float
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit_result import Fit
 from jaxid.io import atomic_folder
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c import CWriter

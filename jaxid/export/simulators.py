@@ -11,7 +11,7 @@ from jaxid.arrays import AnyArray, Float, Joints, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit_result import Fit
 from jaxid.io import json_text, write_bytes, write_text
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot

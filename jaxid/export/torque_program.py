@@ -26,7 +26,7 @@ from jaxid.arrays import AnyArray, Float, Joints, double_precision
 from jaxid.dynamics import projection_equation
 from jaxid.dynamics.model import Model
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
-from jaxid.identification.fit import Fit
+from jaxid.identification.fit_result import Fit
 from jaxid.io import write_bytes
 from jaxid.program import Program, lower, trace
 from jaxid.robot.robot import Robot

@@ -18,7 +18,7 @@ from jaxid.errors import InputError
 from .estimators import GivenWeights, WeightedLeastSquares
 from .estimators.solutions_and_weights import Decomposition
 from .factors import Blocks
-from .fit import Fit
+from .fit_result import Fit
 from .identify import fit_problem
 from .problem import RegressionProblem
 from .uncertainty import Uncertainty

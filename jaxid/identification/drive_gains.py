@@ -13,13 +13,13 @@ from scipy import optimize
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
+from jaxid.result_table import Table
 from jaxid.robot.robot import Tool
-from jaxid.table import Table
 
 from .combination import as_least_squares, combine, require_same_base
 from .estimators.solutions_and_weights import NUMERICAL, Decomposition
 from .factors import Factors
-from .fit import Fit, interval_table
+from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
 from .payload import body_columns
 from .uncertainty import Uncertainty

@@ -20,7 +20,7 @@ from .estimators.solutions_and_weights import (
     undetermined,
 )
 from .factors import Factors
-from .fit import ConditionNumbers, Fit
+from .fit_result import ConditionNumbers, Fit
 from .problem import RegressionProblem
 from .uncertainty.result import AbstractUncertainty
 from .uncertainty.spectral import SpectralSandwich

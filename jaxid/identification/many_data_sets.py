@@ -27,7 +27,7 @@ from jaxid.robot.robot import Robot
 
 from .batch_solver import BatchFit, DataSets, solve
 from .estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
-from .fit import Fit
+from .fit_result import Fit
 from .identify import identify
 from .uncertainty import IndependentRows
 

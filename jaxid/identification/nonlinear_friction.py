@@ -15,15 +15,15 @@ from jaxid.dynamics.terms import AbstractTerm, TemperatureScaled
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, Progress
 
-from .estimators.friction import (
+from .estimators.solutions_and_weights import Decomposition
+from .estimators.variable_projection import (
     NonlinearFriction,
     SeparableProblem,
     Shapes,
     project,
     search_shapes,
 )
-from .estimators.solutions_and_weights import Decomposition
-from .fit import Fit
+from .fit_result import Fit
 from .identify import fit_problem
 from .problem import RegressionProblem
 

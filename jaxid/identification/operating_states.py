@@ -10,7 +10,7 @@ from jaxid.arrays import AnyArray, Bool, Float, Int
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
-from jaxid.table import Table
+from jaxid.result_table import Table
 
 from .combination import (
     as_least_squares,
@@ -18,7 +18,7 @@ from .combination import (
     replace_estimates,
     require_same_base,
 )
-from .fit import Fit, interval_table
+from .fit_result import Fit, interval_table
 from .parameter_changes import LEVEL, Comparison, compare_some, joint_test
 from .uncertainty import Uncertainty
 

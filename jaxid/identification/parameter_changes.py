@@ -11,10 +11,10 @@ from scipy import special
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.table import Column, Status, Table, significant, with_deviations
+from jaxid.result_table import Column, Status, Table, significant, with_deviations
 
 from .combination import require_same_base
-from .fit import Fit
+from .fit_result import Fit
 from .uncertainty import Uncertainty
 
 LEVEL = 0.95

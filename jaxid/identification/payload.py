@@ -10,13 +10,13 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
+from jaxid.result_table import Remark, Status, Table
 from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
 from jaxid.robot.robot import Tool
-from jaxid.table import Remark, Status, Table
 
 from .combination import as_least_squares, combine, require_same_base
 from .consistency import BodyBounds, consistency_margin, consistent_body
-from .fit import Fit, interval_table
+from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
 from .uncertainty import Uncertainty
 

@@ -5,7 +5,8 @@ and merge equal expressions; the remaining sequence of operations is a `Program`
 JAX, `evaluate` in NumPy, `to_python` on single floats; `c.CWriter` writes it in C.
 """
 
-from .evaluation import (
+from .jax_sincos import sine_cosine as sine_cosine
+from .numpy_evaluation import (
     evaluate as evaluate,
     evaluate_packed as evaluate_packed,
     to_python as to_python,
@@ -15,7 +16,6 @@ from .program import (
     Program as Program,
     select_outputs as select_outputs,
 )
-from .sincos import sine_cosine as sine_cosine
 from .trace import FREE as FREE, trace as trace
 from .xla import (
     Lowered as Lowered,

@@ -15,9 +15,9 @@ import numpy as np
 
 from jaxid.errors import InputError
 
+from .jax_sincos import DOUBLE, SINGLE, half_pi
 from .program import Program, Reference
 from .scalar import Operation
-from .sincos import DOUBLE, SINGLE, half_pi
 
 _LIBRARY = {
     "sine_cosine": (Operation.SINE, Operation.COSINE),

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from jaxid.arrays import AnyArray, Array
 from jaxid.errors import InputError
 
+from .jax_sincos import sine_cosine
 from .program import Program
 from .scalar import Operation
-from .sincos import sine_cosine
 
 ELEMENTWISE: dict[Operation, Callable] = {
     o: getattr(jnp, o.numpy.__name__) for o in Operation if o is not Operation.INPUT

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import double_precision
-from jaxid.excitation.plan import VAGUE, ExcitationPlan
+from jaxid.excitation.design_result import VAGUE, ExcitationPlan
 from jaxid.io import atomic_folder
-from jaxid.table import Column, Remark, Status, Table, significant
+from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .motion import joint_figure, path_figure, pose_figure, tip_figure

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxid.identification.choices import FilterChoice
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.estimators.solutions_and_weights import LARGEST_UNCERTAINTY
-from jaxid.identification.fit import Fit
+from jaxid.identification.filter_and_parameter_selection import FilterChoice
+from jaxid.identification.fit_result import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.model_validation import Definiteness, TorqueErrors
-from jaxid.robot.robot import Robot
-from jaxid.table import (
+from jaxid.result_table import (
     Column,
     Remark,
     Status,
@@ -23,6 +22,7 @@ from jaxid.table import (
     significant,
     with_deviations,
 )
+from jaxid.robot.robot import Robot
 
 from .page import provenance, render_page
 

@@ -18,7 +18,7 @@ from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints import tip_motion
 from jaxid.robot.collision import GROUND, CollisionModel
-from jaxid.robot.kinematics import placements, tip_placement
+from jaxid.robot.forward_and_inverse_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 

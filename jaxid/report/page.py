@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.table import Remark, Status, Table
+from jaxid.result_table import Remark, Status, Table
 
 from .style import svg_text
 

@@ -16,14 +16,14 @@ from matplotlib.figure import Figure
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 from jaxid.identification.estimators.solutions_and_weights import LARGEST_UNCERTAINTY
-from jaxid.identification.fit import Fit, load
+from jaxid.identification.fit_result import Fit, load
 from jaxid.identification.parameter_changes import LEVEL, Comparison, parameter_kinds
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.model_validation import TorqueErrors
 from jaxid.robot.robot import Robot
 
-from .fit import (
+from .estimates_and_residuals import (
     autocorrelation_figure,
     comparison_figure,
     filter_figure,

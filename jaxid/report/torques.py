@@ -11,8 +11,8 @@ from matplotlib.ticker import MaxNLocator
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 from jaxid.model_validation import TorqueErrors
+from jaxid.result_table import percent, shortened, significant
 from jaxid.robot.robot import Robot
-from jaxid.table import percent, shortened, significant
 
 from .style import (
     BLUE,

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from jaxid.arrays import AnyArray, Array, Float, Hashable, Numbers, double_precision
 from jaxid.errors import InputError
 
-from .kinematics import placements
+from .forward_and_inverse_kinematics import placements
 from .robot import Robot
 from .rotations import SNAP_TOLERANCE, rpy_rotation
 from .shapes import (

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.table import Column, Table
+from jaxid.result_table import Column, Table
 
 from .inertia import Inertia
 from .limits_and_drives import FARTHEST, Drives, Limits, far_notes, limit_notes

@@ -1,6 +1,7 @@
 """Virtual robots: experiments whose truth is known, on our own physics or on MuJoCo."""
 
-from .disturbances import (
+from .example import virtual_panda as virtual_panda, write_example as write_example
+from .friction_and_disturbances import (
     AbstractDisturbance as AbstractDisturbance,
     AbstractGearFriction as AbstractGearFriction,
     CableForce as CableForce,
@@ -9,7 +10,6 @@ from .disturbances import (
     SmoothFriction as SmoothFriction,
     TorqueRipple as TorqueRipple,
 )
-from .example import virtual_panda as virtual_panda, write_example as write_example
 from .mechanics import (
     FlexibleGear as FlexibleGear,
     RigidGear as RigidGear,

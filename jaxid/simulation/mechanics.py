@@ -15,7 +15,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.program import to_python
 
-from .disturbances import AbstractDisturbance, AbstractGearFriction
+from .friction_and_disturbances import AbstractDisturbance, AbstractGearFriction
 
 
 class RigidGear(Hashable):

@@ -18,17 +18,17 @@ from .leads import (
     WithLeads as WithLeads,
     with_leads as with_leads,
 )
-from .spline import (
-    PiecewisePolynomial as PiecewisePolynomial,
-    RestToRestSplineBasis as RestToRestSplineBasis,
-    spline_through as spline_through,
-)
-from .tip_path import (
+from .prescribed_tip_path import (
     Circle as Circle,
     Line as Line,
     TipPath as TipPath,
     iso9283_path as iso9283_path,
     joint_path as joint_path,
+)
+from .spline import (
+    PiecewisePolynomial as PiecewisePolynomial,
+    RestToRestSplineBasis as RestToRestSplineBasis,
+    spline_through as spline_through,
 )
 from .trajectory import (
     AbstractBasis as AbstractBasis,

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxid.diagnosis.findings import channel_findings, stuck_findings, unit_findings
+from jaxid.diagnosis.checks_without_model import channel_findings, stuck_findings, unit_findings
 from jaxid.measurement.recording import Recording
 from jaxid.robot.library import panda, planar_arm
 from jaxid.robot.limits_and_drives import Drives

@@ -21,7 +21,7 @@ import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 import jaxid as jid
 from virtual import observations, standard_parameters
-from jaxid.identification.devices import factorise_across_processes
+from jaxid.identification.many_processes import factorise_across_processes
 
 if len(sys.argv) > 3:
     # Before anything else: making a robot may already start JAX.

@@ -6,7 +6,7 @@ from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.identification.estimators.solutions_and_weights import Decomposition
-from jaxid.table import Status
+from jaxid.result_table import Status
 
 PLAIN = jid.estimators.LeastSquares()
 

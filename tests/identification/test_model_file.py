@@ -12,7 +12,7 @@ import pytest
 from virtual import observations, planar_base, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.fit import checksum_of
+from jaxid.identification.fit_result import checksum_of
 from jaxid.io import from_json, to_json
 
 

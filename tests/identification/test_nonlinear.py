@@ -8,7 +8,7 @@ import virtual
 
 import jaxid as jid
 from jaxid.identification.estimators import NonlinearFriction
-from jaxid.identification.estimators.friction import (
+from jaxid.identification.estimators.variable_projection import (
     SeparableProblem,
     project,
     search_shapes,

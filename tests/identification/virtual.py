@@ -7,7 +7,7 @@ import numpy as np
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.factors import Blocks
-from jaxid.identification.fit import ConditionNumbers
+from jaxid.identification.fit_result import ConditionNumbers
 from jaxid.identification.uncertainty import Uncertainty
 
 

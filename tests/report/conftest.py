@@ -9,7 +9,7 @@ import jaxid as jid
 from jaxid.model_validation import TorqueErrors
 from jaxid.report.identification import Report
 from jaxid.report.result_files import write_report
-from jaxid.simulation.disturbances import SmoothFriction
+from jaxid.simulation.friction_and_disturbances import SmoothFriction
 from jaxid.simulation.virtual import Sensors, random_bodies
 
 

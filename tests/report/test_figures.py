@@ -12,7 +12,7 @@ from PIL import Image
 
 import jaxid as jid
 from jaxid.identification.uncertainty import ResidualSpectra
-from jaxid.report.fit import autocorrelation
+from jaxid.report.estimates_and_residuals import autocorrelation
 from jaxid.report.style import BLUE, ERROR, GREY, MEASURED, ORANGE, PREDICTED
 from jaxid.report.torques import decimate
 

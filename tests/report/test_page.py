@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import jaxid as jid
 from jaxid.report.identification import Report, verdict
 from jaxid.report.page import code, folded, picture, render_page
-from jaxid.table import Column, Remark, Status, Table
+from jaxid.result_table import Column, Remark, Status, Table
 
 EVIL = "<script>alert('&\"')</script>"  # as in conftest.py
 

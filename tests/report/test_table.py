@@ -8,7 +8,7 @@ from rich.console import Console
 
 from jaxid.report.identification import body_table
 from jaxid.report.page import show
-from jaxid.table import (
+from jaxid.result_table import (
     MISSING,
     Column,
     Remark,

@@ -8,7 +8,7 @@ from jax import numpy as jnp
 from scipy.spatial.transform import Rotation
 
 from jaxid.robot import library
-from jaxid.robot.kinematics import (
+from jaxid.robot.forward_and_inverse_kinematics import (
     inverse_kinematics,
     inverse_kinematics_along,
     placements,

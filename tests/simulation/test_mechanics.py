@@ -10,7 +10,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import RigidBodies, RotorInertia
 from jaxid.robot import library
 from jaxid.robot.robot import Robot
-from jaxid.simulation.disturbances import LuGreFriction, SmoothFriction
+from jaxid.simulation.friction_and_disturbances import LuGreFriction, SmoothFriction
 from jaxid.simulation.mechanics import (
     DriveTrain,
     FlexibleGear,

@@ -7,7 +7,7 @@ import jaxid as jid
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import ConstantOffset, RigidBodies, RotorInertia
 from jaxid.robot import library
-from jaxid.simulation.disturbances import SmoothFriction
+from jaxid.simulation.friction_and_disturbances import SmoothFriction
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
 from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series

@@ -6,8 +6,8 @@ import pytest
 
 from jaxid.excitation.constraints import tip_motion
 from jaxid.robot import library
-from jaxid.robot.kinematics import tip_placement
-from jaxid.trajectory.tip_path import iso9283_path, joint_path
+from jaxid.robot.forward_and_inverse_kinematics import tip_placement
+from jaxid.trajectory.prescribed_tip_path import iso9283_path, joint_path
 
 ROBOT = library.tx90l_on_rail()
 DOWN = np.diag([1.0, -1.0, -1.0])

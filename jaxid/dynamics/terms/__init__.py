@@ -1,5 +1,11 @@
 """Terms of a model: effects in the equations of motion that are linear in unknown parameters."""
 
+from .bodies_rotors_springs import (
+    ConstantOffset as ConstantOffset,
+    LinearSpring as LinearSpring,
+    RigidBodies as RigidBodies,
+    RotorInertia as RotorInertia,
+)
 from .friction import (
     AbstractTransition as AbstractTransition,
     AsymmetricCoulombFriction as AsymmetricCoulombFriction,
@@ -14,11 +20,4 @@ from .friction import (
     TemperatureScaled as TemperatureScaled,
     ViscousFriction as ViscousFriction,
 )
-from .term import (
-    AbstractTerm as AbstractTerm,
-    ConstantOffset as ConstantOffset,
-    LinearSpring as LinearSpring,
-    NonlinearParameter as NonlinearParameter,
-    RigidBodies as RigidBodies,
-    RotorInertia as RotorInertia,
-)
+from .term import AbstractTerm as AbstractTerm, NonlinearParameter as NonlinearParameter

@@ -6,7 +6,6 @@ from .estimate import (
     Estimate as Estimate,
     EstimatorInWords as EstimatorInWords,
 )
-from .friction import NonlinearFriction as NonlinearFriction
 from .least_squares import (
     AbstractLoss as AbstractLoss,
     GeneralisedLeastSquares as GeneralisedLeastSquares,
@@ -30,3 +29,4 @@ from .solutions_and_weights import (
     Ridge as Ridge,
     Truncated as Truncated,
 )
+from .variable_projection import NonlinearFriction as NonlinearFriction

@@ -15,7 +15,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.io import from_json, json_text, read_json, to_json, write_text
 from jaxid.measurement.observations import Observations
-from jaxid.table import Column, Remark, Status, Table, percent, significant, with_deviations
+from jaxid.result_table import Column, Remark, Status, Table, percent, significant, with_deviations
 
 from .estimators.estimate import AbstractEstimator, EstimatorInWords
 from .estimators.solutions_and_weights import (

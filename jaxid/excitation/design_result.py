@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.table import MISSING, Column, Remark, Status, Table, percent, significant
+from jaxid.result_table import MISSING, Column, Remark, Status, Table, percent, significant
 from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.trajectory import LinearTrajectory
 

@@ -11,13 +11,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.signal import fftconvolve
 
 from jaxid.arrays import Float
-from jaxid.identification.choices import FilterChoice
-from jaxid.identification.fit import DOUBTFUL, TRUSTED, Fit
+from jaxid.identification.filter_and_parameter_selection import FilterChoice
+from jaxid.identification.fit_result import DOUBTFUL, TRUSTED, Fit
 from jaxid.identification.parameter_changes import Comparison, Verdict
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.model_validation import TorqueErrors
+from jaxid.result_table import Status, percent, shortened, significant, with_deviations
 from jaxid.robot.robot import Robot
-from jaxid.table import Status, percent, shortened, significant, with_deviations
 
 from .style import (
     BLUE,

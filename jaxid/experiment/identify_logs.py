@@ -14,10 +14,10 @@ from jaxid.diagnosis import Diagnosis, diagnose
 from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
-from jaxid.identification.choices import FilterChoice, choose_filter
 from jaxid.identification.combination import require_same_base, share_rows, update
 from jaxid.identification.estimators import Complete
-from jaxid.identification.fit import Fit
+from jaxid.identification.filter_and_parameter_selection import FilterChoice, choose_filter
+from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.observations import Observations

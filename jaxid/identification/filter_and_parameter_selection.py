@@ -21,7 +21,7 @@ from jaxid.measurement.recording import Recording
 
 from .estimators import AbstractEstimator, WeightedLeastSquares
 from .estimators.solutions_and_weights import Decomposition
-from .fit import Fit
+from .fit_result import Fit
 from .identify import fit_problem, naive_covariance
 from .problem import RegressionProblem, cross_validation_folds
 from .uncertainty import AbstractUncertainty

@@ -6,7 +6,7 @@ The figures of the paper: `path` (Figs. 3, 8), `joints` (Fig. 4), `filtered` (Fi
 `jaxid` loads this module, and matplotlib, when `jid.plot` is first used.
 """
 
-from .fit import (
+from .estimates_and_residuals import (
     autocorrelation_figure as autocorrelation,
     comparison_figure as comparison,
     filter_figure as filter_choice,

@@ -1,0 +1,320 @@
+"""The command line `jaxid`: names, options and help of the commands.
+
+Their work is imported when they run, so that `jaxid --help` answers at once.
+"""
+
+import io
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.text import Text
+
+from jaxid.errors import InputError
+
+from . import options
+
+app = typer.Typer(
+    name="jaxid",
+    help="Identifies the dynamic parameters of robots: from a log to a model.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+ENDINGS = {"mjcf": ".xml", "pinocchio": "_pinocchio.json"}
+"""Endings of exported models where they are not the name of the format."""
+
+
+def main() -> None:
+    """Run a command; an error of a user is one sentence on stderr, with exit code 2."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals know few characters
+        sys.stdout.reconfigure(errors="replace")
+    try:
+        options.require_one_log_per_option()
+        app()
+    except (InputError, OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
+            raise  # of JAX, not a failed search
+        said = Text(f"jaxid: {options.describe_error(error)}")
+        options.open_console(stderr=True).print(said, soft_wrap=True)
+        raise SystemExit(2) from None
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        from jaxid.report.page import versions
+
+        typer.echo(f"jaxid {versions()['jaxid']}")
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    output: options.OutputFolder = Path("demo"),
+    seed: options.Seed = 0,
+    force: options.Force = False,
+) -> None:
+    """Do the whole paper on a virtual TX90L on its rail.
+
+    Base parameters, optimal excitation, measurement cold and warm, identification, verification on
+    the path of ISO 9283, and how well the path is followed with and without the model.
+    """
+    from jaxid.demo.results import remarks, tables, write_study
+    from jaxid.demo.study import run_study
+    from jaxid.experiment.identify_logs import stages
+    from jaxid.report.page import show, show_remarks
+
+    console = options.start(output, force)
+    with stages(options.open_console(stderr=True)) as stage:
+
+        def progress(name: str, fraction: float) -> None:
+            if fraction == 0.0:
+                stage(name)
+            stage.through(fraction)
+
+        study = run_study(seed, progress)
+        stage("writing the report")
+        files = write_study(output, study)
+    show(console, *tables(study))
+    show_remarks(console, remarks(study))
+    console.print()
+    console.print(Text(f"the report: {files[0]}"), soft_wrap=True)
+
+
+@app.command()
+def example(
+    folder: Annotated[Path, typer.Argument(help="Folder of the files.", metavar="DIR")],
+    seed: options.Seed = 0,
+) -> None:
+    """Write an experiment to try things on.
+
+    An experiment file and two logs of a virtual robot whose parameters are known.
+    """
+    from jaxid.simulation.example import write_example
+
+    console = options.start()
+    for file in write_example(folder, seed=seed):
+        console.print(Text(f"wrote {file}"), soft_wrap=True)
+    words = f"now: jaxid identify {folder}/experiment.toml {folder}/identification.csv "
+    words += f"--verify {folder}/verification.csv -o {folder}/report"
+    console.print(Text(words), soft_wrap=True)
+
+
+@app.command()
+def init(
+    urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.", metavar="ARM.URDF")],
+    tip: options.Tip = None,
+    base: options.Base = None,
+) -> None:
+    """Print a commented experiment file for a robot.
+
+    Like this: jaxid init arm.urdf > experiment.toml
+    """
+    from jaxid.experiment.template import write_template
+
+    options.start()
+    text = write_template(urdf, tip=tip, base=base)
+    typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
+
+
+@app.command()
+def excite(
+    experiment: options.ExperimentFile,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
+    ] = Path("trajectory.csv"),
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on where a design was stopped.")
+    ] = False,
+    all_criteria: Annotated[
+        bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
+    ] = False,
+) -> None:
+    """Design the motion to record, within the limits of the joints.
+
+    Beside the table lie the trajectory itself (.json), the same for ROS (.ros.yaml), pictures of
+    joints and end-effector in a folder, and the state of the design until it is done. Ctrl-C keeps
+    the best motion so far.
+    """
+    from . import commands
+
+    console = options.start()
+    options.refuse_foreign_table(output)
+    commands.excite(console, experiment, output, resume, all_criteria)
+
+
+@app.command()
+def inspect(
+    experiment: options.ExperimentFile,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(help="Logs to examine.", metavar="LOG")
+    ] = None,
+) -> None:
+    """Show what can be identified, and if logs are sane.
+
+    Joints, motors and limits; base parameters and what becomes of each standard parameter; ranges,
+    speeds and forces of each log beside the limits, and what the log does not determine.
+    """
+    from . import commands
+
+    commands.inspect(options.start(), experiment, logs or [])
+
+
+@app.command()
+def identify(
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    verify: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="LOG", help="A log that the fit does not see; may be repeated."),
+    ] = None,
+    split: Annotated[
+        float | None,
+        typer.Option(
+            metavar="F", help="Fit the first fraction F (0-1) of each log, validate with the rest."
+        ),
+    ] = None,
+    output: options.OutputFolder = Path("report"),
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write the figures as PDF too, for papers.")
+    ] = False,
+    force: options.Force = False,
+) -> None:
+    """Estimate the parameters and write a report.
+
+    A page for the browser, with figures and a verdict; the same numbers for programs.
+    """
+    from . import commands
+
+    console = options.start(output, force)
+    commands.identify(console, experiment, logs, verify or [], split, output, pdf)
+
+
+@app.command()
+def export(
+    report: Annotated[
+        Path, typer.Argument(help="Report, or a model file (.json).", metavar="REPORT")
+    ],
+    to: Annotated[
+        Literal["c", "urdf", "mjcf", "json", "pinocchio", "jax"],
+        typer.Option("--to", help="What to write."),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE", help="The file; by default `arm`."),
+    ] = None,
+    urdf: Annotated[
+        Path | None, typer.Option(metavar="ARM.URDF", help="The robot's file, for `--to urdf`.")
+    ] = None,
+    tip: options.Tip = None,
+    base: options.Base = None,
+    single: Annotated[
+        bool, typer.Option("--float", help="C that computes in single precision.")
+    ] = False,
+    force: options.Force = False,
+) -> None:
+    """Write an identified model as C, URDF, MJCF, JSON, vectors, or a JAX function.
+
+    C is a feed-forward for controllers: one file and its header, named like the output.
+    """
+    from . import commands
+
+    console = options.start()
+    path = Path(f"arm{ENDINGS.get(to, f'.{to}')}") if output is None else output
+    made = [path, path.with_suffix(".h")] if to == "c" else [path]
+    if to == "c" and path.suffix != ".c":
+        raise InputError(f"`--output` must be a C file like arm.c, but is `{path}`.")
+    for one in made:
+        if one.is_dir():
+            raise InputError(f"`{one}` is a folder: choose another `--output`.")
+        if one.exists() and not force:
+            raise InputError(f"`{one}` is there already: choose another `--output`, or `--force`.")
+    chain = {"tip": tip, "base": base}
+    commands.export(report, to, path, urdf, chain, double=not single)
+    console.print()
+    console.print(Text(f"wrote {path.parent}: {', '.join(x.name for x in made)}"))
+
+
+@app.command()
+def compare(
+    first: Annotated[
+        Path, typer.Argument(help="Report of one run, like that of the cold robot.", metavar="COLD")
+    ],
+    second: Annotated[
+        Path, typer.Argument(help="Report of another run of the same robot.", metavar="WARM")
+    ],
+    level: Annotated[
+        float, typer.Option("--level", metavar="L", help="Confidence of the decisions (0-1).")
+    ] = 0.95,
+    output: options.OutputFolder = Path("comparison"),
+    force: options.Force = False,
+) -> None:
+    """Decide which parameters have changed between two runs.
+
+    Each argument is a folder that `jaxid identify` has written.
+    """
+    from . import commands
+
+    console = options.start(output, force)
+    if first.resolve() == second.resolve():
+        raise InputError(f"`{first}` is given twice: compare two different runs.")
+    commands.compare(console, (first, second), level, output)
+
+
+@app.command()
+def payload(
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    loaded: options.Loaded,
+    body: Annotated[
+        str | None, typer.Option(metavar="JOINT", help="The joint that moves the payload.")
+    ] = None,
+    output: options.OutputFolder = Path("payload"),
+    force: options.Force = False,
+) -> None:
+    """Find a payload's mass, centre of mass and moments of inertia.
+
+    From logs without it and logs with it. Friction may differ between them.
+    """
+    from . import commands
+
+    commands.payload(options.start(output, force), experiment, logs, loaded, body, output)
+
+
+@app.command()
+def gains(
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    loaded: options.Loaded,
+    output: options.OutputFolder = Path("gains"),
+    force: options.Force = False,
+) -> None:
+    """Find the drives' true forces, like torque constants, with a load that is known.
+
+    From logs without it and logs with it; the table `[load]` of the experiment file describes it.
+    """
+    from . import commands
+
+    commands.gains(options.start(output, force), experiment, logs, loaded, output)
+
+
+@app.command()
+def states(
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    output: options.OutputFolder = Path("states"),
+    force: options.Force = False,
+) -> None:
+    """Fit several states of a robot at once: one inertia, friction for each.
+
+    One log or report for each, like cold and warm. Friction and offsets are each state's own,
+    all else is shared.
+    """
+    from . import commands
+
+    commands.states(options.start(output, force), experiment, logs, output)
