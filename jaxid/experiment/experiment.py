@@ -187,7 +187,7 @@ class Experiment:
     def _columns_of(self, log: Path) -> Columns:
         if self.columns is None:
             raise InputError(
-                f"{self.path.name}: the table `[recording]` is missing, which names the columns of "
+                f"{self.path.name}: the table `[recording]` is missing: it names the columns of "
                 f"`{log.name}`."
             )
         return self.columns
