@@ -42,7 +42,7 @@ from jaxid.dynamics.projection_equation import (
 )  # private: Eq. 38 as the paper forms M
 from jaxid.export.torque_program import body_parameters, torque_program  # private: counts, timing
 from jaxid.program import trace  # private: other forms of the same torques
-from jaxid.program.c import CWriter  # private: C of other forms
+from jaxid.program.c_writer import CWriter  # private: C of other forms
 from jaxid.program.scalar import Operation  # private: number of angles
 
 FLAGS = {"O2": ["-O2"], "O3": ["-O3", "-march=native"]}

@@ -61,7 +61,7 @@ from .measurement.observations import Observations as Observations, observe as o
 from .measurement.reading import read_recording as read_recording, scan_log as scan_log
 from .measurement.recording import Recording as Recording
 from .model_validation import validate as validate
-from .program.cache import keep_compiled as keep_compiled
+from .program.jax_compilation_cache import keep_compiled as keep_compiled
 from .robot import (
     collision as collision,
     library as robots,  # noqa: F401

@@ -23,7 +23,7 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment.decoder import check_names, decode
 from jaxid.experiment.experiment import TABLES
 from jaxid.experiment.model_and_log_tables import FILTERS, SIDES
-from jaxid.identification.estimators.solutions_and_weights import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
 from jaxid.identification.fit_result import DOUBTFUL, TRUSTED
 from jaxid.model_validation import POSES
 from jaxid.report.identification import LARGE_CONDITION, MEAN_ERROR, RMS_ERROR, UNSEEN_RATIO

@@ -67,7 +67,7 @@ def start(output: Path | None = None, force: bool = False) -> Console:
     import jax
 
     from jaxid.io import require_writable
-    from jaxid.program.cache import keep_compiled
+    from jaxid.program.jax_compilation_cache import keep_compiled
     from jaxid.report.result_files import SCHEMAS, schema_of
 
     jax.config.update("jax_enable_x64", True)

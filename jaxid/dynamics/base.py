@@ -15,7 +15,7 @@ from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
 from jaxid.result_table import MISSING, Column, Remark, Status, Table
 
-from .closed_form_coefficients import ClosedForms, closed_forms
+from .base_parameter_closed_forms import ClosedForms, closed_forms
 from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion

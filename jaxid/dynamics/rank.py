@@ -14,8 +14,8 @@ import scipy.linalg
 
 from jaxid.arrays import AnyArray, Float
 
+from .base_parameter_expressions import length_power
 from .dispatch import in_numpy
-from .expressions import length_power
 from .model import Model
 from .motion import Motion
 

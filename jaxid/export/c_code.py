@@ -11,7 +11,7 @@ from jaxid.arrays import Float
 from jaxid.identification.fit_result import Fit
 from jaxid.io import atomic_folder
 from jaxid.program import Program, evaluate, trace
-from jaxid.program.c import CWriter
+from jaxid.program.c_writer import CWriter
 
 from .torque_program import other_forces, torques
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxid.errors import InputError
 
 from .estimators import GivenWeights, WeightedLeastSquares
-from .estimators.solutions_and_weights import Decomposition
+from .estimators.regularisation_and_weights import Decomposition
 from .factors import Blocks
 from .fit_result import Fit
 from .identify import fit_problem

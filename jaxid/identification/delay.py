@@ -16,7 +16,7 @@ from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import require_finite_delay
 
 from .estimators import AbstractWeights, MaximumForces
-from .estimators.solutions_and_weights import Decomposition
+from .estimators.regularisation_and_weights import Decomposition
 from .factors import Blocks, RowChunk
 from .parameter_changes import joint_test
 from .problem import RegressionProblem

@@ -17,7 +17,7 @@ from jaxid.result_table import Table
 from jaxid.robot.robot import Tool
 
 from .combination import as_least_squares, combine, require_same_base
-from .estimators.solutions_and_weights import NUMERICAL, Decomposition
+from .estimators.regularisation_and_weights import NUMERICAL, Decomposition
 from .factors import Factors
 from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters

@@ -20,7 +20,7 @@ from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.recording import Recording
 
 from .estimators import AbstractEstimator, WeightedLeastSquares
-from .estimators.solutions_and_weights import Decomposition
+from .estimators.regularisation_and_weights import Decomposition
 from .fit_result import Fit
 from .identify import fit_problem, naive_covariance
 from .problem import RegressionProblem, cross_validation_folds

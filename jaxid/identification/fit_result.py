@@ -18,7 +18,7 @@ from jaxid.measurement.observations import Observations
 from jaxid.result_table import Column, Remark, Status, Table, percent, significant, with_deviations
 
 from .estimators.estimate import AbstractEstimator, EstimatorInWords
-from .estimators.solutions_and_weights import (
+from .estimators.regularisation_and_weights import (
     LARGEST_UNCERTAINTY,
     AbstractSpectralSolution,
     Complete,

@@ -13,7 +13,7 @@ from jaxid.measurement.observations import Observations, Progress
 
 from .estimators.estimate import AbstractEstimator
 from .estimators.least_squares import WeightedLeastSquares
-from .estimators.solutions_and_weights import (
+from .estimators.regularisation_and_weights import (
     NUMERICAL,
     AbstractSpectralSolution,
     Decomposition,

@@ -15,7 +15,7 @@ from jaxid.dynamics.terms import AbstractTerm, TemperatureScaled
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, Progress
 
-from .estimators.solutions_and_weights import Decomposition
+from .estimators.regularisation_and_weights import Decomposition
 from .estimators.variable_projection import (
     NonlinearFriction,
     SeparableProblem,

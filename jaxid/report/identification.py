@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.identification.consistency.estimator import Consistency
-from jaxid.identification.estimators.solutions_and_weights import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
 from jaxid.identification.filter_and_parameter_selection import FilterChoice
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.uncertainty import ResidualSpectra

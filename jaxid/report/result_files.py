@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
-from jaxid.identification.estimators.solutions_and_weights import LARGEST_UNCERTAINTY
+from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
 from jaxid.identification.fit_result import Fit, load
 from jaxid.identification.parameter_changes import LEVEL, Comparison, parameter_kinds
 from jaxid.identification.uncertainty import Uncertainty

@@ -8,7 +8,7 @@ import pytest
 from trees import mixed_tree, random_tree
 
 from jaxid.dynamics.base import BaseParameters, base_parameters
-from jaxid.dynamics.expressions import (
+from jaxid.dynamics.base_parameter_expressions import (
     Coefficient,
     Dimension,
     Expression,

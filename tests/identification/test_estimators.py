@@ -10,7 +10,7 @@ from scipy import optimize
 from virtual import dense, observations, planar_base, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.estimators.solutions_and_weights import Decomposition
+from jaxid.identification.estimators.regularisation_and_weights import Decomposition
 from jaxid.identification.factors import Factors
 from jaxid.trajectory.trajectory import AbstractTrajectory
 

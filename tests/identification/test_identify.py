@@ -5,7 +5,7 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.identification.estimators.solutions_and_weights import Decomposition
+from jaxid.identification.estimators.regularisation_and_weights import Decomposition
 from jaxid.result_table import Status
 
 PLAIN = jid.estimators.LeastSquares()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxid.identification.estimators.solutions_and_weights import Decomposition
+from jaxid.identification.estimators.regularisation_and_weights import Decomposition
 from jaxid.identification.factors import empty_factors
 
 

@@ -14,7 +14,7 @@ from sample_functions import SIZE, every_operation, random_functions, samples
 
 from jaxid.errors import InputError
 from jaxid.program import evaluate, trace
-from jaxid.program.c import CWriter
+from jaxid.program.c_writer import CWriter
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
 HEAD = "#include <float.h>\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n"

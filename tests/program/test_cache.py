@@ -9,13 +9,13 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxid.program import cache
-from jaxid.program.cache import keep_compiled
+from jaxid.program import jax_compilation_cache as cache
+from jaxid.program.jax_compilation_cache import keep_compiled
 
 SCRIPT = """
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
-from jaxid.program.cache import keep_compiled
+from jaxid.program.jax_compilation_cache import keep_compiled
 print(keep_compiled())
 hits = []
 jax.monitoring.register_event_listener(lambda name, **_: hits.append(name))

@@ -17,7 +17,7 @@ from .least_squares import (
     Tukey as Tukey,
     WeightedLeastSquares as WeightedLeastSquares,
 )
-from .solutions_and_weights import (
+from .regularisation_and_weights import (
     AbstractSolution as AbstractSolution,
     AbstractSpectralSolution as AbstractSpectralSolution,
     AbstractWeights as AbstractWeights,

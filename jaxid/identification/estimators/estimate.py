@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 
 from ..factors import Blocks, RowChunk
 from ..problem import RegressionProblem
-from .solutions_and_weights import (
+from .regularisation_and_weights import (
     AbstractSolution,
     AbstractSpectralSolution,
     Complete,

@@ -24,7 +24,7 @@ from .estimate import (
     Influence,
     weighted_joints,
 )
-from .solutions_and_weights import (
+from .regularisation_and_weights import (
     NUMERICAL,
     AbstractSolution,
     AbstractWeights,

@@ -30,7 +30,7 @@ from ..factors import Blocks, Factors, JointFactor, RowChunk
 from ..problem import RegressionProblem
 from .estimate import AbstractEstimator
 from .least_squares import WeightedLeastSquares
-from .solutions_and_weights import Decomposition
+from .regularisation_and_weights import Decomposition
 
 
 class NonlinearFriction(AbstractEstimator):

@@ -10,7 +10,7 @@ from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, require_float64
 from jaxid.errors import InputError
 
 from ..estimators.estimate import Estimate
-from ..estimators.solutions_and_weights import Decomposition
+from ..estimators.regularisation_and_weights import Decomposition
 from ..factors import Blocks
 from .result import AbstractUncertainty, Uncertainty
 

@@ -23,7 +23,7 @@ from jaxid.program import FREE, evaluate, trace
 from jaxid.robot.inertia import AXES
 from jaxid.robot.robot import Robot
 
-from .expressions import Coefficient, Dimension, Expression, Monomial, dimension
+from .base_parameter_expressions import Coefficient, Dimension, Expression, Monomial, dimension
 from .model import Model
 from .rank import (
     characteristic_length,
