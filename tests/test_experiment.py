@@ -182,35 +182,6 @@ asymmetric = true
     assert "Iam2" in hard.parameter_names
 
 
-def test_columns(load):
-    text = """
-[recording]
-angles = ["a", "b"]
-forces = [3, 4]
-velocities = "v{}"
-sample_time = 0.004
-angle_unit = "deg"
-velocity_unit = "rpm"
-force_unit = ["A", "mA"]
-torque_constants = [0.5, 0.6]
-angle_signs = [1, -1]
-force_signs = [-1, 1]
-angle_offsets = [0.1, 0]
-side = "motor"
-forces_side = "joint"
-"""
-    columns = load(ARM + text).columns
-    assert columns.angles == ("a", "b")
-    assert columns.forces == (3, 4)
-    assert columns.sample_time == 0.004
-    angles, velocities, forces = columns.to_si(np.ones((1, 2)), np.ones((1, 2)), np.ones((1, 2)))
-    np.testing.assert_allclose(angles[0], [np.pi / 180 + 0.1, -np.pi / 180])
-    np.testing.assert_allclose(velocities[0], [np.pi / 30, -np.pi / 30])
-    np.testing.assert_allclose(forces[0], [-0.5, 0.6e-3])
-    assert columns.angles_on_motor_side
-    assert not columns.forces_on_motor_side
-
-
 ESTIMATORS = {
     'kind = "least_squares"': jid.estimators.LeastSquares(),
     'kind = "least_squares"\nridge = "cross_validated"': jid.estimators.LeastSquares(

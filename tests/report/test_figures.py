@@ -65,22 +65,6 @@ def test_torques_show_what_was_measured_and_predicted(fit, validation):
     require_everything_inside(figure)
 
 
-def test_torques_of_some_joints_and_rows(errors_of):
-    errors, robot = errors_of(3), arm_of(3)
-    counted = np.ones((200, 3), bool)
-    counted[:30] = counted[190:] = counted[100:120, 0] = False
-    limits = np.array([np.nan, 50.0, 50.0])
-    errors = dataclasses.replace(errors, counted=counted, max_forces=limits)
-    figure = jid.plot.torques(errors, robot, joints=(2, 0))
-    uppers, lowers = figure.axes[::2], figure.axes[1::2]
-    assert [a.get_title(loc="left") for a in uppers] == [robot.joint_names[k] for k in (2, 0)]
-    assert ["%" in a.get_title(loc="right") for a in uppers] == [True, False]
-    np.testing.assert_array_equal(line(uppers[1], MEASURED).get_xdata(), errors.time[30:190])
-    drawn = np.isfinite(line(lowers[1], ERROR).get_ydata())
-    np.testing.assert_array_equal(drawn, counted[30:190, 0])
-    jid.plot.torques(errors_of(2, rows=1), arm_of(2)).canvas.draw()
-
-
 def test_long_names_fit_on_the_page(errors_of):
     joints = 3
     names = tuple(f"a_long_name_of_the_joint_number_{i}" for i in range(joints))
@@ -120,49 +104,6 @@ def test_bars_are_percents_of_the_largest_forces(errors_of):
     np.testing.assert_allclose(heights(figure, BLUE), 100 * first.mean / first.force_rms)
     assert figure.axes[0].get_ylabel() == "error [% of RMS force]"
     assert not heights(figure, ORANGE)
-
-
-def test_several_recordings_and_groups(errors_of):
-    long, short = errors_of(2, rows=300, seed=1), errors_of(2, rows=100, seed=2)
-    counted = np.ones((300, 2), bool)
-    counted[:200, 0] = False
-    long = dataclasses.replace(long, counted=counted)
-    groups = (("LS", (long, short)), ("WLS", (short,)), ("CAD", (long,)))
-    figure = jid.plot.bars(groups, arm_of(2))
-    expected = [
-        (100 * long.mean[0] + 100 * short.mean[0]) / 200 * 2.0,
-        (300 * long.mean[1] + 100 * short.mean[1]) / 400 * 2.0,
-    ]
-    np.testing.assert_allclose(heights(figure, BLUE), expected)
-    assert len({to_hex(b.get_facecolor()) for b in figure.axes[0].patches}) == 3
-
-
-def test_parameters_are_sorted_by_what_is_known_of_them(fit):
-    parameters = np.array(fit.parameters)
-    parameters[2] = 0.0
-    fit = dataclasses.replace(fit, parameters=parameters)
-    figure = jid.plot.parameters(fit)
-    names = [t.get_text() for axes in figure.axes for t in axes.get_yticklabels()]
-    order = np.argsort(fit.relative_standard_deviations, kind="stable")
-    assert names == [fit.base.names[k] for k in order]
-    assert figure.axes[0].texts[0].get_text().endswith(fit.base.units[order[0]])
-    points, arrows = (c.get_offsets() for c in figure.axes[0].collections[1:3])
-    assert len(points) == fit.base.size - 1
-    assert [x for x, _ in arrows] == [figure.axes[0].get_xlim()[1]]
-    assert names[-1] == fit.base.names[2]
-    require_everything_inside(figure)
-
-
-def test_the_comparison_shows_both_intervals(fit, changed):
-    figure = jid.plot.comparison(changed)
-    require_everything_inside(figure)
-    (axes,) = figure.axes
-    bold = [t.get_text() for t in axes.get_yticklabels() if t.get_fontweight() == "bold"]
-    assert bold == ["fv1"]
-    k = fit.base.names.index("fv1")
-    points = [c.get_offsets()[k, 0] for c in axes.collections if len(c.get_offsets()) > 1]
-    np.testing.assert_allclose(points[1] / points[0], 1 / 3, rtol=1e-12)
-    assert max(points) < 1.0
 
 
 def test_long_lines_keep_every_peak_and_their_ends_and_short_ones_all_points():
@@ -241,18 +182,6 @@ def test_the_animation_has_its_frames_and_its_time(motion, tmp_path):
     with Image.open(tmp_path / "arm.gif") as picture:
         assert picture.n_frames == 5
         assert picture.info["duration"] == pytest.approx(500.0, abs=10.0)
-
-
-def test_desired_and_filtered_motion_stand_in_one_panel(motion):
-    off = jid.Motion(motion.q, motion.qd + 0.1, motion.qdd - 0.2)
-    figure = jid.plot.filtered(arm_of(2), T, motion, off, 1)
-    for axes, wanted, found, said in (
-        (figure.axes[0], motion.qd, off.qd, "0.1 rad/s"),
-        (figure.axes[1], motion.qdd, off.qdd, "0.2 rad/s²"),
-    ):
-        np.testing.assert_array_equal(line(axes, MEASURED).get_ydata(), wanted[:, 1])
-        np.testing.assert_array_equal(line(axes, PREDICTED).get_ydata(), found[:, 1])
-        assert axes.get_title(loc="right") == f"RMS difference {said}"
 
 
 def test_autocorrelation_is_that_of_the_plain_formula(errors_of):

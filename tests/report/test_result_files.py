@@ -116,13 +116,6 @@ def test_values_that_are_not_finite_are_null(tmp_path, fit, validation, quick):
     assert set(same.verdicts) == {Verdict.UNKNOWN, Verdict.UNCHANGED}
 
 
-def test_the_model_can_be_used_again(written, fit):
-    model = load(written)["model"]
-    p = np.random.default_rng(0).standard_normal(fit.base.model.size)
-    again = p[model["independent"]] + np.array(model["kappa"]) @ p[model["dependent"]]
-    np.testing.assert_allclose(again, fit.base.from_standard(p), rtol=1e-14)
-
-
 def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, quick):
     for name in ("log.csv", "torque_mine.png"):
         (tmp_path / name).write_text("mine")

@@ -92,16 +92,6 @@ def test_the_terminal_shows_the_same_letters_in_colour():
     assert "\x1b[32m✓" in coloured.getvalue()
 
 
-def test_a_fit_shows_estimates_with_both_deviations(fit):
-    table = fit.summary()
-    for k, row in enumerate(table.rows):
-        numbers = [float(row[column]) for column in (2, 3, -2, -1)]
-        assert abs(numbers[0] - fit.parameters[k]) <= 0.5 * fit.standard_deviations[k]
-        naive, ratio = fit.naive_standard_deviations[k], fit.uncertainty.ratios[k]
-        expected = [fit.standard_deviations[k], naive, ratio]
-        np.testing.assert_allclose(numbers[1:], expected, rtol=0.06)
-
-
 def test_bodies_show_their_margins_and_the_active_bounds(consistent):
     robot = consistent.base.model.robot
     table = body_table(consistent.consistency, robot.joint_names)
