@@ -4,7 +4,7 @@ import enum
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
 from jaxid.result_table import MISSING, Column, Remark, Status, Table
 
-from .base_parameter_closed_forms import ClosedForms, closed_forms
 from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion
@@ -27,6 +26,12 @@ from .rank import (
     regrouping,
     singular_values,
 )
+
+if TYPE_CHECKING:
+    from .base_parameter_closed_forms import ClosedForms
+else:
+    # Closed forms are loaded where they are used.
+    ClosedForms = Any
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
@@ -81,6 +86,8 @@ class BaseParameters(Hashable):
     @functools.cached_property
     def closed_forms(self) -> ClosedForms:
         """Base parameters in letters, computed when they are first needed (Eq. 24)."""
+        from .base_parameter_closed_forms import closed_forms
+
         return closed_forms(self.model, self.indices, self.dependent, np.asarray(self.kappa))
 
     @property

@@ -66,7 +66,7 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[np.ndarray, Uncert
     for one, other in itertools.combinations(fits, 2):
         if share_rows(one.time_blocks, other.time_blocks):
             names = f"`{one.name}` and `{other.name}`"
-            raise InputError(f"{names} have seen the same data: give each log once.")
+            raise InputError(f"{names} have seen the same data, which would count twice.")
     offsets = offsets or [np.zeros(fit.base.size) for fit in fits]
     factors, rows = [fit.factor for fit in fits], []
     for (R, z), E, c in zip(factors, maps, offsets, strict=True):
