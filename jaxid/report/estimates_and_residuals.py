@@ -97,6 +97,8 @@ def _list_panels(
     columns = math.ceil(len(order) / 40)
     rows = math.ceil(len(order) / columns)
     figure.set_size_inches(max(7.5, WIDTH / 2 * columns), margin + line * rows)
+    # Texts are wider at the resolution of files than at that of the layout.
+    figure.set_layout_engine("constrained", w_pad=0.16)
     grid = figure.add_gridspec(1, columns, wspace=0.06)
     for column in range(columns):
         axes = figure.add_subplot(grid[column])
