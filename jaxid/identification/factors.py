@@ -197,7 +197,7 @@ class Blocks(eqx.Module):
         """The factors of all rows."""
         return functools.reduce(operator.add, self.parts)
 
-    def select(self, chosen: Iterable[int]) -> "Blocks":
+    def select(self, chosen: Iterable[int | np.integer]) -> "Blocks":
         """Return some of the blocks."""
         return Blocks(tuple(self.parts[k] for k in chosen))
 
