@@ -37,9 +37,7 @@ import numpy as np
 import timing
 
 import jaxid as jid
-from jaxid.dynamics.projection_equation import (
-    partial_velocities,
-)  # private: Eq. 38 as the paper forms M
+from jaxid.dynamics.projection_equation import partial_velocities  # private: Eq. 38
 from jaxid.export.torque_program import body_parameters, torque_program  # private: counts, timing
 from jaxid.program import trace  # private: other forms of the same torques
 from jaxid.program.c_writer import CWriter  # private: C of other forms

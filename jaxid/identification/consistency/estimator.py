@@ -46,7 +46,7 @@ UNPROVED = (
     "the search ended before its error bound fell below its tolerance: widen the bounds, or pass "
     "`throw=False` to accept the estimate with its error bound."
 )
-"""What a user reads where the optimum was not proved."""
+"""Error message where the optimum was not proved."""
 
 
 class Consistency(eqx.Module):
