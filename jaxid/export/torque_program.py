@@ -60,7 +60,7 @@ class Description:
     def forces(self, q: AnyArray, qd: AnyArray, qdd: AnyArray) -> Joints:
         """Return the generalised forces of the bodies at one sample [N m or N] (Eq. 11)."""
         scale = np.where(self.robot.revolute, 1.0, 1.0 / self.unit)
-        p = inertial_parameters(self.bodies)
+        p = inertial_parameters(_with_44_bits(self.bodies))
         motion = (scale * q + self.turned, scale * qd, scale * qdd)
         return scale * projection_equation.rigid_body_forces(self.robot, p, *motion)
 
@@ -159,6 +159,12 @@ def _distances(robot: Robot, body: int) -> Iterator[float]:
 def _without_rounding(x: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Set to zero what cancels up to rounding, compared with the largest entry before."""
     return np.where(np.abs(x) < 1e-13 * np.abs(before).max(), 0.0, x)
+
+
+def _with_44_bits(x: np.ndarray) -> np.ndarray:
+    """Round numbers so that their sums and differences are exact, and equal ones are found equal."""
+    mantissa, exponent = np.frexp(x)
+    return np.ldexp(np.round(mantissa * 2.0**44), exponent - 44)
 
 
 def body_parameters(
