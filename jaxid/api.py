@@ -3,6 +3,7 @@
 from . import (
     simulation as simulation,
     trajectory as trajectories,  # noqa: F401
+    units as units,
 )
 from .diagnosis import diagnose as diagnose
 from .dynamics import terms as terms
@@ -50,7 +51,7 @@ from .identification.parameter_changes import compare as compare
 from .identification.payload import identify_payload as identify_payload
 from .identification.problem import RegressionProblem as RegressionProblem
 from .identification.uncertainty.blocks import bootstrap as bootstrap
-from .measurement import filters as filters, units as units
+from .measurement import filters as filters
 from .measurement.columns import Columns as Columns
 from .measurement.filters import (
     Decimation as Decimation,

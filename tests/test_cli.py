@@ -318,7 +318,7 @@ def test_long_logs_give_what_short_ones_give(folder, words, monkeypatch, kind, c
     monkeypatch.setattr("jaxid.experiment.experiment.LONG", 500)
     monkeypatch.setattr("jaxid.experiment.experiment.read_recording", None)
     if compiled_rows:
-        monkeypatch.setattr("jaxid.identification.long_logs.LONG", 500)
+        monkeypatch.setattr("jaxid.RegressionProblem.compiled_samples", 500)
     words("identify", *arguments, "-o", "long")
     short, long = (result(folder, name) for name in ("short", "long"))
     for key in ("rows", "recordings"):

@@ -22,8 +22,9 @@ from jaxid.arrays import Float
 from jaxid.program import FREE, evaluate, trace
 from jaxid.robot.inertia import AXES
 from jaxid.robot.robot import Robot
+from jaxid.units import Dimension, dimension
 
-from .base_parameter_expressions import Coefficient, Dimension, Expression, Monomial, dimension
+from .base_parameter_expressions import Coefficient, Expression, Monomial
 from .model import Model
 from .rank import (
     characteristic_length,

@@ -1,4 +1,4 @@
-"""Expressions of base parameters in letters, `mx2 + l2x*m3 - l2x*mz4/l3z`, and units (Eq. 24).
+"""Expressions of base parameters in letters, `mx2 + l2x*m3 - l2x*mz4/l3z` (Eq. 24).
 
 An expression is a sum of standard parameters; the coefficient of each is a short sum of products of
 lengths, or a number where there is no short form.
@@ -7,9 +7,6 @@ lengths, or a number where there is no short form.
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple
-
-import numpy as np
 
 Number = Fraction | float
 Powers = tuple[tuple[str, int], ...]
@@ -131,43 +128,3 @@ def _sum(parts: list[tuple[bool, str]]) -> str:
         sign = ("-" if negative else "") if not text else (" - " if negative else " + ")
         text += sign + part
     return text
-
-
-class Dimension(NamedTuple):
-    """Exponents of kilogram, metre and second in a unit."""
-
-    kilogram: int
-    metre: int
-    second: int
-
-
-_KNOWN = {
-    "1": Dimension(0, 0, 0),
-    "rad": Dimension(0, 0, 0),
-    "kg": Dimension(1, 0, 0),
-    "m": Dimension(0, 1, 0),
-    "s": Dimension(0, 0, 1),
-    "N": Dimension(1, 1, -2),
-    "J": Dimension(1, 2, -2),
-    "W": Dimension(1, 2, -3),
-}
-_SUPERSCRIPTS = {"²": 2, "³": 3, "⁴": 4}
-
-
-def dimension(unit: str) -> Dimension | None:
-    """Return the dimension of a unit such as `N m s/rad`, or None if it is not known."""
-    total = np.zeros(3, int)
-    for position, part in enumerate(unit.split("/")):
-        for factor in part.replace("(", " ").replace(")", " ").split():
-            power = _SUPERSCRIPTS.get(factor[-1], 1)
-            name = factor[:-1] if factor[-1] in _SUPERSCRIPTS else factor
-            if name not in _KNOWN:
-                return None
-            total += (power if position == 0 else -power) * np.array(_KNOWN[name])
-    return Dimension(*(int(x) for x in total))
-
-
-def length_power(unit: str) -> int:
-    """Return the power of length in a unit: 2 in kg m² and in N m; 0 if it is not known."""
-    found = dimension(unit)
-    return 0 if found is None else found.metre

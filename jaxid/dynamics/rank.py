@@ -13,8 +13,8 @@ import numpy as np
 import scipy.linalg
 
 from jaxid.arrays import AnyArray, Float
+from jaxid.units import length_power
 
-from .base_parameter_expressions import length_power
 from .dispatch import in_numpy
 from .model import Model
 from .motion import Motion

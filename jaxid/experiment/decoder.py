@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.io import union_members
-from jaxid.measurement.units import Unit, unit
+from jaxid.units import Unit, unit
 
 RENAMED = {"rows.slow": "min_speed", "rows.every": "step"}
 """Old keys and their new names."""

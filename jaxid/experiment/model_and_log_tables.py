@@ -11,9 +11,9 @@ from jaxid.dynamics import terms
 from jaxid.errors import InputError
 from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.units import Unit
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
+from jaxid.units import Unit
 
 from .decoder import (
     Bounds,

@@ -18,9 +18,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from jaxid.io import union_members
-from jaxid.measurement.units import Unit
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
+from jaxid.units import Unit
 
 from .decoder import Key, keys_of
 from .estimator_table import KINDS

@@ -162,7 +162,7 @@ def _without_rounding(x: np.ndarray, before: np.ndarray) -> np.ndarray:
 
 
 def _with_44_bits(x: np.ndarray) -> np.ndarray:
-    """Round numbers so that their sums and differences are exact, and equal ones are found equal."""
+    """Round numbers so that their sums are exact, and equal ones are found equal."""
     mantissa, exponent = np.frexp(x)
     return np.ldexp(np.round(mantissa * 2.0**44), exponent - 44)
 

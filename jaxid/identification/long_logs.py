@@ -28,8 +28,6 @@ from jaxid.program import Program, lower
 
 from .factors import Factors, JointFactor, divide_rows, row_chunks, without_tool
 
-LONG = 100_000
-"""Samples from which compiling pays."""
 CHUNK = 2048
 """Samples of an iteration of the loop."""
 PIECE = 32768
@@ -44,9 +42,7 @@ Stage = tuple[np.ndarray, int]
 
 
 def suits(observations: Observations) -> bool:
-    """Return whether a log is long enough to compile for, and its filters are short enough."""
-    if observations.samples < LONG:
-        return False
+    """Return whether the filters of a log are short enough to compile for."""
     sizes = [(len(response), factor) for response, factor in _stages(observations)]
     # A filter is a matrix product of so many products for each row and column.
     cost = sum(lags / factor for lags, factor in sizes)

@@ -18,7 +18,6 @@ from .factors import (
     empty_factors,
     row_chunks,
 )
-from .long_logs import stream_blocks, suits
 
 Span = tuple[int, int, int]
 """Index of a recording, and the half-open range of some of its rows."""
@@ -46,6 +45,8 @@ class RegressionProblem:
     """Samples whose columns are evaluated at once."""
     cached_numbers = 2**26
     """Numbers (half a gigabyte) up to which columns are kept for the next pass."""
+    compiled_samples = 100_000
+    """Samples from which it pays to compile the pass over a recording."""
 
     def __init__(
         self,
@@ -77,16 +78,22 @@ class RegressionProblem:
         if self._given is not None:
             return self._given
         self.require_samples()
-        parts = []
-        for number, recording in enumerate(self.recordings):
-            edges, first = self._edges[number], self._first_block(number)
+        numbers = range(len(self.recordings))
+        return Blocks(tuple(part for number in numbers for part in self._blocks_of(number)))
+
+    def _blocks_of(self, number: int) -> Sequence[Factors]:
+        """Return the factors of a recording's blocks; for a long one the loop is compiled."""
+        recording, edges = self.recordings[number], self._edges[number]
+        if recording.samples >= self.compiled_samples:
+            from .long_logs import stream_blocks, suits
+
             if suits(recording):
                 report = functools.partial(self._report, number)
-                parts += stream_blocks(self.base, recording, edges, report)
-            else:
-                folded = self.fold(RowChunk.equations, chunks=self._chunks(number))
-                parts += folded.parts[first : first + len(edges) - 1]
-        return Blocks(tuple(parts))
+                return stream_blocks(self.base, recording, edges, report)
+
+        folded = self.fold(RowChunk.equations, chunks=self._chunks(number))
+        first = self._first_block(number)
+        return folded.parts[first : first + len(edges) - 1]
 
     @functools.cached_property
     def factors(self) -> Factors:

@@ -8,14 +8,14 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaxid import units
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
+from jaxid.units import Quantity, Unit
 
-from . import units
 from .filters import optional
 from .log_files import LogTable, Selection, open_table
 from .recording import positive_time
-from .units import Quantity, Unit
 
 Units = Unit | tuple[Unit, ...]
 """One unit for all joints, or one for each."""

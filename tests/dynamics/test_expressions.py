@@ -10,11 +10,8 @@ from trees import mixed_tree, random_tree
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.base_parameter_expressions import (
     Coefficient,
-    Dimension,
     Expression,
     Monomial,
-    dimension,
-    length_power,
 )
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import (
@@ -28,6 +25,7 @@ from jaxid.dynamics.terms import (
 )
 from jaxid.robot import library
 from jaxid.robot.robot import Robot
+from jaxid.units import Dimension, dimension, length_power
 
 DRIVES = (ViscousFriction(), CoulombFriction(), RotorInertia())
 SEVEN, TEN = RigidBodies(principal_axes=True), RigidBodies()

@@ -41,7 +41,7 @@ def write(fit):
 LONG = """
 assert len(jax.devices()) == 3
 from jaxid.identification import long_logs
-long_logs.LONG, long_logs.PIECE = 1000, 2048
+jid.RegressionProblem.compiled_samples, long_logs.PIECE = 1000, 2048
 smooth, shares = jid.ZeroPhaseButterworth(30.0), []
 o = observations(base.model, p, samples=20011, noise=0.3, filter=smooth, every=15)
 write(jid.identify(base, o, jid.estimators.LeastSquares(), progress=shares.append))
@@ -117,7 +117,7 @@ def base():
 
 def test_a_long_log_on_three_devices_without_asking(base, tmp_path, monkeypatch):
     process = start(LONG, tmp_path / "3.npz", flags="--xla_force_host_platform_device_count=3")
-    monkeypatch.setattr(long_logs, "LONG", 1000)
+    monkeypatch.setattr(jid.RegressionProblem, "compiled_samples", 1000)
     monkeypatch.setattr(long_logs, "PIECE", 2048)
     smooth, p = jid.ZeroPhaseButterworth(30.0), standard_parameters(base.model)
     o = observations(base.model, p, samples=20011, noise=0.3, filter=smooth, every=15)

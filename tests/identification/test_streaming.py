@@ -122,13 +122,12 @@ def test_a_prismatic_arm_against_a_dense_matrix():
 def test_long_logs_take_the_compiled_pass_by_themselves(base, monkeypatch):
     o = observed(base, mask=np.random.default_rng(3).random((6000, 2)) < 0.7)
     slow = jid.RegressionProblem(base, [o, o], divisions=5).blocks
-    monkeypatch.setattr(long_logs, "LONG", 5000)
+    monkeypatch.setattr(jid.RegressionProblem, "compiled_samples", 5000)
     quick = jid.RegressionProblem(base, [o, o], divisions=5).blocks
     distances = [distance(a, b) for a, b in zip(slow.parts, quick.parts, strict=True)]
     assert 0.0 < max(distances) < 1e-12
 
 
 def test_filters_with_a_long_memory_stay_in_numpy(base):
-    assert not long_logs.suits(observed(base, samples=long_logs.LONG, filter=SMOOTH))
-    assert long_logs.suits(observed(base, samples=long_logs.LONG, filter=SMOOTH, every=20))
-    assert not long_logs.suits(observed(base))
+    assert not long_logs.suits(observed(base, samples=100_000, filter=SMOOTH))
+    assert long_logs.suits(observed(base, samples=100_000, filter=SMOOTH, every=20))

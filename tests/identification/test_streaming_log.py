@@ -69,7 +69,7 @@ def agree(base, log, o):
 @pytest.mark.parametrize("long", [1000, 100_000])
 def test_parquet_compiled_and_in_numpy(base, parquet, monkeypatch, long):
     monkeypatch.setattr(jid.RegressionProblem, "samples_per_chunk", 3000)
-    monkeypatch.setattr(long_logs, "LONG", long)
+    monkeypatch.setattr(jid.RegressionProblem, "compiled_samples", long)
     monkeypatch.setattr(long_logs, "PIECE", 4096)
     log = scan_log(parquet, COLUMNS, base.model.robot, SMOOTH, EVERY)
     agree(base, log, in_memory(base, parquet, EVERY))

@@ -9,10 +9,10 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
-from jaxid.measurement import units
+from jaxid import units
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.reading import read_recording
-from jaxid.measurement.units import Quantity, Unit
+from jaxid.units import Quantity, Unit
 
 COLUMNS = Columns(angles="q{}", forces="tau{}", velocities="dq{}", time="t")
 PLAIN = Columns(angles="q{}", forces="tau{}", time="t")
