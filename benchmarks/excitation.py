@@ -193,7 +193,7 @@ def constrained(part, keys, options):
         if part.startswith("capsules"):
             found["clearance"] = float(np.min(shapes.clearance(robot, m.q)))
         if part == "rest":
-            ends = evaluation.motion(t)[[0, -1]]
+            ends = evaluation.motion(t)[np.array([0, -1])]
             found["speed at ends"] = float(np.abs(ends.qd[0]).max())
         if part in ("forces", "free"):
             model = bases[0].model
