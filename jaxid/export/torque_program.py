@@ -51,7 +51,11 @@ class Description:
     @property
     def cost(self) -> int:
         """Estimate of the operations: numbers that are not zero, weighted by experience."""
-        lengths = np.abs(np.asarray(self.robot.offset))
+        robot, turning = self.robot, np.zeros(self.robot.joints, bool)
+        for i, parent in enumerate(robot.parent):
+            turning[i] = parent >= 0 and (robot.revolute[parent] or turning[parent])
+        # A length counts only in a frame that turns.
+        lengths = np.abs(np.asarray(robot.offset))[turning]
         present = lengths > 1e-12
         ones = np.abs(lengths - 1.0) < 1e-12
         frames = 4 * present.any(axis=1).sum() + 6 * present.sum() - 3 * ones.sum()
