@@ -62,7 +62,7 @@ class CollisionModel(Hashable):
         robot: Robot,
         capsules: Sequence[Capsule],
         obstacles: Sequence[HalfSpace | Box] = (),
-        pairs: Sequence[tuple[str, str]] | None = None,
+        pairs: Sequence[Sequence[str]] | None = None,
     ):
         self.capsules = tuple(capsules)
         self.obstacles = tuple(obstacles)
@@ -170,7 +170,7 @@ def _meeting_pairs(
     ]
 
 
-def _indices(names: list[str], capsules: int, pair: tuple[str, str]) -> tuple[int, int]:
+def _indices(names: list[str], capsules: int, pair: Sequence[str]) -> tuple[int, int]:
     for name in pair:
         if name not in names:
             raise InputError(
