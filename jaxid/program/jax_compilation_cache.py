@@ -8,6 +8,8 @@ from pathlib import Path
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from jaxid.errors import InputError
+
 VARIABLE = "JAXID_CACHE_DIR"
 """Environment variable that names the folder of the cache, or turns the cache off."""
 MAX_BYTES = 2**28
@@ -18,15 +20,19 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
     """Store compiled functions on disk, where the next process finds them.
 
     The commands call it; call it first in a notebook. A cache that JAX was given otherwise
-    (`JAX_COMPILATION_CACHE_DIR`) stays in use. The least recently used functions are removed when
-    the folder holds more than 256 MiB.
+    (`JAX_COMPILATION_CACHE_DIR`) stays in use. Functions lie in a folder of their own, which only
+    its owner can read or write, for JAX runs what it finds there. The least recently used ones are
+    removed when they take more than 256 MiB; no other file is ever touched.
 
     Args:
-        folder: Folder of the cache. If None, the one in the environment variable
+        folder: Folder above that of the cache. If None, the one in the environment variable
             `JAXID_CACHE_DIR` (`off` turns the cache off), or `jaxid` in the user's cache folder.
 
     Returns:
         Folder in use; None if the cache is off or nothing can be written there.
+
+    Raises:
+        InputError: If the folder belongs to somebody else, or others can write to it.
     """
     present = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     if folder is None and present:
@@ -35,9 +41,11 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
     turned_off = variable is not None and variable.strip().lower() in ("", "0", "off", "none")
     if folder is None and turned_off:
         return None
-    place = Path(folder or variable or user_cache()).expanduser().absolute()
+    above = Path(folder or variable or user_cache()).expanduser().absolute()
+    place = above / "compiled"
     try:
-        place.mkdir(parents=True, exist_ok=True)
+        _require_private(above)
+        _require_private(place)
         _remove_oldest(place, MAX_BYTES)
     except OSError:
         return None
@@ -63,10 +71,24 @@ def user_cache() -> Path:
     return (xdg if xdg.is_absolute() else home / ".cache") / "jaxid"
 
 
+def _require_private(folder: Path) -> None:
+    """Check that a folder is the user's own; make it and those above it if they are missing."""
+    for path in reversed([folder, *folder.parents]):
+        with contextlib.suppress(FileExistsError):
+            path.mkdir()
+            path.chmod(0o700)
+    status = folder.stat()
+    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
+        raise InputError(
+            f"`{folder}` belongs to somebody else, or others can write to it, but code from there "
+            f"is run: give {VARIABLE} a folder of your own, or turn the cache off with `off`."
+        )
+
+
 def _remove_oldest(folder: Path, max_bytes: int) -> None:
     """Remove the least recently used files; other processes may do so at the same time."""
     files = []
-    for path in folder.iterdir():
+    for path in folder.glob("*-cache"):
         with contextlib.suppress(FileNotFoundError):
             status = path.stat()
             if path.is_file():

@@ -1,6 +1,7 @@
 """Compiled functions that one process stores are found by the next."""
 
 import os
+import stat
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from pathlib import Path
 import jax
 import pytest
 
+from jaxid.errors import InputError
 from jaxid.program import jax_compilation_cache as cache
 from jaxid.program.jax_compilation_cache import keep_compiled
 
@@ -61,22 +63,22 @@ def run(folder):
 
 
 def test_the_second_process_compiles_nothing(tmp_path):
-    folder = tmp_path / "deep" / "cache"
-    where, hits, misses = run(folder)
+    folder = tmp_path / "deep" / "cache" / "compiled"
+    where, hits, misses = run(folder.parent)
     assert (where, hits) == (str(folder), 0)
     assert misses > 0
     stored = {f.name for f in folder.glob("*-cache")}
     assert stored
     # A busy machine may store a trivial function too, but nothing stored is compiled again.
-    assert run(folder)[1] >= len(stored)
+    assert run(folder.parent)[1] >= len(stored)
     assert stored <= {f.name for f in folder.iterdir()}
 
 
 def test_it_can_be_moved_and_turned_off(updates, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert keep_compiled() == tmp_path / "jaxid"
-    assert updates["jax_compilation_cache_dir"] == str(tmp_path / "jaxid")
-    assert keep_compiled(tmp_path / "other") == tmp_path / "other"
+    assert keep_compiled() == tmp_path / "jaxid" / "compiled"
+    assert updates["jax_compilation_cache_dir"] == str(tmp_path / "jaxid" / "compiled")
+    assert keep_compiled(tmp_path / "other") == tmp_path / "other" / "compiled"
     updates.clear()
     for off in ("", "0", "OFF", "none"):
         monkeypatch.setenv(cache.VARIABLE, off)
@@ -90,11 +92,35 @@ def test_it_can_be_moved_and_turned_off(updates, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("updates")
-def test_the_least_recently_used_go_first(tmp_path, monkeypatch):
+def test_the_least_recently_used_go_first_and_no_other_file(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "MAX_BYTES", 2500)
-    now = time.time()
-    for age, name in enumerate("edcba"):
-        (tmp_path / name).write_bytes(bytes(1000))
-        os.utime(tmp_path / name, (now - 1000 * age, now - 1000 * age))
+    place, now = keep_compiled(tmp_path), time.time()
+    others = [
+        folder / name for folder in (tmp_path, place) for name in ("thesis.tex", "-cache.zip")
+    ]
+    for age, path in enumerate([*others, *(place / f"{x}-cache" for x in "edcba")]):
+        path.write_bytes(bytes(1000))
+        os.utime(path, (now - 1000 * age, now - 1000 * age))
     keep_compiled(tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "e"]
+    assert sorted(p.name for p in place.glob("*-cache")) == ["d-cache", "e-cache"]
+    assert all(path.exists() for path in others)
+
+
+@pytest.mark.usefixtures("updates")
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="rights of POSIX")
+def test_only_its_owner_can_write_to_it(tmp_path, monkeypatch):
+    before = os.umask(0)
+    try:
+        place = keep_compiled(tmp_path / "deep" / "cache")
+    finally:
+        os.umask(before)
+    made = [place, *place.parents][:3]
+    assert [stat.S_IMODE(x.stat().st_mode) for x in made] == [0o700] * 3
+    for folder in made[:2]:
+        folder.chmod(0o770)
+        with pytest.raises(InputError, match="others can write to it"):
+            keep_compiled(tmp_path / "deep" / "cache")
+        folder.chmod(0o700)
+    monkeypatch.setattr(os, "getuid", lambda: place.stat().st_uid + 1)
+    with pytest.raises(InputError, match="belongs to somebody else"):
+        keep_compiled(tmp_path / "deep" / "cache")
