@@ -31,6 +31,13 @@ class Status(enum.Enum):
     NEUTRAL = "·"
 
 
+def printable(text: str) -> str:
+    """Return a text whose control and escape sequences are spelled out: no terminal obeys them."""
+    return "".join(
+        c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class Remark:
     """Sentence below a table, or on a page.
@@ -47,7 +54,8 @@ class Remark:
 
     def __post_init__(self) -> None:
         stop = "" if self.text.endswith((".", "?", "!")) else "."
-        object.__setattr__(self, "text", self.text + stop)
+        object.__setattr__(self, "text", printable(self.text + stop))
+        object.__setattr__(self, "detail", printable(self.detail))
 
 
 def significant(value: float, digits: int = 3) -> str:
@@ -119,7 +127,9 @@ class Column:
         listed = isinstance(self.values, list | tuple)
         values = self.values if listed else np.asarray(self.values).tolist()
         values = tuple(x.item() if isinstance(x, np.generic) else x for x in values)
+        values = tuple(printable(x) if isinstance(x, str) else x for x in values)
         object.__setattr__(self, "values", values)
+        object.__setattr__(self, "name", printable(self.name))
         if not self.kind:
             numeric = bool(values) and all(isinstance(x, int | float) for x in values)
             object.__setattr__(self, "kind", "number" if numeric else "text")
@@ -161,9 +171,9 @@ class Table:
         status: Sequence[Status] = (),
         rules: Iterable[int] = (),
     ):
-        self.title = title
+        self.title = printable(title)
         self.columns = columns
-        self.facts = tuple((word, str(text)) for word, text in facts)
+        self.facts = tuple((word, printable(str(text))) for word, text in facts)
         self.remarks = tuple(Remark(x) if isinstance(x, str) else x for x in remarks)
         self.status = tuple(status)
         self.rules = frozenset(rules)

@@ -15,6 +15,7 @@ from jaxid.experiment import identify_logs
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
+from jaxid.experiment.template import toml_text
 from jaxid.export.c_code import export_c
 from jaxid.export.simulators import export_mjcf, export_pinocchio, export_urdf
 from jaxid.export.torque_program import export_jax
@@ -226,7 +227,7 @@ def payload(
     inertia = ", ".join(f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper)
     lines = [
         "[robot.tool]",
-        f'body = "{name}"',
+        f"body = {toml_text(name)}",
         f"mass = {found.mass:.6g}",
         f"centre_of_mass = [{', '.join(f'{v:.6g}' for v in found.centre_of_mass)}]",
         f"inertia = {{ {inertia} }}",

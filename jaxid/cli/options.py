@@ -4,12 +4,14 @@ import errno
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 from jaxid.errors import InputError
+from jaxid.result_table import printable
 
 WIDTH = 100
 """Width of the output where there is no terminal."""
@@ -86,9 +88,19 @@ def start(output: Path | None = None, force: bool = False) -> Console:
     return open_console()
 
 
+class Terminal(Console):
+    """Terminal on which the names of files and joints cannot be control sequences."""
+
+    def print(self, *objects: Any, **arguments: Any) -> None:  # noqa: D102
+        for text in objects:
+            if isinstance(text, Text):
+                text.plain = printable(text.plain)
+        super().print(*objects, **arguments)
+
+
 def open_console(stderr: bool = False) -> Console:
     """Return the terminal, or a console of fixed width where there is none."""
-    console = Console(stderr=stderr, highlight=False)
+    console = Terminal(stderr=stderr, highlight=False)
     if not console.is_terminal and "COLUMNS" not in console._environ:
         console.width = WIDTH
     return console

@@ -135,7 +135,7 @@ def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
     needed = key.default is inspect.Parameter.empty
     if value is None and not (needed or (example and not active) or "=" in example):
         value = key.default
-    shown = _toml(value)
+    shown = toml_text(value)
     if shown is None:
         # An example of the right type: a value for each joint where a list is needed.
         active, option = False, union_members(key.hint)[0]
@@ -150,10 +150,10 @@ def _key(key: Key, joints: int, value: Any, active: bool) -> Iterator[str]:
     yield from _entry(key.name, shown, text, active)
 
 
-def _toml(value: Any) -> str | None:
+def toml_text(value: Any) -> str | None:
     """Return a value as TOML; None for what a file need not say."""
     if isinstance(value, list | tuple):
-        shown = [repr(x) if isinstance(x, float) else _toml(x) for x in value]
+        shown = [repr(x) if isinstance(x, float) else toml_text(x) for x in value]
         return f"[{', '.join(map(str, shown))}]" if value else None
     if isinstance(value, bool):
         return str(value).lower()

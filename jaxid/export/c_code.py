@@ -1,7 +1,9 @@
 """The feed-forward as one C99 file and its header."""
 
 import inspect
+import json
 import math
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -112,7 +114,7 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
         for j, turns in enumerate(robot.revolute)
     )
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
-    terms = ", ".join(type(t).__name__ for t in fit.base.model.terms)
+    terms = _ascii(", ".join(type(t).__name__ for t in fit.base.model.terms))
     prototypes = []
     for x in functions:
         shapes = zip(x.inputs, x.program.input_shapes, strict=True)
@@ -125,7 +127,7 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
     listed = "\n\n".join(prototypes)
     return f"""/* Identified model of the robot "{_ascii(robot.name)}", for a controller.
 
-   Model of {fit.date or "an unknown day"}, {fit.checksum}
+   Model of {_ascii(fit.date) or "an unknown day"}, {fit.checksum}
    Recordings: {_ascii(", ".join(fit.recordings) or "unknown")}
    Terms: {terms}
    Gravity in the frame of the ground: {gravity} m/s^2
@@ -148,7 +150,7 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
 #define {name.upper()}_JOINTS {robot.joints}
 #define {name.upper()}_PARAMETERS {fit.base.size}
 #define {name.upper()}_CHECKSUM "{fit.checksum}"
-#define {name.upper()}_DATE "{fit.date}"
+#define {name.upper()}_DATE {json.dumps(_ascii(fit.date))}
 
 #ifdef __cplusplus
 extern "C" {{
@@ -169,10 +171,11 @@ extern const {writer.type} {name}_parameters[{fit.base.size}];
 
 def _source(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
     base, name = fit.base, writer.prefix
-    estimates = zip(np.asarray(fit.parameters).tolist(), base.names, base.units, strict=True)
+    labels = [f"{x} [{unit}]" for x, unit in zip(base.names, base.units, strict=True)]
+    estimates = zip(np.asarray(fit.parameters).tolist(), labels, strict=True)
     parameters = "\n".join(
-        f"    {writer.number(x)}{',' if k + 1 < base.size else ' '} /* {label} [{_ascii(unit)}] */"
-        for k, (x, label, unit) in enumerate(estimates)
+        f"    {writer.number(x)}{',' if k + 1 < base.size else ' '} /* {_ascii(label)} */"
+        for k, (x, label) in enumerate(estimates)
     )
     definitions = "\n".join(
         writer.definition(x.program, f"{name}_{x.name}", x.inputs, (x.output,)) for x in functions
@@ -254,8 +257,9 @@ def _table(name: str, writer: CWriter, rows: Float[np.ndarray, "states entries"]
 
 
 def _ascii(text: str) -> str:
-    """Return words that can stand in a comment for any compiler."""
+    """Return words that can stand in a comment or a string for any compiler."""
     words = {"²": "^2", "³": "^3", "°": "deg", "\\": "/", "*/": "* /", "/*": "/ *"}
     for symbol, word in words.items():
         text = text.replace(symbol, word)
-    return " ".join(text.encode("ascii", "replace").decode().split())
+    text = re.sub(r"\?(?=\?)", "? ", text.encode("ascii", "replace").decode())
+    return " ".join(text.split())

@@ -1,5 +1,6 @@
 """Files for simulators and tools: URDF, MJCF, and the parameters that Pinocchio takes."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
 from jaxid.identification.fit_result import Fit
 from jaxid.io import json_text, write_bytes, write_text
+from jaxid.result_table import printable
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import SNAP_TOLERANCE
@@ -105,7 +107,7 @@ def _origin(fit: Fit, left_out: tuple[str, ...]) -> str:
     text = f"{fit.date or 'an unknown day'}, {fit.checksum}. "
     if left_out:
         text += f"Not in this file: {', '.join(left_out)}. "
-    return text.replace("--", "- -")
+    return re.sub("-(?=-)", "- ", printable(text))
 
 
 def _text(values: AnyArray | tuple | float) -> str:

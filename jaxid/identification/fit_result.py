@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,15 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.io import from_json, json_text, read_json, to_json, write_text
 from jaxid.measurement.observations import Observations
-from jaxid.result_table import Column, Remark, Status, Table, percent, significant, with_deviations
+from jaxid.result_table import (
+    Column,
+    Remark,
+    Status,
+    Table,
+    percent,
+    significant,
+    with_deviations,
+)
 
 from .estimators.estimate import AbstractEstimator, EstimatorInWords
 from .estimators.regularisation_and_weights import (
@@ -370,6 +379,11 @@ def _check(fit: Fit) -> None:
             raise InputError(f"`{name}` must have the shape {shape}, but has {np.shape(array)}")
     if not np.isfinite(fit.parameters).all():
         raise InputError("`parameters` must hold finite numbers")
+    if not re.fullmatch(r"(\d{4}-\d{2}-\d{2})?", fit.date, re.ASCII):
+        raise InputError(f"`date` must be like 2026-01-31, but is {fit.date!r:.40}")
+    for text in (fit.name, *fit.recordings, *fit.notes, *fit.base.names, *fit.base.units):
+        if not text.isprintable():
+            raise InputError(f"the text {text!r:.40} must be printable")
 
 
 def interval_table(

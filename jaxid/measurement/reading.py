@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.dynamics.motion import Motion
+from jaxid.result_table import printable
 from jaxid.robot.robot import Robot
 
 from .columns import Columns, Log, open_log
@@ -67,7 +68,7 @@ def read_recording(
         angles_on_motor_side=columns.angles_on_motor_side,
         forces_on_motor_side=columns.forces_on_motor_side,
         largest_gap=largest_gap,
-        name=Path(path).stem if name is None else name,
+        name=printable(Path(path).stem) if name is None else name,
         first_row=log.tables[0].first_row,
     )
 
@@ -159,7 +160,7 @@ def scan_log(
     first_row = log.tables[0].first_row
     source = Path(path)
     measured = columns.velocities is not None
-    name = source.stem if name is None else name
+    name = printable(source.stem) if name is None else name
     if columns.sample_time is not None:
         grid = TimeGrid(columns.sample_time, ((0, rows),))
     else:
