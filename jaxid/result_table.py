@@ -9,6 +9,7 @@ are texts for two columns of `kind="number"`.
 import dataclasses
 import enum
 import math
+import re
 import shutil
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,6 +21,11 @@ Lines = Iterator[list[tuple[str, "Status | str"]]]
 """Lines of text, as parts with a style each."""
 MISSING = "–"  # noqa: RUF001
 """Text in place of a number that is not known."""
+
+_CONTROLS = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
+)
+"""Controls, marks of direction and others that nobody sees, and halves of characters."""
 
 
 class Status(enum.Enum):
@@ -33,9 +39,7 @@ class Status(enum.Enum):
 
 def printable(text: str) -> str:
     """Return a text whose control and escape sequences are spelled out: no terminal obeys them."""
-    return "".join(
-        c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text
-    )
+    return _CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import Remark, Status, Table
+from jaxid.result_table import Remark, Status, Table, printable
 
 from .style import svg_text
 
@@ -48,7 +48,7 @@ def render_page(
         (name, re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-"), [*map(_render, blocks)])
         for name, blocks in sections
     ]
-    return str(_macros().page(title, shown, lead, footer))
+    return printable(str(_macros().page(title, shown, lead, footer)))
 
 
 def _render(block: Any) -> Markup:
