@@ -93,7 +93,7 @@ def _urdf(name, joints):
                 axis=axis,
                 low=-2.5 if turns else -0.5,
                 high=2.5 if turns else 0.5,
-                effort=m * 15,
+                effort=m * 60,
                 speed=3.0 if turns else 1.5,
             ),
         ]
@@ -114,7 +114,9 @@ def reference(model, seconds, dt, seed, amplitude=0.5):
     q = q / np.abs(q).max(axis=0) * amplitude * (high - low) / 2 * 0.6
     ramp = np.clip(np.minimum(t, seconds - t) / 0.5, 0, 1)[:, None]
     smooth = ramp**3 * (10 - 15 * ramp + 6 * ramp**2)
-    return t, (low + high) / 2 + smooth * q
+    q = smooth * q
+    fastest = np.abs(np.gradient(q, dt, axis=0)).max(axis=0) / (0.8 * model.velocityLimit)
+    return t, (low + high) / 2 + q / np.maximum(fastest, 1.0)
 
 
 def simulate(
@@ -162,7 +164,6 @@ def simulate(
     t, r = reference(model, seconds, dt, seed, amplitude)
     rd, rdd = np.gradient(r, dt, axis=0), np.gradient(np.gradient(r, dt, axis=0), dt, axis=0)
     ideal = np.array([pin.rnea(model, data, *x) for x in zip(r, rd, rdd, strict=True)])
-    inertia = np.mean([np.diag(pin.crba(model, data, x)) for x in r[:: len(r) // 20]], axis=0)
     size = np.sqrt(np.mean(ideal**2, axis=0)) + 1e-3 * np.abs(ideal).max()
     fv, fc, fs = viscous * size / np.sqrt(np.mean(rd**2, axis=0)), coulomb * size, stribeck * size
     rng = np.random.default_rng(seed + 10**6)
@@ -174,7 +175,8 @@ def simulate(
     angles, forces = np.zeros((2, len(t), n))
     for k in range(len(t)):
         angles[k] = q
-        servo = inertia * (w**2 * (r[k] - q) + 1.4 * w * (rd[k] - v))
+        M = pin.crba(model, data, r[k])
+        servo = M @ (w**2 * (r[k] - q) + 1.4 * w * (rd[k] - v))
         forces[k] = servo + 0.9 * ideal[k] + fc * np.tanh(rd[k] / epsilon)
         for _ in range(steps):
             brake = (fc + fs * np.exp(-((v / 0.05) ** 2))) * np.tanh(v / epsilon) + fv * v

@@ -27,9 +27,10 @@ from jaxid.identification.parameter_changes import compare as compare_fits
 from jaxid.identification.payload import CENTRAL_NAMES, CENTRAL_UNITS, identify_payload
 from jaxid.io import require_writable
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
-from jaxid.report.identification import Report, body_table, motor_tables, residual_table
+from jaxid.report.identification import body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import read_fit, write_comparison, write_estimates, write_report
+from jaxid.report.verdict import Report, verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 
@@ -37,6 +38,10 @@ from .options import command_line, open_console
 
 STOPPED = 130
 """Exit code of a command that Ctrl-C has ended, as shells expect it."""
+UNUSABLE = 3
+"""Exit code of `jaxid identify` if the verdict is that the model must not be used."""
+MARKED = (Status.DOUBTFUL, Status.BAD)
+"""Statuses that the terminal shows of a verdict."""
 UNLIKELY = 0.01
 """Probability that the states agree on shared parameters, below which a remark is made."""
 
@@ -113,8 +118,9 @@ def identify(
             errors[result.fitted :],
             result.validation.definiteness,
             settings,
-            (*result.experiment.notes, *result.notes, *result.findings),
-            (*result.findings, *result.mistakes),
+            (*result.experiment.notes, *result.notes),
+            result.findings,
+            result.mistakes,
             result.choice,
         )
         written = write_report(output, report, pdf)
@@ -123,15 +129,18 @@ def identify(
     notes = [*result.experiment.notes, *result.notes]
     notes += [note for note in fit.notes if note not in tabulated]
     show(console, robot.summary(), *motor_tables(robot))
-    show_remarks(console, [*notes, *_doubts(result.findings)])
+    show_remarks(console, notes)
     show(console, fit.summary())
     if fit.residual_spectra is not None:
         show(console, residual_table(fit.residual_spectra, robot))
-    show_remarks(console, _doubts(result.mistakes))
     if fit.consistency is not None:
         show(console, body_table(fit.consistency, robot.joint_names))
     show(console, result.validation.summary())
+    judged = verdict(report)
+    show_remarks(console, [r for r in judged if r is judged[0] or r.status in MARKED])
     show_files(console, output, [p.name for p in written])
+    if judged[0].status is Status.BAD:
+        raise typer.Exit(UNUSABLE)
 
 
 def _doubts(texts: Any) -> list[Remark]:

@@ -12,6 +12,10 @@ from jaxid.robot.robot import Robot
 
 STANDING = 0.01
 """Fraction of a joint's largest speed below which it stands."""
+LATE = 1.5
+"""Samples by which velocities may stand later than the derivatives of the angles."""
+SURE = 15.0
+"""Steps of an angle, in units of their noise, that no noise makes."""
 
 
 class LogStatistics:
@@ -29,7 +33,8 @@ class LogStatistics:
         self.highest = np.full(joints, -np.inf)
         self.speed, self.force = np.zeros((2, joints))
         self._energies = np.zeros(3)
-        self._derivatives, self._products = np.zeros((2, joints))
+        # Of velocities, derivatives of the angles, and derivatives of these: sums of products.
+        self._products = np.zeros((joints, 3, 3))
         # Of long logs every n-th sample tells how long joints stand.
         self._every, self._seen = -(-samples // 2**18), 0
         self._speeds: list[np.ndarray] = []
@@ -44,8 +49,9 @@ class LogStatistics:
         self._energies += [np.sum(forces * qd), np.sum(forces**2), np.sum(qd**2)]
         if len(q) > 1:
             derivative = np.gradient(q, sample_time, axis=0)
-            self._derivatives += np.sum(derivative**2, axis=0)
-            self._products += np.sum(derivative * qd, axis=0)
+            second = np.gradient(derivative, sample_time, axis=0)
+            x = np.stack([derivative, second, qd], axis=2)
+            self._products += np.einsum("tja,tjb->jab", x, x)
         self._speeds.append(np.abs(qd[-self._seen % self._every :: self._every]))
         self._seen += len(q)
 
@@ -60,10 +66,27 @@ class LogStatistics:
         power, forces, velocities = self._energies
         return float(power / np.sqrt(forces * velocities)) if forces * velocities > 0 else 0.0
 
-    @property
-    def velocity_ratio(self) -> Float[np.ndarray, " joints"]:
-        """Velocities over derivatives of the angles, by least squares; NaN at rest."""
-        return self._products / np.where(self._derivatives > 0, self._derivatives, np.nan)
+    def velocity_findings(self, joint: int, name: str, sample_time: float) -> Iterator[str]:
+        """Yield what is wrong with measured velocities: their scale, or their time."""
+        P = self._products[joint]
+        if P[0, 0] <= 0 or P[1, 1] <= 0:
+            return
+        ratio = P[0, 2] / P[0, 0]
+        scale, lead = np.linalg.lstsq(P[:2, :2], P[:2, 2], rcond=1e-12)[0]
+        late, text = -lead / scale if scale else 0.0, f"the velocities of joint `{name}` "
+        if abs(ratio - 1.0) > 0.2:
+            yield (
+                f"{text}are {ratio:.3g} times the derivatives of its angles: check "
+                "`recording.velocity_unit` and the order of the columns."
+            )
+        # A shift must explain most of the difference.
+        elif abs(late) > LATE * sample_time and lead**2 * P[1, 1] > 0.5 * (
+            P[2, 2] - 2 * P[0, 2] + P[0, 0]
+        ):
+            yield (
+                f"{text}stand {1e3 * abs(late):.3g} ms {'later' if late > 0 else 'earlier'} in the "
+                "log than the derivatives of its angles: leave `recording.velocities` out."
+            )
 
 
 def limit_findings(
@@ -73,19 +96,14 @@ def limit_findings(
 
     Joints in `faulty` have faults of single channels, which explain more.
     """
-    s, ratio = statistics, statistics.velocity_ratio
+    s = statistics
     angles = [] if faulty else unit_findings(robot, s.lowest, s.highest, log.angles_on_motor_side)
     forces = [] if faulty else _force_findings(robot, s)
     findings = angles + forces
-    for j, name in enumerate(robot.joint_names):
+    for j in range(robot.joints):
         if j in faulty:
             continue
         findings += _joint_findings(robot, j, s, not angles, not forces)
-        if log.velocities is not None and abs(ratio[j] - 1.0) > 0.2:
-            findings.append(
-                f"the velocities of joint `{name}` are {ratio[j]:.3g} times the derivatives of its "
-                "angles: check `recording.velocity_unit` and the order of the columns."
-            )
     # Over a whole log, friction makes a robot consume energy.
     if not faulty and s.power < -0.05:
         findings.append(
@@ -190,8 +208,10 @@ def unit_findings(
     return [f"{text}{cures}."] if cures else []
 
 
-def channel_findings(robot: Robot, recording: Recording) -> list[tuple[int, str]]:
-    """Look for held, spiky and wrapped channels: return the joint and a sentence of each."""
+def channel_findings(
+    robot: Robot, recording: Recording, statistics: LogStatistics | None = None
+) -> list[tuple[int, str]]:
+    """Look for held, spiky, wrapped and late channels: return the joint and a sentence of each."""
     r, found = recording, []
     angles, forces, time = (np.asarray(x) for x in (r.angles, r.forces, r.time))
     owner = "the motor of joint" if r.angles_on_motor_side else "joint"
@@ -203,7 +223,42 @@ def channel_findings(robot: Robot, recording: Recording) -> list[tuple[int, str]
         text = text or _spikes(x, time, r.segments) or _held_angles(x, others, time, r.segments)
         held = _held_forces(forces[:, j], x, time, r.segments)
         found += [(j, angle, text), (j, f"the forces of joint `{name}`", held)]
-    return [(j, f"{channel} {text}") for j, channel, text in found if text]
+    faults = [(j, f"{channel} {text}") for j, channel, text in found if text]
+    if statistics is not None and r.velocities is not None:
+        for j, name in enumerate(robot.joint_names):
+            late = statistics.velocity_findings(j, name, r.sample_time)
+            faults += [(j, text) for text in late]
+    return faults
+
+
+def clock_findings(recording: Recording) -> list[str]:
+    """Look for rows that are lost or repeated: all joints jump, or stand, for one sample."""
+    lost, repeated, time = [], [], np.asarray(recording.time)
+    for a, b in recording.segments:
+        steps = np.diff(np.asarray(recording.angles)[a:b], axis=0)
+        if len(steps) < 100:
+            continue
+        before, own, after = steps[:-2], steps[1:-1], steps[2:]
+        usual = 0.5 * (before + after)
+        noise = 1.4826 * np.median(np.abs(own - usual), axis=0)
+        moving = noise > 0
+        if not moving.any():
+            continue
+        usual, own, bend = (x[:, moving] / noise[moving] for x in (usual, own, after - before))
+        smooth = np.abs(bend).max(axis=1) < SURE
+        fast, off = np.abs(usual) > SURE, np.abs(own - usual) > SURE
+        # Every joint that is fast enough to show it takes part.
+        jumps = smooth & fast.any(axis=1) & (off | ~fast).all(axis=1)
+        still = (own == 0).all(axis=1)
+        further = np.sum(own * usual, axis=1) > 1.5 * np.sum(usual**2, axis=1)
+        lost += (time[a + 2 : b - 1][jumps & further]).tolist()
+        repeated += (time[a + 2 : b - 1][jumps & still]).tolist()
+    cure = "name the column of times (`recording.time`), or record again"
+    return [
+        f"{what} at {len(at)} instant{'' if len(at) == 1 else 's'}, first at {at[0]:.6g} s: {cure}."
+        for what, at in (("rows seem to be lost", lost), ("rows seem to be repeated", repeated))
+        if at
+    ]
 
 
 def _wrapped(x: np.ndarray, time: np.ndarray) -> str:
@@ -295,7 +350,10 @@ def _held_forces(
         step = float(np.quantile(np.abs(np.diff(f)), 0.99))
         for first, last in _runs(f, max(_shortest(b - a), int(30 * usual))):
             held = slice(first, last + 1)
-            if np.mean(moving[held]) < 0.5 or np.std(speed[held]) < 0.05 * fastest:
+            # Forces of a robot may be constant at constant speed, but not if they are noisy.
+            noisy = np.count_nonzero(np.diff(f) == 0) - (last - first) < 0.01 * len(f)
+            steady = np.std(speed[held]) < 0.05 * fastest and not noisy
+            if np.mean(moving[held]) < 0.5 or steady:
                 continue
             jumps = [abs(f[first] - f[first - 1])] if first else []
             jumps += [abs(f[last + 1] - f[last])] if last + 1 < len(f) else []

@@ -1,22 +1,12 @@
-"""Diagnosis of a log: signs of wrong units, signs, channels, sensors and delays, as sentences.
-
-For mislabelled channels, every possible mistake is corrected in turn, and the model is fitted anew
-to some instants of the log, with friction that takes energy from the robot, as all friction does.
-Without that condition a wrong sign would only change signs of parameters where joints are hardly
-coupled.
-"""
+"""Diagnosis of a log: signs of wrong units, signs, channels, sensors and delays, as sentences."""
 
 import dataclasses
-import itertools
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.arrays import AnyArray
-from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.delay import estimate_delay
 from jaxid.identification.estimators import GivenWeights
@@ -31,12 +21,12 @@ from jaxid.robot.robot import Robot
 from .checks_without_model import (
     LogStatistics,
     channel_findings,
+    clock_findings,
     limit_findings,
     stuck_findings,
 )
+from .mistakes import likely_mistakes
 
-BAD = 0.03
-"""Fraction (0 to 1) of the forces left unexplained from which mistakes are looked for."""
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
 EXAMINED = 2**17
@@ -69,10 +59,11 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
 
     def mistakes(self, fit: Fit) -> tuple[str, ...]:
-        """Return the likely mistakes in signs, order, units and sides of the log's columns.
+        """Return the likely mistake in the description of the log or the robot, as a sentence.
 
-        That is a single one whose correction makes the model fit the log, as a sentence; nothing if
-        the model fits, or no single mistake explains why it does not.
+        That is a single one whose correction explains most of what the model misses, and more than
+        any other; nothing if the model fits. If it misses much, and no single mistake explains
+        that, the sentence says where.
 
         Args:
             fit: Fit of the robot's model, to this log or to several.
@@ -83,21 +74,7 @@ class Diagnosis:
             return ()
         step = -(-o.rows // 300)
         motion = o.motion[o.instants[::step]]
-        forces = o.reduced_forces[::step]
-        left = _unexplained(fit.base, motion, forces)
-        if left < BAD:
-            return ()
-        corrected = _corrected(self.robot, motion, forces, self.motor_sides)
-        tried = sorted((_unexplained(fit.base, m, f), text) for text, m, f in corrected)
-        best = tried[0][0]
-        likely = [text for rest, text in tried if rest <= 1.05 * best]
-        # With more than three candidates nothing is known.
-        if best > 0.9 * left or len(likely) > 3:
-            return ()
-        return (
-            f"{', or '.join(likely)}: the model then misses {100 * best:.2g} % of the forces "
-            f"instead of {100 * left:.2g} %.",
-        )
+        return likely_mistakes(fit, motion, o.reduced_forces[::step], self.motor_sides)
 
     def with_fit(self, fit: Fit) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
@@ -210,10 +187,11 @@ def diagnose(
             if progress is not None:
                 progress(samples.stop / whole.samples)
     sides = part.angles_on_motor_side, part.forces_on_motor_side
-    faults = channel_findings(robot, part)
+    faults = channel_findings(robot, part, statistics)
     faulty = tuple(dict.fromkeys(joint for joint, _ in faults))
     findings = [
         *(text for _, text in faults),
+        *clock_findings(part),
         *limit_findings(robot, part, statistics, faulty),
         *stuck_findings(robot, part, faulty),
     ]
@@ -260,100 +238,14 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
     )
 
 
-def _corrected(
-    robot: Robot, motion: Motion, forces: np.ndarray, sides: tuple[bool, bool]
-) -> Iterator[tuple[str, Motion, np.ndarray]]:
-    """Yield possible mistakes, as clauses, each with the motion and forces without it."""
-    drives = robot.drives
-    names = robot.joint_names
-    n = robot.joints
-    eye = np.eye(n)
-    columns = [motion.q, motion.qd, motion.qdd]
-    torques = forces
-    if sides[0]:
-        columns = [drives.motor_angles(motion.q), *map(drives.motor_velocities, columns[1:])]
-    if sides[1]:
-        torques = drives.motor_torques(forces)
-
-    def without(text: str, angles: np.ndarray = eye, forces: np.ndarray = eye, sides=sides):
-        """Return a clause, with motion and forces of other combinations of the log's columns."""
-        q, qd, qdd = (x @ angles for x in columns)
-        f = torques @ forces
-        if sides[0]:
-            q, qd, qdd = drives.joint_angles(q), *map(drives.joint_velocities, (qd, qdd))
-        f = drives.joint_forces(f) if sides[1] else f
-        return text, Motion(q, qd, qdd), np.asarray(f)
-
-    for j, name in enumerate(names):
-        change = np.diag(np.where(np.arange(n) == j, -1.0, 1.0))
-        key = f"of joint `{name}` seems to be wrong (`recording."
-        yield without(f"the sign of the force {key}force_signs`)", forces=change)
-        yield without(f"the sign of the angle {key}angle_signs`)", change)
-    # The number of pairs grows with the square.
-    for i, j in itertools.combinations(range(n), 2) if n <= 12 else ():
-        change = np.eye(n)
-        change[[i, j]] = change[[j, i]]
-        key = f"of joints `{names[i]}` and `{names[j]}` seem to be exchanged (`recording."
-        yield without(f"the forces {key}forces`)", forces=change)
-        yield without(f"the angles {key}angles`)", change)
-    for unit, factor in (("deg", np.pi / 180), ("rev", 2 * np.pi)):
-        for said, by in ((unit, factor), (f"rad, not in {unit}", 1 / factor)):
-            text = f"the angles of the log seem to be in {said} (`recording.angle_unit`)"
-            yield without(text, np.diag(np.where(robot.revolute, by, 1.0)))
-    if drives.is_direct:
-        return
-    angles, forces_too = (not side for side in sides)
-    cases = (
-        ("angles and forces", angles, 'side = "{}"`)', (angles, angles)),
-        ("angles", angles, "side`, with `forces_side` as it is)", (angles, sides[1])),
-        ("forces", forces_too, 'forces_side = "{}"`)', (sides[0], forces_too)),
-    )
-    for what, motors, key, other in cases[sides[0] != sides[1] :]:
-        owner = "motor" if motors else "joint"
-        text = f"the {what} of the log seem to be the {owner}s' (`recording.{key.format(owner)}"
-        yield without(text, sides=other)
-
-
-def _unexplained(base: BaseParameters, motion: Motion, forces: np.ndarray) -> float:
-    """Return the fraction (0 to 1) of the forces that least squares leave unexplained.
-
-    All joints count equally. Friction terms that would come out negative are left out.
-    """
-    wanted = forces - base.tool_forces(motion)
-    size = np.sqrt(np.mean(wanted**2, axis=0))
-    scale = 1.0 / np.where(size > 0, size, np.inf)
-    rows = base.regressor_rows(motion)
-    joints = len(scale)
-    theta = np.zeros((joints, len(forces), base.size + 1))
-    for joint, columns in enumerate(base.acting_columns):
-        theta[joint][:, columns] = rows[joint] * scale[joint]
-    theta[..., -1] = (wanted * scale).T
-    theta = theta.reshape(-1, base.size + 1)
-    if not np.isfinite(theta).all():
-        return np.inf
-    R = np.asarray(np.linalg.qr(theta, mode="r"))
-    length = np.linalg.norm(R, axis=0)
-    R, target = R[:, :-1] / np.where(length[:-1] > 0, length[:-1], 1.0), R[:, -1]
-    braking = np.array([re.fullmatch(r"f[vc]\d+", name) is not None for name in base.names])
-    used = np.ones(base.size, bool)
-    while True:
-        found = np.zeros(base.size)
-        found[used] = np.linalg.lstsq(R[:, used], target, rcond=1e-9)[0]
-        pushing = braking & (found < 0)
-        if not pushing.any():
-            break
-        used &= ~pushing
-    return float(np.linalg.norm(R @ found - target) / max(length[-1], 1e-300))
-
-
 def negative_friction(fit: Fit) -> tuple[str, ...]:
-    """Report joints whose friction is negative beyond doubt: a sign or the model is wrong."""
+    """Report joints whose friction is negative beyond doubt: the model or the log is wrong."""
     robot, names = fit.base.model.robot, fit.base.names
     certain = np.asarray(fit.parameters) < -SURE * np.asarray(fit.standard_deviations)
     wrong = {name for name, negative in zip(names, certain, strict=True) if negative}
     return tuple(
-        f"friction of joint `{label}` comes out negative ({' and '.join(found)}): check the signs "
-        "of its angles and forces (`recording.angle_signs`, `force_signs`)."
+        f"friction of joint `{label}` comes out negative ({' and '.join(found)}), as no friction "
+        "is: something in the model or the log of this joint is wrong."
         for j, label in enumerate(robot.joint_names)
         if (found := [f"{kind}{j + 1}" for kind in ("fv", "fc") if f"{kind}{j + 1}" in wrong])
     )

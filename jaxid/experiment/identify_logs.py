@@ -249,6 +249,7 @@ def identify_logs(
     stage("predicting torques")
     every = [*fitted, *unseen]
     validation = validate(fit, every, progress=stage.through)
+    stage("looking for mistakes")
     mistakes = mistakes_in_logs([diagnosis for *_, diagnosis in loaded[: len(logs)]], fit)
     notes = list(dict.fromkeys(note for o in every for note in o.notes))
     return Identification(

@@ -1,18 +1,14 @@
 """Page of an identification: verdict, task, estimates, errors; and the tables of its results."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from jaxid.identification.consistency.estimator import Consistency
-from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
-from jaxid.identification.filter_and_parameter_selection import FilterChoice
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.uncertainty import ResidualSpectra
-from jaxid.model_validation import Definiteness, TorqueErrors
+from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import (
     Column,
     Remark,
@@ -25,46 +21,7 @@ from jaxid.result_table import (
 from jaxid.robot.robot import Robot
 
 from .page import provenance, render_page
-
-MEAN_ERROR = (1.0, 3.0)
-"""Mean errors up to which forces are predicted well, and tolerably [% of the largest forces]."""
-RMS_ERROR = (5.0, 15.0)
-"""RMS errors that are good, and tolerable [% of the RMS forces]."""
-UNSEEN_RATIO = (1.5, 3.0)
-"""Errors on new motions, relative to those of the fit, that are good, and tolerable."""
-LARGE_CONDITION = 1e3
-"""Condition number, with scaled columns, above which parameters are hard to tell apart."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Report:
-    """Content of the report of an identification.
-
-    Attributes:
-        fit: Identified parameters.
-        identification: Errors on the logs of the fit.
-        verification: Errors on logs that the fit has not seen.
-        definiteness: Definiteness of the mass matrix.
-        settings: Origin of the result.
-        notes: Notes on the logs, as sentences.
-        doubts: Findings that deserve attention, as sentences.
-        choice: Choice of the filter, where it was left to the logs.
-    """
-
-    fit: Fit
-    identification: Sequence[TorqueErrors]
-    verification: Sequence[TorqueErrors]
-    definiteness: Definiteness
-    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    notes: Sequence[str] = ()
-    doubts: Sequence[str] = ()
-    choice: FilterChoice | None = None
-
-    @property
-    def every_note(self) -> tuple[str, ...]:
-        """Notes on the robot, the fit and the logs, each once."""
-        fit = self.fit
-        return tuple(dict.fromkeys((*fit.base.model.robot.notes, *fit.notes, *self.notes)))
+from .verdict import Report, verdict
 
 
 def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
@@ -72,7 +29,7 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
     fit, settings = report.fit, report.settings
     base, robot = fit.base, fit.base.model.robot
     overall, *criteria = verdict(report)
-    notes = [Remark(note) for note in report.every_note if note not in report.doubts]
+    notes = [Remark(note) for note in report.every_note]
     errors = (*report.identification, *report.verification)
     lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
     task = [
@@ -235,125 +192,3 @@ def body_table(consistency: Consistency, names: Sequence[str]) -> Table:
             ("active bounds", "; ".join(consistency.active) or "none"),
         ],
     )
-
-
-def verdict(report: Report) -> list[Remark]:
-    """Return the verdict on a model: one sentence for everything, then one for each criterion."""
-    fit, definiteness = report.fit, report.definiteness
-    condition = fit.condition_numbers.scaled
-    eigenvalue = significant(definiteness.smallest)
-    bodies = []
-    if fit.consistency is not None:
-        active = "; ".join(fit.consistency.active) or "none"
-        bodies = [Remark(f"All bodies are physically consistent; active bounds: {active}")]
-    found = [
-        _judge_forces(report.verification or report.identification, bool(report.verification)),
-        *_judge_new_motions(report.identification, report.verification),
-        dataclasses.replace(
-            fit.determination[0],
-            detail="A combination counts as undetermined if it leaves more than "
-            f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open.",
-        ),
-        Remark(
-            f"Estimates: {dict(fit.facts)['estimates']}",
-            detail="Standard deviation over estimate. A parameter near zero is never known to a "
-            "few percent, and that is no fault: look at its interval.",
-        ),
-        Remark(
-            str(definiteness),
-            Status.GOOD if definiteness.positive_definite else Status.BAD,
-            f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If it is "
-            "negative, do not simulate or control with this model where joints were not moved.",
-        ),
-        *_judge_residuals(fit),
-        Remark(
-            f"The condition number with columns of length one is {significant(condition, 3)}.",
-            Status.GOOD if condition < LARGE_CONDITION else Status.DOUBTFUL,
-            f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to tell apart.",
-        ),
-        *bodies,
-        *(
-            Remark(text[:1].upper() + text[1:], Status.DOUBTFUL)
-            for text in dict.fromkeys(report.doubts)
-        ),
-    ]
-    statuses = [remark.status for remark in found]
-    if Status.BAD in statuses:
-        whole = Remark("Do not rely on this model yet: what is marked ✗ comes first.", Status.BAD)
-    elif Status.DOUBTFUL in statuses:
-        text = "A usable model; look at what is marked ! before you rely on it."
-        whole = Remark(text, Status.DOUBTFUL)
-    else:
-        whole = Remark("A good model: all criteria below are met.", Status.GOOD)
-    return [whole, *found]
-
-
-def _judge_forces(recordings: Sequence[TorqueErrors], unseen: bool) -> Remark:
-    on = "logs that the fit has not seen" if unseen else "the logs of the fit"
-    average = max(float(np.mean(e.mean_percent)) for e in recordings)
-    if np.isfinite(average):
-        worst = max(float(np.max(e.mean_percent)) for e in recordings)
-        return Remark(
-            f"On {on}, forces are predicted to {significant(average, 2)} % of the largest forces, "
-            f"averaged over the joints; the worst joint to {significant(worst, 2)} %.",
-            *_grade(average, MEAN_ERROR, "%", "Mean |e| (Eq. 37); the paper states below 1 %."),
-        )
-    worst = 100 * max(float(np.nanmean(e.rms_relative)) for e in recordings)
-    text = f"the RMS error is {significant(worst, 2)} % of the RMS force, averaged over the joints."
-    return Remark(
-        f"On {on}, {text}",
-        *_grade(worst, RMS_ERROR, "%", "The largest forces of the joints are not known."),
-    )
-
-
-def _grade(
-    value: float,
-    limits: tuple[float, float],
-    unit: str,
-    more: str,
-) -> tuple[Status, str]:
-    """Return whether a value is good, tolerable or bad, and the limits in words."""
-    good, tolerable = limits
-    status = Status.GOOD if value <= good else Status.DOUBTFUL if value <= tolerable else Status.BAD
-    return status, f"Good: up to {good:g} {unit}; tolerable: up to {tolerable:g} {unit}. {more}"
-
-
-def _judge_new_motions(
-    identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors]
-) -> list[Remark]:
-    if not verification:
-        text = "The model was not validated on an unseen log: use `--verify` or `--split`."
-        return [Remark(text, Status.DOUBTFUL)]
-    if not identification:
-        return []
-    # Joint by joint, so that large joints do not hide small ones.
-    fitted, unseen = (
-        np.sqrt(np.mean([np.asarray(e.rms) ** 2 for e in group], axis=0))
-        for group in (identification, verification)
-    )
-    ratio = float(np.fmax.reduce(unseen / np.where(fitted > 0, fitted, np.nan)))
-    ratio = ratio if np.isfinite(ratio) else 1.0
-    text = f"RMS errors on unseen logs are up to {significant(ratio, 3)} times those of the fit."
-    more = "More means that the new motion needs what the fit's logs did not show."
-    return [Remark(text, *_grade(ratio, UNSEEN_RATIO, "times", more))]
-
-
-def _judge_residuals(fit: Fit) -> list[Remark]:
-    spectra = fit.residual_spectra
-    if spectra is None:
-        return []
-    joints, white = len(spectra.white), sum(spectra.white)
-    rule = (
-        f"Bartlett's test: the cumulative spectrum of white residuals departs from a straight "
-        f"line by less than {percent(spectra.limit)} % in 95 % of cases. The intervals account "
-        "for correlated residuals."
-    )
-    nearly = float(np.max(np.asarray(spectra.departure))) <= 2.0 * spectra.limit
-    status = Status.NEUTRAL if nearly else Status.DOUBTFUL
-    doubt = ""
-    if white == joints:
-        status = Status.GOOD
-    elif not nearly:
-        doubt = ": some effect is not in the model, or the noise itself is coloured"
-    text = f"The residuals are white noise for {white} of {joints} joints{doubt}"
-    return [Remark(text, status, rule)]

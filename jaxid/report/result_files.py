@@ -30,10 +30,11 @@ from .estimates_and_residuals import (
     parameter_figure,
     residual_figure,
 )
-from .identification import Report, identification_page
+from .identification import identification_page
 from .page import versions
 from .style import save
 from .torques import error_figure, torque_figure
+from .verdict import Report, verdict
 
 MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""
@@ -260,6 +261,10 @@ def _record(report: Report) -> dict[str, Any]:
     return plain(
         {
             **header("result.json"),
+            "verdict": [
+                {"status": remark.status.name.lower(), "text": remark.text}
+                for remark in verdict(report)
+            ],
             "robot": _robot_record(robot),
             "base_parameters": parameter_rows(fit),
             "lengths": base.lengths,

@@ -1,0 +1,219 @@
+"""Verdict on an identified model: one sentence for everything, and one for each criterion."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxid.dynamics.terms import ConstantOffset
+from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
+from jaxid.identification.filter_and_parameter_selection import FilterChoice
+from jaxid.identification.fit_result import Fit
+from jaxid.model_validation import Definiteness, TorqueErrors
+from jaxid.result_table import Remark, Status, significant
+
+RMS_ERROR = (5.0, 50.0)
+"""RMS errors on new motions that are good, and tolerable [% of the RMS force, worst joint]."""
+FIT_ERROR = (2.0, 30.0)
+"""Forces that a fit may miss although its residuals are not noise [% of the RMS force]."""
+UNSEEN_RATIO = 1.5
+"""Errors on new motions, relative to those of the fit, that are good."""
+SMALL = 0.01
+"""Fraction (0 to 1) of the largest force below which an RMS force counts as that fraction."""
+LARGE_CONDITION = 1e3
+"""Condition number, with scaled columns, above which parameters are hard to tell apart."""
+PRICE = (10.0, 100.0)
+"""Increase of the residuals by bounds that is good, and tolerable [%]."""
+OFFSET = 0.3
+"""Constant force that asks for an explanation, relative to the largest force of its joint."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Report:
+    """Content of the report of an identification.
+
+    Attributes:
+        fit: Identified parameters.
+        identification: Errors on the logs of the fit.
+        verification: Errors on logs that the fit has not seen.
+        definiteness: Definiteness of the mass matrix.
+        settings: Origin of the result.
+        notes: Notes on the logs, as sentences.
+        doubts: Findings on the logs that deserve attention, as sentences.
+        mistakes: Likely mistakes in the description of the logs or the robot, as sentences.
+        choice: Choice of the filter, where it was left to the logs.
+    """
+
+    fit: Fit
+    identification: Sequence[TorqueErrors]
+    verification: Sequence[TorqueErrors]
+    definiteness: Definiteness
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    notes: Sequence[str] = ()
+    doubts: Sequence[str] = ()
+    mistakes: Sequence[str] = ()
+    choice: FilterChoice | None = None
+
+    @property
+    def every_note(self) -> tuple[str, ...]:
+        """Notes on the robot, the fit and the logs, each once."""
+        fit = self.fit
+        return tuple(dict.fromkeys((*fit.base.model.robot.notes, *fit.notes, *self.notes)))
+
+
+def verdict(report: Report) -> list[Remark]:
+    """Return the verdict on a model: one sentence for everything, then one for each criterion."""
+    fit, definiteness = report.fit, report.definiteness
+    condition = fit.condition_numbers.scaled
+    eigenvalue = significant(definiteness.smallest)
+    found = [
+        *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
+        *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
+        *_judge_fit(fit, report.identification),
+        *_judge_new_motions(report.identification, report.verification),
+        dataclasses.replace(
+            fit.determination[0],
+            detail="A combination counts as undetermined if it leaves more than "
+            f"{100 * LARGEST_UNCERTAINTY:g} % of the whole forces open.",
+        ),
+        Remark(
+            f"Estimates: {dict(fit.facts)['estimates']}",
+            detail="Standard deviation over estimate. A parameter near zero is never known to a "
+            "few percent, and that is no fault: look at its interval.",
+        ),
+        Remark(
+            str(definiteness),
+            Status.GOOD if definiteness.positive_definite else Status.BAD,
+            f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If it is "
+            "negative, do not simulate or control with this model where joints were not moved.",
+        ),
+        Remark(
+            f"The condition number with columns of length one is {significant(condition, 3)}.",
+            Status.GOOD if condition < LARGE_CONDITION else Status.DOUBTFUL,
+            f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to tell apart.",
+        ),
+        *_judge_bounds(fit),
+        *_judge_offsets(fit),
+    ]
+    statuses = [remark.status for remark in found]
+    if Status.BAD in statuses:
+        whole = Remark("Do not rely on this model yet: what is marked ✗ comes first.", Status.BAD)
+    elif Status.DOUBTFUL in statuses:
+        text = "A usable model; look at what is marked ! before you rely on it."
+        whole = Remark(text, Status.DOUBTFUL)
+    else:
+        whole = Remark("A good model: all criteria below are met.", Status.GOOD)
+    return [whole, *found]
+
+
+def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
+    """Judge how much of the forces a fit misses, unless that is white noise."""
+    if not logs:
+        return []
+    spectra, names = fit.residual_spectra, fit.base.model.robot.joint_names
+    missed, found = 100 * _relative(logs), []
+    # Of a residual that is white, no part counts; of others about what departs from white noise.
+    coloured = np.ones(len(names))
+    if spectra is not None:
+        coloured = np.clip(np.asarray(spectra.departure) - spectra.limit, 0.0, None) ** 0.5
+        share = sum(coloured == 0)
+        found = [f"the residuals of {share} of {len(names)} joints are white noise"]
+    worst = int(np.argmax(missed * np.where(coloured > 0, 1.0, 1e-3)))
+    lacking = float(np.max(missed * coloured))
+    status = Status.GOOD if lacking <= FIT_ERROR[0] else Status.DOUBTFUL
+    if status is Status.DOUBTFUL:
+        found.append("some effect is not in the model, or the noise itself is coloured")
+        status = Status.BAD if missed[worst] > FIT_ERROR[1] else status
+    text = f"The model misses up to {significant(missed[worst], 2)} % of the RMS forces that it "
+    return [
+        Remark(
+            f"{text}was fitted to (joint `{names[worst]}`): {', '.join(found)}.",
+            status,
+            f"Good: white noise, or up to {FIT_ERROR[0]:g} % that are not; tolerable: up to "
+            f"{FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with a "
+            "straight line. The intervals account for correlated residuals, not for what the model "
+            "lacks.",
+        )
+    ]
+
+
+def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
+    """Return the RMS errors over the RMS forces of each joint, all logs together."""
+    rms, forces = (
+        np.sqrt(np.mean([np.asarray(x) ** 2 for x in group], axis=0))
+        for group in ([e.rms for e in logs], [e.force_rms for e in logs])
+    )
+    least = SMALL * np.nan_to_num(np.asarray(logs[0].max_forces))
+    forces = np.maximum(forces, least)
+    return np.nan_to_num(rms / np.where(forces > 0, forces, np.inf))
+
+
+def _judge_new_motions(
+    identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors]
+) -> list[Remark]:
+    if not verification:
+        text = "The model was not validated on an unseen log: use `--verify` or `--split`."
+        return [Remark(text, Status.DOUBTFUL)]
+    unseen, ratio = 100 * _relative(verification), 1.0
+    worst = float(np.max(unseen))
+    text = f"On logs that the fit has not seen, it misses up to {significant(worst, 2)} % of the "
+    text += "RMS forces"
+    if identification:
+        # Errors that do not matter may grow.
+        ratios = unseen / np.maximum(100 * _relative(identification), 1e-9)
+        ratio = float(np.max(np.where(unseen > FIT_ERROR[0], ratios, 1.0)))
+    if ratio > 1:
+        text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
+    average = max(float(np.mean(e.mean_percent)) for e in verification)
+    if np.isfinite(average):
+        text += f"; mean errors are {significant(average, 2)} % of the largest forces"
+    status = Status.GOOD
+    if worst > RMS_ERROR[0] or ratio > UNSEEN_RATIO:
+        status = Status.BAD if worst > RMS_ERROR[1] else Status.DOUBTFUL
+    detail = (
+        f"Good: up to {RMS_ERROR[0]:g} % for every joint, and {UNSEEN_RATIO:g} times the errors of "
+        f"the fit where they exceed {FIT_ERROR[0]:g} %; tolerable: up to {RMS_ERROR[1]:g} %. Mean "
+        "errors by Eq. 37: the paper states below 1 %."
+    )
+    return [Remark(f"{text}.", status, detail)]
+
+
+def _judge_bounds(fit: Fit) -> list[Remark]:
+    """Judge the price of bounds: a large one says that the logs contradict them."""
+    if fit.consistency is None:
+        return []
+    price = 100 * fit.consistency.residual_increase
+    active = "; ".join(fit.consistency.active) or "none"
+    status = Status.GOOD if price <= PRICE[0] else Status.DOUBTFUL
+    status = Status.BAD if price > PRICE[1] else status
+    return [
+        Remark(
+            f"All bodies are physically consistent, for {significant(price, 2)} % larger "
+            f"residuals; active bounds: {active}",
+            status,
+            f"Good: up to {PRICE[0]:g} %; tolerable: up to {PRICE[1]:g} %. Above, the logs "
+            "contradict the bounds: check `total_mass`, `mass_max`, units and signs.",
+        )
+    ]
+
+
+def _judge_offsets(fit: Fit) -> list[Remark]:
+    """Judge constant forces: a large one is a weight that gravity does not explain."""
+    robot, found = fit.base.model.robot, []
+    values = dict(zip(fit.base.names, np.asarray(fit.parameters).tolist(), strict=True))
+    (symbol, *_), *_ = ConstantOffset.symbols
+    for j, name in enumerate(robot.joint_names):
+        value, largest = values.get(f"{symbol}{j + 1}", 0.0), float(robot.known_max_forces[j])
+        if abs(value) > OFFSET * largest:
+            unit = robot.force_unit(j)
+            found.append(
+                Remark(
+                    f"Joint `{name}` has a constant force of {significant(value, 3)} {unit}, and "
+                    f"its limit is {significant(largest, 3)} {unit}: is `gravity` right, or does "
+                    "a spring or a cable pull?",
+                    Status.DOUBTFUL,
+                    f"Good: up to {100 * OFFSET:g} % of the largest force.",
+                )
+            )
+    return found
