@@ -69,7 +69,11 @@ def robots(folder):
     """Write robots of many kinds as URDF; return the file of each name."""
     files = {name: Path(folder) / f"{name}.urdf" for name in KINDS}
     for name, joints in KINDS.items():
-        files[name].write_text(_urdf(name, joints))
+        files[name].write_text(_urdf(name, joints, [0.0] * len(joints)))
+        # Motors that are twice as strong as a motion needs.
+        model = pin.buildModelFromUrdf(str(files[name]))
+        _, forces, _ = _ideal(model, *reference(model, 10.0, 0.01, 0))
+        files[name].write_text(_urdf(name, joints, 2 * np.abs(forces).max(axis=0)))
     data = Path(next(iter(cmeel.__path__))).parent / "cmeel.prefix/share/example-robot-data/robots"
     return files | {
         "ur3": data / "ur_description/urdf/ur3_joint_limited_robot.urdf",
@@ -77,7 +81,7 @@ def robots(folder):
     }
 
 
-def _urdf(name, joints):
+def _urdf(name, joints, efforts):
     parts = [f'<robot name="{name}">', '<link name="link0"/>']
     for k, (kind, xyz, axis, m) in enumerate(joints, 1):
         J = 0.02 * m
@@ -93,7 +97,7 @@ def _urdf(name, joints):
                 axis=axis,
                 low=-2.5 if turns else -0.5,
                 high=2.5 if turns else 0.5,
-                effort=m * 60,
+                effort=round(float(efforts[k - 1]), 2),
                 speed=3.0 if turns else 1.5,
             ),
         ]
@@ -117,6 +121,14 @@ def reference(model, seconds, dt, seed, amplitude=0.5):
     q = smooth * q
     fastest = np.abs(np.gradient(q, dt, axis=0)).max(axis=0) / (0.8 * model.velocityLimit)
     return t, (low + high) / 2 + q / np.maximum(fastest, 1.0)
+
+
+def _ideal(model, t, r):
+    """Return velocities and forces of a motion without friction, and accelerations."""
+    rd = np.gradient(r, t, axis=0)
+    rdd, data = np.gradient(rd, t, axis=0), model.createData()
+    forces = [pin.rnea(model, data, *x) for x in zip(r, rd, rdd, strict=True)]
+    return rd, np.array(forces), rdd
 
 
 def simulate(
@@ -162,8 +174,7 @@ def simulate(
     model.gravity.linear = np.array(gravity)
     data, n = model.createData(), model.nv
     t, r = reference(model, seconds, dt, seed, amplitude)
-    rd, rdd = np.gradient(r, dt, axis=0), np.gradient(np.gradient(r, dt, axis=0), dt, axis=0)
-    ideal = np.array([pin.rnea(model, data, *x) for x in zip(r, rd, rdd, strict=True)])
+    rd, ideal, _ = _ideal(model, t, r)
     size = np.sqrt(np.mean(ideal**2, axis=0)) + 1e-3 * np.abs(ideal).max()
     fv, fc, fs = viscous * size / np.sqrt(np.mean(rd**2, axis=0)), coulomb * size, stribeck * size
     rng = np.random.default_rng(seed + 10**6)

@@ -235,7 +235,7 @@ def export(
         if one.exists() and not force:
             raise InputError(f"`{one}` is there already: choose another `--output`, or `--force`.")
     chain = {"tip": tip, "base": base}
-    commands.export(report, to, path, urdf, chain, double=not single)
+    commands.export(report, to, path, urdf, chain, not single, force)
     console.print()
     console.print(Text(f"wrote {path.parent}: {', '.join(x.name for x in made)}"))
 

@@ -29,7 +29,13 @@ from jaxid.io import require_writable
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
-from jaxid.report.result_files import read_fit, write_comparison, write_estimates, write_report
+from jaxid.report.result_files import (
+    read_faults,
+    read_fit,
+    write_comparison,
+    write_estimates,
+    write_report,
+)
 from jaxid.report.verdict import Report, verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
@@ -184,11 +190,22 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
 
 
 def export(
-    report: Path, to: str, path: Path, urdf: Path | None, chain: dict[str, Any], double: bool
+    report: Path,
+    to: str,
+    path: Path,
+    urdf: Path | None,
+    chain: dict[str, Any],
+    double: bool,
+    force: bool,
 ) -> None:
-    """Write the model of a report in a format."""
+    """Write the model of a report in a format; an unusable one only by force."""
     require_writable(path.parent)
-    fit = read_fit(report)
+    fit, faults = read_fit(report), read_faults(report)
+    if faults and not force:
+        raise InputError(
+            f"the verdict of `{report}` is that its model must not be used: {faults[-1]} Mend "
+            "that first, or write it nonetheless with `--force`."
+        )
     if to == "c":
         export_c(fit, path.parent, name=path.stem, double=double)
     elif to == "urdf":

@@ -7,12 +7,14 @@ wrong sign would only change signs of parameters where joints are hardly coupled
 
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from jaxid.dynamics.base import BaseParameters, base_parameters
+from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit_result import Fit
@@ -27,7 +29,7 @@ MOST = 0.5
 """Fraction (0 to 1) of what a model misses that may be left by the correction of a mistake."""
 MANY = 12
 """Number of joints above which no two joints, and no axes, are examined: they would be too many."""
-ALIKE, CLEAR = 1.05, 2.0
+ALIKE, CLEAR = 1.05, 1.5
 """Ratios of what two corrections leave up to which they are the same, and from which one is not."""
 
 
@@ -58,22 +60,15 @@ def likely_mistakes(
         forces: Forces at these instants [N m or N].
         motor_sides: Whether angles and forces of the log are taken for the motors'.
     """
-    base = fit.base
-    left = _unexplained(base, motion, forces)
+    model = fit.base.model
+    robot, geometry = model.robot, _AnyGeometry(model)
+
+    def rest(c: Correction) -> float:
+        return _unexplained(*geometry(c.robot, c.motion), c.forces, model.parameter_names)
+
+    left = rest(Correction("", robot, motion, forces))
     if left < BAD:
         return ()
-    robot, bases = base.model.robot, {}
-
-    def rest(correction: Correction) -> float:
-        changed = correction.robot
-        if changed is robot:
-            own = base
-        else:
-            # Bases of changed robots are needed more than once.
-            own = bases.get(id(changed)) or base_parameters(Model(changed, base.model.terms))
-            bases[id(changed)] = own
-        return _unexplained(own, correction.motion, correction.forces)
-
     candidates = [
         *_of_columns(robot, motion, forces, motor_sides),
         *_of_robot(robot, motion, forces),
@@ -135,8 +130,6 @@ def _of_columns(
         key = f"of joint `{name}` seems to be wrong (`recording."
         yield without(f"the sign of the force {key}force_signs`)", forces=change)
         yield without(f"the sign of the angle {key}angle_signs`)", change)
-        text = f"the axis of joint `{name}` seems to be reversed in the robot, or in the log both "
-        yield without(f"{text}its angle and its force", change, change)
     # The number of pairs grows with the square.
     for i, j in itertools.combinations(range(n), 2) if n <= MANY else ():
         change = np.eye(n)
@@ -166,8 +159,14 @@ def _of_columns(
 def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Correction]:
     """Yield corrections of the robot: zeros of its angles, gravity, and axes of joints."""
     names, n, size = robot.joint_names, robot.joints, np.linalg.norm(robot.gravity)
+    own, every = np.arange(n) == np.arange(n)[:, None], (motion.q, motion.qd, motion.qdd)
+
+    def reversed_axis(text: str, j: int, changed: Robot) -> Correction:
+        signs = np.where(own[j], -1.0, 1.0)
+        return Correction(text, changed, Motion(*(x * signs for x in every)), forces * signs)
+
     for j, turns in ((j, k) for j in range(n) if robot.revolute[j] for k in (-1, 1, 2)):
-        q = motion.q + 0.5 * np.pi * turns * (np.arange(n) == j)
+        q = motion.q + 0.5 * np.pi * turns * own[j]
         text = f"the angle of joint `{names[j]}` seems to lack {90 * turns} degrees (`recording."
         moved = Motion(q, motion.qd, motion.qdd)
         yield Correction(f"{text}angle_offsets`)", robot, moved, forces)
@@ -179,41 +178,62 @@ def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Corr
     if size > 0:
         text = "the forces seem not to contain gravity: the log, or the drive, has subtracted it"
         yield Correction(text, robot.replace(gravity=np.zeros(3)), motion, forces)
+    for j, name in enumerate(names):
+        text = f"the axis of joint `{name}` seems to be reversed in the robot, or in the log both "
+        yield reversed_axis(f"{text}its angle and its force", j, robot)
     for j, shift in itertools.product(range(n) if n <= MANY else (), (1, 2)):
         axis = np.array(robot.axis)
         axis[j] = np.roll(axis[j], shift)
-        turned, flip = robot.replace(axis=axis), np.where(np.arange(n) == j, -1.0, 1.0)
-        for signs in (np.ones(n), flip):
-            shown = " ".join(f"{x:g}" for x in axis[j] * signs[j] + 0.0)
-            text = f"the axis of joint `{names[j]}` seems to be ({shown}) in the frame of its body"
-            moved = Motion(*(x * signs for x in (motion.q, motion.qd, motion.qdd)))
-            yield Correction(text, turned, moved, forces * signs)
+        turned, text = (
+            robot.replace(axis=axis),
+            f"the axis of joint `{names[j]}` seems to be ({{}})",
+        )
+        shown, other = (" ".join(f"{x:g}" for x in s * axis[j] + 0.0) for s in (1, -1))
+        text += " in the frame of its body"
+        yield Correction(text.format(shown), turned, motion, forces)
+        yield reversed_axis(text.format(other), j, turned)
 
 
-def _unexplained(base: BaseParameters, motion: Motion, forces: np.ndarray) -> float:
+class _AnyGeometry(eqx.Module):
+    """Regressor of a model whose axes and gravity are arguments: it is traced only once."""
+
+    model: Model
+
+    def columns(self, axis, gravity, q, qd, qdd):
+        """Return the regressor of one sample, and the forces of the known tool behind it."""
+        model = Model(self.model.robot.replace(axis=axis, gravity=gravity), self.model.terms)
+        known = model.known_forces(q, qd, qdd)[:, None]
+        return jnp.concatenate([model.columns(q, qd, qdd), known], axis=1)
+
+    def __call__(self, robot: Robot, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+        """Return the regressor of each sample, and the forces of the tool."""
+        shared = np.asarray(robot.axis), np.asarray(robot.gravity)
+        samples = motion.q, motion.qd, motion.qdd
+        columns = in_numpy(self, self.columns, *samples, shared=shared)
+        return columns[..., :-1], columns[..., -1]
+
+
+def _unexplained(
+    regressor: np.ndarray, tool_forces: np.ndarray, forces: np.ndarray, names: Sequence[str]
+) -> float:
     """Return the fraction (0 to 1) of the forces that least squares leave unexplained.
 
     All joints count equally. Friction terms that would come out negative are left out.
     """
-    wanted = forces - base.tool_forces(motion)
+    wanted = forces - tool_forces
     size = np.sqrt(np.mean(wanted**2, axis=0))
     scale = 1.0 / np.where(size > 0, size, np.inf)
-    rows = base.regressor_rows(motion)
-    joints = len(scale)
-    theta = np.zeros((joints, len(forces), base.size + 1))
-    for joint, columns in enumerate(base.acting_columns):
-        theta[joint][:, columns] = rows[joint] * scale[joint]
-    theta[..., -1] = (wanted * scale).T
-    theta = theta.reshape(-1, base.size + 1)
+    theta = np.concatenate([regressor, wanted[..., None]], axis=2) * scale[:, None]
+    theta = theta.reshape(-1, theta.shape[2])
     if not np.isfinite(theta).all():
         return np.inf
     R = np.asarray(np.linalg.qr(theta, mode="r"))
     length = np.linalg.norm(R, axis=0)
     R, target = R[:, :-1] / np.where(length[:-1] > 0, length[:-1], 1.0), R[:, -1]
-    braking = np.array([re.fullmatch(r"f[vc]\d+", name) is not None for name in base.names])
-    used = np.ones(base.size, bool)
+    braking = np.array([re.fullmatch(r"f[vc]\d+", name) is not None for name in names])
+    used = np.ones(len(names), bool)
     while True:
-        found = np.zeros(base.size)
+        found = np.zeros(len(names))
         found[used] = np.linalg.lstsq(R[:, used], target, rcond=1e-9)[0]
         pushing = braking & (found < 0)
         if not pushing.any():

@@ -21,6 +21,7 @@ from jaxid.identification.parameter_changes import LEVEL, Comparison, parameter_
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.model_validation import TorqueErrors
+from jaxid.result_table import Status
 from jaxid.robot.robot import Robot
 
 from .estimates_and_residuals import (
@@ -127,6 +128,15 @@ def read_fit(report: Path) -> Fit:
             f"`{report}` must be a folder of `jaxid identify`, but holds no `{MODEL}`."
         )
     return load(path)
+
+
+def read_faults(report: Path) -> list[str]:
+    """Return why the model of a report must not be used, as its verdict says; nothing if it may."""
+    path = (report if report.is_dir() else report.parent) / "result.json"
+    if schema_of(path) != SCHEMAS["result.json"]:
+        return []
+    remarks = read_json(path).get("verdict", ())
+    return [r["text"] for r in remarks if r["status"] == Status.BAD.name.lower()]
 
 
 def write_comparison(

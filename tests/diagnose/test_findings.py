@@ -5,7 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxid.diagnosis.checks_without_model import channel_findings, stuck_findings, unit_findings
+from jaxid.diagnosis import diagnose
+from jaxid.diagnosis.checks_without_model import (
+    channel_findings,
+    clock_findings,
+    stuck_findings,
+    unit_findings,
+)
 from jaxid.measurement.recording import Recording
 from jaxid.robot.library import panda, planar_arm
 from jaxid.robot.limits_and_drives import Drives
@@ -130,3 +136,38 @@ def test_forces_that_are_cut_off_are_recognised(level):
     moving[1200:1800] = moving[1200]
     forces[1200:1800] = forces.max(axis=0) + 1.0
     assert stuck(forces, moving) == []
+
+
+def lost(angles, **more):
+    return clock_findings(Recording.of(angles, TAU[: len(angles)], sample_time=DT, **more))
+
+
+@pytest.mark.parametrize("count", [0.0, 1e-4, 2e-3])
+def test_lost_and_repeated_rows_are_named_and_nothing_else(count):
+    angles = Q + 1e-5 * np.random.default_rng(0).normal(size=Q.shape)
+    angles = count * np.round(angles / count) if count else angles
+    assert lost(angles) == lost(np.repeat(angles, 2, axis=0)[: len(TAU)]) == []
+    if count < 1e-3:
+        (said,) = lost(np.delete(angles, [700, 900, 901], axis=0))
+        assert said.startswith("rows seem to be lost at 2 instants, first at 3.5 s")
+        (said,) = lost(np.insert(angles, 700, angles[699], axis=0)[: len(TAU)])
+        assert said.startswith("rows seem to be repeated at 1 instant, first at 3.5 s")
+
+
+@pytest.mark.parametrize(
+    ("samples", "factor", "words"), [(0, 1, ""), (8, 1, " ms later"), (0, 2, "are 2 times")]
+)
+def test_velocities_are_compared_with_the_angles(samples, factor, words):
+    velocities = factor * np.roll(np.gradient(Q, DT, axis=0), samples, axis=0)
+    log = Recording.of(Q, TAU, sample_time=DT, velocities=velocities)
+    found = [text for text in diagnose(log, ROBOT).findings if "the velocities of" in text]
+    assert all(words in text for text in found)
+    assert len(found) == (7 if words else 0)
+
+
+def test_noisy_forces_that_are_held_are_named_also_at_constant_speed():
+    angles = np.cumsum(np.full_like(Q, 0.002), axis=0)
+    ((joint, text),) = faults(angles, changed(TAU, slice(600, 700), TAU[600, 2]))
+    assert joint == 2
+    assert "stay at" in text
+    assert faults(angles, np.round(np.cumsum(np.full_like(Q, 1e-4), axis=0), 2)) == []

@@ -115,6 +115,55 @@ def test_units_and_sides_are_found(motors, said):
     assert "the forces of the log seem to be the motors' (`recording.forces_side = \"mo" in sentence
 
 
+def test_whole_joints_and_zeros_of_angles_are_found(motors, said):
+    angles, forces = motors
+    order = [1, 0, 2, 3]
+    (sentence,) = said(angles[:, order], forces[:, order])
+    assert sentence.startswith("angles and forces of joints `joint1` and `joint2` seem to be")
+    q = np.asarray(ROBOT.drives.joint_angles(angles)) - np.pi / 2 * (np.arange(4) == 2)
+    (sentence,) = said(np.asarray(ROBOT.drives.motor_angles(q)), forces)
+    assert sentence.startswith("the angle of joint `joint3` seems to lack 90 degrees")
+
+
+def described(**change):
+    """Return what is said of the log if the robot is described wrongly."""
+
+    def mistakes(motors):
+        robot = ROBOT.replace(**change)
+        base = base_parameters(Model(robot, BASE.model.terms))
+        log, o = log_of(*motors)
+        fit = identify(base, o)
+        return diagnose(log, robot, observations=o).mistakes(fit)
+
+    return mistakes
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 9.81), (9.81, 0.0, 0.0), (0.0, -9.81, 0.0)])
+def test_gravity_is_named_and_not_a_sign(motors, gravity):
+    (sentence,) = described(gravity=np.array(gravity))(motors)
+    assert sentence.startswith("gravity seems to be [0, 0, -9.81] (`robot.gravity`)")
+
+
+@pytest.mark.parametrize(
+    ("joint", "axis", "words"), [(1, (0, -1, 0), "reversed"), (2, (1, 0, 0), "(0 1 0)")]
+)
+def test_an_axis_is_named_and_not_a_sign(motors, joint, axis, words):
+    wrong = AXES.copy()
+    wrong[joint] = axis
+    (sentence,) = described(axis=wrong)(motors)
+    assert sentence.startswith(f"the axis of joint `joint{joint + 1}` seems to be {words}")
+
+
+def test_what_no_single_mistake_explains_is_no_cure(motors):
+    offset = np.array(ROBOT.offset)
+    offset[2] += (-0.5, 0.4, 0.3)
+    wrong = AXES.copy()
+    wrong[3] = 0, 1, 0
+    (sentence,) = described(axis=wrong, offset=offset)(motors)
+    assert sentence.startswith("the model does not fit")
+    assert "of joint `joint" in sentence
+
+
 @pytest.mark.parametrize(("factor", "words"), [(1e3, "all joints need"), (1e-3, "no joint needs")])
 def test_forces_in_another_unit_are_one_doubt_and_not_four(motors, factor, words):
     log, o = log_of(motors[0], factor * motors[1])

@@ -7,8 +7,8 @@ import pytest
 
 import jaxid as jid
 from jaxid.model_validation import TorqueErrors
-from jaxid.report.identification import Report
 from jaxid.report.result_files import write_report
+from jaxid.report.verdict import Report
 from jaxid.simulation.friction_and_disturbances import SmoothFriction
 from jaxid.simulation.virtual import Sensors, random_bodies
 

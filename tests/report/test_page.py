@@ -4,10 +4,15 @@ import dataclasses
 import json
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import equinox as eqx
+import numpy as np
+import pytest
 
 import jaxid as jid
-from jaxid.report.identification import Report, verdict
 from jaxid.report.page import code, folded, picture, render_page
+from jaxid.report.verdict import Report, _judge_bounds, _judge_offsets, verdict
 from jaxid.result_table import Column, Remark, Status, Table
 
 EVIL = "<script>alert('&\"')</script>"  # as in conftest.py
@@ -72,7 +77,7 @@ def test_the_page_is_whole_and_needs_nothing_else(written):
     assert len(text) < 1_500_000
     assert "urdf = 'a<b'" in found.text
     assert f"a note {EVIL}" in found.text
-    assert "The log looks odd." in found.text
+    assert "the log looks odd." in found.text
 
 
 def test_every_parameter_stands_there_with_the_numbers_of_the_result(written, fit):
@@ -121,10 +126,53 @@ def test_the_verdict_follows_what_was_found(fit, validation):
     )
     bad = dataclasses.replace(second, predicted=second.predicted + 20.0)
     found = verdict(Report(fit, (first,), (bad,), validation.definiteness))
-    assert found[0].status is Status.BAD
-    assert found[1].status is Status.BAD
-    assert "has not seen" in found[1].text
+    assert [found[k].status for k in (0, 1, 2)] == [Status.BAD, Status.GOOD, Status.BAD]
+    assert "has not seen" in found[2].text
     alone = verdict(Report(fit, (first,), (), validation.definiteness))
     assert any("--verify" in remark.text for remark in alone)
     sick = dataclasses.replace(validation.definiteness, smallest=-1.0, indefinite=0.2)
     assert verdict(Report(fit, (first,), (second,), sick))[0].status is Status.BAD
+
+
+@pytest.mark.parametrize(
+    ("share", "departure", "status"),
+    [(0.2, 0.5, Status.DOUBTFUL), (0.2, 0.0, Status.GOOD), (0.6, 0.5, Status.BAD)],
+)
+def test_a_fit_that_misses_more_than_noise_is_doubted_and_then_rejected(
+    fit, validation, share, departure, status
+):
+    first, second = validation.errors
+    spectra = eqx.tree_at(lambda s: s.departure, fit.residual_spectra, np.full(2, departure))
+    wave = np.sin(np.asarray(first.time))[:, None] * first.force_rms
+    missed = dataclasses.replace(first, predicted=first.predicted + 1.4 * share * wave)
+    judged = dataclasses.replace(fit, residual_spectra=spectra)
+    found = verdict(Report(judged, (missed,), (second,), validation.definiteness))
+    assert found[1].status is status
+
+
+def test_mistakes_come_first_and_decide(fit, validation):
+    first, second = validation.errors
+    said = {"mistakes": ("a sign is wrong",), "doubts": ("rows are lost",)}
+    found = verdict(Report(fit, (first,), (second,), validation.definiteness, **said))
+    assert [r.text for r in found[1:3]] == ["a sign is wrong.", "rows are lost."]
+    assert [r.status for r in found[:3]] == [Status.BAD, Status.BAD, Status.DOUBTFUL]
+
+
+def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
+    robot = fit.base.model.robot
+    base = SimpleNamespace(model=SimpleNamespace(robot=robot), names=("m1", "fo1", "fo2"))
+    limits = np.asarray(robot.known_max_forces)
+    for share, count in ((0.1, 0), (-0.8, 1)):
+        p = np.array([1e6, share * limits[0], 0.01 * limits[1]])
+        found = _judge_offsets(SimpleNamespace(base=base, parameters=p))
+        assert [r.status for r in found] == [Status.DOUBTFUL] * count
+    assert f"joint `{robot.joint_names[0]}`" in found[0].text.lower()
+
+
+@pytest.mark.parametrize(
+    ("price", "status"), [(0.05, Status.GOOD), (0.5, Status.DOUBTFUL), (19.0, Status.BAD)]
+)
+def test_bounds_that_the_log_contradicts_are_not_good(consistent, price, status):
+    costly = dataclasses.replace(consistent.consistency, residual_increase=price)
+    (found,) = _judge_bounds(dataclasses.replace(consistent, consistency=costly))
+    assert found.status is status

@@ -9,7 +9,6 @@ import pytest
 
 from jaxid.identification.parameter_changes import Verdict, compare
 from jaxid.report import result_files
-from jaxid.report.identification import Report
 from jaxid.report.result_files import (
     consistency_record,
     plain,
@@ -18,6 +17,7 @@ from jaxid.report.result_files import (
     write_comparison,
     write_report,
 )
+from jaxid.report.verdict import Report
 
 
 @pytest.fixture
