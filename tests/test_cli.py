@@ -120,11 +120,11 @@ def run(capsys):
 
 @pytest.fixture
 def words(run):
-    """Runs a command that ends well, and returns what it prints on one line."""
+    """Runs a command, and returns what it prints on one line; code 3 is an unusable model."""
 
-    def words(*args):
+    def words(*args, ends=0):
         code, out, err = run(*args)
-        assert (code, err) == (0, "")
+        assert (code, err) == (ends, "")
         return " ".join(out.split())
 
     return words
@@ -185,22 +185,29 @@ def test_logs_of_one_name_are_told_apart_by_their_folders(folder, run):
 
 def test_what_is_not_determined_is_said_with_a_cure(folder, words):
     write_log(folder / "still.csv", 5, still=True)
-    said = words("identify", "experiment.toml", "still.csv")
+    said = words("identify", "experiment.toml", "still.csv", ends=3)
     for text in ("NOT DETERMINED by these logs", "mean nothing one by one", "Record a motion"):
         assert text in said
     assert '`ridge = "cross_validated"`' in said
     (folder / "ridge.toml").write_text(EXPERIMENT + "[estimator]\nridge = 'cross_validated'\n")
-    said = words("identify", "ridge.toml", "still.csv", "-o", "ridge")
+    said = words("identify", "ridge.toml", "still.csv", "-o", "ridge", ends=3)
     assert "NOT DETERMINED" in said
     assert "`ridge =" not in said
 
 
-def test_a_single_slip_that_explains_a_bad_fit_is_named(folder, words):
+def test_a_single_slip_that_explains_a_bad_fit_is_named(folder, run, words):
     pl.read_csv("a.csv").with_columns(-pl.col("tau2")).write_csv("turned.csv")
     slip = "the sign of the force of joint `joint2` seems to be wrong (`recording.force_sig"
     assert "!" not in words("inspect", "experiment.toml", "a.csv")
-    for command in ("inspect", "identify"):
-        assert slip in words(command, "experiment.toml", "turned.csv")
+    assert slip in words("inspect", "experiment.toml", "turned.csv")
+    said = words("identify", "experiment.toml", "turned.csv", ends=3)
+    assert f"✗ turned: {slip}" in said
+    assert "Do not rely on this model yet" in said
+    found = json.loads((folder / "report" / "result.json").read_text("utf-8"))["verdict"]
+    assert [r["status"] for r in found[:2]] == ["bad", "bad"]
+    command = ("export", "report", "--to", "json", "-o", "arm.json")
+    assert refused(run(*command), "must not be used", slip, "`--force`")
+    assert run(*command, "--force")[0] == 0
     said = words("states", "experiment.toml", "b.csv", "turned.csv")
     assert f"turned: {slip[:50]}" in said
     assert "b: " not in said

@@ -203,7 +203,7 @@ def export(
     fit, faults = read_fit(report), read_faults(report)
     if faults and not force:
         raise InputError(
-            f"the verdict of `{report}` is that its model must not be used: {faults[-1]} Mend "
+            f"the verdict of `{report}` is that its model must not be used: {faults[0]} Mend "
             "that first, or write it nonetheless with `--force`."
         )
     if to == "c":

@@ -88,7 +88,8 @@ class BaseParameters(Hashable):
         """Base parameters in letters, computed when they are first needed (Eq. 24)."""
         from .base_parameter_closed_forms import closed_forms
 
-        return closed_forms(self.model, self.indices, self.dependent, np.asarray(self.kappa))
+        model, kappa = _snapped(self.model), np.asarray(self.kappa)
+        return closed_forms(model, self.indices, self.dependent, kappa)
 
     @property
     def expressions(self) -> tuple[str, ...]:
@@ -264,7 +265,8 @@ def base_parameters(
     r"""Find the combinations of parameters that forces determine (Eqs. 20-22).
 
     The regressor is evaluated at random motions and stacked. Columns that earlier ones replace are
-    found by Gram-Schmidt in column order, and counted again by singular values.
+    found by Gram-Schmidt in column order, and counted again by singular values. Rounded quarter
+    turns count as exact here (`Robot.snapped`); in forces the robot keeps its own geometry.
 
     Args:
         model: The model.
@@ -280,7 +282,7 @@ def base_parameters(
     methods = {"gram_schmidt": gram_schmidt, "singular_values": singular_values}
     if method not in methods:
         raise InputError(f"`method` must be one of {', '.join(methods)}, but is {method!r}.")
-    W, scale = random_regressor(model, seed)
+    W, scale = random_regressor(_snapped(model), seed)
     found = methods.pop(method)(W)
     ((_, check),) = methods.items()
     other = check(W)
@@ -291,6 +293,10 @@ def base_parameters(
     notes = _doubts(found, other, left, weakest)
     independent, dependent, smallest, largest = found
     return BaseParameters(model, independent, dependent, kappa, smallest, largest, notes)
+
+
+def _snapped(model: Model) -> Model:
+    return Model(model.robot.snapped(), model.terms)
 
 
 def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.library import from_dh
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
-from jaxid.robot.rotations import SNAP_TOLERANCE, rpy_rotation
+from jaxid.robot.rotations import rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 
 from .decoder import Finite, Magnitude, PerJoint, Positive, Vector
@@ -130,7 +130,8 @@ class RobotSource:
         base_rotation: Orientation of the robot on the ground: roll, pitch, yaw [deg], like
             `[0.0, 0.0, 0.0]`.
         base_position: Position of the robot on the ground [m], like `[0.0, 0.0, 0.0]`.
-        snap_tolerance: Angle [rad] up to which orientations count as quarter turns, like `1e-4`.
+        snap_tolerance: Angle [rad] up to which the robot's axes are taken for parallel or
+            perpendicular, like `1e-3` for a file with 1.571 instead of pi/2.
         tool: Known load at the end-effector, whose forces are subtracted.
     """
 
@@ -155,9 +156,9 @@ class RobotSource:
         if len(given) != 1:
             came = " and ".join(f"`{k}`" for k in given) or "none of them"
             raise InputError(f"one of `urdf`, `builtin` and `dh` is needed, but there is {came}.")
-        owners = {"tip": "urdf", "base": "urdf", "convention": "dh", "snap_tolerance": "urdf or dh"}
+        owners = {"tip": "urdf", "base": "urdf", "convention": "dh"}
         for key, owner in owners.items():
-            if getattr(self, key) is not None and given[0] not in owner.split():
+            if getattr(self, key) is not None and given[0] != owner:
                 raise InputError(f"`{key}` belongs to `{owner}`, not to `{given[0]}`: remove it.")
 
     @property
@@ -168,9 +169,8 @@ class RobotSource:
 
     @property
     def chain(self) -> dict[str, Any]:
-        """Chain in the URDF file, and tolerance of quarter turns."""
-        tolerance = SNAP_TOLERANCE if self.snap_tolerance is None else self.snap_tolerance
-        return {"tip": self.tip, "base": self.base, "snap_tolerance": tolerance}
+        """Chain in the URDF file."""
+        return {"tip": self.tip, "base": self.base}
 
     def build(self, folder: Path) -> Robot:
         """Return the robot; paths are relative to the folder of the experiment file."""
@@ -185,12 +185,13 @@ class RobotSource:
                 convention=self.convention or "",
                 revolute=tuple(not slides for _, slides, _ in self.dh),
                 joint_names=tuple(name or f"joint{i}" for i, (name, *_) in enumerate(self.dh, 1)),
-                snap_tolerance=self.chain["snap_tolerance"],
                 source="Denavit-Hartenberg table of the experiment file",
                 **self.placement,
             )
         else:
             robot = getattr(library, cast(str, self.builtin))().mounted(*self.placement.values())
+        if self.snap_tolerance is not None:
+            robot = robot.snapped(self.snap_tolerance)
         if self.gravity is not None:
             robot = robot.replace(gravity=np.array(self.gravity))
         if self.name is not None:

@@ -17,7 +17,6 @@ from jaxid.io import json_text, write_bytes, write_text
 from jaxid.result_table import printable
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
-from jaxid.robot.rotations import SNAP_TOLERANCE
 from jaxid.robot.urdf import UrdfTree, load_urdf
 
 from .torque_program import body_parameters
@@ -122,7 +121,6 @@ def export_urdf(
     *,
     tip: str | None = None,
     base: str | None = None,
-    snap_tolerance: float = SNAP_TOLERANCE,
 ) -> Path:
     """Write a robot's own URDF file with the identified model in it.
 
@@ -137,16 +135,14 @@ def export_urdf(
         path: Path of the new file.
         tip: Last link, as in `load_urdf`.
         base: First link, as in `load_urdf`.
-        snap_tolerance: Tolerance of angles, as in `load_urdf` [rad].
 
     Raises:
         FileNotFoundError: If the source does not exist.
         InputError: If the bodies of the fit cannot exist, or the file describes another robot.
     """
     robot, bodies = fit.base.model.robot, _feasible_bodies(fit, "a URDF file")
-    options = {"tip": tip, "base": base, "snap_tolerance": snap_tolerance}
-    _require_same(robot, load_urdf(source, **options), source)
-    carriers = UrdfTree(source, **options).carriers
+    _require_same(robot, load_urdf(source, tip=tip, base=base), source)
+    carriers = UrdfTree(source, tip=tip, base=base).carriers
     dynamics, rotors, left_out = joint_dynamics(fit)
     efforts = np.asarray(robot.known_max_forces)
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)

@@ -135,7 +135,7 @@ def read_faults(report: Path) -> list[str]:
     path = (report if report.is_dir() else report.parent) / "result.json"
     if schema_of(path) != SCHEMAS["result.json"]:
         return []
-    remarks = read_json(path).get("verdict", ())
+    _, *remarks = read_json(path).get("verdict", ({},))
     return [r["text"] for r in remarks if r["status"] == Status.BAD.name.lower()]
 
 

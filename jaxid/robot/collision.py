@@ -17,7 +17,7 @@ from jaxid.errors import InputError
 
 from .forward_and_inverse_kinematics import placements
 from .robot import Robot
-from .rotations import SNAP_TOLERANCE, rpy_rotation
+from .rotations import rpy_rotation
 from .shapes import (
     GROUND as GROUND,
     Box as Box,
@@ -192,7 +192,6 @@ def fit_capsules(
     base_rotation: Numbers | None = None,
     base_position: Numbers = _ZERO,
     packages: str | Path | None = None,
-    snap_tolerance: float = SNAP_TOLERANCE,
 ) -> tuple[Capsule, ...]:
     """Fit a capsule around every collision geometry of a URDF file.
 
@@ -209,14 +208,13 @@ def fit_capsules(
         base_position: As in `load_urdf` [m].
         packages: Folder that holds the packages of `package://` paths. If None, they are searched
             in the folders above the file.
-        snap_tolerance: As in `load_urdf` [rad].
 
     Raises:
         FileNotFoundError: If the file or a mesh does not exist.
         ImportError: If there are meshes and trimesh is not installed.
         InputError: If the file cannot be loaded, or its geometry cannot be read.
     """
-    tree = UrdfTree(path, base=base, tip=tip, snap_tolerance=snap_tolerance)
+    tree = UrdfTree(path, base=base, tip=tip)
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
     place = np.array(base_position, np.float64)
     found: list[Capsule] = []

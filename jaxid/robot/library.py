@@ -17,7 +17,7 @@ from jaxid.errors import InputError
 from .collision import Capsule, CollisionModel, HalfSpace
 from .limits_and_drives import Drives, Limits
 from .robot import Robot
-from .rotations import SNAP_TOLERANCE, axis_rotation, rpy_rotation, snap_angles
+from .rotations import axis_rotation, rpy_rotation
 
 _X, _, _Z = np.eye(3)
 
@@ -33,7 +33,6 @@ def from_dh(
     base_position: Numbers = (0.0, 0.0, 0.0),
     tip_rotation: Numbers | None = None,
     tip_offset: Numbers = (0.0, 0.0, 0.0),
-    snap_tolerance: float = SNAP_TOLERANCE,
     notes: tuple[str, ...] = (),
     **fields: Any,
 ) -> Robot:
@@ -60,7 +59,6 @@ def from_dh(
         base_position: Origin of that frame on the ground [m].
         tip_rotation: Attitude of the end-effector in the last frame of the table.
         tip_offset: Origin of the end-effector in the last frame of the table [m].
-        snap_tolerance: Angles this close to a multiple of 90 degrees become exact [rad]; 0 is off.
         notes: Changes and assumptions that were made, one sentence each.
         fields: Further arguments of `Robot`: `gravity`, `limits`, `drives`, `tool`, `source`.
 
@@ -80,12 +78,9 @@ def from_dh(
     table = np.column_stack([table, np.zeros(n)])[:, :4]
     revolute = (True,) * n if revolute is None else revolute
 
-    labels = joint_names or tuple(f"joint{i + 1}" for i in range(n))
     rotation, offset = np.empty((n, 3, 3)), np.empty((n, 3))
     R, r = np.eye(3), np.zeros(3)
-    for i, (label, (alpha, a, d, theta)) in enumerate(zip(labels, table, strict=False)):
-        pair, snapped = snap_angles(label, ("alpha", "theta"), (alpha, theta), snap_tolerance)
-        (alpha, theta), notes = pair, notes + snapped
+    for i, (alpha, a, d, theta) in enumerate(table):
         twist = axis_rotation(_X, alpha)
         turn = axis_rotation(_Z, theta)
         if convention == "modified":

@@ -13,6 +13,7 @@ from jaxid.result_table import Column, Table
 
 from .inertia import Inertia
 from .limits_and_drives import FARTHEST, Drives, Limits, far_notes, limit_notes
+from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -237,6 +238,20 @@ class Robot(eqx.Module):
     def replace(self, **fields: Any) -> "Robot":
         """Return a copy with some fields replaced and checked."""
         return dataclasses.replace(self, **fields)
+
+    def snapped(self, tolerance: float = SNAP_TOLERANCE) -> "Robot":
+        """Return the robot with rounded quarter turns made exact, like 1.5708 for pi/2.
+
+        Args:
+            tolerance: Entries of axes and attitudes this close to zero become zero [rad].
+
+        Raises:
+            InputError: If the tolerance is no small angle.
+        """
+        return self.replace(
+            axis=snapped(self.axis, tolerance),
+            rotation=snapped_rotations(self.rotation, tolerance),
+        )
 
     def mounted(
         self, rotation: Numbers | None = None, position: Numbers = (0.0, 0.0, 0.0)

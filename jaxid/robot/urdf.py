@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from .inertia import Inertia
 from .limits_and_drives import Limits, range_fault
 from .robot import GRAVITY, Robot
-from .rotations import SNAP_TOLERANCE, rpy_rotation, snap_angles, snap_directions
+from .rotations import rpy_rotation, without_rounding
 
 _TURNING = ("revolute", "continuous")
 _ZERO = (0.0, 0.0, 0.0)
@@ -31,7 +31,6 @@ def load_urdf(
     gravity: Numbers = GRAVITY,
     base_rotation: Numbers | None = None,
     base_position: Numbers = _ZERO,
-    snap_tolerance: float = SNAP_TOLERANCE,
 ) -> Robot:
     """Load a robot from a URDF file; its inertias are read by `urdf_parameters`.
 
@@ -54,15 +53,13 @@ def load_urdf(
         gravity: Acceleration of gravity in the frame of the ground [m/s²].
         base_rotation: Attitude of the base link on the ground; upright if None.
         base_position: Origin of the base link on the ground [m].
-        snap_tolerance: Angles, attitudes and axes this close to a quarter turn become exact [rad];
-            the robot's notes list them. Zero turns it off.
 
     Raises:
         FileNotFoundError: If the file does not exist.
         InputError: If it is no URDF, is no open tree, has a mimic, floating or planar joint on
             the way, or angles or lengths in other units.
     """
-    tree = UrdfTree(path, base=base, tip=tip, snap_tolerance=snap_tolerance)
+    tree = UrdfTree(path, base=base, tip=tip)
     limits, limit_notes = _limits(tree)
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     try:
@@ -80,7 +77,7 @@ def load_urdf(
             tip_rotation=tip_rotation,
             tip_offset=tip_offset,
             source=tree.path,
-            notes=(*tree.notes, *limit_notes, *_inertial_notes(tree)),
+            notes=(*limit_notes, *_inertial_notes(tree)),
         )
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
@@ -92,7 +89,6 @@ def urdf_parameters(
     *,
     tip: str | None = None,
     base: str | None = None,
-    snap_tolerance: float = SNAP_TOLERANCE,
     check: bool = True,
 ) -> Float[AnyArray, " inertial"]:
     """Return the inertial parameters that a URDF file claims, often from CAD (Eq. 9).
@@ -106,7 +102,6 @@ def urdf_parameters(
         path: URDF file.
         tip: As in `load_urdf`.
         base: As in `load_urdf`.
-        snap_tolerance: As in `load_urdf` [rad].
         check: Whether links that cannot exist are rejected; otherwise their numbers are returned
             as they are.
 
@@ -114,7 +109,7 @@ def urdf_parameters(
         FileNotFoundError: If the file does not exist.
         InputError: If the file cannot be loaded, an inertia is not finite, or a link cannot exist.
     """
-    tree = UrdfTree(path, base=base, tip=tip, snap_tolerance=snap_tolerance)
+    tree = UrdfTree(path, base=base, tip=tip)
     parameters = np.zeros((len(tree.joints), 10))
     for name, (body, R, r) in tree.carriers.items():
         if body < 0 or (inertial := tree.inertial(name)) is None:
@@ -140,7 +135,6 @@ class UrdfTree:
         joints: Elements of the moving joints; `parent`, `axis`, `rotation` and `offset` as in
             `Robot`.
         tip: Name of the end-effector's link.
-        notes: Notes on angles and axes that were snapped.
     """
 
     def __init__(
@@ -149,7 +143,6 @@ class UrdfTree:
         *,
         base: str | None = None,
         tip: str | None = None,
-        snap_tolerance: float = SNAP_TOLERANCE,
     ) -> None:
         self.path = str(path)
         element = _read_xml(path)
@@ -167,9 +160,9 @@ class UrdfTree:
                     f"`{argument}` must be a link of `{self.path}`, but is `{link}`; its links are "
                     f"{_listed(list(self.links))}."
                 )
-        self.joints, self.parent, self.notes = [], [], []
+        self.joints, self.parent = [], []
         self.axis, self.rotation, self.offset = [], [], []
-        self._merge(root if base is None else base, tip, snap_tolerance)
+        self._merge(root if base is None else base, tip)
 
     def _named(self, root: Any, tag: str) -> dict[str, Any]:
         """Return the elements of a tag by their names."""
@@ -215,7 +208,7 @@ class UrdfTree:
             )
         return roots[0]
 
-    def _merge(self, base: str, tip: str | None, tolerance: float) -> None:
+    def _merge(self, base: str, tip: str | None) -> None:
         """Merge links on fixed joints into the bodies that carry them, depth first."""
         chain = None if tip is None else self._chain(base, tip)
         self.carriers = {base: (-1, np.eye(3), np.zeros(3))}
@@ -223,20 +216,18 @@ class UrdfTree:
         waiting = self._below[base][::-1]
         while waiting:
             joint = waiting.pop()
-            name = joint.get("name")
             fixed = joint.get("type") == "fixed"
             if not fixed and chain is not None and joint not in chain:
                 continue
             parent, child = _ends(joint)
-            rotation, offset = self._origin(joint, tolerance)
+            rotation, offset = self._origin(joint)
             body, R, r = self.carriers[parent]
             r = r + R @ offset
-            R, notes = snap_directions(name, "attitude", R @ rotation, tolerance)
-            self.notes += notes
+            R = without_rounding(R @ rotation)
             if fixed:
                 self.carriers[child] = (body, R, r)
             else:
-                self.axis.append(self._axis(joint, tolerance))
+                self.axis.append(self._axis(joint))
                 self.carriers[child] = (len(self.joints), np.eye(3), np.zeros(3))
                 self.joints.append(joint)
                 self.parent.append(body)
@@ -264,16 +255,14 @@ class UrdfTree:
             link, _ = _ends(joints[-1])
         return joints
 
-    def _origin(self, joint: Any, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    def _origin(self, joint: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return attitude and origin of a joint in its parent link."""
         offset, rpy = (self.numbers(joint.find("origin"), key, _ZERO) for key in ("xyz", "rpy"))
         if np.abs(rpy).max() > _LARGEST_ANGLE:
             raise self.error(joint, f"has an `rpy` of {_words(rpy)}: give radians, not degrees")
-        snapped, notes = snap_angles(joint.get("name"), ("roll", "pitch", "yaw"), rpy, tolerance)
-        self.notes += notes
-        return rpy_rotation(snapped), offset
+        return rpy_rotation(rpy), offset
 
-    def _axis(self, joint: Any, tolerance: float) -> np.ndarray:
+    def _axis(self, joint: Any) -> np.ndarray:
         """Return the unit vector of a moving joint's axis."""
         kind, mimic = joint.get("type"), joint.find("mimic")
         if kind not in (*_TURNING, "prismatic") or mimic is not None:
@@ -286,9 +275,7 @@ class UrdfTree:
         length = np.linalg.norm(axis)
         if length < 1e-9:
             raise self.error(joint, "has the zero vector as its axis: give it a direction")
-        snapped, notes = snap_directions(joint.get("name"), "axis", axis / length, tolerance)
-        self.notes += notes
-        return snapped
+        return without_rounding(axis / length)
 
     def inertial(self, link: str) -> tuple[Inertia, str] | None:
         """Return a link's inertia in its own frame, and why no body has it; None if it has none."""

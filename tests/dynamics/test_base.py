@@ -103,7 +103,7 @@ def test_doubts_are_reported():
     assert "`m4` is barely" in barely.notes[0]
 
 
-def test_rounded_quarter_turns_are_reported():
+def test_rounded_quarter_turns_count_as_exact_and_others_are_reported():
     def arm(quarter):
         turn = np.array([[1, 0, 0], [0, np.cos(quarter), -np.sin(quarter)],
                          [0, np.sin(quarter), np.cos(quarter)]])  # fmt: skip
@@ -116,7 +116,8 @@ def test_rounded_quarter_turns_are_reported():
         )
 
     exact = base_parameters(Model(arm(np.pi / 2), (TEN, *DRIVES)))
-    rounded = base_parameters(Model(arm(1.5708), (TEN, *DRIVES)))
+    assert base_parameters(Model(arm(1.5708), (TEN, *DRIVES))).indices == exact.indices
+    rounded = base_parameters(Model(arm(1.571), (TEN, *DRIVES)))
     assert exact.notes == ()
     assert rounded.size > exact.size
     assert any("1.5708" in note for note in rounded.notes)

@@ -59,11 +59,11 @@ def _configuration(model: pin.Model, q: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("file", "tip", "joints"), ARMS + TREES)
 def test_regressor_of_a_real_robot(file, tip, joints):
     path = ROBOTS / file
-    robot = load_urdf(path, tip=tip, snap_tolerance=0.0)
+    robot = load_urdf(path, tip=tip)
     assert robot.joints == joints
     model, order = _pinocchio(path, robot.joint_names)
     q, qd, qdd = trees.random_motion(np.random.default_rng(joints), SAMPLES, joints)
-    p = urdf_parameters(path, tip=tip, snap_tolerance=0.0)
+    p = urdf_parameters(path, tip=tip)
     bodies = Model(robot, (RigidBodies(),))
     found = np.asarray(bodies.regressor(Motion(q, qd, qdd)))
     data = model.createData()

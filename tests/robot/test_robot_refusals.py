@@ -63,7 +63,7 @@ CALLS = [
     (lambda: from_dh(np.zeros((2, 4)), convention="craig"), "`convention`"),
     (lambda: from_dh([(0.0, 1.0)], **STANDARD), "`rows`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD, revolute=(True,)), "`axis`"),
-    (lambda: from_dh(np.zeros((2, 4)), **STANDARD, snap_tolerance=1.0), "`snap_tolerance`"),
+    (lambda: from_dh(np.zeros((2, 4)), **STANDARD).snapped(1.0), "`snap_tolerance`"),
     (lambda: inverse_kinematics(panda(), [1.0, 0.0]), "position"),
     (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], 2 * np.eye(3)), "rotation"),
     (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], posture=[0.0]), "`posture`"),

@@ -3,13 +3,14 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxid.robot.rotations import axis_rotation, rpy_rotation, snap_angles, snap_directions
+from jaxid.robot.rotations import (
+    axis_rotation,
+    rpy_rotation,
+    snapped_rotations,
+    without_rounding,
+)
 
 angles = st.floats(-7.0, 7.0)
-
-
-def snap(angle, tolerance):
-    return snap_angles("j", ("roll",), [angle], tolerance)[0][0]
 
 
 @given(angles, angles, angles)
@@ -28,35 +29,19 @@ def test_quarter_turns_are_exact():
             np.testing.assert_allclose(R, expected, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("printed", "tolerance", "meant"),
-    [
-        (1.5708, 1e-4, np.pi / 2),
-        (3.14159, 1e-4, np.pi),
-        (-4.7124, 1e-4, -3 * np.pi / 2),
-        (1.57, 1e-3, np.pi / 2),
-        (1.57, 1e-4, 1.57),
-        (1.5708, 0.0, 1.5708),
-    ],
-)
-def test_printed_angles_snap_within_the_tolerance_only(printed, tolerance, meant):
-    assert snap(printed, tolerance) == meant
+@pytest.mark.parametrize("printed", [1.5708, 3.14159, -4.7124, 1.57079633, 5.49e-5])
+@pytest.mark.parametrize("order", ["xyz", "zyx", "yzx"])
+def test_rounded_quarter_turns_become_exact(printed, order):
+    meant = np.round(printed / (np.pi / 2)) * (np.pi / 2)
+    for other in (0.3, -1.1, 2.0, np.pi / 2, 0.0):
+        R, exact = (
+            Rotation.from_euler(order, [other, angle, 0.0]).as_matrix()
+            for angle in (printed, meant)
+        )
+        np.testing.assert_allclose(snapped_rotations(R, 1e-4), exact, atol=3e-15)
+        np.testing.assert_array_equal(snapped_rotations(R, 0.0), R)
 
 
-@given(angles, angles, angles)
-def test_a_rotation_is_left_alone_unless_all_of_it_is_near(roll, pitch, yaw):
-    R = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
-    near = np.abs(R - np.round(R)).max() <= 1e-4
-    snapped, _ = snap_directions("j", "attitude", R, 1e-4)
-    if near:
-        assert np.array_equal(snapped, np.round(R))
-    else:
-        np.testing.assert_allclose(snapped, R, atol=2e-15)
-    np.testing.assert_array_equal(snap_directions("j", "attitude", snapped, 1e-4)[0], snapped)
-    once = snap(roll, 1e-4)
-    assert snap(once, 1e-4) == once
-
-
-def test_rounding_is_cleaned_even_without_tolerance():
+def test_rounding_is_cleaned():
     R = Rotation.from_euler("x", np.pi / 2).as_matrix() + 6e-17
-    assert set(np.abs(snap_directions("j", "attitude", R, 0.0)[0]).ravel()) == {0.0, 1.0}
+    assert set(np.abs(without_rounding(R)).ravel()) == {0.0, 1.0}
