@@ -306,10 +306,11 @@ def _doubts(found: Dependence, other: Dependence, left: float, weakest: str) -> 
             f"the two ways to choose base parameters disagree ({len(found.independent)} and "
             f"{len(other.independent)}): the geometry is nearly degenerate, or angles are rounded."
         )
-    if found.smallest_independent < 1e-4:
+    if found.smallest_independent < 5e-4:
         notes.append(
             f"`{weakest}` is barely a base parameter: only {found.smallest_independent:.1e} of its "
-            "column is new, because of a length near zero or a rounded angle such as 1.5708."
+            "column is new, because of a length near zero or an angle like 1.571 instead of pi/2, "
+            "which `robot.snapped(1e-3)` (`snap_tolerance`) makes exact."
         )
     if found.dependent and found.gap < 1e3:
         notes.append(
