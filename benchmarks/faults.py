@@ -1,6 +1,6 @@
 """Damaged files, SIGKILL at random moments, and long use in one process.
 
-    python benchmarks/faults.py [fuzz kill soak] [--quick] [--minutes 8] [--json FILE]
+    python benchmarks/faults.py [fuzz kill interrupt soak] [--quick] [--minutes 8] [--json FILE]
 
 The files are those of `jaxid example`, the random numbers seeded.
 
@@ -12,6 +12,10 @@ kill: `jaxid identify` writes into the folder of an earlier report and gets SIGK
 moment of the time that it takes undisturbed. Right is: every file equals that of one of the two
 reports, `result.json` is absent or all files belong to it, and the same command then ends well.
 
+interrupt: each command gets SIGINT, every fifth time SIGTERM, at a random moment between 60 ms (in
+which Python itself starts) and its undisturbed end. Right is: it ends within 2 s with 130 or 143
+and one sentence, or as if nothing had come; no traceback; no temporary file is left.
+
 soak: logs are identified, batches fitted and motions designed for robots that change every round.
 Printed: resident memory after the first sixth of the time and at the end, and open files.
 """
@@ -21,6 +25,7 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -60,9 +65,8 @@ WORDS = (
 def jaxid(*words, **options):
     """Start a command of the package in a process of its own."""
     command = [sys.executable, "-m", "jaxid", *map(str, words)]
-    return subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **options
-    )
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, **options}
+    return subprocess.Popen(command, **options)
 
 
 def example(folder):
@@ -215,6 +219,55 @@ def kill(folder, minutes, quick):
     return [Row("kill", "jaxid identify", "faults.py kill", "0 wrong", said, not wrong)]
 
 
+# Ctrl-C
+
+
+def interrupt(folder, minutes, quick):
+    """Send signals to commands at random moments, and count what is not right."""
+    experiment, log = folder / "experiment.toml", folder / "identification.csv"
+    report, rows = folder / "done", []
+    if jaxid("identify", experiment, log, "-o", report).wait():
+        raise SystemExit("`jaxid identify` failed")
+    commands = {
+        "init": ("init", folder / "arm.urdf"),
+        "example": ("example", folder / "new", "--force"),
+        "inspect": ("inspect", experiment, log),
+        "identify": ("identify", experiment, log, "-o", folder / "report"),
+        "export": ("export", report, "--to", "c", "-o", folder / "arm.c", "--force"),
+        "compare": ("compare", report, report, "-o", folder / "comparison"),
+        "states": ("states", experiment, log, folder / "verification.csv", "-o", folder / "states"),
+        "excite": ("excite", experiment, "-o", folder / "motion" / "motion.csv"),
+        "demo": ("demo", "-o", folder / "demo"),
+    }
+    for name, words in commands.items():
+        chance, wrong, slowest = random.Random(name), [], 0.0
+        begun = time.monotonic()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            first = jaxid(*words)
+            first.wait(60.0)
+        first.kill()
+        took = time.monotonic() - begun
+        moments = 2 if quick else 50
+        for count in range(moments):
+            shutil.rmtree(folder / "motion", ignore_errors=True)
+            signals = signal.SIGTERM if count % 5 == 4 else signal.SIGINT
+            process = jaxid(*words, stderr=subprocess.PIPE)
+            time.sleep(chance.uniform(0.06, took))
+            sent = time.monotonic()
+            process.send_signal(signals)
+            said = process.communicate()[1].decode()
+            slowest = max(slowest, time.monotonic() - sent)
+            left = [str(x) for x in folder.rglob(".jaxid-*")]
+            stopped = process.returncode == 128 + signals and said.count("\n") == 1
+            if left or "Traceback" in said or not (stopped or process.returncode in (0, 3)):
+                wrong.append(f"{process.returncode}: {said[-200:]!r} {left}")
+        said = f"{moments} signals, {len(wrong)} wrong, slowest {slowest:.2f} s {' '.join(wrong)}"
+        holds = not wrong and slowest < 2.0
+        rows.append(Row("interrupt", name, "faults.py interrupt", "0 wrong, 2 s", said, holds))
+        print(name, said, flush=True)
+    return rows
+
+
 # Long use
 
 
@@ -266,7 +319,7 @@ def soak(folder, minutes, quick):
 def main():
     """Run the chosen parts."""
     parser = timing.parser(__doc__, "a few seconds of each")
-    parts = {"fuzz": fuzz, "kill": kill, "soak": soak}
+    parts = {"fuzz": fuzz, "kill": kill, "interrupt": interrupt, "soak": soak}
     parser.add_argument("parts", nargs="*", default=list(parts))
     parser.add_argument("--minutes", type=float, default=8.0)
     options = parser.parse_args()

@@ -27,6 +27,8 @@ import numpy as np
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 
+TEMPORARY: set[Path] = set()
+"""Temporary folders in use; who ends the process at once removes them."""
 _DTYPES = ("float64", "float32", "int64", "int32", "bool")
 
 
@@ -95,6 +97,7 @@ def _temporary_folder(folder: Path) -> Iterator[Path]:
     if not place.is_dir():
         raise InputError(f"`{place}` must be a folder, but is none: choose another place.")
     path = place / f".jaxid-{uuid.uuid4().hex[:12]}"
+    TEMPORARY.add(path)
     try:
         path.mkdir()
     except OSError as error:
@@ -103,6 +106,7 @@ def _temporary_folder(folder: Path) -> Iterator[Path]:
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
+        TEMPORARY.discard(path)
 
 
 def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxid import cli
+from jaxid.cli import app as cli
 
 HERE = Path(__file__).resolve().parent / "golden"
 TOLERANCE = float(os.environ.get("JAXID_GOLDEN_TOLERANCE", "1e-9"))

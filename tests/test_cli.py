@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from jaxid import cli
+from jaxid.cli import app as cli
 from jaxid.experiment.experiment import load_experiment
 
 pytestmark = pytest.mark.usefixtures("blank_figures")

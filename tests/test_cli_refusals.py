@@ -6,7 +6,7 @@ import sys
 import pytest
 from test_cli import EXPERIMENT, first, folder, material, refused, run  # noqa: F401
 
-from jaxid.cli import main
+from jaxid.cli.app import main
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxid import cli
+from jaxid.cli import app as cli
 from jaxid.errors import InputError
 from jaxid.excitation import search
 from jaxid.excitation.coefficient_limits import JointLimits
@@ -69,7 +69,7 @@ STAGES = {"SCHEDULE": search.SCHEDULE, "SETTLING": search.SETTLING}
 LAST_STAGE_ALONE = """
 import jaxid.excitation.search as search
 search.SCHEDULE = search.SETTLING = ()
-from jaxid.cli import main
+from jaxid.cli.app import main
 main()
 """
 

@@ -28,7 +28,7 @@ ENDINGS = {"mjcf": ".xml", "pinocchio": "_pinocchio.json"}
 
 
 def main() -> None:
-    """Run a command; an error of a user is one sentence on stderr, with exit code 2."""
+    """Run a command in this thread; an error of a user is one sentence, with exit code 2."""
     if isinstance(sys.stdout, io.TextIOWrapper):  # some terminals know few characters
         sys.stdout.reconfigure(errors="replace")
     try:
@@ -131,6 +131,9 @@ def excite(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where a design was stopped.")
     ] = False,
+    best: Annotated[
+        bool, typer.Option("--best", help="Write the best motion of a stopped design.")
+    ] = False,
     all_criteria: Annotated[
         bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
     ] = False,
@@ -138,14 +141,14 @@ def excite(
     """Design the motion to record, within the limits of the joints.
 
     Beside the table lie the trajectory itself (.json), the same for ROS (.ros.yaml), pictures of
-    joints and end-effector in a folder, and the state of the design until it is done. Ctrl-C keeps
-    the best motion so far.
+    joints and end-effector in a folder, and the state of the design until it is done. After Ctrl-C
+    `--resume` goes on, and `--best` writes the best motion so far.
     """
     from . import commands
 
     console = options.start()
     options.refuse_foreign_table(output)
-    commands.excite(console, experiment, output, resume, all_criteria)
+    commands.excite(console, experiment, output, resume, best, all_criteria)
 
 
 @app.command()

@@ -1,6 +1,7 @@
 """Work of the commands for an experiment and its logs, and what they print."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
+from jaxid.excitation.design import DesignProgress
 from jaxid.experiment import identify_logs
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import Experiment, load_experiment
@@ -40,6 +42,7 @@ from jaxid.report.verdict import Report, verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 
+from . import process
 from .options import command_line, open_console
 
 STOPPED = 130
@@ -153,27 +156,35 @@ def _doubts(texts: Any) -> list[Remark]:
     return [Remark(text, Status.DOUBTFUL) for text in texts]
 
 
-def excite(console: Console, path: Path, output: Path, resume: bool, all_criteria: bool) -> None:
+def excite(
+    console: Console, path: Path, output: Path, resume: bool, best: bool, all_criteria: bool
+) -> None:
     """Design a motion and write it; the state of the design is kept until it is done."""
     state = output.with_suffix(".state.npz")
+    if best and not state.exists():
+        raise InputError(f"`{state}` is not there: `--best` needs the state of a stopped design.")
+    resume = resume or best
     if state.exists() and not resume:
         raise InputError(
-            f"`{state}` is there: `--resume` goes on with it; to begin anew, remove the file."
+            f"`{state}` is there: `--resume` goes on with it, `--best` writes the best motion in "
+            "it; to begin anew, remove the file."
         )
     experiment, errors = load_experiment(path), open_console(stderr=True)
     if resume and not state.exists():
         show_remarks(console, _doubts([f"`{state}` is not there: the design begins anew"]))
-    try:
-        with identify_logs.stages(errors) as stage:
-            design = design_motion(experiment, stage.design, state, resume)
-    except KeyboardInterrupt:
-        cure = "start again, and give it more time"
-        if state.is_file():
-            cure = f"`--resume` goes on with `{state}`, where it was"
-        said = "the design was stopped before a motion kept all limits, and nothing was written"
-        errors.print(Text(f"jaxid: {said}: {cure}."), soft_wrap=True)
-        raise typer.Exit(STOPPED) from None
-    written = write_design(experiment, design, output, command_line())
+    farewell = f"stopped: once `{state}` is there, `--resume` goes on with it, and `--best` writes "
+    with process.handing_over(farewell + "the best motion in it"):
+        try:
+            with identify_logs.stages(errors) as stage:
+                design = design_motion(experiment, _until_stopped(stage, best), state, resume)
+        except KeyboardInterrupt:
+            cure = "start again, and give it more time"
+            if state.is_file():
+                cure = f"`--resume` goes on with `{state}`, where it was"
+            said = "the design was stopped before a motion kept all limits, and nothing was written"
+            errors.print(Text(f"jaxid: {said}: {cure}."), soft_wrap=True)
+            raise typer.Exit(STOPPED) from None
+        written = write_design(experiment, design, output, command_line())
     if not design.plan.interrupted:
         state.unlink(missing_ok=True)
     show(console, *design.plan.tables())
@@ -181,12 +192,25 @@ def excite(console: Console, path: Path, output: Path, resume: bool, all_criteri
     show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in written])
     if all_criteria and not design.plan.interrupted:
         with identify_logs.stages(errors) as stage:
-            plans = compare_criteria(experiment, stage.design)
+            plans = compare_criteria(experiment, _until_stopped(stage))
         if plans:
             show(console, side_by_side_table(plans))
         done = sum(not plan.interrupted for plan in plans)
         if done < len(CRITERIA):
             show_remarks(console, _doubts([f"stopped after {done} of {len(CRITERIA)} criteria"]))
+
+
+def _until_stopped(
+    stage: identify_logs.Stages, already: bool = False
+) -> Callable[[DesignProgress], None]:
+    """Return the callback of a design, which stops it after a signal, or at once."""
+
+    def progress(now: DesignProgress) -> None:
+        if already or process.STOP.is_set():
+            raise KeyboardInterrupt
+        stage.design(now)
+
+    return progress
 
 
 def export(

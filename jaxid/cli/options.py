@@ -118,7 +118,7 @@ def describe_error(error: Exception) -> str:
 
 def command_line() -> str:
     """Return the command line that gives the same result again."""
-    words = (word for word in sys.argv[1:] if word not in ("--force", "--resume"))
+    words = (word for word in sys.argv[1:] if word not in ("--force", "--resume", "--best"))
     return shlex.join(["jaxid", *words])
 
 

@@ -8,7 +8,7 @@ import pytest
 from export_samples import fit_of, possible
 
 import jaxid as jid
-from jaxid import cli
+from jaxid.cli import app as cli
 
 URDF = """<robot name="stick"><link name="a"/><link name="b"/><joint name="hinge"
  type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>"""

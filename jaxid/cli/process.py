@@ -1,0 +1,99 @@
+"""The process of a command: it works in a thread, and signals are answered at once.
+
+Python handles signals in the main thread, between two of its instructions. If the main thread
+compiled or computed, Ctrl-C would wait for that, or be lost in a callback of JAX. So it only waits.
+Files are written under temporary names and renamed, so that a process may end at any moment.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from typing import NoReturn
+
+GRACE = 1.3
+"""Time after Ctrl-C in which a command may still hand over what it has [s]."""
+STOP = threading.Event()
+"""Set when a signal has asked the command to stop."""
+_farewells: list[str] = []
+
+
+class _SignalReceived(BaseException):
+    """Raised in the main thread, where nothing but waiting is interrupted."""
+
+
+@contextlib.contextmanager
+def handing_over(farewell: str) -> Iterator[None]:
+    """Grant a block some time after a signal to react to `STOP`.
+
+    Args:
+        farewell: What is said if the time does not suffice.
+    """
+    _farewells.append(farewell)
+    yield
+    _farewells.remove(farewell)
+
+
+def main() -> NoReturn:
+    """Run a command; Ctrl-C and SIGTERM end it within two seconds, with one sentence."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _receive)
+    codes, done = [], threading.Event()
+
+    def work() -> None:
+        codes.append(_code())
+        done.set()
+
+    try:
+        threading.Thread(target=work, daemon=True).start()
+        # A signal that another thread has received does not wake this one.
+        while not done.wait(0.1):
+            pass
+    except _SignalReceived as received:
+        (number,) = received.args
+        for again in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(again, lambda *_: os._exit(128 + number))
+        STOP.set()
+        done.wait(GRACE if _farewells else 0.0)
+        if not codes:
+            _say(_farewells[-1] if _farewells else "stopped: nothing was written")
+            codes.append(128 + number)
+    _leave(codes[0])
+
+
+def _receive(number: int, _) -> None:
+    raise _SignalReceived(number)
+
+
+def _code() -> int:
+    """Run the command and return its exit code; a bug keeps its traceback."""
+    from .app import main
+
+    try:
+        main()
+    except SystemExit as stopped:
+        return stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+def _say(text: str) -> None:
+    # A progress bar has hidden the cursor, and stands in the line.
+    clear = "\x1b[?25h\r\x1b[2K" if sys.stderr.isatty() else ""
+    sys.stderr.write(f"{clear}jaxid: {text}.\n")
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process at once: nothing that still runs in a thread is torn down half-way."""
+    for folder in getattr(sys.modules.get("jaxid.io"), "TEMPORARY", ()):
+        shutil.rmtree(folder, ignore_errors=True)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
