@@ -5,8 +5,10 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -378,3 +380,19 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
     assert "2 Hz" in said
     assert "filter.png" in result(folder)["files"]
+
+
+@pytest.mark.parametrize("moment", [1.0, 4.0])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_command_at_once_and_leaves_nothing(folder, moment, number):
+    command = [sys.executable, "-m", "jaxid", "excite", "experiment.toml", "-o", "new/motion.csv"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True
+    )
+    time.sleep(moment)
+    process.send_signal(number)
+    said = process.communicate(timeout=60)[1]
+    assert (process.returncode, said.count("\n")) == (128 + number, 1), said
+    assert said.startswith("jaxid: ")
+    assert not list(folder.rglob(".jaxid-*"))

@@ -245,14 +245,16 @@ def clock_findings(recording: Recording) -> list[str]:
         if not moving.any():
             continue
         usual, own, bend = (x[:, moving] / noise[moving] for x in (usual, own, after - before))
-        smooth = np.abs(bend).max(axis=1) < SURE
-        fast, off = np.abs(usual) > SURE, np.abs(own - usual) > SURE
-        # Every joint that is fast enough to show it takes part.
-        jumps = smooth & fast.any(axis=1) & (off | ~fast).all(axis=1)
-        still = (own == 0).all(axis=1)
-        further = np.sum(own * usual, axis=1) > 1.5 * np.sum(usual**2, axis=1)
-        lost += (time[a + 2 : b - 1][jumps & further]).tolist()
-        repeated += (time[a + 2 : b - 1][jumps & still]).tolist()
+        # All joints go on by the same number of steps, as far as noise lets see.
+        speed = np.sum(usual**2, axis=1)
+        count = np.sum(own * usual, axis=1) / np.maximum(speed, 1.0)
+        off, expected = np.abs(own - usual), np.abs(usual) * np.abs(count - 1)[:, None]
+        jumps = (np.abs(bend).max(axis=1) < SURE) & (speed > 9.0) & (off > SURE).any(axis=1)
+        jumps &= ((off > SURE) | (expected < 2 * SURE)).all(axis=1)
+        jumps &= np.sum((own - count[:, None] * usual) ** 2, axis=1) < 0.1 * np.sum(off**2, axis=1)
+        inner = time[a + 2 : b - 1]
+        lost += inner[jumps & (count > 1.5)].tolist()
+        repeated += inner[jumps & (own == 0).all(axis=1)].tolist()
     cure = "name the column of times (`recording.time`), or record again"
     return [
         f"{what} at {len(at)} instant{'' if len(at) == 1 else 's'}, first at {at[0]:.6g} s: {cure}."

@@ -42,7 +42,7 @@ class Diagnosis:
         robot: Robot of the log.
         statistics: Extremes of the log, joint by joint.
         findings: Signs of mistakes, as sentences; empty if there are none.
-        faulty: Joints with held, spiky or wrapped channels, which no model can fit.
+        faulty: Joints whose channels no model can fit: held, spiky, wrapped, or with rows lost.
         observations: Observations in which mistakes are looked for, of a long log a part; None if
             no part is long enough.
         motor_sides: Whether angles and forces of the log are taken for the motors'.
@@ -189,9 +189,10 @@ def diagnose(
     sides = part.angles_on_motor_side, part.forces_on_motor_side
     faults = channel_findings(robot, part, statistics)
     faulty = tuple(dict.fromkeys(joint for joint, _ in faults))
+    clock = clock_findings(part)
     findings = [
         *(text for _, text in faults),
-        *clock_findings(part),
+        *clock,
         *limit_findings(robot, part, statistics, faulty),
         *stuck_findings(robot, part, faulty),
     ]
@@ -200,6 +201,7 @@ def diagnose(
         cure = "check `recording.time_unit` or `sample_time`."
         findings.append(f"the log has {rate:.3g} samples in a second: {cure}")
     found = tuple(findings)
+    faulty = tuple(range(robot.joints)) if clock else faulty
     diagnosis = Diagnosis(log, robot, statistics, found, faulty, observations, sides, notes)
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 

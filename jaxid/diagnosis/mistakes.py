@@ -23,7 +23,7 @@ from jaxid.robot.robot import Robot
 
 BAD = 0.03
 """Fraction (0 to 1) of the forces left unexplained from which mistakes are looked for."""
-FAR = 0.2
+FAR = 0.15
 """Fraction (0 to 1) of the forces that no model misses whose description is right."""
 MOST = 0.5
 """Fraction (0 to 1) of what a model misses that may be left by the correction of a mistake."""
@@ -60,11 +60,15 @@ def likely_mistakes(
         forces: Forces at these instants [N m or N].
         motor_sides: Whether angles and forces of the log are taken for the motors'.
     """
-    model = fit.base.model
-    robot, geometry = model.robot, _AnyGeometry(model)
+    model, geometries = fit.base.model, {}
+    robot = model.robot
 
     def rest(c: Correction) -> float:
-        return _unexplained(*geometry(c.robot, c.motion), c.forces, model.parameter_names)
+        kinds = c.robot.revolute
+        if kinds not in geometries:
+            geometries[kinds] = _AnyGeometry(Model(c.robot, model.terms))
+        columns = geometries[kinds](c.robot, c.motion)
+        return _unexplained(*columns, c.forces, model.parameter_names)
 
     left = rest(Correction("", robot, motion, forces))
     if left < BAD:
@@ -72,13 +76,15 @@ def likely_mistakes(
     candidates = [
         *_of_columns(robot, motion, forces, motor_sides),
         *_of_robot(robot, motion, forces),
+        *(_of_kinds(robot, motion, forces) if left > FAR else ()),
     ]
     tried = sorted(((rest(c), c.text) for c in candidates), key=lambda pair: pair[0])
     best = tried[0][0]
     likely = [text for value, text in tried if value <= ALIKE * best]
     others = [value for value, _ in tried[len(likely) :]]
     # With more than three candidates nothing is known.
-    if best <= MOST * left and len(likely) <= 3 and min(others, default=np.inf) >= CLEAR * best:
+    clear = len(likely) <= 3 and min(others, default=np.inf) >= CLEAR * best
+    if clear and best <= min(MOST * left, FAR):
         return (
             f"{', or '.join(likely)}: the model then misses {100 * best:.2g} % of the forces "
             f"instead of {100 * left:.2g} %.",
@@ -192,6 +198,14 @@ def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Corr
         text += " in the frame of its body"
         yield Correction(text.format(shown), turned, motion, forces)
         yield reversed_axis(text.format(other), j, turned)
+
+
+def _of_kinds(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Correction]:
+    """Yield corrections of the kinds of joints."""
+    for j, name in enumerate(robot.joint_names[:MANY]):
+        kinds = tuple(turns != (i == j) for i, turns in enumerate(robot.revolute))
+        text = f"joint `{name}` seems to {'turn' if kinds[j] else 'slide'}"
+        yield Correction(text, robot.replace(revolute=kinds), motion, forces)
 
 
 class _AnyGeometry(eqx.Module):
