@@ -193,8 +193,10 @@ def simulate(
             brake = (fc + fs * np.exp(-((v / 0.05) ** 2))) * np.tanh(v / epsilon) + fv * v
             v = v + h * pin.aba(model, data, q, v, forces[k] - brake + unknown[k])
             q = q + h * v
-    # The drive holds a force for one sample: the mean around a sample belongs to its angles.
-    held = 0.5 * (forces + np.vstack([forces[:1], forces[:-1]]))
+    # The drive holds a force for one sample: the mean around a sample belongs to its angles. The
+    # steps of a sample act at their beginnings.
+    own = 0.5 + 0.5 / steps
+    held = own * forces + (1 - own) * np.vstack([forces[:1], forces[:-1]])
     held = held + noise * size * rng.standard_normal(held.shape)
     if bits is not None:
         turn = np.array([2 * np.pi if "R" in j.shortname() else 1.0 for j in model.joints[1:]])

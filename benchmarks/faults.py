@@ -231,7 +231,7 @@ def interrupt(folder, minutes, quick):
         raise SystemExit("`jaxid identify` failed")
     commands = {
         "init": ("init", folder / "arm.urdf"),
-        "example": ("example", folder / "new", "--force"),
+        "example": ("example", folder / "motion" / "new"),
         "inspect": ("inspect", experiment, log),
         "identify": ("identify", experiment, log, "-o", folder / "report"),
         "export": ("export", report, "--to", "c", "-o", folder / "arm.c", "--force"),

@@ -68,7 +68,7 @@ def inspect(console: Console, path: Path, logs: list[Path]) -> None:
             estimator = experiment.estimation.plain
             fit = estimate(experiment.base, observations, estimator, stage.through)
             stage(f"looking for mistakes in {log.name}")
-            examined.append((diagnosis.with_fit(fit), fit))
+            examined.append((diagnosis.with_fit(fit, experiment.commanded(log)), fit))
     robot = experiment.robot
     show(console, robot.summary(), *motor_tables(robot), experiment.base.summary())
     show_remarks(console, experiment.notes)

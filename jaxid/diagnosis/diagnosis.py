@@ -76,18 +76,20 @@ class Diagnosis:
         motion = o.motion[o.instants[::step]]
         return likely_mistakes(fit, motion, o.reduced_forces[::step], self.motor_sides)
 
-    def with_fit(self, fit: Fit) -> "Diagnosis":
+    def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
 
         Args:
             fit: Fit to this log.
+            commanded: The log with commanded angles in place of the measured ones, filtered alike.
         """
-        found = () if self.faulty else self.mistakes(fit)
+        found, notes = (() if self.faulty else self.mistakes(fit)), self.notes
         if not found and not self.faulty:
             found = negative_friction(fit)
             if self.observations is not None:
-                found += delay_finding(self.observations, fit)
-        return dataclasses.replace(self, findings=(*found, *self.findings))
+                late, more = delay_finding(self.observations, fit, commanded)
+                found, notes = (*found, *late), (*notes, *more)
+        return dataclasses.replace(self, findings=(*found, *self.findings), notes=notes)
 
     def summary(self) -> Table:
         """Return a table: motion and forces of each joint beside its limits, and the findings."""
@@ -253,29 +255,34 @@ def negative_friction(fit: Fit) -> tuple[str, ...]:
     )
 
 
-def delay_finding(observations: Observations, fit: Fit) -> tuple[str, ...]:
-    """Return a sentence about a delay of the forces that the model sees, or nothing."""
+def delay_finding(
+    observations: Observations, fit: Fit, commanded: Observations | None = None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return findings and notes about a delay of the forces that the model sees."""
     # A model that explains too little sees no delay.
     if not fit.residual < 0.3:
-        return ()
+        return (), ()
+    weights = GivenWeights(np.asarray(fit.weights))
     try:
-        delay = estimate_delay(fit.base, observations, GivenWeights(np.asarray(fit.weights)))
+        delay = estimate_delay(fit.base, observations, weights, commanded=commanded)
     except ValueError:
-        return ()
-    half = delay.interval()[1] - delay.seconds
+        return (), ()
+    low, high = (1e3 * x for x in delay.interval())
+    between = f"between {low:.2g} and {high:.2g} ms later in the log than the angles"
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     scatter = float(np.std(delay.of_joints))
-    if abs(delay.seconds) < max(half, scatter, 0.1 * observations.sample_time):
-        return ()
-    text = (
-        f"the forces seem to stand {1e3 * abs(delay.seconds):.3g} ± {1e3 * half:.2g} ms "
-        f"{'later' if delay.seconds > 0 else 'earlier'} in the log than the angles: "
-    )
-    if delay.p_value > 0.001:
+    negligible = abs(delay.seconds) < max(scatter, 0.1 * observations.sample_time)
+    if low <= 0.0 <= high or negligible:
+        return (), (f"the forces stand {between}: a delay cannot be told from none.",)
+    text = f"the forces stand {between}"
+    if delay.p_value <= 0.001:
+        least, most = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))
+        return (
+            f"{text}, but {least:.3g} to {most:.3g} ms joint by joint: as likely, the model lacks "
+            "an effect.",
+        ), ()
+    if commanded is None and delay.feedback > 0.1 * abs(delay.seconds):
+        cure = "name the commanded angles (`recording.commands`) to tell how much"
+    else:
         cure = f"`force_delay = {delay.seconds:.3g}` in `[recording]` removes that"
-        return (f"{text}{cure}, unless the model lacks an effect instead.",)
-    low, high = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))
-    return (
-        f"{text}from {low:.3g} to {high:.3g} ms joint by joint, so that some effect which the "
-        "model lacks is as likely (`force_delay` in `[recording]`).",
-    )
+    return (f"{text}: {cure}.",), ()

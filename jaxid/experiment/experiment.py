@@ -133,8 +133,21 @@ class Experiment:
         Raises:
             InputError: If the file has no table `[recording]`, or the log is not as it says.
         """
-        log, logs = Path(log), self.logs
-        columns = self._columns_of(log)
+        return self._read(Path(log), self._columns_of(Path(log)))
+
+    def commanded(self, log: Path) -> Observations | None:
+        """Return a log with the commanded angles in place of the measured ones, filtered.
+
+        None if the file does not name them, or the log is long.
+        """
+        commands = self.logs.commands
+        if commands is None or self.is_long(log):
+            return None
+        columns = dataclasses.replace(self._columns_of(log), angles=commands, velocities=None)
+        return self.observe(self._read(log, columns))
+
+    def _read(self, log: Path, columns: Columns) -> Recording:
+        logs = self.logs
         recording = read_recording(log, columns, largest_gap=logs.largest_gap, **logs.files(log))
         if recording.joints != self.robot.joints:
             raise InputError(

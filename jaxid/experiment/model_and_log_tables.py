@@ -11,6 +11,7 @@ from jaxid.dynamics import terms
 from jaxid.errors import InputError
 from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.log_files import Selection
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
@@ -143,6 +144,8 @@ class Logs:
         forces_file: File of the forces, if they lie in another file beside the log, like
             `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
         velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
+        commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid inspect` tells a
+            delay in spite of disturbances.
         force_delay: Time by which forces stand later in the log than angles [s].
         largest_gap: Longest pause that is bridged, in sample times.
         start: Start of the part of every log that is used [s], like `0.0`.
@@ -153,6 +156,7 @@ class Logs:
     forces_side: Side | None = None
     forces_file: str | None = None
     velocities_file: str | None = None
+    commands: Selection | None = None
     force_delay: float = 0.0
     largest_gap: Annotated[float, Bounds(above=1.0)] = 1.75
     start: float = -np.inf
