@@ -125,6 +125,48 @@ def test_a_delays_deviation_is_that_of_many_draws(base):
     assert np.mean([d.p_value < 0.01 for d in found]) < 0.2
 
 
+def in_closed_loop(seed, seconds=20.0, dt=0.005):
+    """A pendulum whose servo counteracts unknown forces: measured and commanded observations."""
+    inertia, weight, kp, kd, steps = 0.4, 6.0, 160.0, 16.0, 4
+    rng, t = np.random.default_rng(seed), dt * np.arange(round(seconds / dt))
+    w = 2 * np.pi * np.arange(1, 6) / 8
+    target, rate = (f(np.outer(t, w) + w) @ (x / w) for f, x in ((np.sin, 0.5), (np.cos, 0.5 * w)))
+    unknown = np.convolve(rng.normal(size=len(t)), np.ones(20) / 20, "same")
+    q, v, angles, forces = target[0], rate[0], np.zeros_like(t), np.zeros_like(t)
+    for k in range(len(t)):
+        angles[k], forces[k] = q, kp * (target[k] - q) + kd * (rate[k] - v) + weight * np.sin(q)
+        for _ in range(steps):
+            h = dt / steps
+            v += h * (forces[k] + 3.0 * unknown[k] - weight * np.sin(q)) / inertia
+            q += h * v
+    # A force that is held for one sample belongs to its middle.
+    held = 0.625 * forces + 0.375 * np.append(forces[0], forces[:-1])
+    held += 0.02 * rng.normal(size=len(t))
+    robot = jid.Robot(
+        "pendulum", revolute=(True,), axis=[(0, 1, 0)], rotation=[np.eye(3)], offset=[(0, 0, 0)]
+    )
+    logs = (jid.Recording.of(x[:, None], held[:, None], time=t) for x in (angles, target))
+    filters = jid.ZeroPhaseButterworth(10.0), jid.Subsample(5)
+    return robot, [jid.observe(log, robot, *filters) for log in logs]
+
+
+def test_disturbances_that_a_controller_answers_are_no_delay():
+    held, commanded, bare = [], [], []
+    for seed in range(8):
+        robot, (measured, command) = in_closed_loop(seed)
+        base = jid.base_parameters(jid.Model(robot, (jid.RigidBodies(), jid.ConstantOffset())))
+        weights = jid.estimators.GivenWeights([1.0])
+        found = jid.estimate_delay(base, measured, weights)
+        bare.append(abs(found.seconds) > 2.1 * found.standard_deviation)
+        held.append(found.interval()[0] <= 0.0 <= found.interval()[1])
+        found = jid.estimate_delay(base, measured, weights, commanded=command)
+        assert found.feedback == 0.0
+        commanded.append(found.interval()[0] <= 0.0 <= found.interval()[1])
+    assert all(held)
+    assert sum(bare) >= 6, "without the bound, most intervals would be wrong"
+    assert sum(commanded) >= 7
+
+
 def test_removing_a_delay_undoes_it():
     t = 0.01 * np.arange(400)
     angles = np.sin(np.outer(t, [3.0, 5.0]))
