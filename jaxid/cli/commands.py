@@ -1,6 +1,7 @@
 """Work of the commands for an experiment and its logs, and what they print."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,14 +82,15 @@ def _check_logs(logs: list[Path], verify: list[Path], split: float | None) -> No
     """Reject logs that would count twice, or verify a model that has seen them."""
     if split is not None and not 0 < split < 1:
         raise InputError(f"`--split` must lie between 0 and 1, like 0.6, but is {split:g}.")
-    places = [p.resolve() for p in logs]
+    places = [os.path.realpath(p) for p in logs]
     repeated = next((p for k, p in enumerate(logs) if places[k] in places[:k]), None)
     if repeated is not None:
         raise InputError(f"`{repeated}` is given twice: its rows would count double.")
-    both = set(places) & {p.resolve() for p in verify}
+    both = set(places) & {os.path.realpath(p) for p in verify}
     if both:
         raise InputError(
-            f"`{sorted(both)[0].name}` is given both to identify and to verify with: use `--split`."
+            f"`{Path(sorted(both)[0]).name}` is given both to identify and to verify with: use "
+            "`--split`."
         )
     if all(p.is_dir() for p in logs):
         raise InputError("give at least one log as a file, for torque errors and figures.")
@@ -322,7 +324,7 @@ def gains(
 def states(console: Console, path: Path, logs: list[Path], output: Path) -> None:
     """Fit several states of a robot at once: one inertia, friction for each."""
     experiment = load_experiment(path)
-    names = [log.resolve().stem for log in logs]
+    names = [Path(os.path.realpath(log)).stem for log in logs]
     if len(set(names)) < max(len(names), 2):
         raise InputError(
             "give one log or report for each of two or more states, with different names."
@@ -355,10 +357,11 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
 def _pair(
     experiment: Experiment, logs: list[Path], loaded: list[Path]
 ) -> tuple[list[Fit], list[str]]:
-    twice = {p.resolve() for p in logs} & {p.resolve() for p in loaded}
+    twice = {os.path.realpath(p) for p in logs} & {os.path.realpath(p) for p in loaded}
     if twice:
         raise InputError(
-            f"`{sorted(twice)[0].name}` is given both without and with the load: name it once."
+            f"`{Path(sorted(twice)[0]).name}` is given both without and with the load: name it "
+            "once."
         )
     with identify_logs.stages(open_console(stderr=True)) as stage:
         return identify_logs.read_runs(experiment, [logs, loaded], ["unloaded", "loaded"], stage)

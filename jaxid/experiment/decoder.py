@@ -24,6 +24,8 @@ from jaxid.errors import InputError
 from jaxid.io import union_members
 from jaxid.units import Unit, unit
 
+LARGEST = 1e12
+"""Largest number of a key, infinity apart, in any unit."""
 RENAMED = {"rows.slow": "min_speed", "rows.every": "step"}
 """Old keys and their new names."""
 
@@ -44,18 +46,19 @@ class Bounds(NamedTuple):
     below: float | None = None
 
     def check(self, value: float | int, place: str) -> None:
-        """Reject a number out of the range, and NaN."""
+        """Reject a number out of the range, NaN and infinity."""
+        if not math.isfinite(value):
+            raise InputError(f"`{place}` must be finite, but is {value}.")
         rules = (("above", gt), ("at least", ge), ("at most", le), ("below", lt))
         for bound, (words, holds) in zip(self, rules, strict=True):
             if bound is not None and not holds(value, bound):
-                rule = f"{words} {bound:.10g}" if math.isfinite(bound) else "finite"
-                raise InputError(f"`{place}` must be {rule}, but is {value}.")
+                raise InputError(f"`{place}` must be {words} {bound:.10g}, but is {value}.")
 
 
 Positive = Annotated[float, Bounds(above=0.0)]
 Magnitude = Annotated[float, Bounds(least=0.0)]
 Fraction = Annotated[float, Bounds(above=0.0, below=1.0)]
-Finite = Annotated[float, Bounds(above=-math.inf, below=math.inf)]
+Finite = Annotated[float, Bounds()]
 Count = Annotated[int, Bounds(least=1, most=10_000)]
 Vector = tuple[Finite, Finite, Finite]
 PerJoint = list[float]
@@ -210,11 +213,16 @@ def _convert(value: Any, option: Any, place: str) -> Any:
         return origin(decode_value(x, hint, f"{place}[{k}]") for k, (x, hint) in pairs)
     if option not in _SCALARS:
         try:
-            return _OTHER if isinstance(value, str | dict) else np.array(value, np.float64)
+            made = _OTHER if isinstance(value, str | dict) else np.array(value, np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"`{place}` must hold numbers, in rows of equal length.") from error
+        if made is not _OTHER and (np.abs(made[np.isfinite(made)]) > LARGEST).any():
+            raise InputError(f"`{place}`: no quantity is larger than {LARGEST:g}.")
+        return made
     if not isinstance(value, _SCALARS[option][0]) or isinstance(value, bool) != (option is bool):
         return _OTHER
+    if option in (int, float) and math.isfinite(value) and abs(value) > LARGEST:
+        raise InputError(f"`{place}` is {value:g}: no quantity is larger than {LARGEST:g}.")
     if isinstance(value, str) and not value.isprintable():
         raise InputError(f"`{place}` holds a control character, {value!a}: remove it.")
     return unit(value) if option is Unit else option(value)

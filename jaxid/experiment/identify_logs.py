@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -98,6 +99,12 @@ def _findings(logs: Sequence[LoadedLog]) -> list[str]:
     return [f"{log.name}: {text}" for log, _, diagnosis in logs for text in diagnosis.findings]
 
 
+def _require_motion(logs: Sequence[LoadedLog]) -> None:
+    for log, _, diagnosis in logs:
+        if diagnosis.statistics.speed.max() < 1e-9:
+            raise InputError(f"no joint moves in `{log.name}`: name other columns, or another log.")
+
+
 def select_filter(
     experiment: Experiment, logs: Sequence[Path], stage: Stages, split: float | None = None
 ) -> tuple[Experiment, FilterChoice | None]:
@@ -176,6 +183,7 @@ def read_runs(
     for paths, name in zip(groups, names, strict=True):
         fits = [earlier_run(experiment, path) for path in paths if path.is_dir()]
         logs = [load_log(experiment, path, stage) for path in paths if not path.is_dir()]
+        _require_motion(logs)
         doubts += _findings(logs)
         if logs:
             stage(f"factorising the rows, {name}")
@@ -230,9 +238,10 @@ def identify_logs(
     loaded, stems = [], [path.stem for path in (*logs, *verify)]
     for path in (*logs, *verify):
         # Equal names are preceded by their folders.
-        folder = path.resolve().parent.name
+        folder = Path(os.path.realpath(path)).parent.name
         name = f"{folder}/{path.stem}" if stems.count(path.stem) > 1 else None
         loaded.append(load_log(experiment, path, stage, name))
+    _require_motion(loaded)
     observations = [log for _, log, _ in loaded]
     fitted, unseen = observations[: len(logs)], observations[len(logs) :]
     if split is not None:

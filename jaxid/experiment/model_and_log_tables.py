@@ -32,6 +32,8 @@ FILTERS: dict[str, type[filters.AbstractFilter]] = {
     "paper": filters.PaperFilter,
     "periodic": filters.PeriodicFourier,
 }
+FASTEST = 100.0
+"""Speed that no joint exceeds [rad/s or m/s]."""
 CUTOFF = 10.0
 """Cut-off of the filter where the file says nothing [Hz]."""
 
@@ -80,7 +82,17 @@ class DryFriction:
 def _speed(
     robot: Robot, name: str, value: float | list[float]
 ) -> float | Float[np.ndarray, " joints"]:
-    return per_joint(name, value, robot.joints, 0.0) if isinstance(value, list) else float(value)
+    speeds = np.broadcast_to(np.asarray(value, np.float64), (robot.joints,))
+    if isinstance(value, list):
+        speeds = per_joint(name, value, robot.joints, 0.0)
+    fastest = np.minimum(np.asarray(robot.limits.velocity), FASTEST)
+    if (slow := np.flatnonzero(speeds > fastest)).size:
+        j = int(slow[0])
+        raise InputError(
+            f"`{name}` must be below the largest speed of joint `{robot.joint_names[j]}`, "
+            f"{fastest[j]:g} {robot.joint_unit(j)}/s, but is {speeds[j]:g}."
+        )
+    return speeds if isinstance(value, list) else float(value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,7 @@ description ("like `0.1`") becomes the value of a key that is commented out.
 """
 
 import inspect
+import itertools
 import json
 import math
 import os
@@ -50,8 +51,8 @@ SUMMARIES = {
 """Descriptions of tables where the docstring of their function says something else."""
 INNER = {"robot": ("robot.tool", known_load), "model": ("model.coulomb", DryFriction)}
 """Tables within others, and their functions."""
-OF_KINDS = {name for keys in KINDS.values() for name in keys} - {*KINDS["weighted"]}
-"""Keys of other kinds of estimators, which are commented out."""
+OF_KINDS = {*itertools.chain(*KINDS.values())} - set.intersection(*map(set, KINDS.values()))
+"""Keys that not all kinds of estimators take, which are commented out."""
 
 
 def write_template(

@@ -178,6 +178,15 @@ def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
             f"`{source}` has the joints {', '.join(described.joint_names)}, but the fit has "
             f"{', '.join(robot.joint_names)}: give the file of this robot, or its `tip`."
         )
+    for name, ours, theirs in zip(
+        robot.joint_names, robot.revolute, described.revolute, strict=True
+    ):
+        if ours != theirs:
+            kinds = ("slides", "turns")
+            raise InputError(
+                f"joint `{name}` {kinds[theirs]} in `{source}`, but {kinds[ours]} in the robot of "
+                "the fit: give its own file."
+            )
     # The file does not say how the robot is mounted on the ground.
     inner = [i for i, parent in enumerate(robot.parent) if parent >= 0]
     for quantity, rows in (("axis", slice(None)), ("rotation", inner), ("offset", inner)):

@@ -99,14 +99,16 @@ def estimate_delay(
             raise InputError("`commanded` must have the samples of `observations`.")
     w = (MaximumForces() if weights is None else weights)(base.model.robot, problem.factors)
     together = linalg.block_diag(np.eye(base.size), np.ones((n, 1)))
-    p, seconds = np.zeros(base.size), 0.0
+    p, seconds, step, damping = np.zeros(base.size), 0.0, 0.0, 1.0
     p = _equations(base, recordings, recordings, w, p).select(base.size).solve()
     for _ in range(PASSES):
         moved = ([without_delay(o, seconds) for o in logs] for logs in (recordings, instruments))
         each = _equations(base, *moved, w, p)
         common = each.combined(together)
         x, deviation = common.solve(), float(np.sqrt(common.jackknife()[-1, -1]))
-        p, step = x[:-1], float(x[-1])
+        # Steps that go to and fro become shorter.
+        damping *= 0.5 if x[-1] * step < 0 else 1.0
+        p, step = x[:-1], damping * float(x[-1])
         seconds += step
         if abs(step) <= max(0.02 * deviation, 1e-9 * recordings[0].sample_time):
             break

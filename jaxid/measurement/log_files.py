@@ -278,8 +278,12 @@ class _Layout(NamedTuple):
                 encoding="utf8-lossy",
             )
         except pl.exceptions.PolarsError as error:
+            cells = [text.count(self.separator.encode()) + 1 for text in rows.split(b"\n")]
+            most = len(self.names)
+            wrong = next((k for k, count in enumerate(cells) if count > most), 0)
             raise InputError(
-                f"`{self.source}` must have {len(self.names)} columns in every line."
+                f"line {wrong + line} of `{self.source}` has {cells[wrong]} cells, but there are "
+                f"{most} columns: repair or remove that line."
             ) from error
         if self.decimal_comma:
             frame = frame.select(pl.all().str.replace(",", ".", literal=True))
@@ -339,6 +343,8 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     """Detect the format of a text file by its first bytes."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
+    if b"\0" in head:
+        raise InputError(f"`{source}` is no text: a log is CSV, Parquet, NPZ or MAT.")
     first, _, _ = head.partition(b"\n")
     line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
     if not line.strip():

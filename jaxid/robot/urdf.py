@@ -61,6 +61,7 @@ def load_urdf(
     """
     tree = UrdfTree(path, base=base, tip=tip)
     limits, limit_notes = _limits(tree)
+    inertial_notes = _inertial_notes(tree)
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     try:
         robot = Robot(
@@ -77,7 +78,7 @@ def load_urdf(
             tip_rotation=tip_rotation,
             tip_offset=tip_offset,
             source=tree.path,
-            notes=(*limit_notes, *_inertial_notes(tree)),
+            notes=(*limit_notes, *inertial_notes),
         )
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
@@ -269,7 +270,7 @@ class UrdfTree:
             fault = f"is {kind}" if mimic is None else f"mimics joint `{mimic.get('joint')}`"
             raise self.error(
                 joint,
-                f"{fault}, but must turn or slide: avoid it by `tip` or `base`, or make it fixed",
+                f"{fault}, but must turn or slide: avoid it (`tip`, `--tip`), or make it fixed",
             )
         axis = self.numbers(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
         length = np.linalg.norm(axis)
