@@ -57,12 +57,14 @@ class Log:
         angles: Measured joint coordinates [rad or m].
         forces: Measured drive forces [N m or N].
         commands: Commanded joint coordinates [rad or m].
+        friction: Viscous and Coulomb coefficients of each joint.
     """
 
     time: np.ndarray
     angles: np.ndarray
     forces: np.ndarray
     commands: np.ndarray
+    friction: np.ndarray
 
 
 def robots(folder):
@@ -201,7 +203,7 @@ def simulate(
     if bits is not None:
         turn = np.array([2 * np.pi if "R" in j.shortname() else 1.0 for j in model.joints[1:]])
         angles = np.round(angles / turn * 2**bits) * turn / 2**bits
-    return Log(t, angles, held, r)
+    return Log(t, angles, held, r, np.array([fv, fc]))
 
 
 def write_csv(path, log, **columns):

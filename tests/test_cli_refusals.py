@@ -16,6 +16,15 @@ KEYS = [
     ("cutoff = 10", "cutoff = 99", "take one of 1 samples at most"),
     ('"q{}"', '["q1"]', "for each joint"),
     ('"q{}"', '["q1", "tau1"]', "`tau1` of `a.csv` is used"),
+    *(
+        (
+            "[filter]",
+            f"[model]\ncoulomb = {{ {key} = {value} }}\n[filter]",
+            f"coulomb.{key}` must be",
+        )
+        for key, value in (("epsilon", "inf"), ("epsilon", "500"), ("dead_zone", "inf"))
+    ),
+    ("[limits]", "gravity = [0, 0, 1e308]\n[limits]", "no quantity is larger than 1e+12"),
     ('builtin = "planar_arm"', 'urdf = "lost.urdf"', "`lost.urdf` is no file: paths are relative"),
 ]
 
@@ -35,6 +44,10 @@ COMMANDS = [
     ("identify experiment.toml a.csv ./a.csv", "`a.csv` is given twice"),
     ("identify experiment.toml a.csv --split 2", "`--split` must lie between 0 and 1, like 0.6"),
     ("identify experiment.toml a.csv --verify ./a.csv", "`a.csv` is given both to identify and"),
+    ("identify experiment.toml loop.csv", "`loop.csv` is no file"),
+    ("identify experiment.toml image.csv", "`image.csv` is no text: a log is CSV, Parquet, NPZ"),
+    ("identify experiment.toml long.csv", "line 4 of `long.csv` has 6 cells, but there are 5 col"),
+    ("identify experiment.toml still.csv", "no joint moves in `still`: name other columns"),
     ("init none.urdf", "none.urdf"),
     ("excite experiment.toml -o a.csv", "`a.csv` is there already, and no motion of `jaxid exc"),
     ("excite experiment.toml -o motion", "`motion` must end in .csv"),
@@ -50,6 +63,13 @@ def test_commands(folder, run, words, sentence):  # noqa: F811
     (folder / "mine.ros.yaml").write_text("mine")
     (folder / "pictures").mkdir()
     (folder / "pictures" / "joints.png").write_text("mine")
+    (folder / "loop.csv").symlink_to("loop.csv")
+    (folder / "image.csv").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
+    header, *rows = (folder / "a.csv").read_text().splitlines()
+    rows[2] += ",1"
+    (folder / "long.csv").write_text("\n".join([header, *rows]))
+    still = [f"{0.005 * k:.3f},0.1,0.2,0,0" for k in range(len(rows))]
+    (folder / "still.csv").write_text("\n".join([header, *still]))
     before = sorted(folder.rglob("*"))
     assert refused(run(*words.split()), sentence)
     assert sorted(folder.rglob("*")) == before

@@ -122,6 +122,11 @@ def test_a_urdf_of_another_robot_is_refused(fit, source, tmp_path):
     source.write_text(URDF.replace("0 0.3 0", "0 0.4 0"), "utf-8")
     with pytest.raises(ValueError, match="`offset`"):
         jid.export_urdf(fit, source, tmp_path / "arm.urdf")
+    sliding = URDF.replace('name="elbow" type="revolute"', 'name="elbow" type="prismatic"')
+    assert sliding != URDF
+    source.write_text(sliding, "utf-8")
+    with pytest.raises(ValueError, match="joint `elbow` slides in .* but turns in the robot"):
+        jid.export_urdf(fit, source, tmp_path / "arm.urdf")
     assert not (tmp_path / "arm.urdf").exists()
 
 
