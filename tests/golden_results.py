@@ -20,12 +20,12 @@ TOLERANCE = float(os.environ.get("JAXID_GOLDEN_TOLERANCE", "1e-9"))
 
 
 def command(*words):
-    """Run a command line in this process; fail unless it ends well."""
+    """Run a command line in this process; a model may be called unusable (3), all else fails."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["jaxid", *map(str, words)])
         with pytest.raises(SystemExit) as stopped:
             cli.main()
-    assert stopped.value.code == 0
+    assert stopped.value.code in (0, 3)
 
 
 def numbers_of_report(folder):

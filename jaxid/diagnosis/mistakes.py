@@ -60,8 +60,9 @@ def likely_mistakes(
         forces: Forces at these instants [N m or N].
         motor_sides: Whether angles and forces of the log are taken for the motors'.
     """
-    model, geometries = fit.base.model, {}
+    model = fit.base.model
     robot = model.robot
+    geometries: dict[tuple[bool, ...], _AnyGeometry] = {}
 
     def rest(c: Correction) -> float:
         kinds = c.robot.revolute

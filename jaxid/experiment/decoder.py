@@ -212,11 +212,13 @@ def _convert(value: Any, option: Any, place: str) -> Any:
         pairs = enumerate(zip(value, hints, strict=True))
         return origin(decode_value(x, hint, f"{place}[{k}]") for k, (x, hint) in pairs)
     if option not in _SCALARS:
+        if isinstance(value, str | dict):
+            return _OTHER
         try:
-            made = _OTHER if isinstance(value, str | dict) else np.array(value, np.float64)
+            made = np.array(value, np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(f"`{place}` must hold numbers, in rows of equal length.") from error
-        if made is not _OTHER and (np.abs(made[np.isfinite(made)]) > LARGEST).any():
+        if (np.abs(made[np.isfinite(made)]) > LARGEST).any():
             raise InputError(f"`{place}`: no quantity is larger than {LARGEST:g}.")
         return made
     if not isinstance(value, _SCALARS[option][0]) or isinstance(value, bool) != (option is bool):

@@ -110,7 +110,7 @@ def estimate_delay(
         damping *= 0.5 if x[-1] * step < 0 else 1.0
         p, step = x[:-1], damping * float(x[-1])
         seconds += step
-        if abs(step) <= max(0.02 * deviation, 1e-9 * recordings[0].sample_time):
+        if abs(step) <= max(0.02 * deviation, 1e-6 * recordings[0].sample_time):
             break
     else:
         raise InputError(

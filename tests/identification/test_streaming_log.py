@@ -132,7 +132,7 @@ def test_text_of_any_kind(base, numbers, tmp_path, separator, header, end, point
         ("15,0,,0,0,0", "is empty"),
         ("15,0,nan,0,0,0", "is not finite"),
         ('15,0,",0,0,0', "opens a quotation"),
-        ("1,2,3,4,5,6,7", "6 columns in every line"),
+        ("1,2,3,4,5,6,7", "line 15001 of `log.csv` has 7 cells, but there are 6"),
     ],
 )
 def test_bad_rows_of_long_texts_are_named(base, text, row, complaint):

@@ -78,7 +78,7 @@ def test_invalid_arguments_are_named(case):
 
 
 FILES = {
-    "a floating joint": (arm(kind="floating"), "joint `j1` is floating.* `tip`"),
+    "a floating joint": (arm(kind="floating"), "joint `j1` is floating.*`--tip`"),
     "a mimic joint": (two(link("b"), joint("j2", "a", "b", inner=MIMIC)), "`j2` mimics .*`j1`"),
     "two parents": (two(link("b"), joint("j2", "base", "b"), joint("j3", "a", "b")), "`j3` moves"),
     "a loop without root": (
