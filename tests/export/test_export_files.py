@@ -125,7 +125,7 @@ def test_a_urdf_of_another_robot_is_refused(fit, source, tmp_path):
     sliding = URDF.replace('name="elbow" type="revolute"', 'name="elbow" type="prismatic"')
     assert sliding != URDF
     source.write_text(sliding, "utf-8")
-    with pytest.raises(ValueError, match="joint `elbow` slides in .* but turns in the robot"):
+    with pytest.raises(ValueError, match="joint `elbow` slides in"):
         jid.export_urdf(fit, source, tmp_path / "arm.urdf")
     assert not (tmp_path / "arm.urdf").exists()
 
