@@ -9,6 +9,8 @@ import tempfile
 
 # The workers of one run share what they compile; the user's cache is left alone.
 os.environ["JAXID_CACHE_DIR"] = "off"
+# Each worker has one core; threads of linear algebra on the cores of other workers cost much time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     COMPILED = tempfile.TemporaryDirectory(prefix="jaxid-compiled-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = COMPILED.name

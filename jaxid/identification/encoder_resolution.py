@@ -17,6 +17,8 @@ FEWEST = 100
 """Changes of an angle from which its steps are looked for."""
 LARGE = 0.5
 """Bias, in standard deviations, from which an interval of 95 % holds clearly less often."""
+NEGLIGIBLE = 1e-5
+"""Step relative to the motion that cannot matter: biases grow with its square."""
 SMALL_STEPS = 20.0
 """Steps in a change of an angle up to which rounded text still tells that their number is whole."""
 
@@ -86,7 +88,8 @@ def resolution_finding(
     fit: Fit, recording: Recording, observations: Observations
 ) -> tuple[str, ...]:
     """Return a sentence about parameters whose intervals the resolution makes wrong, or nothing."""
-    if recording.velocities is not None or not encoder_steps(recording).any():
+    matters = encoder_steps(recording) > NEGLIGIBLE * np.std(np.asarray(recording.angles), axis=0)
+    if recording.velocities is not None or not matters.any():
         return ()
     bias = np.abs(resolution_bias(fit, recording, observations))
     ratio = bias / np.where(fit.standard_deviations > 0, fit.standard_deviations, np.inf)
