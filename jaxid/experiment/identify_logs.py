@@ -16,7 +16,7 @@ from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
 from jaxid.identification.combination import require_same_base, share_rows, update
-from jaxid.identification.encoder_resolution import resolution_finding
+from jaxid.identification.encoder_resolution import resolution_note
 from jaxid.identification.estimators import Complete
 from jaxid.identification.filter_and_parameter_selection import FilterChoice, choose_filter
 from jaxid.identification.fit_result import Fit
@@ -261,11 +261,11 @@ def identify_logs(
     validation = validate(fit, every, progress=stage.through)
     stage("looking for mistakes")
     mistakes = mistakes_in_logs([diagnosis for *_, diagnosis in loaded[: len(logs)]], fit)
-    findings = _findings(loaded)
+    notes = [note for o in every for note in o.notes]
     for log, whole, diagnosis in loaded[: len(logs)]:
         if isinstance(log, Recording) and not diagnosis.faulty:
-            findings += [f"{log.name}: {x}" for x in resolution_finding(fit, log, whole)]
-    notes = list(dict.fromkeys(note for o in every for note in o.notes))
+            notes += [f"{log.name}: {x}" for x in resolution_note(fit, log, whole)]
+    notes, findings = list(dict.fromkeys(notes)), _findings(loaded)
     return Identification(
         experiment, choice, fit, validation, len(fitted), notes, findings, mistakes
     )

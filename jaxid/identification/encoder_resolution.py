@@ -84,7 +84,7 @@ def resolution_bias(
     return estimate(rounded) - estimate(exact)
 
 
-def resolution_finding(
+def resolution_note(
     fit: Fit, recording: Recording, observations: Observations
 ) -> tuple[str, ...]:
     """Return a sentence about parameters whose intervals the resolution makes wrong, or nothing."""

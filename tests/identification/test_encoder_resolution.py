@@ -7,7 +7,7 @@ import jaxid as jid
 from jaxid.identification.encoder_resolution import (
     encoder_steps,
     resolution_bias,
-    resolution_finding,
+    resolution_note,
 )
 
 STEP = 2 * np.pi / 2**11
@@ -58,6 +58,6 @@ def test_the_bias_is_that_of_many_encoders():
 def test_only_encoders_that_matter_are_pointed_out():
     q = np.asarray(MOTION.q)
     coarse, fine = (fitted(s * np.round(q / s), 0.05) for s in (STEP, 2e-5))
-    (said,) = resolution_finding(*coarse)
+    (said,) = resolution_note(*coarse)
     assert "the encoders are so coarse" in said
-    assert resolution_finding(*fine) == resolution_finding(*fitted(q, 0.05)) == ()
+    assert resolution_note(*fine) == resolution_note(*fitted(q, 0.05)) == ()
