@@ -84,9 +84,7 @@ def resolution_bias(
     return estimate(rounded) - estimate(exact)
 
 
-def resolution_note(
-    fit: Fit, recording: Recording, observations: Observations
-) -> tuple[str, ...]:
+def resolution_note(fit: Fit, recording: Recording, observations: Observations) -> tuple[str, ...]:
     """Return a sentence about parameters whose intervals the resolution makes wrong, or nothing."""
     matters = encoder_steps(recording) > NEGLIGIBLE * np.std(np.asarray(recording.angles), axis=0)
     if recording.velocities is not None or not matters.any():
