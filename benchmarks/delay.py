@@ -7,9 +7,9 @@ friction; disturbances that move the robot: none, or 3 % of the RMS force below 
 the right law of friction; a zero-phase Butterworth filter at 10 Hz, every 25th row. The delay is
 estimated once by the measured motion alone, once with the commanded one.
 
-Covered is a draw whose 95 % interval holds the truth. A delay is told if the interval leaves zero
-out, and it is more than a tenth of a sample, as `jaxid inspect` does. False is what is told with an
-interval that leaves the truth out by more than a tenth of a sample.
+Covered is a draw whose 95 % interval holds the truth. A delay is told if the interval of 99.9 %
+leaves zero out, and it is more than a tenth of a sample, as `jaxid inspect` does. False is what is
+told with an interval that leaves the truth out by more than a tenth of a sample.
 """
 
 import tempfile
@@ -59,6 +59,7 @@ def study(robot, file, friction, disturbance, draws):
                 delay = jid.estimate_delay(base, both[0], weights, commanded=commanded)
                 low, high = delay.interval()
                 held, slack = low <= late <= high, 0.1e-3
+                low, high = delay.interval(0.999)
                 told = not low <= 0 <= high and abs(delay.seconds) > slack
                 false = told and not low - slack <= late <= high + slack
                 found[k, way] += held, told, false

@@ -267,7 +267,8 @@ def delay_finding(
         delay = estimate_delay(fit.base, observations, weights, commanded=commanded)
     except ValueError:
         return (), ()
-    low, high = (1e3 * x for x in delay.interval())
+    # What is advised must be sure.
+    low, high = (1e3 * x for x in delay.interval(0.999))
     between = f"between {low:.2g} and {high:.2g} ms later in the log than the angles"
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     scatter = float(np.std(delay.of_joints))
