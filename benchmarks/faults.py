@@ -230,13 +230,14 @@ def interrupt(folder, minutes, quick):
     (folder / "arm.urdf").write_text(URDF, encoding="utf-8")
     if jaxid("identify", experiment, log, "-o", report).wait():
         raise SystemExit("`jaxid identify` failed")
+    shutil.copytree(report, folder / "again")
     commands = {
         "init": ("init", folder / "arm.urdf"),
         "example": ("example", folder / "motion" / "new"),
         "inspect": ("inspect", experiment, log),
         "identify": ("identify", experiment, log, "-o", folder / "report"),
         "export": ("export", report, "--to", "c", "-o", folder / "arm.c", "--force"),
-        "compare": ("compare", report, report, "-o", folder / "comparison"),
+        "compare": ("compare", report, folder / "again", "-o", folder / "comparison"),
         "states": ("states", experiment, log, folder / "verification.csv", "-o", folder / "states"),
         "excite": ("excite", experiment, "-o", folder / "motion" / "motion.csv"),
         "demo": ("demo", "-o", folder / "demo"),

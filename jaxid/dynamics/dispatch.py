@@ -1,8 +1,8 @@
-"""Dispatch of methods for one sample: NumPy for few samples, fused XLA for many, or plain JAX.
+"""Methods for one sample applied to many: in NumPy for few samples, in compiled blocks for many.
 
-A method of a model for one sample is traced once into a scalar program, if the robot's geometry is
-known; the programs of the models that were used last are kept. If JAX is tracing the geometry, the
-method runs as it is written.
+A method of a model is traced once into a scalar program, if the robot's geometry is known; the
+programs of the models that were used last are kept. Derivatives, and methods of a robot whose
+geometry JAX is tracing, take the model's spatial form, which is a short program on whole arrays.
 """
 
 import functools
@@ -10,15 +10,19 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from jaxid.arrays import AnyArray, Array, Float, Joints, Numbers, as_array, content, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Program, evaluate, lower, trace
+from jaxid.program import Program, dense_rows, evaluate, evaluate_rows, trace
+from jaxid.program.blocks import BLOCK, on_rows
 
 FEW = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
@@ -26,12 +30,82 @@ KEPT = 64
 """Number of programs that are kept, of the models that were used last."""
 
 
-_programs: OrderedDict[tuple, Program] = OrderedDict()
+def spatial_form(owner: Any) -> Any:
+    """Return a model, or what holds one, whose methods for one sample are few array operations."""
+
+    def has(x: Any) -> bool:
+        return hasattr(x, "spatial_form")
+
+    return jax.tree.map(lambda x: x.spatial_form if has(x) else x, owner, is_leaf=has)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleMethod:
+    """A method for one sample: its program, and the function that is differentiated.
+
+    Attributes:
+        program: Program of the method.
+        plain: The method in spatial form.
+    """
+
+    program: Program
+    plain: Callable
+
+    @functools.cached_property
+    def on_rows(self) -> Callable:
+        """The method on rows of samples: [samples, results] from arrays as in `on_rows`."""
+
+        @jax.custom_jvp
+        def run(*arrays: Array) -> Array:
+            return on_rows(self.program, *arrays)
+
+        def derivative(primals: tuple, tangents: tuple) -> tuple:
+            moving = [k for k, x in enumerate(tangents) if not isinstance(x, SymbolicZero)]
+
+            def of_moving(*given: Array) -> Array:
+                arrays = list(primals)
+                for k, x in zip(moving, given, strict=True):
+                    arrays[k] = x
+                return plain_rows(self.plain, *arrays)
+
+            return jax.jvp(
+                of_moving, tuple(primals[k] for k in moving), tuple(tangents[k] for k in moving)
+            )
+
+        run.defjvp(derivative, symbolic_zeros=True)
+        return run
+
+    @functools.cached_property
+    def compiled(self) -> Callable:
+        """`on_rows`, compiled."""
+        return jax.jit(self.on_rows)
+
+
+def plain_rows(plain: Callable, *arrays: Array) -> Float[Array, "samples out"]:
+    """Apply a function of one sample to arrays as in `on_rows`, in memory that does not grow."""
+
+    def one(parts: list[Array]) -> Array:
+        own = iter(parts)
+        return jnp.ravel(plain(*(next(own) if x.ndim == 2 else x for x in arrays)))
+
+    samples = [x for x in arrays if x.ndim == 2]
+    if len(samples[0]) == 1:
+        return one([x[0] for x in samples])[None]
+
+    def in_blocks(samples: list[Array]) -> Array:
+        return jax.lax.map(jax.checkpoint(one), samples, batch_size=BLOCK)
+
+    if len(samples[0]) <= BLOCK:
+        return jax.vmap(one)(samples)
+    return jax.lax.platform_dependent(samples, cpu=in_blocks, default=jax.vmap(one))
+
+
+_methods: OrderedDict[tuple, SampleMethod] = OrderedDict()
 _lock = threading.Lock()
 
 
-def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:
-    """Return the scalar program of a method of a model; it is traced when first needed.
+def method_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> SampleMethod:
+    """Return a method of a model with its scalar program, which is traced when first needed.
 
     An owner may have a method `derived_program(name, *shapes)`, which returns the program of its
     method of that name if it follows from the program of another model, or None.
@@ -42,23 +116,29 @@ def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
         shapes: Shapes of the method's arguments.
     """
     key = (definition.__name__, shapes, *content(owner))
-    program = _programs.get(key)
-    if program is None:
+    method = _methods.get(key)
+    if method is None:
         derive = getattr(owner, "derived_program", None)
         program = None if derive is None else derive(definition.__name__, *shapes)
         program = trace(definition, *shapes) if program is None else program
+        method = SampleMethod(program, in_spatial_form(definition, owner))
     with _lock:
-        _programs[key] = program
-        _programs.move_to_end(key)
-        while len(_programs) > KEPT:
-            _programs.popitem(last=False)
-    return program
+        _methods[key] = method
+        _methods.move_to_end(key)
+        while len(_methods) > KEPT:
+            _methods.popitem(last=False)
+    return method
 
 
-@functools.lru_cache(maxsize=KEPT)
-def _compiled(program: Program) -> Callable:
-    lowered = lower(program)
-    return jax.jit(lambda *arrays: lowered.dense(*arrays))
+def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:
+    """Return the scalar program of a method of a model; see `method_of`."""
+    return method_of(owner, definition, *shapes).program
+
+
+def in_spatial_form(definition: Callable, owner: Any) -> Callable:
+    """Return a method of an owner as that of its spatial form; other functions as they are."""
+    function: Any = getattr(definition, "__func__", None)
+    return definition if function is None else functools.partial(function, spatial_form(owner))
 
 
 def on_samples(
@@ -66,40 +146,82 @@ def on_samples(
     definition: Callable,
     *samples: AnyArray,
     shared: tuple[Numbers, ...] = (),
-) -> Array:
+) -> AnyArray:
     """Apply a method for one sample to arrays with any leading batch axes.
+
+    NumPy arrays give a NumPy array; arrays of JAX one on their device.
 
     Args:
         owner: Model.
         definition: Method, whose arguments are first the shared ones, then those of one sample.
         samples: Arguments with batch axes before their last axis.
-        shared: Parameters that all samples have in common.
+        shared: Parameters that all samples have in common, or with batch axes too.
 
     Raises:
-        InputError: If the arguments do not have the same shape, or parameters are no numbers.
+        InputError: If batch axes do not fit each other, or parameters are no numbers.
     """
-    shared = tuple(as_array("p", x) for x in shared)
-    if any(x.shape != samples[0].shape for x in samples):
-        shapes = ", ".join(str(x.shape) for x in samples)
+    arrays = [*(as_array("p", x) for x in shared), *samples]
+    try:
+        batch = np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
+    except ValueError:
+        shapes = ", ".join(str(x.shape) for x in arrays)
         raise InputError(
-            f"coordinates, velocities and accelerations must have one shape, but have {shapes}."
-        )
-    batch = samples[0].shape[:-1]
-    count = math.prod(batch)
-    flat = [x.reshape((count, x.shape[-1])) for x in samples]
+            f"leading axes of parameters and motion must fit each other, but shapes are {shapes}."
+        ) from None
+    shapes = tuple(x.shape[-1:] for x in arrays)
     if is_traced(owner):
-        out = jax.vmap(lambda *x: definition(*shared, *x))(*map(jnp.asarray, flat))
-        return jnp.reshape(out, (*batch, *out.shape[1:]))
-    shapes = (*(x.shape for x in shared), *(x.shape[1:] for x in flat))
-    program = program_of(owner, definition, *shapes)
-    arguments = (*shared, *(x.T for x in flat))
-    if count <= FEW and not is_traced(arguments):
-        precision = jnp.result_type(*(x.dtype for x in arguments), float)
-        out = jnp.asarray(evaluate(program, *arguments), precision)
-    else:
-        out = _compiled(program)(*arguments)
-    out = jnp.moveaxis(jnp.broadcast_to(out, (*out.shape[:-1], count)), -1, 0)
-    return jnp.reshape(out, (*batch, *out.shape[1:]))
+        plain = in_spatial_form(definition, owner)
+        run: Callable = functools.partial(plain_rows, plain)
+        out = _over_batches(run, batch, [jnp.asarray(x) for x in arrays], len(shared))
+        shape = jax.eval_shape(plain, *(jax.ShapeDtypeStruct(x, out.dtype) for x in shapes)).shape
+        return jnp.reshape(out, (*batch, *shape))
+    method = method_of(owner, definition, *shapes)
+    ((shape),) = method.program.output_shapes
+    in_jax = [x for x in arrays if isinstance(x, jax.Array)]
+    if not is_traced(arrays):
+        count = math.prod(batch)
+        on_host = all(d.platform == "cpu" for x in in_jax for d in x.devices())
+        if on_host and count <= FEW:
+            out = _in_numpy(method.program, arrays, batch)
+            out = out.reshape((*batch, *shape))
+            return jax.device_put(out, in_jax[0].sharding) if in_jax else out
+    run = method.on_rows if is_traced(arrays) else method.compiled
+    dtype = jnp.result_type(*(x.dtype for x in arrays), float)
+    out = _over_batches(run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared))
+    out = jnp.reshape(out, (*batch, *shape))
+    return out if in_jax else np.asarray(out)
+
+
+def _in_numpy(program: Program, arrays: list, batch: tuple[int, ...]) -> np.ndarray:
+    """Return the packed results [samples, results] in NumPy, in the precision of the arrays."""
+    dtype = np.result_type(*(x.dtype for x in arrays), np.float32)
+    given = [np.moveaxis(np.asarray(x, np.float64), -1, 0) for x in arrays]
+    rank = len(batch) + 1
+    given = [x.reshape(len(x), *(1,) * (rank - x.ndim), *x.shape[1:]) for x in given]
+    return dense_rows(program, evaluate_rows(program, *given), dtype)
+
+
+def _over_batches(
+    run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int
+) -> Float[Array, "*batch out"]:
+    """Apply a function of rows of samples, by `vmap` over the leading axes of parameters."""
+    ranks = [x.ndim - 1 for x in arrays[:shared]]
+    if not any(ranks):
+        rows = [jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in arrays[shared:]]
+        rows = [x.reshape(math.prod(batch), x.shape[-1]) for x in rows]
+        return run(*arrays[:shared], *rows).reshape(*batch, -1)
+    rank = len(batch)
+    full = [x.reshape(*(1,) * (rank + 1 - x.ndim), *x.shape) for x in arrays]
+    axes = [0 if x.shape[0] > 1 else None for x in full]
+    inner = [x if a == 0 else x[0] for x, a in zip(full, axes, strict=True)]
+    if all(a is None for a in axes):
+        return _over_batches(run, batch[1:], inner, shared)[None]
+
+    def one(*parts: Array) -> Array:
+        parts = [x.reshape(x.shape[-1:]) if all(n == 1 for n in x.shape[:-1]) else x for x in parts]
+        return _over_batches(run, batch[1:], parts, shared)
+
+    return jax.vmap(one, axes)(*inner)
 
 
 def in_numpy(

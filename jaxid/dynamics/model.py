@@ -5,6 +5,7 @@ from functools import reduce
 from operator import add
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,9 +14,9 @@ from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
 from . import projection_equation
-from .dispatch import on_samples, solve_symmetric
+from .dispatch import on_samples, solve_symmetric, spatial_form
 from .motion import Motion
-from .packed_regressor import PackedRegressor
+from .packed_regressor import PackedRegressor, gram
 from .terms import (
     AbstractTerm,
     CoulombFriction,
@@ -117,6 +118,11 @@ class Model(Hashable):
         """Return the potential energy of one sample by definition."""
         return reduce(add, (t.potential_columns(self.robot, q) @ x for t, x in self.split(p)))
 
+    @property
+    def spatial_form(self) -> "SpatialModel":
+        """The same model by spatial vectors."""
+        return SpatialModel(self.robot, spatial_form(self.terms))
+
     def known_forces(self, q, qd, qdd) -> Joints:
         """Return the generalised forces of the known tool at one sample [N m or N]."""
         tool = self.robot.tool
@@ -150,6 +156,19 @@ class Model(Hashable):
         """
         self.check(motion.q)
         return PackedRegressor(self, self.columns, motion)
+
+    def gram(
+        self, motion: Motion, weights: Joints | None = None
+    ) -> Float[AnyArray, "standard standard"]:
+        r"""Return the information $\sum_k \Theta_k^T W^2 \Theta_k$ of a motion (Eq. 29).
+
+        Takes a small part of the time of the regressor, which is never held in memory.
+
+        Args:
+            motion: Joint motion [samples, joints].
+            weights: Weight of each joint's rows [1/(N m) or 1/N]; 1 if None.
+        """
+        return gram(self, self.columns, motion, weights)
 
     def inverse_dynamics(
         self,
@@ -239,3 +258,12 @@ class Model(Hashable):
                 f"{q.shape}."
             )
         return q
+
+
+class SpatialModel(Model):
+    """A model by spatial vectors, for derivatives and for geometry that JAX is tracing."""
+
+    def acceleration(self, p, q, qd, forces):
+        """Return the accelerations of one sample that forces cause (Eq. 38)."""
+        factor = jax.scipy.linalg.cho_factor(self.inertia(p, q))
+        return jax.scipy.linalg.cho_solve(factor, forces - self.bias(p, q, qd))

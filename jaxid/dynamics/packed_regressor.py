@@ -9,11 +9,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, is_traced
+from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
 from jaxid.errors import InputError
 from jaxid.program import Program, evaluate_packed, lower
+from jaxid.program.blocks import row_products
 
 from .dispatch import FEW, KEPT, program_of
 from .motion import Motion
@@ -52,6 +54,21 @@ class JointRegressor(eqx.Module):
         groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
         return lower(self.program).stacked(groups, *arrays)
 
+    def gram(self, weights: AnyArray, *arrays: AnyArray) -> Float[Array, "columns columns"]:
+        r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns.
+
+        Args:
+            weights: Weight of each joint's rows.
+            arrays: Arguments of the definition [samples, entries].
+        """
+        groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
+        whole = jnp.zeros((self.size, self.size), arrays[0].dtype)
+        sums = row_products(self.program, groups, *map(jnp.asarray, arrays))
+        for own, w, products in zip(self.columns, weights, sums, strict=True):
+            k = np.array(own, int)
+            whole = whole.at[k[:, None], k].add(w**2 * products)
+        return whole
+
     def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
         """Return the columns of each joint, evaluated in NumPy."""
         batch = np.shape(arrays[0])[1:]
@@ -63,6 +80,40 @@ class JointRegressor(eqx.Module):
                 row[:] = packed[joint * self.size + k]
             found.append(rows)
         return found
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _compiled_gram(regressor: JointRegressor) -> Callable:
+    return jax.jit(regressor.gram)
+
+
+def gram(
+    owner: eqx.Module, definition: Callable, motion: Motion, weights: AnyArray | None
+) -> Float[Array, "columns columns"]:
+    """Return the Gram matrix of a model's columns over a motion; see `Model.gram`.
+
+    Raises:
+        InputError: If the motion does not have one axis of samples, or JAX is tracing the model's
+            own numbers.
+    """
+    arrays = motion.q, motion.qd, motion.qdd
+    n = _require_rows(owner, motion)
+    weights = np.ones(n) if weights is None else as_array("weights", weights)
+    regressor = JointRegressor(owner, definition, (n,), (n,), (n,))
+    run = regressor.gram if is_traced(arrays, weights) else _compiled_gram(regressor)
+    return run(jnp.asarray(weights, motion.q.dtype), *arrays)
+
+
+def _require_rows(owner: eqx.Module, motion: Motion) -> int:
+    if motion.q.ndim != 2:
+        raise InputError(
+            f"`motion` must have the shape [samples, joints], but has {motion.q.shape}."
+        )
+    if is_traced(owner):
+        raise InputError(
+            "a packed regressor needs a robot whose geometry is known: use `regressor`."
+        )
+    return motion.joints
 
 
 class PackedRegressor(eqx.Module):
@@ -95,14 +146,7 @@ class PackedRegressor(eqx.Module):
 
     def __init__(self, owner: eqx.Module, definition: Callable, motion: Motion):
         arrays = [x.T for x in (motion.q, motion.qd, motion.qdd)]
-        if motion.q.ndim != 2:
-            raise InputError(
-                f"`motion` must have the shape [samples, joints], but has {motion.q.shape}."
-            )
-        if is_traced(owner):
-            raise InputError(
-                "a packed regressor needs a robot whose geometry is known: use `regressor`."
-            )
+        _require_rows(owner, motion)
         program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
         varying, self.places = _layout(program)
         self.samples, self.columns = len(motion.q), program.output_shapes[0][1]

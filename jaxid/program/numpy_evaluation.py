@@ -27,13 +27,13 @@ class _Plan(NamedTuple):
 
     Attributes:
         loads: Cell, input's number and entry's position for each entry that is read.
-        steps: Function, operands, result's cell, and whether it can write into that cell.
+        run: Function that does all operations on the cells.
         results: Cells of the nodes that are results.
         cells: Number of cells.
     """
 
     loads: tuple[tuple[int, int, int], ...]
-    steps: tuple[tuple[Callable, tuple[Reference, ...], int, bool], ...]
+    run: Callable[[list[np.ndarray]], None]
     results: dict[int, int]
     cells: int
 
@@ -51,7 +51,7 @@ def evaluate(program: Program, *arrays: AnyArray) -> Any:
     Raises:
         InputError: If the arrays do not fit the program's inputs.
     """
-    return program.unpack(*_evaluate(program, arrays), np)
+    return program.unpack(*_packed(program, arrays), np)
 
 
 def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | float]:
@@ -65,7 +65,37 @@ def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | fl
         For each entry of each output, in order, an array of the batch's shape, or a constant.
         Equal entries share one array.
     """
+    return _packed(program, arrays)[0]
+
+
+def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
+    """Compute the distinct results of a program that vary, in NumPy: [results, samples].
+
+    Args:
+        program: Program made by `trace`.
+        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
+    """
     return _evaluate(program, arrays)[0]
+
+
+def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
+    """Return the packed result of each sample [samples, results] from its distinct values.
+
+    Args:
+        program: Program made by `trace`.
+        rows: Distinct results that vary [results, samples], in the order of the packed result.
+        dtype: Precision of the result.
+    """
+    results, samples = _plan(program).results, rows.shape[1]
+    out = np.zeros((samples, len(program.outputs)), dtype)
+    varying = [k for k, x in enumerate(program.outputs) if isinstance(x, int)]
+    source = [results[program.outputs[k]] for k in varying]
+    constants = [k for k, x in enumerate(program.outputs) if not isinstance(x, int) and x != 0]
+    out[:, constants] = [program.outputs[k] for k in constants]
+    for start in range(0, samples, _BLOCK // 4):
+        part = slice(start, start + _BLOCK // 4)
+        out[part, varying] = rows[source, part].T
+    return out
 
 
 @functools.lru_cache(maxsize=64)
@@ -75,24 +105,36 @@ def _plan(program: Program) -> _Plan:
         if isinstance(x, int):
             results.setdefault(x, len(results))
     last_use = {k: position for position, node in enumerate(program.nodes) for k in node.uses}
-    cell, idle, cells, loads, steps = dict(results), [], len(results), [], []
+    cell, idle, cells, loads = dict(results), [], len(results), []
+    # Written as one function, since a loop over the operations takes as long as a short operation.
+    lines, scope, names = [], {"where": _select, "inf": np.inf, "nan": np.nan}, {}
     for position, node in enumerate(program.nodes):
         if position not in cell:
             if idle:
                 cell[position] = idle.pop()
             else:
                 cell[position], cells = cells, cells + 1
+        own = f"c{cell[position]}"
         if node.operation is Operation.INPUT:
             number, entry = node.place
             loads.append((cell[position], number, entry))
+            names[position] = own
             continue
-        operands = tuple(cell[x] if isinstance(x, int) else x for x in node.operands)
-        function = _select if node.operation is Operation.SELECT else node.operation.numpy
-        in_place = "truth" not in node.operation.traits
-        steps.append((function, operands, cell[position], in_place))
+        operands = ", ".join(names[x] if isinstance(x, int) else repr(x) for x in node.operands)
+        function = node.operation.numpy.__name__
+        scope.setdefault(function, node.operation.numpy)
+        if "truth" in node.operation.traits:
+            names[position] = f"t{position}"
+            lines.append(f"t{position} = {function}({operands})")
+        else:
+            names[position] = own
+            lines.append(f"{function}({operands}, out={own})")
         # Only now: no operation may overwrite an operand that it still reads.
         idle += [cell[k] for k in set(node.uses) if last_use[k] == position and k not in results]
-    return _Plan(tuple(loads), tuple(steps), results, cells)
+    unpack = "".join(f"c{k}, " for k in range(cells))
+    body = "".join(f"    {line}\n" for line in lines)
+    exec(f"def run(cells):\n    [{unpack}] = cells\n{body}", scope)
+    return _Plan(tuple(loads), scope["run"], results, cells)
 
 
 def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
@@ -101,10 +143,19 @@ def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
     return out
 
 
-def _evaluate(
+def _packed(
     program: Program, arrays: tuple[AnyArray, ...]
 ) -> tuple[list[np.ndarray | float], tuple[int, ...]]:
     """Return the packed result, and the batch's shape."""
+    table, batch = _evaluate(program, arrays)
+    rows, results = [row.reshape(batch) for row in table], _plan(program).results
+    return [rows[results[x]] if isinstance(x, int) else x for x in program.outputs], batch
+
+
+def _evaluate(
+    program: Program, arrays: tuple[AnyArray, ...]
+) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Return the distinct results that vary [results, samples], and the batch's shape."""
     plan = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
@@ -115,15 +166,10 @@ def _evaluate(
         for start in range(0, samples, _BLOCK):
             block = slice(start, min(start + _BLOCK, samples))
             cells = [*table[:, block], *scratch[:, : block.stop - block.start]]
-            values = list(cells)
             for target, number, entry in plan.loads:
-                values[target][:] = inputs[number][entry, block]
-            for function, operands, result, in_place in plan.steps:
-                read = [values[x] if isinstance(x, int) else x for x in operands]
-                own = {"out": cells[result]} if in_place else {}
-                values[result] = function(*read, **own)
-    rows = [row.reshape(batch) for row in table]
-    return [rows[plan.results[x]] if isinstance(x, int) else x for x in program.outputs], batch
+                cells[target][:] = inputs[number][entry, block]
+            plan.run(cells)
+    return table, batch
 
 
 def to_python(program: Program) -> Callable[..., tuple[float, ...]]:

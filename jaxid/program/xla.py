@@ -7,7 +7,7 @@ would be computed many times over. A fence on a shared value stops that.
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -123,16 +123,17 @@ class Lowered(eqx.Module):
         packed = [jnp.asarray(x, dtype) for x in self(*arrays)]
         return self.program.unpack(packed, self.entries(*arrays)[1], jnp)
 
-    def run(self, entries: list[Array], operations: dict[Operation, Callable]) -> Values:
+    def run(self, entries: Sequence[Sequence[Array]], operations: dict[Operation, Callable]) -> Values:
         """Compute all nodes.
 
         Args:
-            entries: Arrays of the inputs, entries first.
+            entries: Entries of each input, in order.
             operations: Function for each kind of operation.
         """
         nodes = self.program.nodes
-        dtype = entries[0].dtype if entries else jnp.result_type(float)
-        source = next((x for x in entries if x.size), jnp.zeros((1,), dtype))
+        # The last input: XLA folds what depends on constants, such as parameters often are.
+        source = next((x[0] for x in reversed(entries) if len(x)), jnp.zeros((1,)))
+        dtype = source.dtype
         anchor = hidden_one(source[(0,) * source.ndim]) if self.fence else jnp.ones((), dtype)
         pairs = {}
         angles = {n.uses[0]: None for n in nodes if n.operation in CIRCULAR}

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Joints, matching, one_or_each
-from jaxid.dynamics import projection_equation
+from jaxid.dynamics import projection_equation, spatial_dynamics
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot
 
@@ -63,11 +63,33 @@ class RigidBodies(AbstractTerm):
         """Return the mass matrix of the bodies (Eq. 38)."""
         return projection_equation.rigid_body_mass_matrix(robot, self.all_ten(robot, p), q)
 
+    @property
+    def spatial_form(self) -> "SpatialBodies":
+        """The same bodies by spatial vectors."""
+        return SpatialBodies(self.principal_axes)
+
     def potential_columns(self, robot, q):
         """Return the potential energy of masses and first moments."""
         return projection_equation.potential_energy_columns(robot, q)[
             :, : self.body_parameters
         ].ravel()
+
+
+class SpatialBodies(RigidBodies):
+    """The same bodies by spatial vectors: few operations on whole arrays."""
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the columns of all bodies (Eq. 11)."""
+        theta = spatial_dynamics.spatial_regressor(robot, q, qd, qdd)
+        return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
+
+    def forces(self, robot, p, q, qd, qdd):
+        """Return the generalised forces of all bodies (Eq. 11)."""
+        return spatial_dynamics.spatial_forces(robot, self.all_ten(robot, p), q, qd, qdd)
+
+    def mass_matrix(self, robot, p, q):
+        """Return the mass matrix of the bodies (Eq. 38)."""
+        return spatial_dynamics.spatial_mass_matrix(robot, self.all_ten(robot, p), q)
 
 
 class RotorInertia(AbstractTerm):
