@@ -28,6 +28,8 @@ FEW = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
 KEPT = 64
 """Number of programs that are kept, of the models that were used last."""
+LONG = {"inertia": 16, "acceleration": 16}
+"""Joints beyond which the program of a method, which grows with their square, is not compiled."""
 
 
 def spatial_form(owner: Any) -> Any:
@@ -43,17 +45,54 @@ def spatial_form(owner: Any) -> Any:
 class SampleMethod:
     """A method for one sample: its program, and the function that is differentiated.
 
+    An owner may have a method `derived_program(name, *shapes)`, which returns the program of its
+    method of that name if it follows from the program of another model, or None.
+
     Attributes:
-        program: Program of the method.
-        plain: The method in spatial form.
+        owner: Model, whose numbers become constants of the program.
+        definition: Method of the model for one sample.
+        shapes: Shapes of the method's arguments.
     """
 
-    program: Program
-    plain: Callable
+    owner: Any
+    definition: Callable
+    shapes: tuple[tuple[int, ...], ...]
+
+    @functools.cached_property
+    def program(self) -> Program:
+        """Program of the method, traced when first needed."""
+        derive = getattr(self.owner, "derived_program", None)
+        name, shapes = self.definition.__name__, self.shapes
+        program = None if derive is None else derive(name, *shapes)
+        return trace(self.definition, *shapes) if program is None else program
+
+    @functools.cached_property
+    def plain(self) -> Callable:
+        """The method in spatial form; a function that is no method of the owner, as it is."""
+        if getattr(self.definition, "__self__", None) is not self.owner:
+            return self.definition
+        return getattr(spatial_form(self.owner), self.definition.__name__)
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the spatial form takes the place of the program, which would be long."""
+        joints = self.shapes[-1][0]
+        is_own = self.plain is not self.definition
+        return is_own and joints > LONG.get(self.definition.__name__, math.inf)
+
+    @functools.cached_property
+    def output_shape(self) -> tuple[int, ...]:
+        """Shape of the result for one sample."""
+        if not self.is_long and not is_traced(self.owner):
+            return self.program.output_shapes[0]
+        samples = [jnp.zeros(x) for x in self.shapes]
+        return jax.eval_shape(lambda *x: self.plain(*x), *samples).shape
 
     @functools.cached_property
     def on_rows(self) -> Callable:
         """The method on rows of samples: [samples, results] from arrays as in `on_rows`."""
+        if self.is_long or is_traced(self.owner):
+            return functools.partial(plain_rows, self.plain)
 
         @jax.custom_jvp
         def run(*arrays: Array) -> Array:
@@ -105,25 +144,16 @@ _lock = threading.Lock()
 
 
 def method_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> SampleMethod:
-    """Return a method of a model with its scalar program, which is traced when first needed.
-
-    An owner may have a method `derived_program(name, *shapes)`, which returns the program of its
-    method of that name if it follows from the program of another model, or None.
+    """Return a method of a model for one sample; those that were used last are kept.
 
     Args:
-        owner: Model, whose numbers become constants of the program.
+        owner: Model whose geometry is known.
         definition: Method of the model for one sample.
         shapes: Shapes of the method's arguments.
     """
     key = (definition.__name__, shapes, *content(owner))
-    method = _methods.get(key)
-    if method is None:
-        derive = getattr(owner, "derived_program", None)
-        program = None if derive is None else derive(definition.__name__, *shapes)
-        program = trace(definition, *shapes) if program is None else program
-        method = SampleMethod(program, in_spatial_form(definition, owner))
     with _lock:
-        _methods[key] = method
+        method = _methods.setdefault(key, SampleMethod(owner, definition, shapes))
         _methods.move_to_end(key)
         while len(_methods) > KEPT:
             _methods.popitem(last=False)
@@ -133,12 +163,6 @@ def method_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...])
 def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> Program:
     """Return the scalar program of a method of a model; see `method_of`."""
     return method_of(owner, definition, *shapes).program
-
-
-def in_spatial_form(definition: Callable, owner: Any) -> Callable:
-    """Return a method of an owner as that of its spatial form; other functions as they are."""
-    function: Any = getattr(definition, "__func__", None)
-    return definition if function is None else functools.partial(function, spatial_form(owner))
 
 
 def on_samples(
@@ -170,26 +194,20 @@ def on_samples(
         ) from None
     shapes = tuple(x.shape[-1:] for x in arrays)
     if is_traced(owner):
-        plain = in_spatial_form(definition, owner)
-        run: Callable = functools.partial(plain_rows, plain)
-        out = _over_batches(run, batch, [jnp.asarray(x) for x in arrays], len(shared))
-        shape = jax.eval_shape(plain, *(jax.ShapeDtypeStruct(x, out.dtype) for x in shapes)).shape
-        return jnp.reshape(out, (*batch, *shape))
-    method = method_of(owner, definition, *shapes)
-    ((shape),) = method.program.output_shapes
+        method = SampleMethod(owner, definition, shapes)
+    else:
+        method = method_of(owner, definition, *shapes)
     in_jax = [x for x in arrays if isinstance(x, jax.Array)]
-    if not is_traced(arrays):
-        count = math.prod(batch)
-        on_host = all(d.platform == "cpu" for x in in_jax for d in x.devices())
-        if on_host and count <= FEW:
-            out = _in_numpy(method.program, arrays, batch)
-            out = out.reshape((*batch, *shape))
+    known = not is_traced(arrays, owner)
+    if known and not method.is_long and math.prod(batch) <= FEW:
+        if all(d.platform == "cpu" for x in in_jax for d in x.devices()):
+            out = _in_numpy(method.program, arrays, batch).reshape((*batch, *method.output_shape))
             return jax.device_put(out, in_jax[0].sharding) if in_jax else out
-    run = method.on_rows if is_traced(arrays) else method.compiled
+    run = method.compiled if known else method.on_rows
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     out = _over_batches(run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared))
-    out = jnp.reshape(out, (*batch, *shape))
-    return out if in_jax else np.asarray(out)
+    out = jnp.reshape(out, (*batch, *method.output_shape))
+    return np.asarray(out) if known and not in_jax else out
 
 
 def _in_numpy(program: Program, arrays: list, batch: tuple[int, ...]) -> np.ndarray:

@@ -265,5 +265,7 @@ class SpatialModel(Model):
 
     def acceleration(self, p, q, qd, forces):
         """Return the accelerations of one sample that forces cause (Eq. 38)."""
-        factor = jax.scipy.linalg.cho_factor(self.inertia(p, q))
-        return jax.scipy.linalg.cho_solve(factor, forces - self.bias(p, q, qd))
+        parts = [t.mass_and_bias(self.robot, x, q, qd) for t, x in self.split(p)]
+        masses, biases = zip(*parts, strict=True)
+        factor = jax.scipy.linalg.cho_factor(reduce(add, masses))
+        return jax.scipy.linalg.cho_solve(factor, forces - reduce(add, biases))

@@ -17,31 +17,36 @@ from jaxid.arrays import AnyArray, Array, Float, Joints
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.robot import Robot
 
-
-_TENSORS = np.moveaxis(inertia_tensor(np.eye(6)), 0, -1)
-"""Inertia tensors of unit moments (A, B, C, D, E, F), which stand along the last axis."""
-
 Bodies = Float[AnyArray, "joints 10"]
-Spatial = tuple[Float[Array, "joints 3"], Float[Array, "joints 3"]]
-"""Angular and linear part of a motion; moment and force of a wrench; about the ground's origin."""
+Spatial = Float[Array, "joints 6"]
 
 
-class GroundMotion(NamedTuple):
-    """Placement and motion of all bodies, and what the joints do to them.
+def _constants() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the cross products of vectors and of motions, and inertias of unit parameters."""
+    skew = np.stack([np.cross(e, np.eye(3)).T for e in np.eye(3)], axis=-1)
+    crossing = np.zeros((6, 6, 6))
+    crossing[:3, :3, :3] = crossing[3:, :3, 3:] = crossing[3:, 3:, :3] = skew
+    inertia = np.zeros((6, 6, 10))
+    inertia[3:, 3:, 0] = np.eye(3)
+    inertia[:3, 3:, 1:4] = skew
+    inertia[3:, :3, 1:4] = -skew
+    inertia[:3, :3, 4:] = np.moveaxis(inertia_tensor(np.eye(6)), 0, -1)
+    return skew, crossing, inertia
 
-    Attributes:
-        attitudes: Attitudes of the bodies.
-        origins: Origins of the bodies [m].
-        joints: Motion of the bodies beyond a joint at unit speed.
-        velocities: Velocity of each body.
-        accelerations: Acceleration of each body less gravity.
-    """
 
-    attitudes: Float[Array, "joints 3 3"]
-    origins: Float[Array, "joints 3"]
-    joints: Spatial
-    velocities: Spatial
-    accelerations: Spatial
+SKEW, CROSS, INERTIA = _constants()
+r"""$\tilde a$ of unit vectors, $v \times$ of unit motions, and spatial inertias of unit parameters
+$(m, m r_c, A, B, C, D, E, F)$, which stand along the last axis."""
+
+
+def _combine(matrices: np.ndarray, x: Array) -> Array:
+    """Return sums of constant matrices, weighted by the entries of each row of x."""
+    return jnp.tensordot(x, jnp.asarray(matrices, x.dtype), (1, 2))
+
+
+def _times(matrices: Array, x: Array) -> Array:
+    """Multiply a matrix and a vector for each body."""
+    return jnp.einsum("nij,nj->ni", matrices, x)
 
 
 def moved_by(robot: Robot) -> Float[np.ndarray, "joints joints"]:
@@ -52,109 +57,111 @@ def moved_by(robot: Robot) -> Float[np.ndarray, "joints joints"]:
     return moved
 
 
-def skew_all(a: Float[AnyArray, "joints 3"]) -> Float[Array, "joints 3 3"]:
-    r"""Return the matrices $\tilde a$ with $\tilde a b = a \times b$ (Eq. 3)."""
-    return jnp.cross(a[:, :, None], jnp.eye(3, dtype=a.dtype)[None], axis=1)
+def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
+    """Return the homogeneous placements of all bodies in the frame of the ground.
 
-
-def all_placements(robot: Robot, q: Joints) -> tuple[Array, Array]:
-    """Return attitudes and origins [m] of all bodies in the frame of the ground.
-
-    Each turn doubles the number of joints that a placement passes over.
+    Each turn of the loop doubles the number of joints that a placement passes over.
     """
-    turns, axis = np.asarray(robot.revolute), jnp.asarray(robot.axis, q.dtype)
-    angle = jnp.where(turns, q, 0.0)[:, None, None]
+    kind, dtype = np.array(robot.revolute, float)[:, None, None], q.dtype
+    axis, rotation, offset = (
+        jnp.asarray(x, dtype) for x in (robot.axis, robot.rotation, robot.offset)
+    )
+    turns, slides = jnp.asarray(kind, dtype), jnp.asarray(1.0 - kind, dtype)
     along = axis[:, :, None] * axis[:, None, :]
-    turn = along + jnp.cos(angle) * (jnp.eye(3, dtype=q.dtype)[None] - along) + jnp.sin(angle) * skew_all(axis)
-    rotation = jnp.asarray(robot.rotation, q.dtype)
-    slide = jnp.where(turns, 0.0, q)[:, None] * axis
-    origins = jnp.asarray(robot.offset, q.dtype) + (rotation @ slide[:, :, None])[:, :, 0]
-    placed = jnp.concatenate([rotation @ turn, origins[:, :, None]], axis=2)
-    ground = jnp.eye(3, 4, dtype=q.dtype)[None]
-    placed = jnp.concatenate([placed, ground])
-    above = np.array([*robot.parent, -1])
+    across = turns * (jnp.eye(3, dtype=dtype)[None] - along)
+    angle = q[:, None, None]
+    turn = jnp.eye(3, dtype=dtype)[None] + (jnp.cos(angle) - 1) * across
+    turn = turn + turns * jnp.sin(angle) * _combine(SKEW, axis)
+    moved = jnp.concatenate([turn, slides * angle * axis[:, :, None]], axis=2)
+    placed = rotation @ moved + jnp.pad(offset[:, :, None], ((0, 0), (0, 0), (3, 0)))
+    bottom = np.broadcast_to(np.eye(4)[3:], (robot.joints, 1, 4))
+    placed = jnp.concatenate([placed, jnp.asarray(bottom, dtype)], axis=1)
+    above = np.array(robot.parent)
     while (above >= 0).any():
-        outer = jnp.tensordot(np.eye(len(above))[above].astype(q.dtype), placed, 1)
-        joined = outer[:, :, :3] @ placed
-        placed = joined.at[:, :, 3].add(outer[:, :, 3])
-        above = above[above]
-    return placed[:-1, :, :3], placed[:-1, :, 3]
+        # The rows of parents; the ground's is one.
+        outer = jnp.asarray(np.eye(len(above))[above] * (above >= 0)[:, None], dtype)
+        ground = np.eye(4) * (above < 0)[:, None, None]
+        placed = (jnp.tensordot(outer, placed, 1) + jnp.asarray(ground, dtype)) @ placed
+        above = np.where(above >= 0, above[above], -1)
+    return placed
+
+
+class GroundMotion(NamedTuple):
+    """Motion of all bodies about the origin of the ground.
+
+    Attributes:
+        carry: Matrices that carry wrenches from the bodies' frames to the ground; their transposes
+            carry motions back.
+        joints: Motion of what a joint moves at unit speed.
+        velocities: Velocity of each body.
+        accelerations: Acceleration of each body less gravity.
+    """
+
+    carry: Float[Array, "joints 6 6"]
+    joints: Spatial
+    velocities: Spatial
+    accelerations: Spatial
 
 
 def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMotion:
     """Return placements, velocities and accelerations of all bodies."""
-    R, o = all_placements(robot, q)
-    axes = (R @ jnp.asarray(robot.axis, q.dtype)[:, :, None])[:, :, 0]
-    turns, moved = np.asarray(robot.revolute)[:, None], moved_by(robot).astype(q.dtype)
-    turning = jnp.where(turns, axes, 0.0)
-    sliding = jnp.where(turns, jnp.cross(o, axes), axes)
-    w, v = (moved @ (x * qd[:, None]) for x in (turning, sliding))
-    turning_rate = jnp.cross(w, turning)
-    sliding_rate = jnp.cross(w, sliding) + jnp.cross(v, turning)
-    wd = moved @ (turning * qdd[:, None] + turning_rate * qd[:, None])
-    a = moved @ (sliding * qdd[:, None] + sliding_rate * qd[:, None])
-    a = a - jnp.asarray(robot.gravity, q.dtype)[None]
-    return GroundMotion(R, o, (turning, sliding), (w, v), (wd, a))
+    placed, dtype = all_placements(robot, q), q.dtype
+    R = placed[:, :3, :3]
+    arm = _combine(SKEW, placed[:, :3, 3]) @ R
+    carry = jnp.concatenate(
+        [jnp.concatenate([R, arm], axis=2), jnp.concatenate([jnp.zeros_like(R), R], axis=2)], axis=1
+    )
+    turns, axis = np.array(robot.revolute)[:, None], jnp.asarray(robot.axis, dtype)
+    turning, sliding = jnp.where(turns, axis, 0.0), jnp.where(turns, 0.0, axis)
+    linear = _times(arm, turning) + _times(R, sliding)
+    joints = jnp.concatenate([_times(R, turning), linear], axis=1)
+    moved = jnp.asarray(moved_by(robot), dtype)
+    speeds = joints * qd[:, None]
+    v = moved @ speeds
+    a = moved @ (joints * qdd[:, None] + _times(_combine(CROSS, v), speeds))
+    gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
+    return GroundMotion(carry, joints, v, a - gravity[None])
 
 
-def ground_inertias(p: Bodies, R: Array, o: Array) -> tuple[Array, Array, Array]:
-    """Return masses, first moments and inertias of the bodies about the origin of the ground."""
-    m, h = p[:, 0], (R @ p[:, 1:4, None])[:, :, 0]
-    r, arm = skew_all(o), skew_all(h)
-    J = R @ inertia_tensor(p[:, 4:]) @ jnp.swapaxes(R, 1, 2)
-    return m, h + m[:, None] * o, J - r @ arm - arm @ r - m[:, None, None] * (r @ r)
-
-
-def momentum(inertias: tuple[Array, Array, Array], motion: Spatial) -> Spatial:
-    """Return the momentum of bodies, or the wrench that accelerates them from rest."""
-    (m, h, J), (w, v) = inertias, motion
-    return (J @ w[:, :, None])[:, :, 0] + jnp.cross(h, v), m[:, None] * v + jnp.cross(w, h)
+def ground_inertias(p: Bodies, carry: Array) -> Float[Array, "joints 6 6"]:
+    """Return the spatial inertias of the bodies about the origin of the ground."""
+    return carry @ _combine(INERTIA, p) @ jnp.swapaxes(carry, 1, 2)
 
 
 def spatial_forces(robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints) -> Joints:
     """Return the generalised forces of all bodies [N m or N] (Eq. 11)."""
     x = ground_motion(robot, q, qd, qdd)
-    inertias = ground_inertias(p, x.attitudes, x.origins)
-    (w, v), (angular, linear) = x.velocities, momentum(inertias, x.velocities)
-    moment, force = momentum(inertias, x.accelerations)
-    moment = moment + jnp.cross(w, angular) + jnp.cross(v, linear)
-    force = force + jnp.cross(w, linear)
-    carried = moved_by(robot).astype(q.dtype).T
-    turning, sliding = x.joints
-    return jnp.sum(turning * (carried @ moment) + sliding * (carried @ force), axis=1)
+    return _projected_wrenches(robot, ground_inertias(p, x.carry), x)
 
 
-def spatial_mass_matrix(
-    robot: Robot, p: Bodies, q: Joints
-) -> Float[Array, "joints joints"]:
-    """Return the mass matrix of the bodies by composite bodies (Eq. 38)."""
-    rest = jnp.zeros_like(q)
-    x, moved = ground_motion(robot, q, rest, rest), moved_by(robot).astype(q.dtype)
-    inertias = ground_inertias(p, x.attitudes, x.origins)
-    composite: tuple = tuple(jnp.tensordot(moved.T, part, 1) for part in inertias)
-    angular, linear = momentum(composite, x.joints)
-    turning, sliding = x.joints
-    M = moved * (angular @ turning.T + linear @ sliding.T)
-    return M + (M * (1.0 - np.eye(robot.joints, dtype=q.dtype))).T
+def spatial_mass_and_bias(
+    robot: Robot, p: Bodies, q: Joints, qd: Joints
+) -> tuple[Float[Array, "joints joints"], Joints]:
+    """Return the mass matrix of the bodies by composite bodies, and the bias forces (Eq. 38)."""
+    x = ground_motion(robot, q, qd, jnp.zeros_like(q))
+    inertias, moved = ground_inertias(p, x.carry), jnp.asarray(moved_by(robot), q.dtype)
+    composite = jnp.tensordot(moved.T, inertias, 1)
+    M = moved * (_times(composite, x.joints) @ x.joints.T)
+    M = M + (M * jnp.asarray(1.0 - np.eye(len(q)), q.dtype)).T
+    return M, _projected_wrenches(robot, inertias, x)
+
+
+def _projected_wrenches(robot: Robot, inertias: Array, x: GroundMotion) -> Joints:
+    momenta = _times(inertias, x.velocities)
+    rates = jnp.einsum("nji,nj->ni", _combine(CROSS, x.velocities), momenta)
+    wrenches = _times(inertias, x.accelerations) - rates
+    beyond = jnp.asarray(moved_by(robot).T, x.joints.dtype) @ wrenches
+    return jnp.sum(x.joints * beyond, axis=1)
 
 
 def spatial_regressor(
     robot: Robot, q: Joints, qd: Joints, qdd: Joints
 ) -> Float[Array, "joints joints 10"]:
     """Return the regressor of every body (Eq. 11): joints, then bodies and their columns."""
-    x = ground_motion(robot, q, qd, qdd)
-    (w, v), (wd, a), R, o = x.velocities, x.accelerations, x.attitudes, x.origins
-    # Acceleration of the bodies' own origins, then everything in the bodies' own axes (Eq. 10).
-    a = a + jnp.cross(wd, o) + jnp.cross(w, v + jnp.cross(w, o))
-    a, w, wd = (jnp.einsum("bji,bj->bi", R, y) for y in (a, w, wd))
-    turn, tensors = skew_all(w), jnp.asarray(_TENSORS, q.dtype)
-    of_w, of_wd = (jnp.einsum("abk,nb->nak", tensors, y) for y in (w, wd))
-    nothing = jnp.zeros((len(q), 3, 6), q.dtype)
-    force = jnp.concatenate([a[:, :, None], skew_all(wd) + turn @ turn, nothing], axis=2)
-    parts = [nothing[:, :, :1], -skew_all(a), of_wd + turn @ of_w]
-    moment = jnp.concatenate(parts, axis=2)
-    force = R @ force
-    moment = R @ moment + skew_all(o) @ force
-    turning, sliding = x.joints
-    found = jnp.einsum("ji,bik->jbk", turning, moment) + jnp.einsum("ji,bik->jbk", sliding, force)
-    return moved_by(robot).T.astype(q.dtype)[:, :, None] * found
+    carry, joints, v, a = ground_motion(robot, q, qd, qdd)
+    v, a = (jnp.einsum("nji,nj->ni", carry, x) for x in (v, a))
+    unit = jnp.asarray(INERTIA, q.dtype)
+    momenta, rates = (jnp.einsum("ijk,nj->nik", unit, x) for x in (v, a))
+    wrenches = rates - jnp.swapaxes(_combine(CROSS, v), 1, 2) @ momenta
+    found = jnp.einsum("js,bsk->jbk", joints, carry @ wrenches)
+    return jnp.asarray(moved_by(robot).T, q.dtype)[:, :, None] * found

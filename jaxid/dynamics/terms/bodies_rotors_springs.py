@@ -89,7 +89,11 @@ class SpatialBodies(RigidBodies):
 
     def mass_matrix(self, robot, p, q):
         """Return the mass matrix of the bodies (Eq. 38)."""
-        return spatial_dynamics.spatial_mass_matrix(robot, self.all_ten(robot, p), q)
+        return self.mass_and_bias(robot, p, q, jnp.zeros_like(q))[0]
+
+    def mass_and_bias(self, robot, p, q, qd):
+        """Return the mass matrix of the bodies and their bias forces (Eq. 38)."""
+        return spatial_dynamics.spatial_mass_and_bias(robot, self.all_ten(robot, p), q, qd)
 
 
 class RotorInertia(AbstractTerm):

@@ -83,6 +83,12 @@ class AbstractTerm(eqx.Module):
         rest = jnp.zeros_like(q)
         return jax.jacfwd(lambda qdd: self.forces(robot, p, q, rest, qdd))(rest)
 
+    def mass_and_bias(
+        self, robot: Robot, p: Float[AnyArray, " columns"], q: Joints, qd: Joints
+    ) -> tuple[Float[AnyArray, "joints joints"], Joints]:
+        """Return the mass matrix, and the generalised forces without accelerations (Eq. 38)."""
+        return self.mass_matrix(robot, p, q), self.forces(robot, p, q, qd, jnp.zeros_like(q))
+
     def potential_columns(self, robot: Robot, q: Joints) -> Float[AnyArray, " columns"]:
         """Return the potential energy [J] of unit parameters; zero unless energy is stored."""
         return jnp.zeros(len(self.parameters(robot)), q.dtype)
