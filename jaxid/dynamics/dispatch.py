@@ -199,10 +199,10 @@ def on_samples(
         method = method_of(owner, definition, *shapes)
     in_jax = [x for x in arrays if isinstance(x, jax.Array)]
     known = not is_traced(arrays, owner)
-    if known and not method.is_long and math.prod(batch) <= FEW:
-        if all(d.platform == "cpu" for x in in_jax for d in x.devices()):
-            out = _in_numpy(method.program, arrays, batch).reshape((*batch, *method.output_shape))
-            return jax.device_put(out, in_jax[0].sharding) if in_jax else out
+    few = known and not method.is_long and math.prod(batch) <= FEW
+    if few and all(d.platform == "cpu" for x in in_jax for d in x.devices()):
+        out = _in_numpy(method.program, arrays, batch).reshape((*batch, *method.output_shape))
+        return jax.device_put(out, in_jax[0].sharding) if in_jax else out
     run = method.compiled if known else method.on_rows
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     out = _over_batches(run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared))
@@ -227,7 +227,8 @@ def _over_batches(
     if not any(ranks):
         rows = [jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in arrays[shared:]]
         rows = [x.reshape(math.prod(batch), x.shape[-1]) for x in rows]
-        return run(*arrays[:shared], *rows).reshape(*batch, -1)
+        out = run(*arrays[:shared], *rows)
+        return out.reshape((*batch, out.shape[-1]))
     rank = len(batch)
     full = [x.reshape(*(1,) * (rank + 1 - x.ndim), *x.shape) for x in arrays]
     axes = [0 if x.shape[0] > 1 else None for x in full]

@@ -87,6 +87,7 @@ def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
 
     if count <= BLOCK:
         return turn(list(arrays))
+
     def step(k: Array, out: Array) -> Array:
         # The last block begins earlier, so that it is as long as the others.
         start = jnp.minimum(k * BLOCK, count - BLOCK)

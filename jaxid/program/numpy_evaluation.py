@@ -152,9 +152,7 @@ def _packed(
     return [rows[results[x]] if isinstance(x, int) else x for x in program.outputs], batch
 
 
-def _evaluate(
-    program: Program, arrays: tuple[AnyArray, ...]
-) -> tuple[np.ndarray, tuple[int, ...]]:
+def _evaluate(program: Program, arrays: tuple[AnyArray, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return the distinct results that vary [results, samples], and the batch's shape."""
     plan = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)

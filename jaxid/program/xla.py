@@ -26,7 +26,9 @@ ELEMENTWISE: dict[Operation, Callable] = {
 }
 CIRCULAR = (Operation.SINE, Operation.COSINE)
 Groups = tuple[tuple[int, ...], ...]
-Values = tuple[list[Array], dict[int, tuple[Array, Array]], Array]
+Entries = Sequence[Array | Sequence[Array]]
+"""Entries of each input, in order: arrays of the batch's shape."""
+Values = tuple[list[Array], dict[int, tuple[Array, Array]], Array | None]
 """Array of each node, sines and cosines by the positions of their angles, and the fences' one."""
 
 
@@ -123,7 +125,9 @@ class Lowered(eqx.Module):
         packed = [jnp.asarray(x, dtype) for x in self(*arrays)]
         return self.program.unpack(packed, self.entries(*arrays)[1], jnp)
 
-    def run(self, entries: Sequence[Sequence[Array]], operations: dict[Operation, Callable]) -> Values:
+    def run(
+        self, entries: Sequence[Sequence[Array]], operations: dict[Operation, Callable]
+    ) -> Values:
         """Compute all nodes.
 
         Args:
@@ -132,9 +136,10 @@ class Lowered(eqx.Module):
         """
         nodes = self.program.nodes
         # The last input: XLA folds what depends on constants, such as parameters often are.
-        source = next((x[0] for x in reversed(entries) if len(x)), jnp.zeros((1,)))
-        dtype = source.dtype
-        anchor = hidden_one(source[(0,) * source.ndim]) if self.fence else jnp.ones((), dtype)
+        firsts = [x[0] for x in reversed(entries) if len(x)]
+        dtype = firsts[0].dtype if firsts else jnp.result_type(float)
+        source = next((x for x in firsts if x.size), jnp.zeros((1,), dtype))
+        anchor = hidden_one(source[(0,) * source.ndim]) if self.fence else None
         pairs = {}
         angles = {n.uses[0]: None for n in nodes if n.operation in CIRCULAR}
         angles = [k for k in angles if nodes[k].operation is Operation.INPUT]
@@ -201,14 +206,14 @@ def lower(program: Program, fence: bool | None = None) -> Lowered:
     """
     if fence is None:
         fence = jax.default_backend() == "cpu"
-    return Lowered(program, fence, fenced_nodes(program))
+    return Lowered(program, fence, fenced_nodes(program) if fence else frozenset())
 
 
 @jax.custom_jvp
-def _circular(x: Array, anchor: Array) -> tuple[Array, Array]:
+def _circular(x: Array, anchor: Array | None) -> tuple[Array, Array]:
     """Return sine and cosine behind fences; their derivatives are made from the fenced values."""
     sine, cosine = sine_cosine(x)
-    return sine / anchor, cosine / anchor
+    return (sine, cosine) if anchor is None else (sine / anchor, cosine / anchor)
 
 
 @_circular.defjvp

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, as_array, namespace
 
 Values = Any
 """Arrays of NumPy or JAX, and NumPy scalars."""
@@ -30,7 +30,7 @@ for _k, (_i, _j) in enumerate(((1, 2), (0, 2), (0, 1))):
     BASIS[7 + _k, _i, _j] = BASIS[7 + _k, _j, _i] = 1.0
 
 
-def pseudo_inertia(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*batch 4 4"]:
+def pseudo_inertia(bodies: Float[AnyArray, "*batch 10"]) -> Float[AnyArray, "*batch 4 4"]:
     r"""Return the pseudo-inertia $\begin{pmatrix} \Sigma & m r_c \\ m r_c^T & m \end{pmatrix}$.
 
     The second moments are $\Sigma = \frac12 \mathrm{tr}(J^o) I - J^o$ [kg m²].
@@ -38,16 +38,17 @@ def pseudo_inertia(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray, "*
     Args:
         bodies: Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin of the body's frame.
     """
-    return np.einsum("...i,iab->...ab", np.asarray(bodies), BASIS)
+    p = as_array("bodies", bodies)
+    return namespace(p).tensordot(p, BASIS.astype(p.dtype), 1)
 
 
-def inertial_parameters(pseudo: Float[AnyArray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 10"]:
+def inertial_parameters(pseudo: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 10"]:
     """Return the parameters $(m, m r_c, A, B, C, D, E, F)$ of pseudo-inertias."""
-    P = np.asarray(pseudo)
+    P, xp = pseudo, namespace(pseudo)
     xx, yy, zz = P[..., 0, 0], P[..., 1, 1], P[..., 2, 2]
     first_moments = (P[..., k, 3] for k in range(3))
     products = P[..., 1, 2], P[..., 0, 2], P[..., 0, 1]
-    return np.stack([P[..., 3, 3], *first_moments, yy + zz, xx + zz, xx + yy, *products], axis=-1)
+    return xp.stack([P[..., 3, 3], *first_moments, yy + zz, xx + zz, xx + yy, *products], axis=-1)
 
 
 def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -66,7 +67,7 @@ def consistency_margin(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray
     It is the smallest eigenvalue of the pseudo-inertia after its diagonal is scaled to one: at most
     1, independent of units, 0 for a flat body, negative for a body that cannot exist.
     """
-    P = pseudo_inertia(bodies)
+    P = pseudo_inertia(np.asarray(bodies))
     size = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1)))
     scale = 1.0 / np.where(size > 0, size, 1.0)
     return np.linalg.eigvalsh(P * scale[..., :, None] * scale[..., None, :])[..., 0]

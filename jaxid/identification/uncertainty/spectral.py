@@ -25,7 +25,7 @@ from .result import AbstractUncertainty, ResidualSpectra, Uncertainty
 
 MAX_ROWS = 2**15
 """Largest number of rows of a stretch; longer parts of a log are divided."""
-MAX_SAMPLES = 2**20
+MAX_SAMPLES = 2**17
 """Samples up to which every stretch is transformed; of longer logs some, evenly spread."""
 MAX_LENGTHS = 4
 """Number of different lengths up to which each has its own lines; of more, similar ones share them,

@@ -1,0 +1,137 @@
+"""The public dynamics of many samples: by blocks, under every transformation, on every platform."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from trees import random_tree
+
+import jaxid as jid
+from jaxid.dynamics.dispatch import in_numpy, program_of, spatial_form
+from jaxid.dynamics.motion import Motion
+
+MODEL = jid.Model(jid.robots.planar_arm())
+P = np.random.default_rng(0).uniform(0.5, 1.0, MODEL.size)
+
+
+def motion(samples, joints=2, seed=1):
+    q, qd, qdd = np.random.default_rng(seed).normal(size=(3, samples, joints))
+    return Motion(q, qd, qdd)
+
+
+def in_jax(x):
+    return jax.tree.map(jnp.asarray, x)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 255, 256, 257, 700])
+def test_blocks_of_any_number_of_samples(samples):
+    x = motion(samples)
+    given = x.q, x.qd, x.qdd
+    forces = in_numpy(MODEL, MODEL.forces, *given, shared=(P,))
+    columns = in_numpy(MODEL, MODEL.columns, *given)
+    found = jax.jit(MODEL.inverse_dynamics)(P, in_jax(x))
+    np.testing.assert_allclose(found, forces, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(jax.jit(MODEL.regressor)(in_jax(x)), columns, atol=1e-12)
+    weights = np.array([0.5, 2.0])
+    rows = (weights[:, None] * columns).reshape(-1, MODEL.size)
+    np.testing.assert_allclose(MODEL.gram(x, weights), rows.T @ rows, rtol=1e-11, atol=1e-10)
+
+
+def test_no_samples():
+    x = motion(0)
+    assert jax.jit(MODEL.inverse_dynamics)(P, in_jax(x)).shape == (0, 2)
+    assert MODEL.regressor(x).shape == (0, 2, MODEL.size)
+    np.testing.assert_array_equal(MODEL.gram(x), np.zeros((MODEL.size, MODEL.size)))
+
+
+def test_numpy_stays_in_numpy_and_jax_in_jax():
+    x = motion(3)
+    assert type(MODEL.inverse_dynamics(P, x)) is np.ndarray
+    assert type(MODEL.regressor(motion(5000))) is np.ndarray
+    assert isinstance(MODEL.inverse_dynamics(P, in_jax(x)), jax.Array)
+
+
+@pytest.mark.parametrize("samples", [3, 300])
+def test_leading_axes_of_parameters_and_motion_broadcast(samples):
+    many = P * np.array([1.0, 2.0, 3.0])[:, None, None]
+    x = motion(samples)
+    expected = MODEL.inverse_dynamics(P, x) * np.array([1.0, 2.0, 3.0])[:, None, None]
+    assert MODEL.inverse_dynamics(many, x).shape == (3, samples, 2)
+    for run in (MODEL.inverse_dynamics, jax.jit(MODEL.inverse_dynamics)):
+        np.testing.assert_allclose(run(jnp.asarray(many), in_jax(x)), expected, rtol=1e-12)
+        np.testing.assert_allclose(run(many, x), expected, rtol=1e-12)
+    over_p = jax.jit(jax.vmap(MODEL.inverse_dynamics, (0, None)))
+    np.testing.assert_allclose(over_p(many[:, 0], in_jax(x)), expected, rtol=1e-12)
+    three = jax.tree.map(lambda a: jnp.stack([a] * 3), in_jax(x))
+    over_both = jax.jit(jax.vmap(MODEL.inverse_dynamics))
+    np.testing.assert_allclose(over_both(many[:, 0], three), expected, rtol=1e-12)
+    single = jax.jit(jax.vmap(MODEL.inverse_dynamics, (None, 0)))
+    np.testing.assert_allclose(single(P, in_jax(x)), expected[0], rtol=1e-12)
+
+
+def test_parameters_that_are_constants_cost_nothing():
+    """XLA folds a fence that depends on constants only, and computes shared values many times."""
+    x = in_jax(motion(512))
+
+    def fences(function, *arguments):
+        return jax.jit(function).lower(*arguments).compile().as_text().count(" divide(")
+
+    passed = fences(MODEL.inverse_dynamics, P, x)
+    assert passed == fences(lambda x: MODEL.inverse_dynamics(P, x), x) > 0
+
+
+def own_divisions(name):
+    """Divisions of the scalar program itself."""
+    shapes = [(2,)] * 3
+    method, shapes = {
+        "inverse_dynamics": (MODEL.forces, [P.shape, *shapes]),
+        "mass_matrix": (MODEL.inertia, [P.shape, (2,)]),
+        "forward_dynamics": (MODEL.acceleration, [P.shape, *shapes]),
+        "gram": (MODEL.columns, shapes),
+    }[name]
+    return program_of(MODEL, method, *shapes).counts.divisions
+
+
+@pytest.mark.parametrize("name", ["inverse_dynamics", "mass_matrix", "forward_dynamics", "gram"])
+def test_a_gpu_gets_no_fences_and_no_host_callbacks(name):
+    x = in_jax(motion(600))
+    arguments = {
+        "inverse_dynamics": (P, x),
+        "mass_matrix": (P, x.q),
+        "forward_dynamics": (P, x.q, x.qd, x.qdd),
+        "gram": (x,),
+    }[name]
+    traced = jax.jit(getattr(MODEL, name)).trace(*arguments)
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    # Quotients of the method itself: speeds over epsilon, and the solution for accelerations.
+    own = own_divisions(name)
+    assert text.count("stablehlo.divide") == own
+    assert "callback" not in text
+    assert "callback" not in traced.lower(lowering_platforms=("cpu",)).as_text()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_spatial_form_is_the_definition(seed):
+    robot = random_tree(seed, 7).robot()
+    model = jid.Model(robot)
+    p = jnp.asarray(np.random.default_rng(seed).normal(size=model.size))
+    q, qd, qdd = jnp.asarray(np.random.default_rng(seed + 9).normal(size=(3, 7)))
+    spatial = spatial_form(model)
+    for name, given in (
+        ("columns", (q, qd, qdd)),
+        ("forces", (p, q, qd, qdd)),
+        ("inertia", (p, q)),
+    ):
+        expected = np.asarray(getattr(model, name)(*given))
+        found = np.asarray(getattr(spatial, name)(*given))
+        np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_a_robot_of_many_joints_moves_as_its_definition_says():
+    """Beyond some joints the mass matrix is no scalar program."""
+    robot = random_tree(5, 18).robot()
+    model = jid.Model(robot, (jid.RigidBodies(),))
+    p = np.tile([2.0, 0.1, 0.0, 0.2, 0.3, 0.3, 0.2, 0.0, 0.0, 0.0], 18)
+    x = motion(2, 18)
+    forces = model.inverse_dynamics(p, x)
+    np.testing.assert_allclose(model.forward_dynamics(p, x.q, x.qd, forces), x.qdd, atol=1e-8)
