@@ -53,6 +53,7 @@ class Script(NamedTuple):
 
 SPEED = (
     Script("peers", 2),
+    Script("surface", 4),
     Script("fences", 2),
     Script("compile", 2),
     Script("streaming", 6),
@@ -73,6 +74,9 @@ METHODS = (
     Script("demo", 10),
     Script("doctor", 20),
     Script("faults", 30),
+    Script("spoilt", 25),
+    Script("delay", 40),
+    Script("resolution", 10),
 )
 SCRIPTS = SPEED + METHODS
 

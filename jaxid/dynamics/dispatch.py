@@ -237,8 +237,8 @@ def _over_batches(
         return _over_batches(run, batch[1:], inner, shared)[None]
 
     def one(*parts: Array) -> Array:
-        parts = [x.reshape(x.shape[-1:]) if all(n == 1 for n in x.shape[:-1]) else x for x in parts]
-        return _over_batches(run, batch[1:], parts, shared)
+        given = [x.reshape(x.shape[-1:]) if math.prod(x.shape[:-1]) == 1 else x for x in parts]
+        return _over_batches(run, batch[1:], given, shared)
 
     return jax.vmap(one, axes)(*inner)
 

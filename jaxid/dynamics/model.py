@@ -35,9 +35,10 @@ class Model(Hashable):
     r"""The equations of motion $\Theta(q, \dot q, \ddot q)\, p = Q_m$ (Eqs. 16, 18).
 
     The columns stand in the order of the terms, the paper's order by default: bodies, viscous,
-    Coulomb, rotors. Every method takes any leading batch axes and works under `jit`, `vmap` and
-    `grad`, also with respect to the robot's geometry. For few samples it runs in NumPy at once; for
-    many it is compiled for the robot, whose numbers are then constants: write
+    Coulomb, rotors. Every method takes any leading batch axes, which broadcast, and works under
+    `jit`, `vmap`, `grad`, `jvp` and `scan`, also with respect to the robot's geometry. NumPy arrays
+    give NumPy arrays; arrays of JAX stay on their device. For few samples a method runs in NumPy at
+    once; for many it is compiled for the robot, whose numbers are then constants: write
     `jax.jit(model.regressor)` rather than pass the model to what is compiled.
 
     Attributes:

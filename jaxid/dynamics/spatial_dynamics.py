@@ -30,7 +30,7 @@ def _constants() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     inertia[3:, 3:, 0] = np.eye(3)
     inertia[:3, 3:, 1:4] = skew
     inertia[3:, :3, 1:4] = -skew
-    inertia[:3, :3, 4:] = np.moveaxis(inertia_tensor(np.eye(6)), 0, -1)
+    inertia[:3, :3, 4:] = np.moveaxis(np.asarray(inertia_tensor(np.eye(6))), 0, -1)
     return skew, crossing, inertia
 
 
@@ -39,7 +39,7 @@ r"""$\tilde a$ of unit vectors, $v \times$ of unit motions, and spatial inertias
 $(m, m r_c, A, B, C, D, E, F)$, which stand along the last axis."""
 
 
-def _combine(matrices: np.ndarray, x: Array) -> Array:
+def _combine(matrices: np.ndarray, x: AnyArray) -> Array:
     """Return sums of constant matrices, weighted by the entries of each row of x."""
     return jnp.tensordot(x, jnp.asarray(matrices, x.dtype), (1, 2))
 

@@ -104,7 +104,7 @@ class AbstractConstraint(eqx.Module):
         return [e._replace(value=float(v)) for e, v in zip(entries, peaks, strict=True)]
 
 
-def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[Array, "*batch 3"], ...]:
+def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[AnyArray, "*batch 3"], ...]:
     """Return position, velocity and acceleration of the end-effector's origin [m, s].
 
     They are those in the frame of the ground, without gravity.

@@ -135,7 +135,7 @@ class Description:
 
 def simplest_description(robot: Robot, parameters: Float[np.ndarray, "joints 10"]) -> Description:
     """Return a description of a robot, with ten parameters of each body, of few operations."""
-    given = Description(robot, pseudo_inertia(parameters), np.zeros(robot.joints))
+    given = Description(robot, np.asarray(pseudo_inertia(parameters)), np.zeros(robot.joints))
     best = given.carry_inward()
     for body in range(robot.joints):
         for distance in _distances(given.robot, body):

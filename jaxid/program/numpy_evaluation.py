@@ -88,8 +88,8 @@ def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
     """
     results, samples = _plan(program).results, rows.shape[1]
     out = np.zeros((samples, len(program.outputs)), dtype)
-    varying = [k for k, x in enumerate(program.outputs) if isinstance(x, int)]
-    source = [results[program.outputs[k]] for k in varying]
+    nodes = {k: results[x] for k, x in enumerate(program.outputs) if isinstance(x, int)}
+    varying, source = list(nodes), list(nodes.values())
     constants = [k for k, x in enumerate(program.outputs) if not isinstance(x, int) and x != 0]
     out[:, constants] = [program.outputs[k] for k in constants]
     for start in range(0, samples, _BLOCK // 4):

@@ -125,9 +125,7 @@ class Lowered(eqx.Module):
         packed = [jnp.asarray(x, dtype) for x in self(*arrays)]
         return self.program.unpack(packed, self.entries(*arrays)[1], jnp)
 
-    def run(
-        self, entries: Sequence[Sequence[Array]], operations: dict[Operation, Callable]
-    ) -> Values:
+    def run(self, entries: Entries, operations: dict[Operation, Callable]) -> Values:
         """Compute all nodes.
 
         Args:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Numbers, as_array, is_traced
+from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced
 from jaxid.errors import InputError
 
 from .pseudo_inertia import consistency_margin, inertial_parameters, pseudo_inertia
@@ -56,7 +56,7 @@ class LogCholesky(eqx.Module):
         return cls(jnp.concatenate([jnp.log(diagonal), above], axis=-1))
 
     @property
-    def parameters(self) -> Float[Array, "*batch 10"]:
+    def parameters(self) -> Float[AnyArray, "*batch 10"]:
         """Parameters $(m, m r_c, A, B, C, D, E, F)$ of each body."""
         x = jnp.asarray(self.coordinates)
         U = jnp.exp(x[..., :4, None]) * jnp.eye(4, dtype=x.dtype).reshape(
