@@ -200,9 +200,11 @@ def on_samples(
     in_jax = [x for x in arrays if isinstance(x, jax.Array)]
     known = not is_traced(arrays, owner)
     few = known and not method.is_long and math.prod(batch) <= FEW
-    if few and all(d.platform == "cpu" for x in in_jax for d in x.devices()):
+    devices = {d for x in in_jax for d in x.devices()} if known else set()
+    if few and len(devices) <= 1 and all(d.platform == "cpu" for d in devices):
         out = _in_numpy(method.program, arrays, batch).reshape((*batch, *method.output_shape))
-        return jax.device_put(out, in_jax[0].sharding) if in_jax else out
+        with jax.default_device(*devices or (None,)):
+            return jnp.asarray(out) if in_jax else out
     run = method.compiled if known else method.on_rows
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     out = _over_batches(run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared))
