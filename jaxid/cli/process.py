@@ -91,7 +91,8 @@ def _say(text: str) -> None:
 
 def _leave(code: int) -> NoReturn:
     """End the process at once: nothing that still runs in a thread is torn down half-way."""
-    for folder in getattr(sys.modules.get("jaxid.io"), "TEMPORARY", ()):
+    # A copy: the command goes on in its own thread.
+    for folder in tuple(getattr(sys.modules.get("jaxid.io"), "TEMPORARY", ())):
         shutil.rmtree(folder, ignore_errors=True)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
