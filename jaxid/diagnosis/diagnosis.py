@@ -31,6 +31,8 @@ SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
 EXAMINED = 2**17
 """Largest number of samples of a long log that are examined."""
+APART = 5.0
+"""Ratio of a force's departure from the model to all others from which it is an event."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +74,8 @@ class Diagnosis:
         # Faults of channels explain the rest.
         if self.faulty or o is None:
             return ()
+        if moments := departures(fit, o):
+            return moments
         step = -(-o.rows // 300)
         motion = o.motion[o.instants[::step]]
         return likely_mistakes(fit, motion, o.reduced_forces[::step], self.motor_sides)
@@ -242,6 +246,31 @@ def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
     )
 
 
+def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
+    """Report forces that depart from the model for one moment, and at no other time nearly as far.
+
+    Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the log at
+    most, beside what the filter spreads.
+    """
+    o, robot = observations, fit.base.model.robot
+    motion, forces = o.motion[o.instants], np.asarray(o.reduced_forces)
+    errors = np.abs(forces - fit.predict(motion) - fit.base.tool_forces(motion)) * o.mask
+    size = np.sqrt(np.mean(forces**2, axis=0))
+    length = o.filter.edge(o.sample_time) + 0.01 * o.samples
+    found = []
+    for j, (name, error) in enumerate(zip(robot.joint_names, errors.T, strict=True)):
+        k = int(np.argmax(error))
+        others = error[np.abs(o.instants - o.instants[k]) > length]
+        if error[k] > max(0.5 * size[j], APART * others.max(initial=0.0)):
+            found.append(
+                f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
+                f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "
+                "a fifth of that: a contact or a fault of a sensor; leave that part out "
+                "(`recording.start`, `recording.stop`)."
+            )
+    return tuple(found)
+
+
 def negative_friction(fit: Fit) -> tuple[str, ...]:
     """Report joints whose friction is negative beyond doubt: the model or the log is wrong."""
     robot, names = fit.base.model.robot, fit.base.names
@@ -271,9 +300,7 @@ def delay_finding(
     low, high = (1e3 * x for x in delay.interval(0.999))
     between = f"between {low:.2g} and {high:.2g} ms later in the log than the angles"
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
-    scatter = float(np.std(delay.of_joints))
-    negligible = abs(delay.seconds) < max(scatter, 0.1 * observations.sample_time)
-    if low <= 0.0 <= high or negligible:
+    if low <= 0.0 <= high or abs(delay.seconds) < float(np.std(delay.of_joints)):
         return (), (f"the forces stand {between}: a delay cannot be told from none.",)
     text = f"the forces stand {between}"
     if delay.p_value <= 0.001:

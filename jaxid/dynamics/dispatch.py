@@ -201,12 +201,12 @@ def on_samples(
     known = not is_traced(arrays, owner)
     few = known and not method.is_long and math.prod(batch) <= FEW
     devices = {d for x in in_jax for d in x.devices()} if known else set()
+    dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     if few and len(devices) <= 1 and all(d.platform == "cpu" for d in devices):
         out = _in_numpy(method.program, arrays, batch).reshape((*batch, *method.output_shape))
         with jax.default_device(*devices or (None,)):
-            return jnp.asarray(out) if in_jax else out
+            return jnp.asarray(out, dtype) if in_jax else out
     run = method.compiled if known else method.on_rows
-    dtype = jnp.result_type(*(x.dtype for x in arrays), float)
     out = _over_batches(run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared))
     out = jnp.reshape(out, (*batch, *method.output_shape))
     return np.asarray(out) if known and not in_jax else out

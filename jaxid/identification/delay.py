@@ -37,6 +37,8 @@ class Delay(eqx.Module):
         dof: Degrees of freedom of the standard deviation.
         feedback: Largest error that disturbances can cause which the controller counteracts [s];
             zero if the commanded motion is known.
+        resolution: What no log tells [s]: a tenth of a sample, for drives hold their forces, and a
+            model does not follow a filtered motion exactly.
         of_joints: Each joint's own delay [s].
         p_value: Probability that joints with one common delay would differ so much.
     """
@@ -45,17 +47,19 @@ class Delay(eqx.Module):
     standard_deviation: float
     dof: float
     feedback: float
+    resolution: float
     of_joints: Float[AnyArray, " joints"]
     p_value: float
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Return the lower and upper limit of the delay [s], `feedback` included.
+        """Return the lower and upper limit of the delay [s], with `feedback` and `resolution`.
 
         Args:
             level: Probability (0 to 1) that the interval contains the true delay.
         """
         half = self.standard_deviation * float(special.stdtrit(self.dof, 0.5 + 0.5 * level))
-        return self.seconds - half - self.feedback, self.seconds + half + self.feedback
+        half += self.feedback + self.resolution
+        return self.seconds - half, self.seconds + half
 
 
 def estimate_delay(
@@ -122,7 +126,8 @@ def estimate_delay(
     differences = contrast @ spread @ contrast.T
     p_value = joint_test(contrast @ delays, differences, BLOCKS - 1.0)[1]
     feedback = common.feedback(x) if commanded is None else 0.0
-    return Delay(seconds, deviation, BLOCKS - 1.0, feedback, seconds - step + delays, p_value)
+    limits = feedback, 0.1 * recordings[0].sample_time
+    return Delay(seconds, deviation, BLOCKS - 1.0, *limits, seconds - step + delays, p_value)
 
 
 class _Equations(NamedTuple):

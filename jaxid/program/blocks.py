@@ -19,6 +19,8 @@ from .xla import hidden_one, lower, primitives
 
 BLOCK = 256
 """Samples of one evaluation."""
+ALWAYS = np.array(True)
+"""Condition of a `where` whose result only differs along as many axes as its other branch."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -54,9 +56,19 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
         return tuple(values[k] for k in nodes)
 
     # Results of a branch are stored: what uses them does not compute them again.
-    last = arrays[-1]
-    nothing = tuple(jnp.zeros(block, last.dtype) for _ in nodes)
-    return jax.lax.cond(hidden_one(last[0, 0]) > 0, evaluate, lambda _: nothing, arrays)
+    first = arrays[-1][0, 0]
+    nothing = tuple(jnp.broadcast_to(first, (block,)) for _ in nodes)
+    return jax.lax.cond(hidden_one(first) > 0, evaluate, lambda _: nothing, arrays)
+
+
+def differing_alike(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Return arrays that all differ along the axes of `shard_map` along which one of them does.
+
+    The results of branches and loops must not depend on which input differs.
+    """
+    firsts = (x[(0,) * x.ndim] for x in arrays)
+    like = functools.reduce(lambda a, b: jnp.where(ALWAYS, a, b), firsts)
+    return tuple(jnp.where(ALWAYS, x, like) for x in arrays)
 
 
 def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
@@ -96,7 +108,8 @@ def _in_blocks(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
         ]
         return jax.lax.dynamic_update_slice_in_dim(out, turn(parts), start, axis=0)
 
-    empty = jnp.zeros((count, len(program.outputs)), dtype)
+    # All of it is overwritten.
+    empty = jnp.broadcast_to(arrays[-1][0, 0], (count, len(program.outputs)))
     return jax.lax.fori_loop(0, -(-count // BLOCK), step, empty)
 
 
@@ -148,7 +161,7 @@ def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
             rows.append(jnp.broadcast_to(x, (size, count, x.shape[-1])).reshape(-1, x.shape[-1]))
         return run(*rows).reshape(size, count, -1), True
 
-    return run(*arrays)
+    return run(*differing_alike(arrays))
 
 
 def row_products(
@@ -183,11 +196,13 @@ def row_products(
             own = products(evaluate(program, *parts), counted)
             return [a + b for a, b in zip(sums, own, strict=True)]
 
-        empty = [jnp.zeros((len(group), len(group)), dtype) for group in groups]
+        sizes = [(len(group), len(group)) for group in groups]
+        # `where`, see `differing_alike`.
+        empty = [jnp.where(ALWAYS, jnp.zeros(x, dtype), arrays[-1][0, 0]) for x in sizes]
         return jax.lax.fori_loop(0, -(-count // size), step, empty)
 
     return jax.lax.platform_dependent(
-        *arrays,
+        *differing_alike(arrays),
         cpu=functools.partial(by_chunks, block_results, min(BLOCK, count)),
         default=functools.partial(by_chunks, results_at_once, min(2**16, count)),
     )

@@ -125,6 +125,17 @@ def test_whole_joints_and_zeros_of_angles_are_found(motors, said):
     assert sentence.startswith("the angle of joint `joint3` seems to lack 90 degrees")
 
 
+def test_a_force_that_departs_for_a_moment_is_found(motors, said):
+    angles, forces = motors
+    pulse = np.zeros_like(forces)
+    pulse[1000:1006, 0] = 5.0 * np.abs(forces[:, 0]).max()
+    (sentence,) = said(angles, forces + pulse)
+    name = ROBOT.joint_names[0]
+    assert sentence.startswith(f"the force of joint `{name}` departs from the model by")
+    assert " at 5 s" in sentence
+    assert said(angles, forces) == ()
+
+
 def described(**change):
     """Return what is said of the log if the robot is described wrongly."""
 

@@ -135,3 +135,34 @@ def test_a_robot_of_many_joints_moves_as_its_definition_says():
     x = motion(2, 18)
     forces = model.inverse_dynamics(p, x)
     np.testing.assert_allclose(model.forward_dynamics(p, x.q, x.qd, forces), x.qdd, atol=1e-8)
+
+
+@pytest.mark.parametrize("samples", [8, 300])
+def test_the_samples_of_a_mesh_of_devices(samples):
+    """Branches and loops agree on what differs along a mesh, whichever argument differs."""
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("d",))
+    spec = jax.sharding.PartitionSpec("d")
+    x = in_jax(motion(samples))
+
+    def on_mesh(function, spec_out=spec):
+        run = jax.shard_map(function, mesh=mesh, in_specs=spec, out_specs=spec_out)
+        return jax.jit(run)(x)
+
+    def cost(x):
+        return jnp.sum(MODEL.inverse_dynamics(P, x) ** 2)
+
+    found = on_mesh(lambda x: MODEL.inverse_dynamics(P, x))
+    np.testing.assert_allclose(found, MODEL.inverse_dynamics(P, x), rtol=1e-12)
+    np.testing.assert_allclose(on_mesh(MODEL.regressor), MODEL.regressor(x), atol=1e-12)
+    sums = on_mesh(lambda x: jax.lax.psum(MODEL.gram(x), "d"), jax.sharding.PartitionSpec())
+    np.testing.assert_allclose(sums, MODEL.gram(x), rtol=1e-11, atol=1e-11)
+    slopes, expected = on_mesh(jax.grad(cost)), jax.grad(cost)(x)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), slopes, expected)
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float32])
+def test_eager_results_have_the_precision_of_compiled_ones(dtype):
+    x = jax.tree.map(lambda x: jnp.asarray(x, dtype), motion(3))
+    p = jnp.asarray(P, dtype)
+    compiled = jax.jit(MODEL.inverse_dynamics)(p, x)
+    assert MODEL.inverse_dynamics(p, x).dtype == compiled.dtype == dtype
