@@ -39,6 +39,7 @@ def test_keys(folder, run, key, wrong, sentence):  # noqa: F811
 COMMANDS = [
     ("inspect none.toml", "`none.toml` is no file"),
     ("identify experiment.toml none.csv", "`none.csv` is no file"),
+    ("identify no.toml none.csv --verify x.csv", "`no.toml`, `none.csv`, `x.csv` are no files"),
     ("identify experiment.toml a.csv --verify b.csv c.csv", "repeat it before `c.csv`"),
     ("identify experiment.toml a.csv --verify=b.csv c.csv", "repeat it before `c.csv`"),
     ("identify experiment.toml a.csv ./a.csv", "`a.csv` is given twice"),

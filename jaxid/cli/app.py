@@ -69,7 +69,7 @@ def demo(
     from jaxid.experiment.identify_logs import stages
     from jaxid.report.page import show, show_remarks
 
-    console = options.start(output, force)
+    console = options.start(output=output, force=force)
     with stages(options.open_console(stderr=True)) as stage:
 
         def progress(name: str, fraction: float) -> None:
@@ -115,9 +115,9 @@ def init(
 
     Like this: jaxid init arm.urdf > experiment.toml
     """
+    options.start(urdf)
     from jaxid.experiment.template import write_template
 
-    options.start()
     text = write_template(urdf, tip=tip, base=base)
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
@@ -144,9 +144,9 @@ def excite(
     joints and end-effector in a folder, and the state of the design until it is done. After Ctrl-C
     `--resume` goes on, and `--best` writes the best motion so far.
     """
+    console = options.start(experiment)
     from . import commands
 
-    console = options.start()
     options.refuse_foreign_table(output)
     commands.excite(console, experiment, output, resume, best, all_criteria)
 
@@ -163,9 +163,10 @@ def inspect(
     Joints, motors and limits; base parameters and what becomes of each standard parameter; ranges,
     speeds and forces of each log beside the limits, and what the log does not determine.
     """
+    console = options.start(experiment, *(logs or []))
     from . import commands
 
-    commands.inspect(options.start(), experiment, logs or [])
+    commands.inspect(console, experiment, logs or [])
 
 
 @app.command()
@@ -192,9 +193,9 @@ def identify(
 
     A page for the browser, with figures and a verdict; the same numbers for programs.
     """
+    console = options.start(experiment, *logs, *(verify or []), output=output, force=force)
     from . import commands
 
-    console = options.start(output, force)
     commands.identify(console, experiment, logs, verify or [], split, output, pdf)
 
 
@@ -225,9 +226,9 @@ def export(
 
     C is a feed-forward for controllers: one file and its header, named like the output.
     """
+    console = options.start(report, *([urdf] if urdf else []))
     from . import commands
 
-    console = options.start()
     path = Path(f"arm{ENDINGS.get(to, f'.{to}')}") if output is None else output
     made = [path, path.with_suffix(".h")] if to == "c" else [path]
     if to == "c" and path.suffix != ".c":
@@ -261,9 +262,9 @@ def compare(
 
     Each argument is a folder that `jaxid identify` has written.
     """
+    console = options.start(first, second, output=output, force=force)
     from . import commands
 
-    console = options.start(output, force)
     if first.resolve() == second.resolve():
         raise InputError(f"`{first}` is given twice: compare two different runs.")
     commands.compare(console, (first, second), level, output)
@@ -284,9 +285,10 @@ def payload(
 
     From logs without it and logs with it. Friction may differ between them.
     """
+    console = options.start(experiment, *logs, *loaded, output=output, force=force)
     from . import commands
 
-    commands.payload(options.start(output, force), experiment, logs, loaded, body, output)
+    commands.payload(console, experiment, logs, loaded, body, output)
 
 
 @app.command()
@@ -301,9 +303,10 @@ def gains(
 
     From logs without it and logs with it; the table `[load]` of the experiment file describes it.
     """
+    console = options.start(experiment, *logs, *loaded, output=output, force=force)
     from . import commands
 
-    commands.gains(options.start(output, force), experiment, logs, loaded, output)
+    commands.gains(console, experiment, logs, loaded, output)
 
 
 @app.command()
@@ -318,6 +321,7 @@ def states(
     One log or report for each, like cold and warm. Friction and offsets are each state's own,
     all else is shared.
     """
+    console = options.start(experiment, *logs, output=output, force=force)
     from . import commands
 
-    commands.states(options.start(output, force), experiment, logs, output)
+    commands.states(console, experiment, logs, output)

@@ -59,13 +59,23 @@ def require_one_log_per_option() -> None:
             raise InputError(f"`{option}` takes one log: repeat it before `{second}`.")
 
 
-def start(output: Path | None = None, force: bool = False) -> Console:
+def start(*reads: Path, output: Path | None = None, force: bool = False) -> Console:
     """Turn on double precision and the cache of compiled code; return the terminal.
+
+    Args:
+        reads: Files and folders that the command reads: what is missing is named at once.
+        output: Folder of the result.
+        force: Whether the folder may hold other files.
 
     Raises:
         OSError: If nothing can be written into the folder `output`.
-        InputError: If there is something else than an earlier report in its place.
+        InputError: If something is missing, or there is something else than an earlier report in
+            the folder's place.
     """
+    missing = [f"`{path}`" for path in reads if not path.exists()]
+    if missing:
+        words = "is no file or folder" if len(missing) == 1 else "are no files or folders"
+        raise InputError(f"{', '.join(missing)} {words}: check the path.")
     import jax
 
     from jaxid.io import require_writable

@@ -80,12 +80,12 @@ def test_files_hold_the_model(report, run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("nowhere", "--to", "c"), "`nowhere` must be a folder"),
+        (("nowhere", "--to", "c"), "`nowhere` is no file or folder"),
         (("empty", "--to", "c"), "`empty` must be a folder"),
         (("report", "--to", "c", "-o", "arm.h"), "must be a C file like arm.c"),
         (("report", "--to", "c", "-o", "7arm.c"), "names in C code"),
         (("report", "--to", "json", "-o", "empty"), "`empty` is a folder"),
-        (("report", "--to", "urdf", "--urdf", "other.urdf"), "`other.urdf` does not exist"),
+        (("report", "--to", "urdf", "--urdf", "other.urdf"), "`other.urdf` is no file"),
         (("built_in.json", "--to", "urdf"), "name it with `--urdf`"),
         (("built_in.json", "--to", "mjcf"), 'kind = "consistent"'),
     ],
