@@ -19,7 +19,7 @@ from .dynamics.terms import (
 )
 from .errors import InputError as InputError
 from .excitation import constraints as constraints, criteria as criteria
-from .excitation.design import design_excitation as design_excitation
+from .excitation.design import design_excitation as design_excitation, minimise as minimise
 from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
 from .export.c_code import export_c as export_c
@@ -50,7 +50,6 @@ from .identification.operating_states import identify_states as identify_states
 from .identification.parameter_changes import compare as compare
 from .identification.payload import identify_payload as identify_payload
 from .identification.problem import RegressionProblem as RegressionProblem
-from .identification.uncertainty.blocks import bootstrap as bootstrap
 from .measurement import filters as filters
 from .measurement.columns import Columns as Columns
 from .measurement.filters import (

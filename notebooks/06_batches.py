@@ -118,7 +118,7 @@ log = jid.Recording.of(motion.q, forces[0], sample_time=step, name="one log")
 seen = jid.observe(log, robot, jid.ZeroPhaseButterworth(12.0), jid.Subsample(3))
 fit = jid.identify(base, seen)
 blocks = jid.RegressionProblem(base, [seen], divisions=32).blocks
-draws = np.asarray(jid.bootstrap(blocks, fit.weights, 2000, jax.random.key(0)))
+draws = np.asarray(jid.uncertainty.bootstrap(blocks, fit.weights, 2000, jax.random.key(0)))
 
 figure, axes = plt.subplots(figsize=(11, 3.0))
 axes.axhline(1.0, color="#22262b", lw=1)

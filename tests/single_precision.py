@@ -126,7 +126,7 @@ CASES = {
     ),
     "PhysicallyConsistent": lambda: consistent().parameters,
     "identify_batch": batch,
-    "bootstrap": lambda: jid.bootstrap(
+    "bootstrap": lambda: jid.uncertainty.bootstrap(
         jid.RegressionProblem(base, [cold]).blocks, np.ones(2), 20, key
     ),
     "factorise_across_processes": lambda: (

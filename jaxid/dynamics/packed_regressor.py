@@ -46,7 +46,7 @@ class JointRegressor(eqx.Module):
         self.size = rows.shape[1]
 
     def __call__(self, *arrays: AnyArray) -> list[Float[Array, "*batch columns samples"]]:
-        """Return the columns of each joint; JAX differentiates them in reverse mode only.
+        """Return the columns of each joint.
 
         Args:
             arrays: Arguments of the definition, batch and samples last.

@@ -90,7 +90,7 @@ def informations(
     return plain, weighted + prior[None]
 
 
-@jax.custom_vjp
+@jax.custom_jvp
 def _gram(
     columns: Float[Array, "starts columns samples"],
 ) -> Float[Array, "starts columns columns"]:
@@ -98,10 +98,11 @@ def _gram(
     return jnp.einsum("bis,bjs->bij", columns, columns)
 
 
-_gram.defvjp(
-    lambda columns: (_gram(columns), columns),
-    lambda columns, g: (jnp.einsum("bij,bjs->bis", g + jnp.swapaxes(g, 1, 2), columns),),
-)
+@_gram.defjvp
+def _gram_derivative(primals: tuple, tangents: tuple) -> tuple:
+    (columns,), (change,) = primals, tangents
+    half = jnp.einsum("bis,bjs->bij", change, columns)
+    return _gram(columns), half + jnp.swapaxes(half, 1, 2)
 
 
 def standard_deviations(weighted: Float[AnyArray, "base base"]) -> Float[np.ndarray, " base"]:
@@ -259,7 +260,7 @@ CRITERIA = (
 """All criteria, in the order of the tables."""
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def spectral(
     function: Callable[[Array, Sharpness], Array],
     matrix: Float[Array, "size size"],
@@ -269,22 +270,24 @@ def spectral(
 
     For $f(\Lambda) = \varphi(\lambda)$ with $\Lambda = U \operatorname{diag}(\lambda) U^T$ the
     gradient is $U \operatorname{diag}(\varphi'(\lambda)) U^T$: it needs no derivatives of
-    eigenvectors, also where eigenvalues are equal.
+    eigenvectors, also where eigenvalues are equal. The sharpness is a constant.
     """
-    return _spectral_forward(function, matrix, sharpness)[0]
+    return function(jnp.log(_eigenvalues(matrix)[0]), sharpness)
 
 
-def _spectral_forward(
-    function: Callable, matrix: Array, sharpness: Sharpness
-) -> tuple[Array, Array]:
+@spectral.defjvp
+def _spectral_derivative(function: Callable, primals: tuple, tangents: tuple) -> tuple:
+    matrix, sharpness = primals
+    eigenvalues, U = _eigenvalues(matrix)
+    value, slopes = jax.value_and_grad(function)(jnp.log(eigenvalues), sharpness)
+    gradient = (U * (slopes / eigenvalues)[None]) @ U.T
+    return value, jnp.sum(gradient * tangents[0])
+
+
+def _eigenvalues(matrix: Float[Array, "size size"]) -> tuple[Array, Array]:
+    """Return eigenvalues and eigenvectors; below a fraction of the largest is rounding."""
     eigenvalues, U = jnp.linalg.eigh(matrix)
-    # Eigenvalues below this fraction of the largest one are rounding errors.
-    kept = jnp.maximum(eigenvalues, 1e-15 * eigenvalues[-1])
-    value, slopes = jax.value_and_grad(function)(jnp.log(kept), sharpness)
-    return value, (U * (slopes / kept)[None]) @ U.T
-
-
-spectral.defvjp(_spectral_forward, lambda function, gradient, g: (g * gradient, None))
+    return jnp.maximum(eigenvalues, 1e-15 * eigenvalues[-1]), U
 
 
 def log_condition(logs: Float[Array, " size"], sharpness: Sharpness) -> Float[Array, ""]:

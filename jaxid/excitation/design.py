@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, PRNGKeyArray
+from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
@@ -16,9 +16,12 @@ from jaxid.trajectory.trajectory import AbstractBasis
 
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
-from .design_result import ExcitationPlan
-from .problem import ExcitationProblem
+from .design_result import SETTLED, DesignStatus, ExcitationPlan
+from .problem import ExcitationProblem, evaluate, evaluate_within_limits
 from .search import Search
+
+Solver = Callable[[ExcitationProblem, Float[Array, "starts scaled"]], AnyArray]
+"""A solver of excitation problems: from random motions to better ones."""
 
 
 class DesignProgress(NamedTuple):
@@ -72,8 +75,8 @@ def design_excitation(
         prior: Information of earlier experiments in the same noise, the inverse of their
             covariance; the design adds to it.
         samples: Number of measured samples of one run of the motion.
-        settings: Arguments of `minimise`: `starts`, `generations`, `polish`, `key`, `nominal`,
-            `progress`, `state`, `resume`, `throw`.
+        settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `polish`, `key`,
+            `nominal`, `progress`, `state`, `resume`, `throw`.
 
     Raises:
         InputError: If arguments do not fit, or no motion keeps all constraints: the message says
@@ -90,6 +93,7 @@ def design_excitation(
 
 def minimise(
     problem: ExcitationProblem,
+    solver: Solver | None = None,
     *,
     starts: int = 32,
     generations: int = 12,
@@ -110,6 +114,9 @@ def minimise(
 
     Args:
         problem: Problem to be solved.
+        solver: Another solver: a function of the problem and of random motions [starts, scaled]
+            that returns better motions. What comes out is made to keep the limits of the joints for
+            all times, and the best motion is taken.
         starts: Number of random motions to start from.
         generations: Number of generations.
         polish: Number of the best motions that are polished; 0 for the path in JAX alone.
@@ -130,32 +137,21 @@ def minimise(
         if value < low:
             raise InputError(f"`{name}` must be at least {low}, but is {value}.")
     key = jax.random.key(0) if key is None else key
-    search = Search(problem, key, starts, generations, polish)
     path = None if state is None else Path(state)
-    if resume and path is not None and path.is_file():
-        search.resume(path)
-
-    def report() -> None:
-        if progress is not None:
-            first = int(search.best.order()[0])
-            task = "searching from many starts" if search.searching else "polishing the best"
-            value, kept = search.best.value[first], search.best.excess[first] <= 0.0
-            done = search.done / search.steps
-            progress(DesignProgress(done, task, float(np.exp(value)), bool(kept)))
-
-    interrupted = False
-    try:
-        report()
-        while search.done < search.steps:
-            search.advance()
-            if path is not None:
-                search.save(path)
-            report()
-    except KeyboardInterrupt:
-        interrupted = True
-    search.finish()
-    x = np.asarray(search.best.x[int(search.best.order()[0])])
-    median = int(np.argsort(np.asarray(search.first))[starts // 2])
+    if solver is None:
+        search = Search(problem, key, starts, generations, polish)
+        if resume and path is not None and path.is_file():
+            search.resume(path)
+        status = _advance(search, path, progress)
+        best, first, history = search.best, search.first, search.history[: search.done + 1]
+    else:
+        x = problem.limits.random(key, starts)
+        random = evaluate(problem, x)
+        best = evaluate_within_limits(problem, solver(problem, x))
+        status, first = DesignStatus.GIVEN, random.value
+        history = [one.best_value for one in (random, best)]
+    x = np.asarray(best.x[int(best.order()[0])])
+    median = int(np.argsort(np.asarray(first))[starts // 2])
     plan = ExcitationPlan(
         base=problem.base,
         trajectory=problem.trajectory(x),
@@ -167,14 +163,44 @@ def minimise(
         samples=problem.samples,
         findings=tuple(problem.findings(x)),
         nominal=np.full(problem.base.size, np.nan) if nominal is None else np.asarray(nominal),
-        interrupted=interrupted,
+        status=status,
+        history=np.asarray(history),
     )
     if throw and not plan.feasible:
         unkept = "; ".join(plan.diagnosis)
-        if interrupted:
+        if status is DesignStatus.STOPPED:
             raise KeyboardInterrupt(f"stopped before a motion kept all limits: {unkept}")
         if path is not None:
             # The design is complete: resuming it would end in the same place.
             path.unlink(missing_ok=True)
         raise InputError(f"no motion was found that keeps all limits: {unkept}")
     return plan
+
+
+def _advance(
+    search: Search, path: Path | None, progress: Callable[[DesignProgress], None] | None
+) -> DesignStatus:
+    """Do all steps of a search, or those until Ctrl-C."""
+
+    def report() -> None:
+        if progress is not None:
+            task = "searching from many starts" if search.searching else "polishing the best"
+            best = float(search.history[search.done])
+            progress(DesignProgress(search.done / search.steps, task, best, search.feasible))
+
+    stopped = False
+    try:
+        report()
+        while search.done < search.steps:
+            search.advance()
+            if path is not None:
+                search.save(path)
+            report()
+    except KeyboardInterrupt:
+        stopped = True
+    search.finish()
+    if stopped:
+        return DesignStatus.STOPPED
+    before = search.history[search.steps - search.steps // 4]
+    improved = search.history[-1] < (1.0 - SETTLED) * before
+    return DesignStatus.IMPROVING if improved else DesignStatus.CONVERGED

@@ -1,5 +1,6 @@
 """A designed experiment: the motion, the expected deviations, and the use of the limits."""
 
+import enum
 import functools
 import math
 from pathlib import Path
@@ -26,6 +27,17 @@ from .criteria import (
 
 VAGUE = 0.5
 """Relative standard deviation above which a parameter counts as hardly determined."""
+SETTLED = 2e-3
+"""Relative improvement in the last quarter of the steps below which a design has converged."""
+
+
+class DesignStatus(enum.StrEnum):
+    """How a design ended; whether its motion keeps all limits is `ExcitationPlan.feasible`."""
+
+    CONVERGED = "the last quarter of its steps hardly improved the motion"
+    IMPROVING = "the last quarter of its steps still improved the motion"
+    STOPPED = "stopped before its end"
+    GIVEN = "found by a solver that was given"
 
 
 class Comparison(NamedTuple):
@@ -51,7 +63,8 @@ class ExcitationPlan(eqx.Module):
         samples: Number of measured samples of one run.
         findings: Use of the constraints beside the limits of the joints.
         nominal: Base parameters as far as they are known before, NaN where not.
-        interrupted: Whether the design was stopped before its end.
+        status: How the design ended.
+        history: Value of the criterion for the best motion, before the first step and after each.
     """
 
     base: BaseParameters
@@ -64,7 +77,13 @@ class ExcitationPlan(eqx.Module):
     samples: int = eqx.field(static=True)
     findings: tuple[Finding, ...]
     nominal: Float[AnyArray, " base"]
-    interrupted: bool = eqx.field(static=True)
+    status: DesignStatus = eqx.field(static=True)
+    history: Float[AnyArray, " steps"]
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the design was stopped before its end."""
+        return self.status is DesignStatus.STOPPED
 
     @property
     def feasible(self) -> bool:
@@ -182,6 +201,11 @@ class ExcitationPlan(eqx.Module):
             remarks.append(Remark(text, Status.BAD))
         if self.interrupted:
             remarks.append(Remark("The design was stopped before its end", Status.DOUBTFUL))
+        if self.status is DesignStatus.IMPROVING:
+            text = (
+                "The last steps still improved the motion: more `generations` may find a better one"
+            )
+            remarks.append(Remark(text))
         return remarks
 
     def __str__(self) -> str:

@@ -317,6 +317,11 @@ class Candidates(NamedTuple):
         """Excess where a constraint is not kept; zero elsewhere."""
         return np.maximum(np.asarray(self.excess), 0.0)
 
+    @property
+    def best_value(self) -> float:
+        """Value of the criterion itself for the best motion."""
+        return float(np.exp(self.value[int(self.order()[0])]))
+
     def order(self) -> np.ndarray:
         """Return the starts from best to worst; motions that keep their constraints come first."""
         return np.lexsort((np.asarray(self.value), self.broken))

@@ -71,6 +71,7 @@ class Search:
         steps: Number of steps: of the starts, of their descendants, the last one, and polishing.
         first: Values of the random motions.
         best: Best motions so far.
+        history: Value of the criterion for the best motion, before the first step and after each.
     """
 
     def __init__(
@@ -89,8 +90,14 @@ class Search:
         x = problem.limits.random(key, starts)
         self.done, self.best = 0, evaluate(problem, x)
         self.first = self.best.value
+        self.history = np.full(self.steps + 1, self.best.best_value)
         self._order = self.best.promising()
         self._state = _begin(problem, SEARCHED, x)
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the best motion so far keeps all constraints."""
+        return bool((self.best.broken == 0).any())
 
     @property
     def searching(self) -> bool:
@@ -119,6 +126,7 @@ class Search:
             better = polish(problem, np.asarray(self.best.x[place]))
             self.best = self.best.improved(better, np.arange(len(self.first)) == place)
         self.done = number + 1
+        self.history[self.done :] = self.best.best_value
         if self.done <= self._searching:
             self._order = self.best.promising()
 
@@ -146,10 +154,11 @@ class Search:
                 f"`{path}` is damaged, or of a design with other settings: remove it to begin anew."
             )
         self.done = int(content[0])
-        self.first, self.best, self._order, self._state = content[1:]
+        self.first, self.best, self.history, self._order, self._state = content[1:]
 
     def _content(self) -> tuple:
-        return np.array(self.done), self.first, self.best, self._order, self._state
+        done, known = np.array(self.done), (self.first, self.best, self.history)
+        return done, *known, self._order, self._state
 
     def _digest(self) -> np.ndarray:
         """Return a digest of everything that the result depends on."""

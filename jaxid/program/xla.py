@@ -6,7 +6,6 @@ would be computed many times over. A fence on a shared value stops that.
 """
 
 import functools
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -101,10 +100,10 @@ class Lowered(eqx.Module):
         return self.program.align([jnp.asarray(x, dtype) for x in arrays], jnp)
 
     def stacked(self, groups: Groups, *arrays: AnyArray) -> list[Array]:
-        """Compute entries of the packed result, stacked, for `grad` and `vjp`.
+        """Compute entries of the packed result, stacked, for derivatives.
 
-        The numbers and their derivatives are those of a call, but JAX traces them faster: it
-        processes each operation once, not many times. There is no forward mode.
+        The numbers and their derivatives are those of a call, but JAX traces them faster: the rule
+        of a derivative has primitives without the checks of array operators.
 
         Args:
             groups: Positions in the packed result; each group becomes one array.
@@ -221,77 +220,69 @@ def _circular_jvp(primals, tangents):
     return (sine, cosine), (cosine * dx, -sine * dx)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _stacked(lowered: Lowered, groups: Groups, entries: list[Array]) -> list[Array]:
-    return _stacked_forward(lowered, groups, entries)[0]
-
-
-def _stacked_forward(
-    lowered: Lowered, groups: Groups, entries: list[Array]
-) -> tuple[list[Array], tuple[Values, Array]]:
     first = next(x[0] for x in entries if len(x))
-    values = lowered.run(entries, primitives(first))
+    values = lowered.run(entries, primitives(first))[0]
+    return _in_groups(lowered.program, groups, values, first, is_derivative=False)
+
+
+@_stacked.defjvp
+def _stacked_derivative(lowered: Lowered, groups: Groups, primals: tuple, tangents: tuple) -> tuple:
+    (entries,), (given,) = primals, tangents
+    first = next(x[0] for x in entries if len(x))
+    program, table = lowered.program, primitives(first)
+    values, pairs, anchor = lowered.run(entries, table)
+    multiply, zero = table[Operation.MULTIPLY], jax.lax.full_like(first, 0)
+    changes: list[Array] = []
+    for position, node in enumerate(program.nodes):
+        operation = node.operation
+        if operation is Operation.INPUT:
+            number, entry = node.place
+            changes.append(given[number][entry])
+            continue
+        operands = [values[x] if isinstance(x, int) else x for x in node.operands]
+        own = [changes[x] if isinstance(x, int) else zero for x in node.operands]
+        if operation in CIRCULAR:
+            sine, cosine = pairs[node.uses[0]]
+            slope = cosine if operation is Operation.SINE else table[Operation.NEGATE](sine)
+            change = multiply(own[0], slope)
+        elif operation is Operation.MULTIPLY:
+            pairs_of_one = zip(own, reversed(operands), node.operands, strict=True)
+            parts = [multiply(c, x) for c, x, k in pairs_of_one if isinstance(k, int)]
+            change = functools.reduce(jax.lax.add, parts)
+        elif operation in (Operation.ADD, Operation.SUBTRACT, Operation.NEGATE):
+            change = table[operation](*own)
+        else:
+            real = [jnp.asarray(x, zero.dtype) if isinstance(x, float) else x for x in operands]
+            change = _slope(operation, real, own)
+        changes.append(change / anchor if position in lowered.fenced else change)
+    found = (_in_groups(program, groups, x, first, k) for k, x in enumerate((values, changes)))
+    values, changes = found
+    return values, changes
+
+
+def _slope(operation: Operation, operands: list[Array], changes: list[Array]) -> Array:
+    """Return the derivative of an operation; a condition has none."""
+    if operation is Operation.SELECT:
+        return ELEMENTWISE[operation](operands[0], *changes[1:])
+    return jax.jvp(ELEMENTWISE[operation], operands, changes)[1]
+
+
+def _in_groups(
+    program: Program, groups: Groups, values: list[Array], first: Array, is_derivative: bool | int
+) -> list[Array]:
+    """Stack values of the nodes, or derivatives of them, along the last axis but one."""
     axis = max(first.ndim - 1, 0)
     arrays = []
     for group in groups:
-        own = [lowered.program.outputs[k] for k in group]
-        rows = [values[0][x] if isinstance(x, int) else jax.lax.full_like(first, x) for x in own]
+        own = [program.outputs[k] for k in group]
+        constants = (0.0 if is_derivative else x for x in own)
+        rows = [
+            values[x] if isinstance(x, int) else jax.lax.full_like(first, c)
+            for x, c in zip(own, constants, strict=True)
+        ]
         rows = [jax.lax.expand_dims(x, (axis,)) for x in rows]
         empty = jnp.zeros((*first.shape[:axis], 0, *first.shape[axis:]), first.dtype)
         arrays.append(jax.lax.concatenate(rows, axis) if rows else empty)
-    return arrays, (values, first)
-
-
-def _stacked_backward(
-    lowered: Lowered, groups: Groups, residuals: tuple[Values, Array], given: list[Array]
-) -> tuple[list[Array]]:
-    (values, pairs, anchor), first = residuals
-    program, table = lowered.program, primitives(first)
-    multiply, negate = table[Operation.MULTIPLY], table[Operation.NEGATE]
-    sums: list[Any] = [None] * len(program.nodes)
-
-    def accumulate(x: int | float, c: Array) -> None:
-        if isinstance(x, int) and c.dtype != jax.dtypes.float0:
-            sums[x] = c if sums[x] is None else jax.lax.add(sums[x], c)
-
-    axis = max(first.ndim - 1, 0)
-    for group, stack in zip(groups, given, strict=True):
-        for row, k in enumerate(group):
-            accumulate(program.outputs[k], jax.lax.index_in_dim(stack, row, axis, keepdims=False))
-    zero = jax.lax.full_like(first, 0)
-    inputs = [[zero] * math.prod(shape) for shape in program.input_shapes]
-    for position, node in reversed(list(enumerate(program.nodes))):
-        c, operation = sums[position], node.operation
-        if c is None:
-            continue
-        if operation is Operation.INPUT:
-            number, entry = node.place
-            inputs[number][entry] = c
-            continue
-        if operation in CIRCULAR:
-            (angle,) = node.uses
-            sine, cosine = pairs[angle]
-            is_sine = operation is Operation.SINE
-            accumulate(angle, multiply(c, cosine) if is_sine else negate(multiply(c, sine)))
-            continue
-        if position in lowered.fenced:
-            c = c / anchor
-        operands = [values[x] if isinstance(x, int) else x for x in node.operands]
-        if operation is Operation.ADD:
-            pulled = [c, c]
-        elif operation is Operation.SUBTRACT:
-            pulled = [c, negate(c)]
-        elif operation is Operation.NEGATE:
-            pulled = [negate(c)]
-        elif operation is Operation.MULTIPLY:
-            pulled = [multiply(c, x) for x in reversed(operands)]
-        else:
-            real = [jnp.asarray(x, c.dtype) if isinstance(x, float) else x for x in operands]
-            pulled = jax.vjp(ELEMENTWISE[operation], *real)[1](c)
-        for x, own in zip(node.operands, pulled, strict=True):
-            accumulate(x, own)
-    empty = jnp.zeros((0, *zero.shape), zero.dtype)
-    return ([jnp.stack(own) if own else empty for own in inputs],)
-
-
-_stacked.defvjp(_stacked_forward, _stacked_backward)
+    return arrays

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxid.excitation.constraints import Clearance, ForceLimits, TipLimits
+from jaxid.excitation.criteria import CRITERIA
 from jaxid.excitation.design import minimise
 from jaxid.excitation.problem import (
     CHECKED,
@@ -71,6 +72,18 @@ def test_derivatives_are_central_differences(problem, evaluated):
     wrong = np.linalg.norm(slopes - quotients, axis=1) > 1e-6 * np.linalg.norm(slopes, axis=1)
     assert wrong.sum() <= 2
     assert np.linalg.norm(slopes) > 1.0
+
+
+@pytest.mark.parametrize("criterion", CRITERIA, ids=lambda c: c.name)
+def test_forward_mode_is_reverse_mode(pendulum, criterion, constraints):
+    problem = ExcitationProblem(
+        pendulum, BASIS, criterion=criterion, constraints=constraints, noise=np.ones(1), samples=100
+    )
+    x = problem.random(jax.random.key(3))
+    for function in (problem.value, problem.inequalities):
+        forward, reverse = (jax.jit(jac(function))(x) for jac in (jax.jacfwd, jax.jacrev))
+        np.testing.assert_allclose(forward, reverse, atol=1e-9 * np.abs(reverse).max())
+    assert np.isfinite(jax.jit(jax.hessian(problem.value))(x)).all()
 
 
 def test_the_highest_peaks_are_watched(problem, evaluated):

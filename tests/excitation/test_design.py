@@ -11,6 +11,7 @@ import pytest
 from jaxid.excitation.constraints import AbstractConstraint, Finding
 from jaxid.excitation.criteria import ConditionNumber, DOptimal, information
 from jaxid.excitation.design import design_excitation, minimise
+from jaxid.excitation.design_result import DesignStatus
 from jaxid.excitation.problem import ExcitationProblem
 from jaxid.trajectory.fourier import FourierBasis
 
@@ -104,6 +105,33 @@ def test_a_stopped_design_gives_its_best_and_resumes_to_the_same_motion(
     np.testing.assert_array_equal(resumed.trajectory.coefficients, expected)
     with pytest.raises(ValueError, match="other settings"):
         minimise(free, resume=True, **{**arguments, "key": jax.random.key(4)})
+
+
+def test_a_design_says_how_it_ended(designed):
+    found, seen = designed
+    assert found.status in (DesignStatus.CONVERGED, DesignStatus.IMPROVING)
+    assert len(found.history) == len(seen)
+    assert (np.diff(found.history) <= 0).all()
+    assert found.history[-1] == pytest.approx(found.criterion.value(found.information))
+
+
+def test_another_solver_is_put_around_a_problem(free):
+    """Steepest descent from each start; what leaves the limits is brought back."""
+
+    def descend(problem, starts):
+        slope = jax.jit(jax.vmap(jax.grad(problem.value)))
+        x = starts
+        for _ in range(10):
+            x = x - 0.05 * slope(x)
+        return x
+
+    found = minimise(free, descend, starts=4, key=jax.random.key(3))
+    assert found.status is DesignStatus.GIVEN
+    assert found.feasible
+    assert found.use.max() <= 1.0 + 1e-9
+    before, after = found.history
+    assert after < before
+    assert after == pytest.approx(found.criterion.value(found.information))
 
 
 def test_the_problems_functions_are_those_of_the_motion(impossible, pendulum):

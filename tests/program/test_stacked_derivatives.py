@@ -1,4 +1,4 @@
-"""Reverse mode against the derivatives that JAX finds itself."""
+"""Derivatives of stacked results against those that JAX finds itself."""
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,8 @@ from sample_functions import SIZE, chain, random_functions, samples
 from jaxid.program import lower, trace
 
 
-def assert_reverse_mode(lowered, *x, groups=None, tolerance=1e-12):
-    """Compare stacked results, and cotangents of the inputs for random ones of the results."""
+def assert_derivatives(lowered, *x, groups=None, tolerance=1e-12):
+    """Compare stacked results, their tangents, and cotangents of the inputs."""
     batch = np.broadcast_shapes(*(np.shape(a)[1:] for a in x))
     axis, dtype = max(len(batch) - 1, 0), x[0].dtype
     groups = (tuple(range(len(lowered.program.outputs))),) if groups is None else groups
@@ -23,7 +23,8 @@ def assert_reverse_mode(lowered, *x, groups=None, tolerance=1e-12):
 
     def derivative(function, *x):
         values, pull = jax.vjp(function, *x)
-        return values, pull([jnp.cos(3.0 * y) for y in values])
+        tangents = jax.jvp(function, x, tuple(jnp.sin(2.0 * y) for y in x))[1]
+        return values, pull([jnp.cos(3.0 * y) for y in values]), tangents
 
     def close(a, b):
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
@@ -37,13 +38,13 @@ def assert_reverse_mode(lowered, *x, groups=None, tolerance=1e-12):
 @settings(max_examples=3, deadline=None, derandomize=True)
 def test_the_same_as_jax_finds(function):
     lowered = lower(trace(function, (SIZE,), (SIZE,)))
-    assert_reverse_mode(lowered, *samples(1, (4,)), tolerance=1e-10)
+    assert_derivatives(lowered, *samples(1, (4,)), tolerance=1e-10)
 
 
 def test_under_vmap():
     lowered = lower(trace(chain, (3,), (3,)))
     x = [jnp.asarray(a) for a in samples(2, (2, 6))]
-    assert_reverse_mode(lowered, *(a[:, 0] for a in x))
+    assert_derivatives(lowered, *(a[:, 0] for a in x))
     groups = (tuple(range(9)),)
     pulled = jax.jit(jax.grad(lambda *a: jnp.sum(lowered.stacked(groups, *a)[0] ** 3)))
     mapped = jax.vmap(pulled, in_axes=1, out_axes=1)(*x)
@@ -56,16 +57,16 @@ def test_kinks_choices_constants_and_repeated_results():
         choice = jnp.where(q[2] > p[2], low, jnp.sqrt(1.0 + p[0] ** 2))
         return jnp.stack([choice, -choice, 0.0 * q[0], 3.0 - choice, jnp.arctan2(q[0], p[1]), low])
 
-    assert_reverse_mode(lower(trace(function, (3,), (3,))), *samples(3, (5,)))
+    assert_derivatives(lower(trace(function, (3,), (3,))), *samples(3, (5,)))
     constants = lower(trace(lambda q: jnp.stack([0.0 * q[0], 0.0 * q[1] + 2.0]), (3,)))
-    assert_reverse_mode(constants, *samples(3, (5,), count=1))
+    assert_derivatives(constants, *samples(3, (5,), count=1))
 
 
 def test_single_precision_broadcasting_and_no_samples():
     lowered = lower(trace(chain, (3,), (3,)))
     q, p = (np.asarray(x, np.float32) for x in samples(4, (5,)))
-    assert_reverse_mode(lowered, q, p[:, :1], tolerance=1e-4)
-    assert_reverse_mode(lowered, q[:, :0], p[:, :0])
+    assert_derivatives(lowered, q, p[:, :1], tolerance=1e-4)
+    assert_derivatives(lowered, q[:, :0], p[:, :0])
 
 
 @pytest.mark.parametrize("batch", [(), (2, 5)], ids=str)
@@ -73,4 +74,4 @@ def test_groups_and_batches(batch):
     lowered = lower(trace(chain, (3,), (3,)))
     size = len(lowered.program.outputs)
     groups = (tuple(range(size)), (size - 1, 0, 0), ())
-    assert_reverse_mode(lowered, *samples(5, batch), groups=groups)
+    assert_derivatives(lowered, *samples(5, batch), groups=groups)
