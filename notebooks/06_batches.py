@@ -223,7 +223,7 @@ print(f"on this {device.platform}, in one computation: the same parameters, {dif
 # %% [markdown]
 # The amount of work decides: a single log of a few seconds leaves a GPU idle, thousands of data sets do not. All is in double precision, of which
 # graphics cards for games have little. This notebook was executed on a CPU; `benchmarks/gpu.py` says what your GPU does. Several devices and several hosts
-# share the work on long logs by factors: [long logs and clusters](../docs/operations.md).
+# share the work on long logs by factors: [many devices and processes](../docs/cluster.md).
 #
 # ## What you learned
 #

@@ -190,4 +190,4 @@ with tempfile.TemporaryDirectory() as folder:
 #   ([consistency](05_consistency_payload.ipynb)).
 # * The same on the command line: `jaxid init`, `excite`, `inspect`, `identify`, `export` ([README](../README.md#the-same-in-the-shell)).
 #
-# Where to go on: [how to choose](../docs/how_to_choose.md), [is my fit good?](../docs/is_my_fit_good.md).
+# Where to go on: [how to choose](../docs/how_to_choose.md), [is my fit good?](../docs/is_my_fit_good.md). Next: [your own solver](09_solvers.ipynb).

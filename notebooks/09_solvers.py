@@ -20,7 +20,7 @@ plt.style.use("notebook.mplstyle")
 # %% [markdown]
 # ## The problem
 #
-# The arm of [notebook 03](03_excitation.ipynb), and a tip that stays below 1.5 m/s. The unknown `x` holds scaled Fourier coefficients; `value(x)` is the logarithm
+# The arm of [notebook 03](03_excitation.ipynb), and a tip that stays below 1 m/s. The unknown `x` holds scaled Fourier coefficients; `value(x)` is the logarithm
 # of the criterion, `inequalities(x)` must not be positive, and `violation(x)` is the largest excess at any time.
 
 # %%
@@ -53,7 +53,7 @@ base = jid.base_parameters(jid.Model(robot))
 problem = jid.ExcitationProblem(
     base,
     jid.trajectories.FourierBasis(4, 0.8),
-    constraints=(jid.constraints.TipLimits(speed=1.5),),
+    constraints=(jid.constraints.TipLimits(speed=1.0),),
     samples=400,
 )
 x = problem.random(jax.random.key(0))
@@ -120,7 +120,9 @@ def optax_solver(problem, starts):
             change, state = adam.update(slope(x), state)
             return (optax.apply_updates(x, change), state), None
 
-        run = jax.jit(lambda x, step=step, adam=adam: jax.lax.scan(step, (x, adam.init(x)), None, 400))
+        run = jax.jit(
+            lambda x, step=step, adam=adam: jax.lax.scan(step, (x, adam.init(x)), None, 400)
+        )
         x = run(x)[0][0]
     return x
 
@@ -143,7 +145,7 @@ def jaxopt_solver(problem, starts):
     """L-BFGS from all starts at once."""
     x = starts
     for weight in WEIGHTS:
-        solver = jaxopt.LBFGS(penalised(problem, weight), maxiter=300, tol=1e-8)
+        solver = jaxopt.LBFGS(penalised(problem, weight), maxiter=300, linesearch="backtracking")
         x = jax.jit(jax.vmap(lambda x, solver=solver: solver.run(x).params))(x)
     return x
 
@@ -198,6 +200,22 @@ axes.grid(axis="y", visible=False)
 plt.show()
 
 # %% [markdown]
+# The plan keeps the criterion after each step: most is gained in the first stages, and the generations find what one start alone does not.
+
+# %%
+figure, panels = plt.subplots(1, 2, figsize=(11, 3.2))
+panels[0].plot(plans[ours].history, ".-")
+panels[0].set_xlabel("step of jid.minimise")
+panels[0].set_ylabel("mean axis of the ellipsoid")
+t = np.linspace(0, 2 * np.pi / 0.8, 400)
+for name, style in ((ours, "-"), ("SciPy SLSQP", "--")):
+    panels[1].plot(t, np.asarray(plans[name].trajectory.motion(t).q)[:, 1], style, label=name)
+panels[1].set_xlabel("time [s]")
+panels[1].set_ylabel("angle of the shoulder [rad]")
+panels[1].legend(fontsize=8)
+plt.show()
+
+# %% [markdown]
 # ## Forward and reverse mode
 #
 # The criterion has derivative rules of its own, so both modes and their combinations work: here the value's gradient by both, and Newton's matrix.
@@ -213,6 +231,6 @@ print("shape of the Hessian:", jax.jit(jax.hessian(problem.value))(x).shape)
 #
 # * An `ExcitationProblem` is four functions of one vector; any solver fits around them.
 # * `jid.minimise(problem, solver)` turns what a solver finds into a motion that keeps its limits for all times, with tables and files like any other design.
-# * Solvers that keep inequalities do best after ours; a penalty leaves an excess, and mending that costs part of the gain.
+# * From four starts, SLSQP and BFGS come within some percent of ours; the generations make the rest.
 #
 # Next: [the guide to excitation](../docs/excitation.md).

@@ -17,12 +17,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 
 from jaxid.arrays import AnyArray, Array, Float, Joints, Numbers, as_array, content, is_traced
 from jaxid.errors import InputError
 from jaxid.program import Program, dense_rows, evaluate, evaluate_rows, trace
 from jaxid.program.blocks import BLOCK, on_rows
+from jaxid.program.rules import with_derivatives_of
 
 FEW = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
@@ -94,25 +94,8 @@ class SampleMethod:
         if self.is_long or is_traced(self.owner):
             return functools.partial(plain_rows, self.plain)
 
-        @jax.custom_jvp
-        def run(*arrays: Array) -> Array:
-            return on_rows(self.program, *arrays)
-
-        def derivative(primals: tuple, tangents: tuple) -> tuple:
-            moving = [k for k, x in enumerate(tangents) if not isinstance(x, SymbolicZero)]
-
-            def of_moving(*given: Array) -> Array:
-                arrays = list(primals)
-                for k, x in zip(moving, given, strict=True):
-                    arrays[k] = x
-                return plain_rows(self.plain, *arrays)
-
-            return jax.jvp(
-                of_moving, tuple(primals[k] for k in moving), tuple(tangents[k] for k in moving)
-            )
-
-        run.defjvp(derivative, symbolic_zeros=True)
-        return run
+        plain = functools.partial(plain_rows, self.plain)
+        return with_derivatives_of(plain, functools.partial(on_rows, self.program))
 
     @functools.cached_property
     def compiled(self) -> Callable:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Bool, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
+from jaxid.program.rules import divided
 
 from .uncertainty.spectral import sandwich_of_columns
 
@@ -73,11 +74,19 @@ class DataSets(NamedTuple):
 
 @eqx.filter_jit
 def solve(rows: JointRegressor, batch: DataSets, row_time: float | None = None) -> BatchFit:
-    """Solve all data sets, a group at a time.
+    """Solve all data sets, a group at a time; devices divide them among themselves.
 
     With the time between two rows [s], standard deviations come from the spectral sandwich.
     """
-    batch = jax.tree.map(jnp.asarray, batch)
+    leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, batch))
+
+    def solved(*leaves: Array) -> BatchFit:
+        return _solve_groups(rows, jax.tree.unflatten(tree, leaves), row_time)
+
+    return divided(solved)(*leaves)
+
+
+def _solve_groups(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
     datasets, samples, _ = batch.motion.q.shape
     calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
     group = -(-datasets // calls)

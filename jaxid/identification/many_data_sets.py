@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxid.arrays import AnyArray, Bool, Float, in_parts, is_traced, require_float64
+from jaxid.arrays import AnyArray, Array, Bool, Float, in_parts, is_traced, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
@@ -30,6 +30,15 @@ from .estimators import AbstractEstimator, GivenWeights, WeightedLeastSquares
 from .fit_result import Fit
 from .identify import identify
 from .uncertainty import IndependentRows
+
+KNOWN = {
+    "axis": np.array([0.0, 0.0, 1.0]),
+    "rotation": np.eye(3),
+    "offset": np.zeros(3),
+    "gravity": np.array([0.0, 0.0, -9.81]),
+}
+"""Geometry that stands for numbers that are inputs of a program."""
+GEOMETRY = tuple(KNOWN)
 
 
 def identify_batch(
@@ -46,8 +55,9 @@ def identify_batch(
     """Estimate the base parameters of many data sets in one call (Eqs. 28-33).
 
     The parameters are those of `identify` with `WeightedLeastSquares` on each data set. Compiles
-    once for each shape; works under `jit`, `vmap` and `grad`, where data sets that determine too
-    little are only marked. Without tracing they are solved again by orthogonal factors.
+    once for each shape; works under `jit`, `vmap`, `grad` and `jvp`, by data and by the robot's
+    geometry, where data sets that determine too little are only marked. Without tracing they are
+    solved again by orthogonal factors.
 
     Args:
         base: Base parameters of the robot.
@@ -89,16 +99,17 @@ def identify_batch(
     if estimator is not None:
         fit = _estimate_each(base, batch, estimator, row_time)
     else:
-        rows, reduced = base.joint_regressor, batch
-        if robots is not None:
-            family, numbers = _family(base, robots)
+        if robots is None and not is_traced(robot):
+            rows, reduced = base.joint_regressor, batch
+        else:
+            family, numbers = _traced(base, sets) if robots is None else _family(base, robots)
             n = (robot.joints,)
             rows = JointRegressor(family, family.columns, n, n, n, (numbers.shape[1],))
             reduced = batch._replace(numbers=numbers)
         if robot.tool is not None:
             known = base.model.tool_forces(motion)
             reduced = reduced._replace(forces=batch.forces - known[:, None])
-        if is_traced(batch):
+        if is_traced(reduced):
             fit = solve(rows, reduced, row_time)
         else:
             reduced = jax.tree.map(np.asarray, reduced)
@@ -210,6 +221,23 @@ def _family(base: BaseParameters, robots: Sequence[Robot]) -> tuple[RobotFamily,
     return RobotFamily(base, varying), np.array(numbers)[:, list(varying)]
 
 
+def _traced(base: BaseParameters, sets: int) -> tuple[RobotFamily, Array]:
+    """Return a robot whose geometry JAX is tracing, in the same way: what is traced varies."""
+    own = base.model.robot
+    geometry = {name: getattr(own, name) for name in GEOMETRY}
+    # Where they stand does not matter: these numbers are replaced.
+    known = {k: KNOWN[k] + np.zeros(x.shape) for k, x in geometry.items() if is_traced(x)}
+    base = eqx.tree_at(lambda b: b.model.robot, base, own.replace(**known))
+    if is_traced(base):
+        raise InputError(
+            f"a batch can be differentiated by {', '.join(GEOMETRY)} of the robot, not by its "
+            "limits, drives, or constants of the model."
+        )
+    marked = {k: np.full(np.shape(x), k in known) for k, x in geometry.items()}
+    varying = np.flatnonzero(np.concatenate([x.ravel() for x in jax.tree.leaves(marked)]))
+    numbers = jnp.broadcast_to(ravel_pytree(geometry)[0][varying], (sets, len(varying)))
+    return RobotFamily(base, tuple(varying.tolist())), numbers
+
+
 def _geometry(robot: Robot) -> dict[str, np.ndarray]:
-    names = "axis", "rotation", "offset", "gravity"
-    return {name: np.asarray(getattr(robot, name), np.float64) for name in names}
+    return {name: np.asarray(getattr(robot, name), np.float64) for name in GEOMETRY}

@@ -256,7 +256,8 @@ def _stacked_derivative(lowered: Lowered, groups: Groups, primals: tuple, tangen
         else:
             real = [jnp.asarray(x, zero.dtype) if isinstance(x, float) else x for x in operands]
             change = _slope(operation, real, own)
-        changes.append(change / anchor if position in lowered.fenced else change)
+        fence = anchor if position in lowered.fenced else None
+        changes.append(change if fence is None else change / fence)
     found = (_in_groups(program, groups, x, first, k) for k, x in enumerate((values, changes)))
     values, changes = found
     return values, changes

@@ -1,5 +1,6 @@
 """Batches give what one identification after the other gives."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -164,6 +165,37 @@ def test_under_transformations(base, sets, arrays):
     gradient = jax.grad(lambda f: found(f)[0][1].sum())(jnp.asarray(forces))
     step = found(forces + direction)[0] - expected.parameters
     np.testing.assert_allclose(jnp.vdot(gradient, direction), step[1].sum(), rtol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["offset", "axis", "gravity"])
+def test_derivatives_by_the_geometry_are_differences(base, sets, arrays, name):
+    robot, (m, forces) = base.model.robot, arrays
+    x = jnp.asarray(getattr(robot, name))
+    direction = 0.1 * np.random.default_rng(4).normal(size=x.shape)
+
+    @jax.jit
+    def found(x):
+        own = eqx.tree_at(lambda b: getattr(b.model.robot, name), base, x)
+        fit = identify_batch(own, m, forces, WEIGHTS, row_time=sets[0].sample_time)
+        return fit.parameters, fit.standard_deviations
+
+    h, tangents = 1e-4, jax.jvp(found, (x,), (direction,))[1]
+    there = [found(x + k * h * direction) for k in (1, -1, 2, -2)]
+    for tangent, *near in zip(tangents, *there, strict=True):
+        a, b, c, d = map(np.asarray, near)
+        quotient = (8 * (a - b) - (c - d)) / (12 * h)
+        np.testing.assert_allclose(tangent, quotient, atol=1e-6 * np.abs(quotient).max())
+    slope = jax.grad(lambda x: found(x)[0].sum())(x)
+    np.testing.assert_allclose(jnp.vdot(slope, direction), tangents[0].sum(), rtol=1e-9)
+
+
+def test_a_batch_is_no_function_of_limits(base, arrays):
+    def cost(x):
+        own = eqx.tree_at(lambda b: b.model.robot.limits.velocity, base, x)
+        return identify_batch(own, *arrays, WEIGHTS).parameters.sum()
+
+    with pytest.raises(ValueError, match="differentiated by axis, rotation, offset, gravity"):
+        jax.grad(cost)(jnp.asarray(base.model.robot.limits.velocity))
 
 
 def test_robots_of_one_topology(base):

@@ -47,6 +47,26 @@ o = observations(base.model, p, samples=20011, noise=0.3, filter=smooth, every=1
 write(jid.identify(base, o, jid.estimators.LeastSquares(), progress=shares.append))
 assert shares == sorted(shares) and shares[-1] == 1.0
 """
+DIVIDED = """
+import re
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+motion, (forces,) = np.random.default_rng(0).normal(size=(3, 8, 60, 2)), np.ones((1, 8, 60, 2))
+own = NamedSharding(Mesh(np.array(jax.devices()), ("sets",)), PartitionSpec("sets"))
+data = jid.Motion(*motion), forces + motion.sum(axis=0)
+def found(motion, forces):
+    return jid.identify_batch(base, motion, forces, np.ones(2), row_time=0.01)
+run = jax.jit(found).lower(*jax.device_put(data, own)).compile()
+assert len(jax.devices()) == 4
+assert not re.findall("all-gather|all-reduce|all-to-all|collective-permute", run.as_text())
+fit = run(*jax.device_put(data, own))
+assert fit.parameters.sharding.spec == PartitionSpec("sets")
+slope = jax.jit(jax.grad(lambda f: found(data[0], f).parameters.sum()))
+same = [np.asarray(slope(x)) for x in (data[1], jax.device_put(data[1], own))]
+np.testing.assert_allclose(*same, rtol=1e-9, atol=1e-12)
+alone = found(*data)
+np.savez(sys.argv[1], p=fit.parameters, s=fit.standard_deviations)
+np.testing.assert_allclose(fit.parameters, alone.parameters, rtol=1e-10)
+"""
 SHARDS = """
 from pathlib import Path
 columns = jid.Columns(angles="q{}", forces="tau{}", sample_time=1e-3)
@@ -126,6 +146,13 @@ def test_a_long_log_on_three_devices_without_asking(base, tmp_path, monkeypatch)
     assert process.returncode == 0, output
     found = np.load(tmp_path / "3.npz")
     assert_same(found, fit.parameters, fit.naive_standard_deviations, fit.rows)
+
+
+def test_data_sets_are_divided_as_the_inputs_are(tmp_path):
+    process = start(DIVIDED, tmp_path / "4.npz", flags="--xla_force_host_platform_device_count=4")
+    (output,) = finish(process)
+    assert process.returncode == 0, output
+    assert np.isfinite(np.load(tmp_path / "4.npz")["s"]).all()
 
 
 def test_processes_read_their_own_shards(base, tmp_path):
