@@ -8,7 +8,7 @@ the right law of friction; a zero-phase Butterworth filter at 10 Hz, every 25th 
 estimated once by the measured motion alone, once with the commanded one.
 
 Covered is a draw whose 95 % interval holds the truth; random, one whose interval without the
-resolution of a tenth of a sample does. A delay is told if the interval of 99.9 % leaves zero out,
+resolution of a tenth of a sample does. A delay is told if the interval of 99.99 % leaves zero out,
 as `jaxid inspect` does. False is what is told with an interval that leaves the truth out.
 """
 
@@ -60,7 +60,7 @@ def study(robot, file, friction, disturbance, draws):
                 low, high = delay.interval()
                 held, own = low <= late <= high, delay.resolution
                 random = low + own <= late <= high - own
-                low, high = delay.interval(0.999)
+                low, high = delay.interval(0.9999)
                 told = not low <= 0 <= high
                 found[k, way] += held, random, told, told and not low <= late <= high
     return found

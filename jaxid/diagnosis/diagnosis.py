@@ -297,7 +297,7 @@ def delay_finding(
     except ValueError:
         return (), ()
     # What is advised must be sure.
-    low, high = (1e3 * x for x in delay.interval(0.999))
+    low, high = (1e3 * x for x in delay.interval(0.9999))
     between = f"between {low:.2g} and {high:.2g} ms later in the log than the angles"
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     if low <= 0.0 <= high or abs(delay.seconds) < float(np.std(delay.of_joints)):

@@ -45,14 +45,17 @@ class JointRegressor(eqx.Module):
         self.columns = tuple(tuple(np.flatnonzero(row).tolist()) for row in rows)
         self.size = rows.shape[1]
 
-    def __call__(self, *arrays: AnyArray) -> list[Float[Array, "*batch columns samples"]]:
+    def __call__(
+        self, *arrays: AnyArray, fence: bool | None = None
+    ) -> list[Float[Array, "*batch columns samples"]]:
         """Return the columns of each joint.
 
         Args:
             arrays: Arguments of the definition, batch and samples last.
+            fence: Whether shared values get fences; by default on a CPU, see `lower`.
         """
         groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
-        return lower(self.program).stacked(groups, *arrays)
+        return lower(self.program, fence).stacked(groups, *arrays)
 
     def gram(self, weights: AnyArray, *arrays: AnyArray) -> Float[Array, "columns columns"]:
         r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns.

@@ -5,6 +5,7 @@ and with the forces (Gram matrices) and the solution follow for each, with one r
 residuals themselves where products alone would lose digits.
 """
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from jaxid.program.rules import divided
 
 from .uncertainty.spectral import sandwich_of_columns
 
-AT_ONCE = 2048
+AT_ONCE, AT_ONCE_ON_GPU = 2048, 2**17
 """Samples up to which several data sets evaluate their columns together."""
 WELL_CONDITIONED = 1e4
 """Condition number, with columns of length one, up to which products of rows are accurate enough;
@@ -80,22 +81,31 @@ def solve(rows: JointRegressor, batch: DataSets, row_time: float | None = None) 
     """
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, batch))
 
-    def solved(*leaves: Array) -> BatchFit:
-        return _solve_groups(rows, jax.tree.unflatten(tree, leaves), row_time)
+    def solved(on_cpu: bool, *leaves: Array) -> BatchFit:
+        return _solve_groups(rows, jax.tree.unflatten(tree, leaves), row_time, on_cpu)
 
-    return divided(solved)(*leaves)
+    def on_any(*leaves: Array) -> BatchFit:
+        return jax.lax.platform_dependent(
+            *leaves, cpu=functools.partial(solved, True), default=functools.partial(solved, False)
+        )
+
+    return divided(on_any)(*leaves)
 
 
-def _solve_groups(rows: JointRegressor, batch: DataSets, row_time: float | None) -> BatchFit:
+def _solve_groups(
+    rows: JointRegressor, batch: DataSets, row_time: float | None, on_cpu: bool
+) -> BatchFit:
+    """Solve all data sets: on a CPU in small groups that stay in its cache."""
     datasets, samples, _ = batch.motion.q.shape
-    calls = -(-datasets // max(1, min(AT_ONCE // samples, datasets)))
+    at_once = AT_ONCE if on_cpu else AT_ONCE_ON_GPU
+    calls = -(-datasets // max(1, min(at_once // samples, datasets)))
     group = -(-datasets // calls)
     whole = calls * group
     filled = np.arange(whole) % datasets
     groups = jax.tree.map(lambda x: x[filled].reshape(-1, group, *x.shape[1:]), batch)
 
     def one(pair: tuple[DataSets, list[Array]]) -> BatchFit:
-        return _solve_one(rows, *pair, row_time)
+        return _solve_one(rows, *pair, row_time, on_cpu)
 
     def solve_group(sets: DataSets) -> BatchFit:
         arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(sets.motion)]
@@ -103,15 +113,17 @@ def _solve_groups(rows: JointRegressor, batch: DataSets, row_time: float | None)
             numbers = sets.numbers.T[:, :, None]
             arrays.append(jnp.broadcast_to(numbers, (*numbers.shape[:2], samples)))
         # Columns of each joint [datasets, columns, samples].
-        pairs = sets, rows(*arrays)
+        pairs = sets, rows(*arrays, fence=on_cpu)
         # A CPU multiplies the matrices of one data set faster than those of several together.
-        return jax.vmap(one)(pairs) if jax.default_backend() != "cpu" else jax.lax.map(one, pairs)
+        return jax.lax.map(one, pairs) if on_cpu else jax.vmap(one)(pairs)
 
     fits = jax.lax.map(solve_group, groups)
     return jax.tree.map(lambda x: x.reshape((whole, *x.shape[2:]))[:datasets], fits)
 
 
-def _solve_one(rows: JointRegressor, one: DataSets, A: list[Array], row_time) -> BatchFit:
+def _solve_one(
+    rows: JointRegressor, one: DataSets, A: list[Array], row_time: float | None, on_cpu: bool
+) -> BatchFit:
     """Solve one data set by the products of its rows."""
     weights, places = one.weights, [np.array(own, int) for own in rows.columns]
     length, size = len(one.motion.q), rows.size
@@ -152,7 +164,11 @@ def _solve_one(rows: JointRegressor, one: DataSets, A: list[Array], row_time) ->
 
     # Residuals themselves are only needed where differences of large numbers would lose digits.
     lost = (condition > ACCURATE) | jnp.any(squares < SMALL * forces)
-    p, squares = jax.lax.cond(lost, refine, lambda: (p, squares))
+    if on_cpu:
+        p, squares = jax.lax.cond(lost, refine, lambda: (p, squares))
+    else:
+        # Under `vmap` both would be computed anyway.
+        p, squares = (jnp.where(lost, x, y) for x, y in zip(refine(), (p, squares), strict=True))
     squares = jnp.maximum(squares, 0.0)
     free = jnp.maximum(1.0 - size / jnp.maximum(count.sum(), 1.0), 0.0)
     gains = [inverse[:, k] * w**2 for k, w in zip(places, weights, strict=True)]

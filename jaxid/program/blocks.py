@@ -15,12 +15,11 @@ from jax.custom_batching import custom_vmap
 from jaxid.arrays import Array, Float
 
 from .program import Program
+from .rules import ALWAYS, differing_alike
 from .xla import hidden_one, lower, primitives
 
 BLOCK = 256
 """Samples of one evaluation."""
-ALWAYS = np.array(True)
-"""Condition of a `where` whose result only differs along as many axes as its other branch."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -59,16 +58,6 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
     first = arrays[-1][0, 0]
     nothing = tuple(jnp.broadcast_to(first, (block,)) for _ in nodes)
     return jax.lax.cond(hidden_one(first) > 0, evaluate, lambda _: nothing, arrays)
-
-
-def differing_alike(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Return arrays that all differ along the axes of `shard_map` along which one of them does.
-
-    The results of branches and loops must not depend on which input differs.
-    """
-    firsts = (x[(0,) * x.ndim] for x in arrays)
-    like = functools.reduce(lambda a, b: jnp.where(ALWAYS, a, b), firsts)
-    return tuple(jnp.where(ALWAYS, x, like) for x in arrays)
 
 
 def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:

@@ -1,10 +1,13 @@
 """Rules that JAX follows in place of its own: for derivatives, `vmap`, and many devices."""
 
+import functools
 import string
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.custom_partitioning import custom_partitioning
@@ -12,6 +15,19 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jaxid.arrays import Array
+
+ALWAYS = np.array(True)
+"""Condition of a `where` whose result only differs along as many axes as its other branch."""
+
+
+def differing_alike(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Return arrays that all differ along the axes of `shard_map` along which one of them does.
+
+    The results of branches and loops must not depend on which input differs.
+    """
+    firsts = (x[(0,) * x.ndim] for x in arrays if x.size)
+    like = functools.reduce(lambda a, b: jnp.where(ALWAYS, a, b), firsts)
+    return tuple(jnp.where(ALWAYS, x, like) for x in arrays)
 
 
 def with_derivatives_of(plain: Callable, run: Callable) -> Callable:
@@ -50,6 +66,9 @@ def divided(function: Callable) -> Callable:
 
     @custom_vmap
     def run(*arrays: Array) -> Any:
+        if jax.sharding.get_abstract_mesh().manual_axes:
+            # `shard_map` has divided the arrays already.
+            return function(*arrays)
         program, shapes = jax.make_jaxpr(function, return_shape=True)(*arrays)
         constants = program.consts
 
@@ -66,7 +85,7 @@ def divided(function: Callable) -> Callable:
         out = jax.vmap(function, [0 if x else None for x in batched])(*arrays)
         return out, jax.tree.map(lambda _: True, out)
 
-    return with_derivatives_of(function, run)
+    return with_derivatives_of(function, lambda *arrays: run(*differing_alike(arrays)))
 
 
 def _divisible(function: Callable, whole: Callable, constants: int) -> Callable:

@@ -1,5 +1,7 @@
 """Batches give what one identification after the other gives."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -165,6 +167,36 @@ def test_under_transformations(base, sets, arrays):
     gradient = jax.grad(lambda f: found(f)[0][1].sum())(jnp.asarray(forces))
     step = found(forces + direction)[0] - expected.parameters
     np.testing.assert_allclose(jnp.vdot(gradient, direction), step[1].sum(), rtol=1e-8)
+
+
+def test_a_gpu_solves_many_data_sets_at_once_without_callbacks(base):
+    q, qd, qdd, forces = np.random.default_rng(0).normal(size=(4, 1000, 800, 2))
+
+    def run(motion, forces):
+        return identify_batch(base, motion, forces, WEIGHTS)
+
+    traced = jax.jit(run).trace(jid.Motion(q, qd, qdd), forces)
+    texts = {p: traced.lower(lowering_platforms=(p,)).as_text() for p in ("cpu", "cuda")}
+    trips = {
+        p: {int(n) for n in re.findall(r"dense<(\d+)> : tensor<i64>", texts[p])} for p in texts
+    }
+    assert 500 in trips["cpu"]
+    assert 7 in trips["cuda"]
+    assert 500 not in trips["cuda"]
+    assert "callback" not in texts["cuda"]
+    # Fences are divisions.
+    assert texts["cuda"].count("stablehlo.divide") < 0.5 * texts["cpu"].count("stablehlo.divide")
+
+
+def test_data_sets_of_a_mesh_of_devices(base, arrays):
+    sets = jax.sharding.PartitionSpec("d")
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("d",))
+
+    def found(motion, forces):
+        return identify_batch(base, motion, forces, WEIGHTS).parameters
+
+    run = jax.shard_map(found, mesh=mesh, in_specs=(sets, sets), out_specs=sets)
+    np.testing.assert_allclose(jax.jit(run)(*arrays), found(*arrays), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["offset", "axis", "gravity"])
