@@ -308,7 +308,7 @@ def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     assert content["sources"] == ["first", "warm"]
     assert run("compare", "warm", "first")[0] == 0, "an earlier comparison may go"
     assert refused(run("compare", "first", "first/"), "`first` is given twice")
-    assert refused(run("compare", "first", "none"), "`none` is no file or folder", "`jaxid identify`")
+    assert refused(run("compare", "first", "none"), "`none` is no file or folder")
 
 
 SLOW = EXPERIMENT.replace("step = 4", "step = 4\nmin_speed = 0.05")
