@@ -255,8 +255,8 @@ def test_an_earlier_report_is_replaced_and_foreign_files_are_kept(folder, first,
     (first / "notes.txt").write_text("mine")
     assert run("identify", "experiment.toml", "b.csv", "-o", "first")[0] == 0
     assert result(folder, "first")["fit"]["recordings"] == ["b"]
-    assert {"torque_b.png", "notes.txt"} <= set(os.listdir("first"))
-    assert "torque_a.png" not in os.listdir("first")
+    assert {"torque_b.svg", "notes.txt"} <= set(os.listdir("first"))
+    assert "torque_a.svg" not in os.listdir("first")
     (folder / "data").mkdir()
     (folder / "data" / "precious.txt").write_text("mine")
     arguments = ("identify", "experiment.toml", "a.csv", "-o")
@@ -271,13 +271,13 @@ def test_after_a_failure_nothing_is_half_written(folder, first, run, monkeypatch
     before = {p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()}
 
     def full_disk(*args, **kwargs):
-        raise OSError(28, "No space left on device", "torque_b.png")
+        raise OSError(28, "No space left on device", "torque_b.svg")
 
     monkeypatch.setattr("jaxid.report.result_files.torque_figure", full_disk)
     for output in ("first", "new"):
         assert refused(
             run("identify", "experiment.toml", "b.csv", "-o", output),
-            "`torque_b.png`: No space left on device: nothing was written; make room",
+            "`torque_b.svg`: No space left on device: nothing was written; make room",
         )
     after = {p: (folder / p).read_bytes() for p in listing(folder) if (folder / p).is_file()}
     assert after == before
@@ -379,7 +379,7 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     said = words("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
     assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
     assert "2 Hz" in said
-    assert "filter.png" in result(folder)["files"]
+    assert "filter.svg" in result(folder)["files"]
 
 
 @pytest.mark.parametrize("moment", [1.0, 4.0])

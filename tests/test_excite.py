@@ -150,7 +150,7 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
     code, out, err = run("excite", "experiment.toml", "-o", "plan/motion.csv")
     assert code == 0, err
     files = ["motion", "motion.csv", "motion.json", "motion.ros.yaml"]
-    pages = ["end_effector.png", "joints.png", "path.png", "poses.png", "report.html"]
+    pages = ["end_effector.svg", "joints.svg", "path.svg", "poses.svg", "report.html"]
     assert listing(written / "plan") == [*files, *(f"motion/{page}" for page in pages)]
     t, q, qd, qdd = table(written / "plan" / "motion.csv").T
     np.testing.assert_allclose([qd[0], qdd[0], qd[-1], qdd[-1]], 0.0, atol=1e-9)

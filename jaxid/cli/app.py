@@ -184,9 +184,9 @@ def identify(
         ),
     ] = None,
     output: options.OutputFolder = Path("report"),
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Write the figures as PDF too, for papers.")
-    ] = False,
+    figures: Annotated[
+        Literal["svg", "png", "pdf"], typer.Option(help="Format of the files with figures.")
+    ] = "svg",
     force: options.Force = False,
 ) -> None:
     """Estimate the parameters and write a report.
@@ -196,7 +196,7 @@ def identify(
     console = options.start(experiment, *logs, *(verify or []), output=output, force=force)
     from . import commands
 
-    commands.identify(console, experiment, logs, verify or [], split, output, pdf)
+    commands.identify(console, experiment, logs, verify or [], split, output, figures)
 
 
 @app.command()

@@ -103,7 +103,7 @@ def identify(
     verify: list[Path],
     split: float | None,
     output: Path,
-    pdf: bool,
+    figures: str,
 ) -> None:
     """Estimate the parameters and write a report."""
     _check_logs(logs, verify, split)
@@ -134,7 +134,7 @@ def identify(
             result.mistakes,
             result.choice,
         )
-        written = write_report(output, report, pdf)
+        written = write_report(output, report, figures)
     fit, robot = result.fit, result.experiment.robot
     tabulated = () if fit.consistency is None else fit.consistency.findings
     notes = [*result.experiment.notes, *result.notes]

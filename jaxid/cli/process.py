@@ -71,9 +71,9 @@ def _receive(number: int, _) -> None:
 
 def _code() -> int:
     """Run the command and return its exit code; a bug keeps its traceback."""
-    from .app import main
-
     try:
+        from .app import main
+
         main()
     except SystemExit as stopped:
         return stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)

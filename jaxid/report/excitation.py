@@ -14,7 +14,7 @@ from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .motion import joint_figure, path_figure, pose_figure, tip_figure
 from .page import picture, provenance, render_page
-from .style import save
+from .style import write_figures
 
 
 def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
@@ -122,9 +122,8 @@ def write_excitation(
     )
     with atomic_folder(folder) as staging:
         (staging / "report.html").write_text(page, encoding="utf-8")
-        for name, figure in figures.items():
-            save(figure, staging / f"{name}.png")
-    return [folder / name for name in ("report.html", *(f"{name}.png" for name in figures))]
+        names = ["report.html", *write_figures(staging, figures)]
+    return [folder / name for name in names]
 
 
 def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:

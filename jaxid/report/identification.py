@@ -24,8 +24,10 @@ from .page import provenance, render_page
 from .verdict import Report, verdict
 
 
-def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
-    """Return the page of an identification as HTML."""
+def identification_page(
+    report: Report, figures: Mapping[str, Figure], suffix: str = "svg"
+) -> str:
+    """Return the page of an identification as HTML; figures have files with this suffix."""
     fit, settings = report.fit, report.settings
     base, robot = fit.base, fit.base.model.robot
     overall, *criteria = verdict(report)
@@ -45,7 +47,7 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
     names = [name for name in figures if name.startswith("torque_")]
     shown = max(1, 42 // robot.joints)
     blocks: list[Figure | str] = [figures[name] for name in names[:shown]]
-    if others := ", ".join(f"{name}.png" for name in names[shown:]):
+    if others := ", ".join(f"{name}.{suffix}" for name in names[shown:]):
         blocks.append(f"Figures of more recordings lie beside this page: {others}.")
     about = robot.summary()
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))

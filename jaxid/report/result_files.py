@@ -33,7 +33,7 @@ from .estimates_and_residuals import (
 )
 from .identification import identification_page
 from .page import versions
-from .style import save
+from .style import save, write_figures
 from .torques import error_figure, torque_figure
 from .verdict import Report, verdict
 
@@ -48,24 +48,20 @@ Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
 """Names, units, values and uncertainty of some estimates."""
 
 
-def write_report(folder: Path, report: Report, pdf: bool = False) -> list[Path]:
+def write_report(folder: Path, report: Report, suffix: str = "svg") -> list[Path]:
     """Write `report.html`, `result.json`, `parameters.csv`, `model.json` and figures; return them.
 
-    A folder that exists keeps its other files; files of an earlier report in it are replaced.
+    Figures are files of the format `suffix`: `svg`, `png` or `pdf`. A folder that exists keeps its other files; files of an earlier report in it are replaced.
     """
     record, figures = _record(report), _draw(report)
-    page = identification_page(report, figures)
-    suffixes = (".png", ".pdf") if pdf else (".png",)
+    page = identification_page(report, figures, suffix)
     names = ["report.html", "result.json", "parameters.csv", MODEL]
-    names += [f"{stem}{suffix}" for stem in figures for suffix in suffixes]
     with atomic_folder(folder, _earlier_files) as staging:
+        names += write_figures(staging, figures, suffix)
         write_json(staging / "result.json", {**record, "files": names})
         write_csv(staging / "parameters.csv", parameter_rows(report.fit))
         report.fit.save(staging / MODEL)
         (staging / "report.html").write_text(page, encoding="utf-8")
-        for stem, figure in figures.items():
-            for suffix in suffixes:
-                save(figure, staging / f"{stem}{suffix}")
     return [folder / name for name in names]
 
 
@@ -108,7 +104,7 @@ def _earlier_files(folder: Path) -> set[str]:
     if schema_of(folder / "result.json") != SCHEMAS["result.json"]:
         return set()
     files = read_json(folder / "result.json").get("files", ())
-    return {f for f in files if re.fullmatch(r"[\w.-]+\.(png|pdf)", f)}
+    return {f for f in files if re.fullmatch(r"[\w.-]+\.(svg|png|pdf)", f)}
 
 
 def schema_of(path: Path) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import weakref
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ MEASURED, PREDICTED, ERROR = "#9aa6b2", VERMILION, BLUE
 WIDTH = 11.0
 """Width of a figure [inch]."""
 
+_SVG: weakref.WeakKeyDictionary[Figure, str] = weakref.WeakKeyDictionary()
 _STYLE = Path(__file__).with_name("figures.mplstyle")
 
 
@@ -107,12 +109,33 @@ def save(figure: Figure, path: str | Path) -> None:
 
 
 def svg_text(figure: Figure) -> str:
-    """Return a figure as an SVG element for a page, with text as letters."""
-    file = io.StringIO()
-    with house_style(svg_fonttype="none", svg_hashsalt=figure.get_suptitle()):
-        _lay_out(figure)
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    return file.getvalue()
+    """Return a finished figure as SVG with text as letters; it is drawn once."""
+    if figure not in _SVG:
+        file = io.StringIO()
+        with house_style(svg_fonttype="none", svg_hashsalt=figure.get_suptitle()):
+            _lay_out(figure)
+            figure.savefig(file, format="svg", metadata={"Date": None})
+        _SVG[figure] = file.getvalue()
+    return _SVG[figure]
+
+
+def write_figures(
+    folder: Path, figures: Mapping[str, Figure], suffix: str = "svg"
+) -> list[str]:
+    """Write finished figures, and return the names of their files.
+
+    Args:
+        folder: Folder of the files.
+        figures: Figures by the names of their files, without suffix.
+        suffix: Format: `svg`, in which pages show figures, `png` or `pdf`.
+    """
+    for stem, figure in figures.items():
+        path = folder / f"{stem}.{suffix}"
+        if suffix == "svg":
+            path.write_text(svg_text(figure), encoding="utf-8")
+        else:
+            save(figure, path)
+    return [f"{stem}.{suffix}" for stem in figures]
 
 
 def _lay_out(figure: Figure) -> None:
