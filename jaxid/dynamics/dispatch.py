@@ -1,8 +1,8 @@
 """Methods for one sample applied to many: in NumPy for few samples, in compiled blocks for many.
 
-A method of a model is traced once into a scalar program, if the robot's geometry is known; the
-programs of the models that were used last are kept. Derivatives, and methods of a robot whose
-geometry JAX is tracing, take the model's spatial form, which is a short program on whole arrays.
+A method of a model is traced once into a scalar program, with numbers of the model that JAX is
+tracing as inputs; the programs of the models that were used last are kept. Derivatives take the
+model's spatial form, which is a short program on whole arrays.
 """
 
 import functools
@@ -23,6 +23,8 @@ from jaxid.errors import InputError
 from jaxid.program import Program, dense_rows, evaluate, evaluate_rows, trace
 from jaxid.program.blocks import BLOCK, on_rows
 from jaxid.program.rules import with_derivatives_of
+
+from .open_model import opened
 
 FEW = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
@@ -78,12 +80,13 @@ class SampleMethod:
         """Whether the spatial form takes the place of the program, which would be long."""
         joints = self.shapes[-1][0]
         is_own = self.plain is not self.definition
-        return is_own and joints > LONG.get(self.definition.__name__, math.inf)
+        name = getattr(self.owner, "method", self.definition.__name__)
+        return is_own and joints > LONG.get(name, math.inf)
 
     @functools.cached_property
     def output_shape(self) -> tuple[int, ...]:
         """Shape of the result for one sample."""
-        if not self.is_long and not is_traced(self.owner):
+        if not self.is_long:
             return self.program.output_shapes[0]
         samples = [jnp.zeros(x) for x in self.shapes]
         return jax.eval_shape(lambda *x: self.plain(*x), *samples).shape
@@ -91,10 +94,9 @@ class SampleMethod:
     @functools.cached_property
     def on_rows(self) -> Callable:
         """The method on rows of samples: [samples, results] from arrays as in `on_rows`."""
-        if self.is_long or is_traced(self.owner):
-            return functools.partial(plain_rows, self.plain)
-
         plain = functools.partial(plain_rows, self.plain)
+        if self.is_long:
+            return plain
         return with_derivatives_of(plain, functools.partial(on_rows, self.program))
 
     @functools.cached_property
@@ -167,6 +169,9 @@ def on_samples(
     Raises:
         InputError: If batch axes do not fit each other, or parameters are no numbers.
     """
+    if is_traced(owner):
+        owner, (numbers,) = opened(definition.__name__, owner)
+        definition, shared = owner.call, (numbers, *shared)
     arrays = [*(as_array("p", x) for x in shared), *samples]
     try:
         batch = np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
@@ -176,12 +181,9 @@ def on_samples(
             f"leading axes of parameters and motion must fit each other, but shapes are {shapes}."
         ) from None
     shapes = tuple(x.shape[-1:] for x in arrays)
-    if is_traced(owner):
-        method = SampleMethod(owner, definition, shapes)
-    else:
-        method = method_of(owner, definition, *shapes)
+    method = method_of(owner, definition, *shapes)
     in_jax = [x for x in arrays if isinstance(x, jax.Array)]
-    known = not is_traced(arrays, owner)
+    known = not is_traced(arrays)
     few = known and not method.is_long and math.prod(batch) <= FEW
     devices = {d for x in in_jax for d in x.devices()} if known else set()
     dtype = jnp.result_type(*(x.dtype for x in arrays), float)

@@ -111,7 +111,7 @@ def _solve_groups(
         arrays = [jnp.moveaxis(x, -1, 0) for x in jax.tree.leaves(sets.motion)]
         if sets.numbers is not None:
             numbers = sets.numbers.T[:, :, None]
-            arrays.append(jnp.broadcast_to(numbers, (*numbers.shape[:2], samples)))
+            arrays.insert(0, jnp.broadcast_to(numbers, (*numbers.shape[:2], samples)))
         # Columns of each joint [datasets, columns, samples].
         pairs = sets, rows(*arrays, fence=on_cpu)
         # A CPU multiplies the matrices of one data set faster than those of several together.

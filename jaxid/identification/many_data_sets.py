@@ -15,11 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, in_parts, is_traced, require_float64
+from jaxid.arrays import AnyArray, Bool, Float, in_parts, is_traced, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.open_model import opened
 from jaxid.dynamics.packed_regressor import JointRegressor
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
@@ -31,14 +31,8 @@ from .fit_result import Fit
 from .identify import identify
 from .uncertainty import IndependentRows
 
-KNOWN = {
-    "axis": np.array([0.0, 0.0, 1.0]),
-    "rotation": np.eye(3),
-    "offset": np.zeros(3),
-    "gravity": np.array([0.0, 0.0, -9.81]),
-}
-"""Geometry that stands for numbers that are inputs of a program."""
-GEOMETRY = tuple(KNOWN)
+GEOMETRY = ("axis", "rotation", "offset", "gravity")
+"""Numbers in which the robots of a batch may differ."""
 
 
 def identify_batch(
@@ -87,6 +81,8 @@ def identify_batch(
     if estimator is not None and not (robots is None and weights is None):
         raise InputError("`estimator` has weights of its own: leave out `robots` and `weights`.")
     sets, draws = len(forces), forces.shape[1:-2]
+    if weights is None and is_traced(robot.limits, robot.drives):
+        raise InputError("`weights` must be given where JAX is tracing the robot's limits.")
     if weights is None:
         weights = np.ones(robot.joints) if estimator else 1.0 / np.asarray(robot.max_forces)
     batch = DataSets(
@@ -102,10 +98,11 @@ def identify_batch(
         if robots is None and not is_traced(robot):
             rows, reduced = base.joint_regressor, batch
         else:
-            family, numbers = _traced(base, sets) if robots is None else _family(base, robots)
-            n = (robot.joints,)
-            rows = JointRegressor(family, family.columns, n, n, n, (numbers.shape[1],))
-            reduced = batch._replace(numbers=numbers)
+            family, numbers = opened("columns", base, *_of_each(base, robots or ()))
+            n, size = (robot.joints,), numbers.shape[1]
+            rows = JointRegressor(family, family.call, (size,), n, n, n)
+            numbers = numbers if robots is None else numbers[1:]
+            reduced = batch._replace(numbers=jnp.broadcast_to(numbers, (sets, size)))
         if robot.tool is not None:
             known = base.model.tool_forces(motion)
             reduced = reduced._replace(forces=batch.forces - known[:, None])
@@ -182,62 +179,15 @@ def _estimate_each(base, batch: DataSets, estimator: AbstractEstimator, row_time
     return jax.tree.map(lambda x: x.reshape(len(Q), draws, -1) if x.ndim > 1 else x[::draws], fit)
 
 
-class RobotFamily(eqx.Module):
-    """Robots that differ in some numbers of their geometry, with the base columns of one of them.
-
-    Numbers that are the same for all robots stay constants of the program: robots whose lengths
-    differ cost as much as one robot.
-
-    Attributes:
-        base: The base parameters; its robot has the numbers that do not differ.
-        varying: Positions of those that do, in axes, rotations, offsets and gravity.
-    """
-
-    base: BaseParameters
-    varying: tuple[int, ...] = eqx.field(static=True)
-
-    def columns(self, q, qd, qdd, x) -> Float[AnyArray, "joints base"]:
-        """Return the base regressor of one sample and one robot with the numbers `x` (Eq. 23)."""
-        robot = self.base.model.robot
-        fixed, unravel = ravel_pytree(_geometry(robot))
-        order = np.arange(fixed.size)
-        order[list(self.varying)] = fixed.size + np.arange(len(self.varying))
-        changed = unravel(jnp.concatenate([fixed, x])[order])
-        placed = eqx.tree_at(lambda b: b.model.robot, self.base, robot.replace(**changed))
-        return placed.columns(q, qd, qdd)
-
-
-def _family(base: BaseParameters, robots: Sequence[Robot]) -> tuple[RobotFamily, np.ndarray]:
-    """Return robots of one topology as one definition, and for each robot its own numbers."""
-    own = base.model.robot
+def _of_each(base: BaseParameters, robots: Sequence[Robot]) -> list[BaseParameters]:
+    """Return the base parameters of robots of one topology, with the geometry of each."""
+    own, each = base.model.robot, []
     for robot in robots:
         alike = robot.parent == own.parent and robot.revolute == own.revolute
         if not alike or robot.tool is not None:
             raise InputError(
                 f"`{robot.name}` of `robots` must have the topology of `{own.name}`, and no tool."
             )
-    first, *numbers = [np.asarray(ravel_pytree(_geometry(x))[0]) for x in (own, *robots)]
-    varying = tuple(np.flatnonzero((np.array(numbers) != first).any(axis=0)).tolist())
-    return RobotFamily(base, varying), np.array(numbers)[:, list(varying)]
-
-
-def _traced(base: BaseParameters, sets: int) -> tuple[RobotFamily, Array]:
-    """Return a robot whose geometry JAX is tracing, in the same way: what is traced varies."""
-    own = base.model.robot
-    geometry = {name: getattr(own, name) for name in GEOMETRY}
-    # Where they stand does not matter: these numbers are replaced.
-    known = {k: KNOWN[k] + np.zeros(x.shape) for k, x in geometry.items() if is_traced(x)}
-    base = eqx.tree_at(lambda b: b.model.robot, base, own.replace(**known))
-    if is_traced(base):
-        raise InputError(
-            f"a batch can be differentiated by {', '.join(GEOMETRY)} of the robot, not by its "
-            "limits, drives, or constants of the model."
-        )
-    marked = {k: np.full(np.shape(x), k in known) for k, x in geometry.items()}
-    varying = np.flatnonzero(np.concatenate([x.ravel() for x in jax.tree.leaves(marked)]))
-    numbers = jnp.broadcast_to(ravel_pytree(geometry)[0][varying], (sets, len(varying)))
-    return RobotFamily(base, tuple(varying.tolist())), numbers
-
-
-def _geometry(robot: Robot) -> dict[str, np.ndarray]:
-    return {name: np.asarray(getattr(robot, name), np.float64) for name in GEOMETRY}
+        placed = own.replace(**{name: getattr(robot, name) for name in GEOMETRY})
+        each.append(eqx.tree_at(lambda b: b.model.robot, base, placed))
+    return each

@@ -24,9 +24,7 @@ from .page import provenance, render_page
 from .verdict import Report, verdict
 
 
-def identification_page(
-    report: Report, figures: Mapping[str, Figure], suffix: str = "svg"
-) -> str:
+def identification_page(report: Report, figures: Mapping[str, Figure], suffix: str = "svg") -> str:
     """Return the page of an identification as HTML; figures have files with this suffix."""
     fit, settings = report.fit, report.settings
     base, robot = fit.base, fit.base.model.robot

@@ -51,7 +51,8 @@ Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
 def write_report(folder: Path, report: Report, suffix: str = "svg") -> list[Path]:
     """Write `report.html`, `result.json`, `parameters.csv`, `model.json` and figures; return them.
 
-    Figures are files of the format `suffix`: `svg`, `png` or `pdf`. A folder that exists keeps its other files; files of an earlier report in it are replaced.
+    Figures are files of the format `suffix`: `svg`, `png` or `pdf`. A folder that exists keeps its
+    other files; files of an earlier report in it are replaced.
     """
     record, figures = _record(report), _draw(report)
     page = identification_page(report, figures, suffix)

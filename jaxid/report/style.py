@@ -119,9 +119,7 @@ def svg_text(figure: Figure) -> str:
     return _SVG[figure]
 
 
-def write_figures(
-    folder: Path, figures: Mapping[str, Figure], suffix: str = "svg"
-) -> list[str]:
+def write_figures(folder: Path, figures: Mapping[str, Figure], suffix: str = "svg") -> list[str]:
     """Write finished figures, and return the names of their files.
 
     Args:
