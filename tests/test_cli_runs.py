@@ -180,7 +180,7 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
 FOREIGN = [
     ("", "identify e.toml other b.csv", "holds no `model.json`"),
     ("", "identify e.toml first", "at least one log"),
-    ("[estimator]\nridge = 0.1", "identify e.toml first b.csv", "to plain least squares only"),
+    ("[estimator]\nridge = 0.1", "identify e.toml first b.csv", "to least squares only"),
     ("[model]\nsprings = true", "identify e.toml first b.csv", "different base parameters"),
     ("", "payload e.toml a.csv --loaded b.csv --body elbow", "`--body` must be the name of the jo"),
     (

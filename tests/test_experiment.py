@@ -195,8 +195,10 @@ ESTIMATORS = {
     ),
     'kind = "correlated"': jid.estimators.GeneralisedLeastSquares(),
     'kind = "consistent"\npull = 2\nmargin = 0.01': jid.PhysicallyConsistent(
-        VARIANCES, margin=0.01, pull=jid.consistency.EntropicPull(strength=2.0)
+        VARIANCES, margin=0.01, pull=jid.consistency.EntropicPull(strength=2.0), throw=False
     ),
+    "": jid.PhysicallyConsistent(VARIANCES, pull=jid.consistency.EntropicPull(), throw=False),
+    "pull = 0": jid.PhysicallyConsistent(VARIANCES, throw=False),
 }
 
 

@@ -5,10 +5,16 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Float
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.identification import estimators
-from jaxid.identification.consistency import BodyBounds, EntropicPull, PhysicallyConsistent
+from jaxid.identification.consistency import (
+    BodyBounds,
+    EntropicPull,
+    PhysicallyConsistent,
+    consistency_margin,
+)
 from jaxid.identification.uncertainty import (
     AbstractUncertainty,
     BlockJackknife,
@@ -17,7 +23,7 @@ from jaxid.identification.uncertainty import (
 )
 from jaxid.trajectory.files import load_trajectory
 
-from .decoder import Bounds, Fraction, Positive, decode, keys_of, quoted
+from .decoder import Bounds, Fraction, Magnitude, decode, keys_of, quoted
 from .robot_tables import RobotSource, named
 
 UNCERTAINTIES = {
@@ -71,7 +77,11 @@ def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
         InputError: If a key is wrong, belongs to another kind, or does not go with another one.
     """
     given, bounds = decode([build_estimation, BodyBounds], table, "estimator", complete=False)
-    kind = given.get("kind", "weighted")
+    owners = [KINDS["weighted"], KINDS["consistent"]]
+    if not any(name in owners[0] and name not in owners[1] for name in given):
+        kind = given.get("kind", "consistent")
+    else:
+        kind = given.setdefault("kind", "weighted")
     for name in (*given, *bounds):
         owners = [owner for owner, keys in KINDS.items() if name in keys]
         if owners and kind not in owners:
@@ -92,7 +102,7 @@ def build_estimation(
     *,
     kind: Literal[
         "weighted", "least_squares", "huber", "tukey", "correlated", "instrumental", "consistent"
-    ] = "weighted",
+    ] = "consistent",
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
     ridge: Fraction | Literal["cross_validated"] | None = None,
     truncate: Fraction | None = None,
@@ -104,7 +114,7 @@ def build_estimation(
     reference: str | list[str] | None = None,
     reference_start: float | list[float] = 0.0,
     margin: Fraction | None = None,
-    pull: Positive | None = None,
+    pull: Magnitude = 1.0,
 ) -> Estimation:
     """Estimator of the parameters from the rows, and of their standard deviations.
 
@@ -113,10 +123,11 @@ def build_estimation(
         source: Source of the robot, for a prior.
         folder: Folder of the experiment file.
         bounds: Bounds of bodies, in place of those from the robot's geometry.
-        kind: "weighted": weighted least squares; "least_squares": every newton metre counts the
-            same; "huber", "tukey": rows that the model cannot explain count less, or not at all;
-            "correlated": for residuals that joints have in common; "instrumental": for noisy
-            angles; "consistent": complete bodies that can exist.
+        kind: "consistent": weighted least squares over bodies that can exist; "weighted": without
+            that; "least_squares": every newton metre counts the same; "huber", "tukey": rows that
+            the model cannot explain count less, or not at all; "correlated": for residuals that
+            joints have in common; "instrumental": for noisy angles. Without it, what the other keys
+            belong to.
         weights: Weights of the joints: "maximum_forces" (Eq. 30), the default where they are known;
             or "residual_variances": what the model leaves unexplained.
         ridge: Strength of a pull of undetermined combinations towards zero, relative to the
@@ -125,7 +136,8 @@ def build_estimation(
         truncate: Singular value below which directions are left out, relative to the largest, like
             `0.01`.
         prior: Prior of what the logs do not determine: "urdf" takes the inertias of the URDF file;
-            with `ridge`, `truncate` or `kind = "consistent"`.
+            with `ridge`, `truncate` or `kind = "consistent"`, which takes them by itself if such
+            bodies can exist.
         essential: Held-out error that leaving out parameters may cost in all (fraction), like
             `0.02`: keeps only parameters without which unseen data are predicted worse.
         nonlinear_friction: Whether to find `epsilon` and `stribeck` of each joint too, and to keep
@@ -138,7 +150,7 @@ def build_estimation(
             list with one for each log.
         reference_start: Time stamp at which it began [s], like `0.0`; or a list.
         margin: Fraction of a ball that each body contains ("consistent"), like `0.01`.
-        pull: Strength of a pull towards the prior, or towards balls ("consistent"), like `1.0`.
+        pull: Strength of a pull towards the prior, or towards balls ("consistent"); 0 for none.
 
     Raises:
         InputError: If keys do not go together, or a file cannot be read.
@@ -187,11 +199,14 @@ def build_estimation(
             starts = reference_start if isinstance(reference_start, list) else [reference_start]
             estimator = estimators.InstrumentalVariables(references, joint_weights, tuple(starts))
         case "consistent":
-            entropic = EntropicPull(bodies, pull or 1.0) if pull or bodies is not None else None
+            if bodies is None:
+                bodies = _possible_bodies(source, folder)
+            entropic = EntropicPull(bodies, pull) if pull else None
             if "ellipsoid_centre" in bounds and "ellipsoid_axes" not in bounds:
                 raise InputError("`ellipsoid_centre` needs `ellipsoid_axes`: the half axes [m].")
             limits = BodyBounds.from_geometry(robot).replace(**bounds) if bounds else None
-            estimator = PhysicallyConsistent(joint_weights, limits, margin or 0.0, entropic)
+            given = joint_weights, limits, margin or 0.0, entropic
+            estimator = PhysicallyConsistent(*given, throw=False)
     if bodies is not None and kind != "consistent":
         if isinstance(solution, estimators.Complete):
             raise InputError(
@@ -202,3 +217,14 @@ def build_estimation(
         estimator = estimators.RelativeTo(p, estimator)
     method = UNCERTAINTIES[uncertainty]()
     return Estimation(estimator, plain, method, essential, nonlinear_friction, notes)
+
+
+def _possible_bodies(source: RobotSource, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
+    """Return the bodies of the URDF file if all of them can exist, as those of a robot do."""
+    try:
+        bodies = source.parameters(folder)
+    except InputError:
+        return None
+    if bodies is None or not (consistency_margin(bodies) > 0.0).all():
+        return None
+    return bodies

@@ -15,9 +15,16 @@ from jaxid.diagnosis import Diagnosis, diagnose
 from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.errors import InputError
 from jaxid.excitation.design import DesignProgress
-from jaxid.identification.combination import require_same_base, share_rows, update
+from jaxid.identification.combination import (
+    replace_estimates,
+    require_same_base,
+    share_rows,
+    update,
+    without_bounds,
+)
+from jaxid.identification.consistency import PhysicallyConsistent
 from jaxid.identification.encoder_resolution import resolution_note
-from jaxid.identification.estimators import Complete
+from jaxid.identification.estimators import AbstractEstimator, Complete, GivenWeights
 from jaxid.identification.filter_and_parameter_selection import FilterChoice, choose_filter
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
@@ -135,12 +142,19 @@ def select_filter(
             experiment.base,
             recordings,
             experiment.candidates,
-            estimator=experiment.estimation.estimator,
+            estimator=_without_bounds(experiment),
             min_speed=experiment.min_speed,
             progress=stage.through,
         )
     notes = (*experiment.notes, str(choice))
     return dataclasses.replace(experiment, filter=choice.filter, candidates=(), notes=notes), choice
+
+
+def _without_bounds(experiment: Experiment) -> AbstractEstimator:
+    """Return the estimator of an experiment; for bodies that can exist, plain least squares."""
+    chosen = experiment.estimation
+    bounded = isinstance(chosen.estimator, PhysicallyConsistent)
+    return chosen.plain if bounded else chosen.estimator
 
 
 def earlier_run(experiment: Experiment, folder: Path) -> Fit:
@@ -173,7 +187,7 @@ def read_runs(
         )
     estimation, doubts = experiment.estimation, []
     complete = isinstance(estimation.plain.solution, Complete)
-    plain = estimation.estimator is estimation.plain and complete
+    plain = _without_bounds(experiment) is estimation.plain and complete
     if not plain or estimation.essential is not None:
         rest = "the rest of `[estimator]` does not count"
         doubts.append(f"all runs are weighted least squares here: {rest}")
@@ -260,7 +274,9 @@ def identify_logs(
     every = [*fitted, *unseen]
     validation = validate(fit, every, progress=stage.through)
     stage("looking for mistakes")
-    mistakes = mistakes_in_logs([diagnosis for *_, diagnosis in loaded[: len(logs)]], fit)
+    # Bounds would hide what is wrong.
+    free, diagnoses = without_bounds(fit), [diagnosis for *_, diagnosis in loaded[: len(logs)]]
+    mistakes = mistakes_in_logs(diagnoses, free)
     notes = [note for o in every for note in o.notes]
     for log, whole, diagnosis in loaded[: len(logs)]:
         if isinstance(log, Recording) and not diagnosis.faulty:
@@ -275,14 +291,21 @@ def _add_reports(
     experiment: Experiment, reports: Sequence[Path], fit: Fit, unseen: Sequence[Observations]
 ) -> Fit:
     """Return a fit to all logs, those of earlier reports included, which must not be unseen."""
-    if fit.base.names != experiment.base.names or not fit.is_least_squares:
+    bounded = fit.consistency is not None
+    if fit.base.names != experiment.base.names or not (bounded or fit.is_least_squares):
         essential = experiment.estimation.essential is not None
         kind = "for essential parameters" if essential else fit.estimator
         raise InputError(
-            f"{experiment.path.name}: earlier reports can be added to plain least squares only, "
+            f"{experiment.path.name}: earlier reports can be added to least squares only, "
             f"but the estimator is {kind}: leave `[estimator]` out, or give the logs themselves."
         )
+    estimator = experiment.estimation.estimator
     fit = functools.reduce(update, [*(earlier_run(experiment, p) for p in reports), fit])
+    if isinstance(estimator, PhysicallyConsistent):
+        rows = RegressionProblem(fit.base, blocks=fit.time_blocks, names=fit.recordings)
+        weighted = dataclasses.replace(estimator, weights=GivenWeights(fit.weights))
+        found = dataclasses.replace(fit_problem(rows, weighted), name=fit.name)
+        fit = replace_estimates(found, found.parameters, fit.uncertainty)
     for log in unseen:
         rows = RegressionProblem(experiment.base, [log])
         if fit.blocks is not None and share_rows(fit.blocks, rows.blocks):

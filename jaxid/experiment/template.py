@@ -92,7 +92,7 @@ def write_template(
             "force_unit": forces if len({*angles}) > 1 else forces[0],
         },
         "filter": {"kind": "butterworth", "cutoff": CUTOFF},
-        "estimator": {"kind": "weighted"},
+        "estimator": {"kind": "consistent"},
     }
     sections = [HEAD.format(name=robot.name)]
     for name, functions in TABLES.items():

@@ -42,13 +42,24 @@ def as_least_squares(fit: Fit) -> Fit:
     """Return weighted least squares of a fit's factors: the fit itself where it is that.
 
     For robust, regularised or consistent estimates the factors are solved again with the same
-    weights, and standard deviations come from the block jackknife.
+    weights. The standard deviations of consistent ones are those of least squares already; of
+    others they come from the block jackknife.
     """
     if fit.is_least_squares:
         return fit
     problem = RegressionProblem(fit.base, blocks=fit.blocks, names=fit.recordings)
     plain = fit_problem(problem, WeightedLeastSquares(GivenWeights(fit.weights)))
+    if fit.consistency is not None:
+        plain = replace_estimates(plain, plain.parameters, fit.uncertainty)
     return dataclasses.replace(plain, name=fit.name)
+
+
+def without_bounds(fit: Fit) -> Fit:
+    """Return the least squares behind a physically consistent fit, to which its deviations belong.
+
+    Other fits are returned as they are.
+    """
+    return fit if fit.consistency is None else as_least_squares(fit)
 
 
 def replace_estimates(fit: Fit, parameters, uncertainty: Uncertainty) -> Fit:

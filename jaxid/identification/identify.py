@@ -93,7 +93,8 @@ def fit_problem(
     decomposition = Decomposition.of(R, z)
     B, taken = np.asarray(estimate.inverse), estimate.effective_parameters
     taken = float(np.sum((R @ B) * R)) if taken is None else taken
-    naive = naive_covariance(factors, weights, p, B, taken)
+    free = p if estimate.unbounded is None else np.asarray(estimate.unbounded)
+    naive = naive_covariance(factors, weights, free, B, taken)
     unknown = decomposition.unknown
     naive[unknown, unknown] = np.inf
     raw, _ = factors.weighted(np.ones(len(weights)))
@@ -101,7 +102,7 @@ def fit_problem(
     scaled = R / np.where(R.any(axis=0), np.linalg.norm(R, axis=0), 1.0)
     numbers = [float(np.linalg.cond(x)) if x.any() else np.inf for x in (raw, R, scaled)]
     method = SpectralSandwich() if uncertainty is None else uncertainty
-    errors, spectra = method(plain, estimate, naive)
+    errors, spectra = method(plain, dataclasses.replace(estimate, parameters=free), naive)
     shrinkage = _shrinkage_notes(decomposition.values, estimate.solution)
     return Fit(
         base=base,

@@ -13,7 +13,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.result_table import Column, Status, Table, significant, with_deviations
 
-from .combination import require_same_base
+from .combination import require_same_base, without_bounds
 from .fit_result import Fit
 from .uncertainty import Uncertainty
 
@@ -187,6 +187,8 @@ class Comparison(eqx.Module):
 def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
     """Decide which base parameters have changed between two fits of one robot (Sec. 6).
 
+    Of physically consistent fits the least squares behind them are compared.
+
     Args:
         first: Fit of one state, such as the cold robot.
         second: Fit of another state, such as the warm robot, with other recordings.
@@ -196,6 +198,7 @@ def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:
         InputError: If the fits are not of the same base parameters, or `level` is no fraction.
     """
     require_same_base((first, second))
+    first, second = without_bounds(first), without_bounds(second)
     none = np.zeros((first.base.size, first.base.size))
     return compare_some(first, second, range(first.base.size), none, level)
 

@@ -150,9 +150,13 @@ class UrdfTree:
         name = element.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
         self.links = self._named(element, "link")
+        joints = self._named(element, "joint").values()
+        if any(parent.get("link") == "world" for j in joints for parent in j.iterfind("parent")):
+            # Simulators know this link, so that many files do not define it.
+            self.links.setdefault("world", etree.Element("link", name="world"))
         self._below: dict[str, list[Any]] = {link: [] for link in self.links}
         self._above: dict[str, Any] = {}
-        for joint in self._named(element, "joint").values():
+        for joint in joints:
             self._add(joint)
         root = self._find_root()
         for argument, link in (("base", base), ("tip", tip)):

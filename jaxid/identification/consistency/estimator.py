@@ -43,10 +43,13 @@ from .program import (
 from .pseudo_inertia import consistency_margin, pseudo_inertia
 
 UNPROVED = (
-    "the search ended before its error bound fell below its tolerance: widen the bounds, or pass "
-    "`throw=False` to accept the estimate with its error bound."
+    "the squared residuals may exceed the smallest possible ones by {:.1e} of them; at most "
+    f"{2 * solver.TOLERANCE:.0e} is a proof of the optimum."
 )
-"""Error message where the optimum was not proved."""
+"""Message where the optimum was not proved."""
+
+ACTIVE = 0.01
+"""Fall of the objective without a bound above which it is active [half squared deviations]."""
 
 
 class Consistency(eqx.Module):
@@ -137,7 +140,10 @@ class PhysicallyConsistent(AbstractEstimator):
         optimum = solver.solve_in_numpy(program)
         error_bound = float(optimum.error / max(optimum.value, program.scale))
         if self.throw and not optimum.certified:
-            raise RuntimeError(f"no physically consistent estimate with a proof: {UNPROVED}")
+            raise RuntimeError(
+                f"no physically consistent estimate with a proof: {UNPROVED.format(error_bound)} "
+                "Widen the bounds, or accept it with `throw=False`."
+            )
         p = feasible.standard_parameters(np, data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
@@ -164,10 +170,16 @@ class PhysicallyConsistent(AbstractEstimator):
             *found.findings,
             "standard deviations are those of the estimate without bounds: where bounds are "
             "active, estimates scatter less.",
-            *([] if optimum.certified else [UNPROVED]),
+            *([] if optimum.certified else [UNPROVED.format(error_bound)]),
         )
-        changes = {"parameters": parameters, "standard": p, "consistency": found}
-        return dataclasses.replace(free, **changes, notes=notes)
+        return dataclasses.replace(
+            free,
+            parameters=parameters,
+            standard=p,
+            consistency=found,
+            unbounded=free.parameters,
+            notes=notes,
+        )
 
     def feasible_set(self, base: BaseParameters) -> FeasibleSet:
         """Return the feasible set of a model.
@@ -203,14 +215,13 @@ class PhysicallyConsistent(AbstractEstimator):
 
 
 def _active_bounds(base, feasible, program, optimum: solver.Optimum, bodies) -> tuple[str, ...]:
-    """Name the bounds whose multipliers exceed their slacks (strict complementarity)."""
+    """Name the bounds that keep the estimate from a better one."""
 
     def numbers(chosen: np.ndarray) -> str:
         return ", ".join(str(k + 1) for k in np.flatnonzero(chosen))
 
-    _, slacks = program.slacks(np, optimum.y)
-    tight = np.asarray(optimum.multipliers) > slacks
     labels, n = feasible.linear_bounds()[0], program.drives
+    tight = solver.prices(program, optimum) > ACTIVE
     linear, drives = np.split(tight, [program.bodies * len(labels)])
     pairs = zip(labels, linear.reshape(program.bodies, -1).T, strict=True)
     found = [f"{label} of body {numbers(active)}" for label, active in pairs if active.any()]
@@ -263,7 +274,10 @@ def consistent_body(
     program.require_interior()
     optimum = solver.solve_in_numpy(program)
     if throw and not optimum.certified:
-        raise RuntimeError(f"no consistent body with a proof: {UNPROVED}")
+        raise RuntimeError(
+            "no consistent body with a proof: "
+            f"{UNPROVED.format(float(optimum.error / max(optimum.value, program.scale)))}"
+        )
     parameters = feasible.standard_parameters(np, data, optimum.y)
     distance = float(np.sqrt(2.0 * optimum.value))
     return parameters, distance, float(optimum.error)

@@ -45,8 +45,8 @@ TINY = 1e-14
 class Optimum(eqx.Module):
     """Result of the interior point method: half the squared residuals, with a bound of the error.
 
-    It is certified if the bound is within the tolerance; the multipliers are those of the linear
-    inequalities.
+    It is certified if the bound is within the tolerance. The multipliers are those of the linear
+    inequalities, `matrices` those of the semidefinite ones.
     """
 
     y: Float[AnyArray, "*batch variables"]
@@ -55,6 +55,7 @@ class Optimum(eqx.Module):
     certified: Bool[AnyArray, "*batch"] | np.bool
     iterations: Int[AnyArray, "*batch"] | np.integer
     multipliers: Float[AnyArray, "*batch linear"]
+    matrices: Float[AnyArray, "*batch cones 4 4"]
 
 
 class _Point(NamedTuple):
@@ -104,7 +105,7 @@ def _solve(xp: ModuleType, p: ConeProgram, loop: Callable) -> Optimum:
         point, best, iterations, stalled, _ = state
         point, length = _step(xp, p, gram, point)
         better = point.error < best[-1]
-        new = point.y, point.z, point.value, point.error
+        new = point.y, point.z, point.Z, point.value, point.error
         best = tuple(xp.where(better, a, b) for a, b in zip(new, best, strict=True))
         stalled, iterations = xp.where(better, 0, stalled + 1), iterations + 1
         finished = (
@@ -124,10 +125,26 @@ def _solve(xp: ModuleType, p: ConeProgram, loop: Callable) -> Optimum:
     mu = xp.clip(xp.linalg.norm(rest @ p.A) / force, 1e-6 * most, most)
     Z = xp.maximum(_targets(xp, p), mu) * inverse_S
     first, zero = _point(xp, p, p.start, Z, mu / s), xp.zeros((), int)
-    best = first.y, first.z, first.value, first.error
+    best = first.y, first.z, first.Z, first.value, first.error
     final = loop(lambda state: ~state[-1], iterate, (first, best, zero, zero, zero > 0))
-    _, (y, z, value, error), iterations, _, _ = final
-    return Optimum(y, value, error, is_certified(value, error), iterations, z)
+    _, (y, z, Z, value, error), iterations, _, _ = final
+    return Optimum(y, value, error, is_certified(value, error), iterations, z, Z)
+
+
+def prices(p: ConeProgram, optimum: Optimum) -> Float[np.ndarray, " linear"]:
+    """Return by how much the objective would fall without each linear bound, to second order.
+
+    It is in units of half a squared standard deviation, whatever the units of the bounds.
+    """
+    S, s = p.slacks(np, np.asarray(optimum.y))
+    z, Z = np.asarray(optimum.multipliers), np.asarray(optimum.matrices)
+    curvature = p.A.T @ p.A * (1.0 + TINY * np.eye(p.A.shape[-1]))
+    solve = _newton_solver(np, p, curvature + _barriers(np, p, inverse(np, S), Z, z / s))
+    rows = np.stack([p.linear(np, y)[1] for y in np.eye(p.A.shape[-1])], axis=1)
+    compliance = np.array([row @ solve(row) for row in rows])
+    # Without the bound's own part of the curvature, and then a step of Newton's method.
+    compliance = compliance / np.maximum(1.0 - z / s * compliance, 1e-12)
+    return 0.5 * z * np.maximum(z * compliance - s, 0.0)
 
 
 def _point(xp: ModuleType, p: ConeProgram, y: Values, Z: Values, z: Values) -> _Point:

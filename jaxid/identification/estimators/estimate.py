@@ -82,6 +82,8 @@ class Estimate(eqx.Module):
         standard: Standard parameters, of an estimator that finds a complete set of them.
         notes: Sentences for the user.
         consistency: `Consistency` of a physically consistent estimate, or None.
+        unbounded: Parameters without bounds, whose residuals the uncertainty is computed from;
+            `parameters` themselves if None.
         effective_parameters: Number of parameters that the rows determine, in fractions where the
             solution is regularised; computed from `inverse` if None.
     """
@@ -96,6 +98,7 @@ class Estimate(eqx.Module):
     standard: Float[AnyArray, " standard"] | None = None
     notes: tuple[str, ...] = eqx.field(static=True, default=())
     consistency: Any = None
+    unbounded: Float[AnyArray, " base"] | None = None
     effective_parameters: float | None = None
 
     @classmethod
