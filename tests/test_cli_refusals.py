@@ -47,7 +47,7 @@ COMMANDS = [
     ("identify experiment.toml a.csv --verify ./a.csv", "`a.csv` is given both to identify and"),
     ("identify experiment.toml loop.csv", "`loop.csv` is no file"),
     ("identify experiment.toml image.csv", "`image.csv` is no text: a log is CSV, Parquet, NPZ"),
-    ("identify experiment.toml long.csv", "line 4 of `long.csv` has 6 cells, but there are 5 col"),
+    ("identify experiment.toml long.csv", "line 4 (6 cells, but 5 columns) of `long.csv`; line 5"),
     ("identify experiment.toml still.csv", "no joint moves in `still`: name other columns"),
     ("init none.urdf", "none.urdf"),
     ("excite experiment.toml -o a.csv", "`a.csv` is there already, and no motion of `jaxid exc"),
@@ -67,7 +67,7 @@ def test_commands(folder, run, words, sentence):  # noqa: F811
     (folder / "loop.csv").symlink_to("loop.csv")
     (folder / "image.csv").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
     header, *rows = (folder / "a.csv").read_text().splitlines()
-    rows[2] += ",1"
+    rows[2:9] = [row + ",1" for row in rows[2:9]]
     (folder / "long.csv").write_text("\n".join([header, *rows]))
     still = [f"{0.005 * k:.3f},0.1,0.2,0,0" for k in range(len(rows))]
     (folder / "still.csv").write_text("\n".join([header, *still]))

@@ -148,7 +148,15 @@ class Experiment:
 
     def _read(self, log: Path, columns: Columns) -> Recording:
         logs = self.logs
-        recording = read_recording(log, columns, largest_gap=logs.largest_gap, **logs.files(log))
+        tried = [self.filter, *(candidate.filter for candidate in self.candidates)]
+        recording = read_recording(
+            log,
+            columns,
+            largest_gap=logs.largest_gap,
+            bridged=0.1 / max(getattr(x, "cutoff", np.inf) for x in tried),
+            bad_rows=logs.bad_rows,
+            **logs.files(log),
+        )
         if recording.joints != self.robot.joints:
             raise InputError(
                 f"{self.path.name}: `recording.angles` names {recording.joints} of the "

@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.log_files import Selection
+from jaxid.measurement.reading import BAD_ROWS
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
@@ -159,7 +160,9 @@ class Logs:
         commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid inspect` tells a
             delay in spite of disturbances.
         force_delay: Time by which forces stand later in the log than angles [s].
-        largest_gap: Longest pause that is bridged, in sample times.
+        largest_gap: Longest pause that is bridged, in sample times; a tenth of the period of the
+            filter's cut-off frequency is bridged in any case.
+        bad_rows: Fraction of the rows that may be bad, and are left out.
         start: Start of the part of every log that is used [s], like `0.0`.
         stop: End of that part [s], like `10.0`.
     """
@@ -171,6 +174,7 @@ class Logs:
     commands: Selection | None = None
     force_delay: float = 0.0
     largest_gap: Annotated[float, Bounds(above=1.0)] = 1.75
+    bad_rows: Annotated[float, Bounds(least=0.0, below=1.0)] = BAD_ROWS
     start: float = -np.inf
     stop: float = np.inf
 

@@ -164,6 +164,15 @@ class Log:
                 )
         return self.columns.to_si(angles, arrays.get("velocities"), arrays["forces"])
 
+    @property
+    def bad_rows(self) -> dict[int, str]:
+        """Complaints about rows that were read and are bad, by their positions."""
+        return {
+            k - table.first_row: f"{text} of `{table.source}`"
+            for table in self.tables
+            for k, text in (table.bad or {}).items()
+        }
+
     def stamps(self, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return time stamps [s]; integers and dates count from `start`."""
         stamps, dates = self.tables[0].read(("time",), start, stop).stamps()
@@ -177,8 +186,11 @@ def open_log(
     velocities_path: str | Path | None = None,
     *,
     on_disk: bool = False,
+    lenient: bool = False,
 ) -> Log:
     """Open the files of a log; with `on_disk`, texts and arrays stay on the disk.
+
+    With `lenient`, rows that cannot be read are no error: `Log.bad_rows` names them.
 
     Raises:
         InputError: If a file or column is missing, or files differ in their numbers of rows.
@@ -192,7 +204,7 @@ def open_log(
         selection = getattr(columns, channel)
         if selection is not None:
             files.setdefault(Path(own or path), {})[channel] = selection
-    tables = tuple(open_table(file, chosen, on_disk) for file, chosen in files.items())
+    tables = tuple(open_table(file, chosen, on_disk, lenient) for file, chosen in files.items())
     first = tables[0]
     for table in tables:
         if table.rows != first.rows:

@@ -43,6 +43,8 @@ class LogTable:
         channels: Names of the columns of each channel, in the order of the joints.
         first_row: Number of the first row in the file, for messages.
         unit: Name of a row, for messages: `line` in text files.
+        bad: Complaints about rows that cannot be read, by their numbers; None if the first one is
+            an error.
     """
 
     source: str
@@ -50,6 +52,7 @@ class LogTable:
     channels: Mapping[str, tuple[str, ...]]
     first_row: int = 1
     unit: str = "row"
+    bad: dict[int, str] | None = None
 
     @functools.cached_property
     def rows(self) -> int:
@@ -151,7 +154,11 @@ class LogTable:
 
     def _refuse_first(self, name: str, bad: np.ndarray, column: Any, complaint: str) -> None:
         rows = np.flatnonzero(bad)
-        if rows.size:
+        if self.bad is not None:
+            for k in rows.tolist():
+                text = f"{self.unit} {k + self.first_row} (`{name}` {complaint.format(column[k])})"
+                self.bad.setdefault(k + self.first_row, text)
+        elif rows.size:
             first = int(rows[0])
             more = f" (and {rows.size - 1} more)" if rows.size > 1 else ""
             raise InputError(
@@ -160,13 +167,15 @@ class LogTable:
             )
 
 
-def open_table(path: Path, selections: Mapping[str, Selection], on_disk: bool) -> LogTable:
-    """Open a file; its suffix tells the format."""
+def open_table(
+    path: Path, selections: Mapping[str, Selection], on_disk: bool, lenient: bool = False
+) -> LogTable:
+    """Open a file; its suffix tells the format. With `lenient`, bad rows are collected."""
     if not path.is_file():
         raise InputError(f"`{path}` is no file: check the path of the log.")
     suffix = path.suffix.lower()
     if suffix in SUFFIXES:
-        return _open_text(path, selections, on_disk)
+        return _open_text(path, selections, on_disk, lenient)
     if suffix == ".parquet":
         with _readable_parquet(path.name):
             columns = pl.scan_parquet(path)
@@ -179,7 +188,8 @@ def open_table(path: Path, selections: Mapping[str, Selection], on_disk: bool) -
         raise InputError(
             f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet, .npz or .mat: convert it."
         )
-    return LogTable(path.name, columns, _Layout(path.name, tuple(names)).channels(selections))
+    channels = _Layout(path.name, tuple(names)).channels(selections)
+    return LogTable(path.name, columns, channels, bad={} if lenient else None)
 
 
 def estimated_rows(path: Path) -> int:
@@ -259,10 +269,17 @@ class _Layout(NamedTuple):
             f"the closest first, `{'`, `'.join(near)}`."
         )
 
-    def read_lines(self, rows: bytes, line: int) -> dict[str, pl.Series]:
-        """Return the cells of whole lines, of which `line` is the first."""
+    def read_lines(
+        self, rows: bytes, line: int, bad: dict[int, str] | None = None
+    ) -> dict[str, pl.Series]:
+        """Return the cells of whole lines, of which `line` is the first.
+
+        Lines that are no rows are put into `bad`, and are empty then; without it they are an error.
+        """
         if self.separator == " ":
             rows = b"\n".join(b" ".join(row.split()) for row in rows.splitlines())
+        if bad is not None:
+            rows = self._without_bad_lines(rows, line, bad)
         if b'"' in rows:
             for index, text in enumerate(rows.split(b"\n")):
                 if text.count(b'"') % 2:
@@ -289,18 +306,35 @@ class _Layout(NamedTuple):
             frame = frame.select(pl.all().str.replace(",", ".", literal=True))
         return frame.to_dict(as_series=True)
 
+    def _without_bad_lines(self, rows: bytes, line: int, bad: dict[int, str]) -> bytes:
+        """Return lines with empty ones in place of those that are no rows, which go into `bad`."""
+        separator, count, lines = self.separator.encode(), len(self.names), rows.split(b"\n")
+        for k, text in enumerate(lines):
+            # Separators between quotation marks are text.
+            cells = b"".join(text.split(b'"')[::2]).count(separator) + 1 if text.strip() else 0
+            is_open = text.count(b'"') % 2 == 1
+            if cells == count and not is_open:
+                continue
+            odd = "an open quotation" if is_open else f"{cells} cells, but {count} columns"
+            bad[line + k] = f"line {line + k} ({odd})"
+            lines[k] = separator * (count - 1) if count > 1 else b'""'
+        return b"\n".join(lines)
+
 
 _conversions: dict[tuple, Path] = {}
 """Folders with the Parquet files of long text files."""
 
 
-def _open_text(path: Path, selections: Mapping[str, Selection], on_disk: bool) -> LogTable:
+def _open_text(
+    path: Path, selections: Mapping[str, Selection], on_disk: bool, lenient: bool
+) -> LogTable:
     """Read the needed columns of a text file, or convert them to Parquet unless this was done."""
     with path.open("rb") as file:
         text = _detect_format(path.name, file.read(HEAD))
         file.seek(text.start)
         channels = text.channels(selections)
-        table = LogTable(path.name, {}, channels, 1 + int(text.named), "line")
+        bad = {} if lenient else None
+        table = LogTable(path.name, {}, channels, 1 + int(text.named), "line", bad)
         frames = _read_frames(file, text, table)
         if not on_disk:
             return dataclasses.replace(table, columns=pl.concat(frames).lazy())
@@ -324,15 +358,16 @@ def _read_frames(file: BinaryIO, text: _Layout, table: LogTable) -> Iterator[pl.
         rest = data[len(rows) :].partition(b"\n")[2]
         if not rows:
             continue
-        cells = text.read_lines(rows, line)
+        cells = text.read_lines(rows, line, table.bad)
         part = dataclasses.replace(table, columns=cells, first_row=line)
         columns: dict[str, Any] = {name: part.numbers(name)[:, 0] for name in names}
         for name in stamps:
             # Float64 cannot hold nanoseconds since 1970.
-            exact = np.abs(columns[name]).max() > 2**53 if exact is None else exact
+            largest = np.nanmax(np.abs(columns[name]), initial=0.0)
+            exact = largest > 2**53 if exact is None else exact
             ticks = cells[name].str.strip_chars().cast(pl.Int64, strict=False)
-            if exact and not ticks.null_count():
-                columns[name] = ticks
+            if exact and ticks.null_count() <= len(table.bad or ()):
+                columns[name] = ticks.fill_null(0)
         yield pl.DataFrame(columns)
         line += len(cells[names[0]])
     if line == table.first_row:

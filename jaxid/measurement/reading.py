@@ -1,5 +1,6 @@
 """Logs read as a whole, or in parts with overlap for the filters: larger than memory."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,11 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
 from jaxid.result_table import printable
 from jaxid.robot.robot import Robot
 
 from .columns import Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
+from .log_files import LogTable
 from .observations import (
     AbstractSamples,
     Observations,
@@ -31,6 +34,10 @@ from .recording import (
 
 AT_ONCE = 65536
 """Samples that are read at once."""
+BAD_ROWS = 1e-3
+"""Fraction of the rows of a log that may be bad."""
+NAMED = 20
+"""Bad rows that are named."""
 
 
 def read_recording(
@@ -41,6 +48,8 @@ def read_recording(
     forces_path: str | Path | None = None,
     velocities_path: str | Path | None = None,
     largest_gap: float | int = 1.75,
+    bridged: float = 0.0,
+    bad_rows: float = BAD_ROWS,
 ) -> Recording:
     """Read a log from CSV (any separator, with or without header), Parquet, NPZ or MAT.
 
@@ -52,25 +61,60 @@ def read_recording(
         velocities_path: File with the velocities.
         largest_gap: Longest pause that is bridged by interpolation, in sample times; longer ones
             split the recording into segments.
+        bridged: Pause that is bridged in any case [s].
+        bad_rows: Fraction of the rows that may be bad: they are left out, and `notes` names them.
 
     Raises:
         InputError: If a file, a column, a number or the time is invalid; the message names file,
             column and line.
     """
-    log = open_log(path, columns, forces_path, velocities_path)
+    log = open_log(path, columns, forces_path, velocities_path, lenient=True)
     angles, velocities, forces = log.read()
-    return Recording.of(
+    time = None if columns.time is None else log.stamps()
+    bad = log.bad_rows
+    if time is not None:
+        _find_stray_stamps(time, bad, log.tables[0])
+    rows, sample_time, notes = len(angles), columns.sample_time, ()
+    named = "; ".join(text for _, text in sorted(bad.items())[:NAMED])
+    named += f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+    if len(bad) > bad_rows * rows:
+        raise InputError(
+            f"{len(bad)} of {rows} rows are bad: {named}; repair the log, or let `bad_rows` be "
+            f"above {len(bad) / rows:.2g} (fraction), which leaves them out."
+        )
+    if bad:
+        kept = np.setdiff1d(np.arange(rows), [*bad])
+        if time is None:
+            time, sample_time = (columns.sample_time or 0.0) * np.arange(rows), None
+        angles, forces, time = angles[kept], forces[kept], time[kept]
+        velocities = None if velocities is None else velocities[kept]
+        left = "is bad and was" if len(bad) == 1 else "are bad and were"
+        notes = (f"{len(bad)} of {rows} rows {left} left out: {named}",)
+    recording = Recording.of(
         angles,
         forces,
         velocities=velocities,
-        time=None if columns.time is None else log.stamps(),
-        sample_time=columns.sample_time,
+        time=time,
+        sample_time=sample_time,
         angles_on_motor_side=columns.angles_on_motor_side,
         forces_on_motor_side=columns.forces_on_motor_side,
         largest_gap=largest_gap,
+        bridged=bridged,
         name=printable(Path(path).stem) if name is None else name,
         first_row=log.tables[0].first_row,
     )
+    return dataclasses.replace(recording, notes=(*notes, *recording.notes))
+
+
+def _find_stray_stamps(time: np.ndarray, bad: dict[int, str], table: LogTable) -> None:
+    """Add rows to the bad ones whose stamp alone is out of order."""
+    good = np.setdiff1d(np.arange(len(time)), [*bad])
+    for k in np.flatnonzero(np.diff(time[good]) < 0).tolist():
+        ahead = k == 0 or time[good[k + 1]] >= time[good[k - 1]]
+        row = int(good[k] if ahead else good[k + 1])
+        bad[row] = (
+            f"{table.unit} {row + table.first_row} (its time {time[row]:.9g} s is out of order)"
+        )
 
 
 class SamplesOnDisk(AbstractSamples):
@@ -164,7 +208,8 @@ def scan_log(
     if columns.sample_time is not None:
         grid = TimeGrid(columns.sample_time, ((0, rows),))
     else:
-        grid = find_grid(lambda: _stamps(log), source.name, largest_gap, first_row, in_parts=True)
+        limits = largest_gap, 0.0
+        grid = find_grid(lambda: _stamps(log), source.name, limits, first_row, in_parts=True)
     grid = grid.cropped(start, stop, name)
 
     def load(segments: list[tuple[int, int]]) -> SamplesOnDisk:

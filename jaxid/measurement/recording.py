@@ -68,6 +68,7 @@ class Recording(eqx.Module):
         angles_on_motor_side: bool = False,
         forces_on_motor_side: bool = False,
         largest_gap: float | int = 1.75,
+        bridged: float = 0.0,
         name: str = "recording",
         first_row: int = 1,
     ) -> "Recording":
@@ -85,6 +86,7 @@ class Recording(eqx.Module):
             angles_on_motor_side: Whether angles and velocities are the motors'.
             forces_on_motor_side: Whether forces are the motors'.
             largest_gap: Longest pause that is bridged by interpolation, in sample times.
+            bridged: Pause that is bridged in any case [s].
             name: Name of the log.
             first_row: Number of the first row in its file, for messages.
 
@@ -114,7 +116,8 @@ class Recording(eqx.Module):
                     f"`time` of `{name}` must hold {samples} finite stamps, but has shape "
                     f"{stamps.shape} or stamps that are not finite."
                 )
-            dt, times, added, resample = _resampling(stamps, name, largest_gap, first_row)
+            limits = largest_gap, bridged
+            dt, times, added, resample = _resampling(stamps, name, limits, first_row)
             data = {key: None if x is None else resample(x) for key, x in data.items()}
         else:
             dt, added = positive_time(sample_time or 0.0), []
@@ -305,7 +308,7 @@ class TimeGrid(NamedTuple):
 def find_grid(
     read: Callable[[], Iterable[np.ndarray]],
     source: str,
-    largest_gap: float,
+    limits: tuple[float, float],
     first_row: int,
     in_parts: bool = False,
 ) -> TimeGrid:
@@ -315,7 +318,7 @@ def find_grid(
         read: Function that yields the finite stamps of the rows in consecutive parts [s]; it is
             called three times.
         source: Name of the log, for messages.
-        largest_gap: Longest pause that is bridged by interpolation, in sample times.
+        limits: Pauses that are bridged by interpolation: in sample times, and in seconds.
         first_row: Number of the first row in its file, for messages.
         in_parts: Whether the log is too large to move or remove rows.
 
@@ -331,7 +334,7 @@ def find_grid(
     origin, typical = float(first[0]), float(np.median(steps))
     spread = 1.4826 * float(np.median(np.abs(steps - typical)))
     # A gap is a pause that neither the limit nor the usual jitter explains.
-    limit = max(largest_gap * typical, typical + 8.0 * spread)
+    limit = max(limits[0] * typical, limits[1], typical + 8.0 * spread)
     starts, start_times, pauses = [0], [0.0], []
     rows, total, count = 0, 0.0, 0
     for t, row in _linked(read(), origin):
@@ -417,7 +420,7 @@ def _deviation(grid: TimeGrid, parts: Iterable[tuple[np.ndarray, int]]) -> float
 
 
 def _resampling(
-    stamps: np.ndarray, source: str, largest_gap: float, first_row: int
+    stamps: np.ndarray, source: str, limits: tuple[float, float], first_row: int
 ) -> tuple[float, list[np.ndarray], list[str], Callable[[np.ndarray], np.ndarray]]:
     """Return how rows come to the uniform grid behind their time stamps.
 
@@ -434,7 +437,7 @@ def _resampling(
         steps = np.diff(stamps[kept])
         kept = kept[np.append(True, steps > REPEATED * float(np.median(steps)))]
     t = stamps[kept]
-    grid = find_grid(lambda: [t], source, largest_gap, first_row)
+    grid = find_grid(lambda: [t], source, limits, first_row)
     t = t - stamps[0]
     dt = grid.sample_time
     notes = list(grid.notes)
@@ -446,12 +449,21 @@ def _resampling(
         )
     counts = [b - a for a, b in grid.ranges]
     if not grid.is_exact:
+        missing = -sum(counts)
         counts = [int(np.floor((t[b - 1] - t[a]) / dt + 1e-3)) + 1 for a, b in grid.ranges]
-        notes.append(
-            f"time stamps jitter by up to {100 * grid.deviation / dt:.1f} % of the sample time: "
-            f"resampled to a uniform grid of {dt:.6g} s by cubic splines; if the robot "
-            "samples uniformly and only the stamps are late, give `sample_time` instead"
-        )
+        missing += sum(counts)
+        steps = np.diff(t) / dt
+        if np.abs(steps - np.round(steps)).max() <= JITTER:
+            notes.append(
+                f"{missing} missing sample{'s were' if missing > 1 else ' was'} interpolated by "
+                "cubic splines"
+            )
+        else:
+            notes.append(
+                f"time stamps jitter by up to {100 * grid.deviation / dt:.1f} % of the sample "
+                f"time: resampled to a uniform grid of {dt:.6g} s by cubic splines; if the robot "
+                "samples uniformly and only the stamps are late, give `sample_time` instead"
+            )
     starts = zip(grid.start_times, counts, strict=True)
     times = [start + dt * np.arange(count) for start, count in starts]
 

@@ -216,6 +216,43 @@ def test_quotations_may_hold_separators(tmp_path):
     assert read_recording(tmp_path / "log.csv", PLAIN).samples == 60
 
 
+SPOILT = (
+    lambda cells: cells[:3],  # a line that was cut
+    lambda cells: [*cells, "7"],
+    lambda cells: [],
+    lambda cells: [cells[0], "oops", *cells[2:]],
+    lambda cells: [cells[0], "", *cells[2:]],
+    lambda cells: [*cells[:3], "nan", *cells[4:]],
+    lambda cells: [*cells[:3], "-inf", *cells[4:]],
+    lambda cells: [*cells[:3], "1e99", *cells[4:]],
+    lambda cells: [cells[0], f'"{cells[1]}', *cells[2:]],
+    lambda cells: ["0.5", *cells[1:]],  # a clock that was set back for one sample
+    lambda cells: ["99", *cells[1:]],
+)
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_bad_rows_are_left_out_and_counted(tmp_path, timed):
+    t = 0.001 * np.arange(11_000)
+    rows = [[f"{x:.9g}" for x in row] for row in np.stack([t, np.sin(t), 1 + t, np.cos(t)], 1)]
+    for k, spoil in enumerate(SPOILT):
+        rows[1000 * k + 500] = spoil(rows[1000 * k + 500])
+    lines = ["t,q1,other,tau1", *(",".join(row) for row in rows)]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    columns = PLAIN if timed else Columns(angles="q{}", forces="tau{}", sample_time=0.001)
+    recording = read_recording(tmp_path / "log.csv", columns, bridged=0.01)
+    assert recording.segments == ((0, 11_000),)
+    np.testing.assert_allclose(recording.angles[:, 0], np.sin(recording.time), atol=1e-8)
+    np.testing.assert_allclose(recording.forces[:, 0], np.cos(recording.time), atol=1e-8)
+    count = len(SPOILT) - (0 if timed else 2)
+    assert f"{count} of 11000 rows are bad and were left out: line 502 (" in recording.notes[0]
+    for k in range(count):
+        assert f"line {1000 * k + 502} (" in recording.notes[0]
+    with pytest.raises(ValueError, match=f"{count} of 11000 rows are bad: line 502") as error:
+        read_recording(tmp_path / "log.csv", columns, bad_rows=0.0)
+    assert "\n" not in str(error.value)
+
+
 def test_lengths_and_shapes_must_agree(tmp_path):
     log = a_log()
     path = write_csv(tmp_path / "q.csv", log)
