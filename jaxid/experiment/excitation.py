@@ -23,6 +23,7 @@ from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, 
 from jaxid.trajectory.leads import with_leads
 from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
 
+from .collision_check import collision_remarks
 from .decoder import within
 from .experiment import Experiment
 from .robot_tables import named
@@ -285,6 +286,7 @@ def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | 
     }
     remarks += [Remark(text) for text, holds in notes.items() if holds]
     remarks += force_remarks(experiment, nominal, motion)
+    remarks += collision_remarks(experiment, motion)
     sampled = motion
     if table.sample_time is not None:
         step = table.sample_time

@@ -148,7 +148,7 @@ class Experiment:
 
     def _read(self, log: Path, columns: Columns) -> Recording:
         logs = self.logs
-        tried = [self.filter, *(candidate.filter for candidate in self.candidates)]
+        tried = [self.filter, *(filter for filter, _ in self.candidates)]
         recording = read_recording(
             log,
             columns,
