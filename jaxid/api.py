@@ -42,6 +42,7 @@ from .identification.filter_and_parameter_selection import (
 from .identification.fit_result import Fit as Fit, load as load
 from .identification.identify import identify as identify
 from .identification.many_data_sets import identify_batch as identify_batch
+from .identification.model_selection import Candidate as Candidate, choose_model as choose_model
 from .identification.nonlinear_friction import (
     identify_nonlinear as identify_nonlinear,
     temperature_law as temperature_law,

@@ -233,3 +233,18 @@ def test_essential_parameters_on_the_command_line(folder, first, run, words):  #
     assert f"{few} of {every} base parameters are essential" in said
     assert "eliminated, and taken as zero: " in said
     assert refused(run("identify", "essential.toml", "first", "b.csv"), "for essential parameters")
+
+
+def test_a_model_is_chosen_and_its_file_identifies(shop, run):  # noqa: F811
+    code, out, err = run("choose", "experiment.toml", "empty.csv", "-o", "chosen.toml")
+    assert (code, err) == (0, "")
+    assert "viscous, dry + root of speed + springs" in out
+    assert "is the simplest model" in out
+    chosen = load_experiment("chosen.toml")
+    # The truth has neither springs nor roots, and a comment of the file stays.
+    names = [type(term).__name__ for term in chosen.model.terms]
+    assert "LinearSpring" not in names
+    assert chosen.robot.joint_names == load_experiment("experiment.toml").robot.joint_names
+    assert run("identify", "chosen.toml", "empty.csv", "-o", "c")[0] in (0, 3)
+    again = run("choose", "experiment.toml", "empty.csv", "-o", "chosen.toml")
+    assert refused(again, "`chosen.toml` is there already")

@@ -200,6 +200,27 @@ def identify(
 
 
 @app.command()
+def choose(
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", help="The experiment file to write.")
+    ] = Path("chosen.toml"),
+    force: options.Force = False,
+) -> None:
+    """Choose friction and estimator by errors on unseen parts of logs.
+
+    A table of all models, and an experiment file with the simplest that is about as good as any.
+    """
+    if output.exists() and not force:
+        raise InputError(f"`{output}` is there already: choose another `--output`, or `--force`.")
+    console = options.start(experiment, *logs)
+    from . import commands
+
+    commands.choose(console, experiment, logs, output)
+
+
+@app.command()
 def export(
     report: Annotated[
         Path, typer.Argument(help="Report, or a model file (.json).", metavar="REPORT")

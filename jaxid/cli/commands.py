@@ -14,7 +14,7 @@ from rich.text import Text
 from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.excitation.design import DesignProgress
-from jaxid.experiment import identify_logs
+from jaxid.experiment import choose as choosing, identify_logs
 from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
@@ -28,7 +28,7 @@ from jaxid.identification.identify import identify as estimate
 from jaxid.identification.operating_states import identify_states
 from jaxid.identification.parameter_changes import compare as compare_fits
 from jaxid.identification.payload import CENTRAL_NAMES, CENTRAL_UNITS, identify_payload
-from jaxid.io import require_writable
+from jaxid.io import atomic_folder, require_writable
 from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
@@ -251,6 +251,20 @@ def compare(console: Console, paths: tuple[Path, Path], level: float, output: Pa
     files = write_comparison(output, found, paths)
     show(console, found.summary(), found.group_summary())
     show_files(console, output, [p.name for p in files])
+
+
+def choose(console: Console, path: Path, logs: list[Path], output: Path) -> None:
+    """Choose a model, print the table, and write the experiment file."""
+    _check_logs(logs, [], None)
+    experiment = load_experiment(path)
+    if output.parent.resolve() != path.parent.resolve():
+        raise InputError("`--output` must lie beside the experiment file: its paths count from it.")
+    with identify_logs.stages(open_console(stderr=True)) as stage:
+        choice, text = choosing.choose(experiment, logs, stage)
+    with atomic_folder(output.parent) as folder:
+        (folder / output.name).write_text(text, encoding="utf-8")
+    show(console, choice.summary())
+    show_files(console, output.parent, [output.name])
 
 
 def payload(

@@ -229,6 +229,18 @@ def load_experiment(path: str | Path) -> Experiment:
         )
     try:
         text = path.read_bytes().decode("utf-8-sig")
+    except ValueError as error:
+        raise InputError(f"{path.name}: is no TOML in UTF-8: {error}.") from error
+    return parse_experiment(text, path)
+
+
+def parse_experiment(text: str, path: Path) -> Experiment:
+    """Return the experiment of a file with this text; other paths are relative to its folder.
+
+    Raises:
+        InputError: If the text or something in it is not what it should be.
+    """
+    try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         said = str(error).rstrip(".")

@@ -102,7 +102,8 @@ class Effects:
 
     Attributes:
         principal_axes: Whether to leave out products of inertia (seven per body, Eq. 12).
-        viscous: Whether friction grows with speed.
+        viscous: Whether friction grows with speed; "asymmetric": at one rate for each direction.
+        square_root: Whether friction grows with the square root of speed, too.
         rotor_inertia: Whether the motors' rotors are felt through the gears.
         offset: Whether there is a constant force at each joint (sensor offsets); by default unless
             dry friction is asymmetric.
@@ -113,7 +114,8 @@ class Effects:
     """
 
     principal_axes: bool = False
-    viscous: bool = True
+    viscous: bool | Literal["asymmetric"] = True
+    square_root: bool = False
     rotor_inertia: bool = True
     offset: bool | None = None
     springs: bool = False
@@ -130,14 +132,21 @@ class Effects:
             coupled = bool(terms.CoupledDrives().couplings(robot))
         chosen = (
             terms.RigidBodies(principal_axes=self.principal_axes),
-            self.viscous and terms.ViscousFriction(),
+            self._viscous_friction,
             self.coulomb is not False and dry.term(robot),
+            self.square_root and terms.SquareRootFriction(dry.transition(robot)),
             self.rotor_inertia and terms.RotorInertia(),
             offset and terms.ConstantOffset(),
             coupled and terms.CoupledDrives(dry.transition(robot)),
             self.springs and terms.LinearSpring(),
         )
         return tuple(term for term in chosen if not isinstance(term, bool))
+
+    @property
+    def _viscous_friction(self) -> terms.AbstractTerm | bool:
+        if self.viscous == "asymmetric":
+            return terms.AsymmetricViscousFriction()
+        return self.viscous and terms.ViscousFriction()
 
     def linear_terms(self, robot: Robot) -> tuple[terms.AbstractTerm, ...]:
         """Return the terms with Coulomb's law in place of Stribeck's."""

@@ -36,7 +36,7 @@ def test_example(example, tmp_path):
 def consistent(example):
     """Return the report of the example identified with possible bodies."""
     text = (example / "experiment.toml").read_text(encoding="utf-8")
-    changed = text.replace('kind = "weighted"', 'kind = "consistent"')
+    changed = text.replace('kind = "weighted"', 'kind = "consistent"\npull = 0')
     assert changed != text
     (example / "consistent.toml").write_text(changed, encoding="utf-8")
     logs = (example / "consistent.toml", example / "identification.csv")

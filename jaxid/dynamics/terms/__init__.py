@@ -15,6 +15,7 @@ from .friction import (
     HardSign as HardSign,
     LoadFriction as LoadFriction,
     Reversal as Reversal,
+    SquareRootFriction as SquareRootFriction,
     StribeckFriction as StribeckFriction,
     Tanh as Tanh,
     TemperatureScaled as TemperatureScaled,

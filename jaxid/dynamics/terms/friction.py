@@ -188,6 +188,32 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
         return jnp.concatenate([jnp.diag(0.5 * (moving + s)), jnp.diag(0.5 * (s - moving))], axis=1)
 
 
+class SquareRootFriction(AbstractDryFriction):
+    r"""Friction that grows more slowly than speed.
+
+    $\sqrt{|\dot q_i| / v_1} \tanh(\dot q_i / \epsilon)$: with $v_1$ = 1 rad/s or 1 m/s, its
+    parameters `fr1`, … are the forces at that speed [N m or N]. It is used beside dry and viscous
+    friction: greased gears often lie between the two.
+
+    Attributes:
+        transition: Transition from one direction of motion to the other.
+    """
+
+    transition: AbstractTransition = Tanh()
+    symbols = (("fr", "N m", "N"),)
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the diagonal matrix of the roots of speeds."""
+        # The small number keeps the slope finite at standstill.
+        root = jnp.sqrt(jnp.sqrt(qd**2 + 1e-16))
+        return jnp.diag(root * self.transition(qd))
+
+    @property
+    def nonlinear_parameters(self):
+        """Those of the transition, if chosen: `CoulombFriction` determines them better."""
+        return tuple(x._replace(default=False) for x in super().nonlinear_parameters)
+
+
 class StribeckFriction(AbstractDryFriction):
     r"""Dry friction that falls from a static level to Coulomb's as a joint gets moving.
 

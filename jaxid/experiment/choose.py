@@ -1,0 +1,89 @@
+"""Choice of friction and estimator for an experiment file, by errors on unseen parts of logs."""
+
+import copy
+import itertools
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from jaxid.errors import InputError
+from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
+
+from .experiment import Experiment, parse_experiment
+from .identify_logs import Stages, load_log, select_filter
+
+Changes = dict[str, dict[str, Any]]
+"""Keys that differ from those of a file, by their tables."""
+EFFECTS: dict[str, Changes] = {
+    "root of speed": {"model": {"square_root": True}},
+    "Stribeck": {"model": {"coulomb": {"stribeck": 0.1}}},
+    "viscous by direction": {"model": {"viscous": "asymmetric"}},
+    "springs": {"model": {"springs": True}},
+}
+"""Effects that the model may have beside those that each model has."""
+PLAIN = "viscous, dry"
+ESTIMATORS: dict[str, Changes] = {
+    "least squares": {"estimator": {"kind": "weighted"}},
+    "ridge": {"estimator": {"kind": "weighted", "ridge": "cross_validated"}},
+}
+"""Estimators beside the one that finds bodies that can exist."""
+
+
+def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple[ModelChoice, str]:
+    """Choose friction and estimator with some logs; return the choice and the text of a file.
+
+    Raises:
+        InputError: If a log is not as the file says, or the file seeks nonlinear friction.
+    """
+    if experiment.linear is not None:
+        raise InputError(
+            f"{experiment.path.name}: leave `estimator.nonlinear_friction` out: the choice is "
+            "between models that are linear in their parameters."
+        )
+    experiment, _ = select_filter(experiment, logs, stage)
+    observations = [load_log(experiment, path, stage)[1] for path in logs]
+    stage("choosing the model")
+    changes = dict(_variants(tomllib.loads(experiment.text)))
+    candidates = []
+    for name, own in changes.items():
+        try:
+            variant = parse_experiment(_changed(experiment.text, own), experiment.path)
+        except InputError:
+            continue  # an effect that this robot cannot have
+        candidates.append(Candidate(name, variant.base, variant.estimation.estimator))
+    choice = choose_model(candidates, observations, progress=stage.through)
+    return choice, _changed(experiment.text, changes[choice.chosen.name])
+
+
+def _variants(content: dict[str, Any]) -> Iterator[tuple[str, Changes]]:
+    """Yield names and changes of all candidates, the file itself first."""
+    yield "as the file says", {}
+    given = content.get("model", {})
+    bodies: Changes = {"estimator": {"kind": "consistent"}}
+    for count in range(len(EFFECTS) + 1):
+        for names in itertools.combinations(EFFECTS, count):
+            changes = copy.deepcopy(bodies)
+            for name in names:
+                for key, value in EFFECTS[name]["model"].items():
+                    inner = changes.setdefault("model", {})
+                    inner[key] = {**given.get(key, {}), **value} if key == "coulomb" else value
+            yield " + ".join((PLAIN, *names)), changes
+    for name, own in ESTIMATORS.items():
+        yield f"{PLAIN}, {name}", own
+
+
+def _changed(text: str, changes: Changes) -> str:
+    """Return the text of an experiment file with other keys; all others keep their comments."""
+    document = tomlkit.parse(text)
+    for table, keys in changes.items():
+        own: Any = document.setdefault(table, tomlkit.table())
+        if table == "estimator":
+            # Keys of another kind of estimator would contradict.
+            for key in ("ridge", "truncate", "essential", "limit", "reference"):
+                own.pop(key, None)
+        for key, value in keys.items():
+            own[key] = value
+    return tomlkit.dumps(document)

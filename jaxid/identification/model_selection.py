@@ -1,0 +1,187 @@
+"""Choice between models and estimators by errors on data that their fits have not seen."""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.base import BaseParameters
+from jaxid.errors import InputError
+from jaxid.measurement.observations import Observations, Progress
+from jaxid.result_table import Column, Remark, Status, Table, percent
+
+from .estimators import AbstractEstimator, WeightedLeastSquares
+from .factors import Blocks
+from .problem import RegressionProblem
+
+FOLDS = 5
+"""Parts of time that are left out in turn."""
+ENOUGH_LOGS = 4
+"""Logs from which on whole logs are left out in turn."""
+
+
+class Candidate(NamedTuple):
+    """A model and an estimator.
+
+    Attributes:
+        name: Name in tables.
+        base: Base parameters of the model.
+        estimator: Estimator of the parameters.
+    """
+
+    name: str
+    base: BaseParameters
+    estimator: AbstractEstimator = WeightedLeastSquares()
+
+
+class ModelChoice(eqx.Module):
+    """Result of a choice of models.
+
+    Attributes:
+        candidates: The candidates, in the given order.
+        errors: Error of each candidate on each part of the data, fitted to all other parts,
+            relative to the forces.
+        best: Index of the candidate that is chosen.
+        promise: Error to expect on further data of this kind, relative to the forces: each part was
+            predicted by the candidate that the other parts choose.
+        parts: What was left out in turn, in words.
+    """
+
+    candidates: tuple[Candidate, ...]
+    errors: Float[AnyArray, "candidates parts"]
+    best: int = eqx.field(static=True)
+    promise: float
+    parts: str = eqx.field(static=True)
+
+    @property
+    def chosen(self) -> Candidate:
+        """The candidate that is chosen."""
+        return self.candidates[self.best]
+
+    def summary(self) -> Table:
+        """Return a table of all candidates, the smallest error first."""
+        squares = np.square(self.errors)
+        means = squares.mean(axis=1)
+        order = np.argsort(means).tolist()
+        excess, deviations = _excess(squares)
+        half = 0.5 / np.sqrt(means)
+        columns = {"error": np.sqrt(means), "above": half * excess, "deviation": half * deviations}
+        error, above, deviation = (x[order].tolist() for x in columns.values())
+        return Table(
+            "models by their errors on parts that were left out",
+            Column("model", [self.candidates[k].name for k in order]),
+            Column("parameters", [self.candidates[k].base.size for k in order]),
+            Column("error", error, "%", percent),
+            Column("above the best", above, "%", percent),
+            Column("one deviation", deviation, "%", percent),
+            remarks=[Remark(str(self))],
+            status=[Status.GOOD if k == self.best else Status.NEUTRAL for k in order],
+        )
+
+    def __str__(self):
+        return (
+            f"`{self.chosen.name}` is the simplest model whose error exceeds the smallest one by "
+            "at most one deviation of the difference. On further data of this kind expect errors "
+            f"of {percent(self.promise)} % of the forces: {self.parts} were left out in turn, and "
+            "the choice was repeated without each."
+        )
+
+
+def choose_model(
+    candidates: Sequence[Candidate],
+    observations: Observations | Sequence[Observations],
+    *,
+    progress: Progress | None = None,
+) -> ModelChoice:
+    """Choose the simplest model that predicts unseen parts of the data about as well as any.
+
+    Parts of time are left out in turn, or whole logs if there are at least four. Each candidate is
+    fitted to the rest and predicts the part. Of all candidates whose mean squared error exceeds the
+    smallest one by at most one standard deviation of the difference, the one with the fewest
+    parameters is chosen (Breiman et al., 1984). The promise comes from a second loop around this
+    choice, so that choosing does not make it too small.
+
+    Args:
+        candidates: Models of one robot, and their estimators.
+        observations: Observations of one log, or of several.
+        progress: Callback, called with the completed fraction (0 to 1).
+
+    Raises:
+        InputError: If there are no candidates, or too few rows.
+    """
+    if not candidates:
+        raise InputError("`candidates` must hold at least one model, but is empty.")
+    logs = (observations,) if isinstance(observations, Observations) else tuple(observations)
+    first, by_log = candidates[0], len(logs) >= ENOUGH_LOGS
+    folds = _folds(first.base, logs, by_log)
+    # All candidates are judged with the weights of the first.
+    weights = first.estimator(RegressionProblem(first.base, blocks=_joined(folds))).weights
+    weights = np.asarray(weights) ** 2
+    total = float(np.mean([weights @ fold.total.force_squares for fold in folds]))
+    tables = []
+    for number, candidate in enumerate(candidates):
+        folds = folds if number == 0 else _folds(candidate.base, logs, by_log)
+        tables.append(_held_out_squares(candidate, folds, weights) / total)
+        if progress is not None:
+            progress((number + 1) / len(candidates))
+    table = np.array(tables)
+    parts = table.shape[1]
+    alone = np.arange(parts)
+    squares = table[:, alone, alone]
+    sizes = [candidate.base.size for candidate in candidates]
+    outer = []
+    for out in alone:
+        rest = np.setdiff1d(alone, [out])
+        outer.append(squares[_simplest(table[:, out, rest], sizes), out])
+    return ModelChoice(
+        tuple(candidates),
+        np.sqrt(squares),
+        _simplest(squares, sizes),
+        float(np.sqrt(np.mean(outer))),
+        f"{parts} logs" if by_log else f"{parts} parts of time",
+    )
+
+
+def _folds(base: BaseParameters, logs: Sequence[Observations], by_log: bool) -> list[Blocks]:
+    """Return the factors of the parts that are left out in turn."""
+    if by_log:
+        return [RegressionProblem(base, [log]).blocks for log in logs]
+    blocks = RegressionProblem(base, logs).blocks
+    count = len(blocks.parts)
+    if count < 3:
+        raise InputError("a choice of models needs at least three blocks of rows: record longer.")
+    return [blocks.select(part) for part in np.array_split(np.arange(count), min(FOLDS, count))]
+
+
+def _joined(folds: Sequence[Blocks]) -> Blocks:
+    return Blocks(tuple(itertools.chain(*(fold.parts for fold in folds))))
+
+
+def _held_out_squares(candidate: Candidate, folds: list[Blocks], weights: np.ndarray) -> np.ndarray:
+    """Return the squared errors on the second part of fits without both [parts, parts].
+
+    On the diagonal only that part was left out.
+    """
+    found = np.zeros((len(folds), len(folds)))
+    for i, k in itertools.combinations_with_replacement(range(len(folds)), 2):
+        rest = [fold for number, fold in enumerate(folds) if number not in (i, k)]
+        p = candidate.estimator(RegressionProblem(candidate.base, blocks=_joined(rest))).parameters
+        found[i, k], found[k, i] = (weights @ folds[n].total.residual_squares(p) for n in (k, i))
+    return found
+
+
+def _excess(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much squared errors exceed the smallest ones, and standard deviations of it."""
+    differences = squares - squares[np.argmin(squares.mean(axis=1))]
+    deviations = differences.std(axis=1, ddof=1) / np.sqrt(squares.shape[1])
+    return differences.mean(axis=1), deviations
+
+
+def _simplest(squares: np.ndarray, sizes: Sequence[int]) -> int:
+    """Return the candidate with the fewest parameters that is about as good as the best one."""
+    excess, deviations = _excess(squares)
+    good = np.flatnonzero(excess <= deviations).tolist()
+    return int(min(good, key=lambda k: (sizes[k], excess[k])))
