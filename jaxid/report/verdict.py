@@ -88,13 +88,15 @@ def verdict(report: Report) -> list[Remark]:
             str(definiteness),
             Status.GOOD if definiteness.positive_definite else Status.BAD,
             f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If it is "
-            "negative, do not simulate or control with this model where joints were not moved.",
+            "negative, do not simulate or control with this model where joints were not moved: "
+            '`kind = "consistent"` in `[estimator]` finds bodies that can exist.',
         ),
         Remark(
             f"The condition number with columns of length one is {significant(condition, 3)}.",
             Status.GOOD if condition < LARGE_CONDITION else Status.DOUBTFUL,
             f"Good: below {LARGE_CONDITION:g}. Above, some parameters are hard to tell apart.",
         ),
+        *_judge_signs(fit),
         *_judge_bounds(fit),
         *_judge_offsets(fit),
     ]
@@ -151,6 +153,15 @@ def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:
     return np.nan_to_num(rms / np.where(forces > 0, forces, np.inf))
 
 
+def _constant_share(logs: Sequence[TorqueErrors], joint: int) -> float:
+    """Return which part of the squared errors of a joint are means of single logs (0 to 1)."""
+    errors = [e.errors[:, joint] for e in logs]
+    whole = float(sum(np.nansum(e**2) for e in errors))
+    counts = [np.count_nonzero(np.isfinite(e)) for e in errors]
+    means = sum(n * np.nanmean(e) ** 2 for n, e in zip(counts, errors, strict=True) if n)
+    return float(means) / whole if whole > 0 else 0.0
+
+
 def _judge_new_motions(
     identification: Sequence[TorqueErrors], verification: Sequence[TorqueErrors]
 ) -> list[Remark]:
@@ -167,6 +178,12 @@ def _judge_new_motions(
         ratio = float(np.max(np.where(unseen > MATERIAL, ratios, 1.0)))
     if ratio > 1:
         text += f", and up to {significant(ratio, 2)} times as much as of the fit's own"
+    worst_joint = int(np.argmax(unseen))
+    constant = _constant_share(verification, worst_joint)
+    if worst > RMS_ERROR[0] and constant > OFFSET:
+        share = significant(100 * constant, 2)
+        text += f"; {share} % of the squared error of joint {worst_joint + 1}, the worst, is a "
+        text += "constant of the log, such as an offset of a sensor"
     average = max(float(np.mean(e.mean_percent)) for e in verification)
     if np.isfinite(average):
         text += f"; mean errors are {significant(average, 2)} % of the largest forces"
@@ -179,6 +196,23 @@ def _judge_new_motions(
         "errors by Eq. 37: the paper states below 1 %."
     )
     return [Remark(f"{text}.", status, detail)]
+
+
+def _judge_signs(fit: Fit) -> list[Remark]:
+    """Name friction and rotor inertias that are negative beyond two deviations."""
+    base, robot = fit.base, fit.base.model.robot
+    least = np.concatenate([term.lower_bounds(robot) for term in base.model.terms])
+    alone = ~np.any(np.asarray(base.kappa), axis=1) & (least[list(base.indices)] == 0.0)
+    below = np.asarray(fit.parameters) < -2.0 * fit.standard_deviations
+    if not (names := [f"`{base.names[k]}`" for k in np.flatnonzero(alone & below)]):
+        return []
+    text = f"Friction or rotor inertia comes out negative, as neither is: {', '.join(names)}."
+    cure = (
+        "Good: none below zero by more than two standard deviations. The model lacks an effect of "
+        'these joints, or a sign is wrong; `kind = "consistent"` in `[estimator]` keeps them from '
+        "being negative."
+    )
+    return [Remark(text, Status.DOUBTFUL, cure)]
 
 
 def _judge_bounds(fit: Fit) -> list[Remark]:
