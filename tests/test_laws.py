@@ -17,6 +17,7 @@ ODD = (
     jid.ViscousFriction(),
     jid.CoulombFriction(),
     jid.CoulombFriction(jid.terms.HardSign(dead_zone=0.01)),
+    jid.terms.SquareRootFriction(),
     jid.terms.StribeckFriction(),
     jid.terms.StribeckFriction(0.3, exponent=1.3),
     jid.terms.TemperatureScaled(jid.ViscousFriction(), rate=0.02, temperature=40.0),

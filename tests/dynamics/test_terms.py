@@ -24,6 +24,7 @@ from jaxid.dynamics.terms import (
     LoadFriction,
     RigidBodies,
     RotorInertia,
+    SquareRootFriction,
     StribeckFriction,
     Tanh,
     TemperatureScaled,
@@ -59,6 +60,7 @@ ALL = [
     StribeckFriction(),
     StribeckFriction(np.array([0.1, 0.2, 0.05]), exponent=1.3),
     AsymmetricViscousFriction(),
+    SquareRootFriction(),
     LoadFriction(np.random.default_rng(44).uniform(0.2, 2.0, (N, 10))),
     TemperatureScaled(ViscousFriction(), rate=0.02, temperature=40.0),
 ]
