@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.arrays import AnyArray
+from jaxid.dynamics.terms import SquareRootFriction
 from jaxid.errors import InputError
 from jaxid.identification.delay import estimate_delay
 from jaxid.identification.estimators import GivenWeights
@@ -274,6 +275,9 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
 def negative_friction(fit: Fit) -> tuple[str, ...]:
     """Report joints whose friction is negative beyond doubt: the model or the log is wrong."""
     robot, names = fit.base.model.robot, fit.base.names
+    if any(isinstance(term, SquareRootFriction) for term in fit.base.model.terms):
+        # Only the sum of all friction cannot be negative.
+        return ()
     certain = np.asarray(fit.parameters) < -SURE * np.asarray(fit.standard_deviations)
     wrong = {name for name, negative in zip(names, certain, strict=True) if negative}
     return tuple(

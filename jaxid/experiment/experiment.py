@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,10 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import AbstractTerm
+from jaxid.dynamics.terms import AbstractTerm, AbstractTransition, LoadFriction, Tanh
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
-from jaxid.identification.consistency import BodyBounds
+from jaxid.identification.consistency import BodyBounds, PhysicallyConsistent
 from jaxid.identification.estimators import NonlinearFriction
 from jaxid.identification.filter_and_parameter_selection import (
     FilterCandidate,
@@ -46,6 +46,8 @@ from .model_and_log_tables import (
 )
 from .robot_tables import RobotSource, known_load, replace_drives, replace_limits
 
+LOAD_ROUNDS = 10
+"""Fits after which friction by load must have settled."""
 TABLES: dict[str, tuple[Callable, ...]] = {
     "robot": (RobotSource,),
     "load": (known_load,),
@@ -84,6 +86,7 @@ class Experiment:
         min_speed: Speeds below which rows do not count [rad/s or m/s]; None if all count.
         estimation: Estimator and uncertainty.
         linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
+        load_transition: Transition of friction by load, which the model leaves out; None without.
         excitation: Settings of the motion to design.
         notes: Assumptions where the file says nothing, in sentences.
     """
@@ -103,6 +106,7 @@ class Experiment:
     min_speed: Float[np.ndarray, " joints"] | None
     estimation: Estimation
     linear: tuple[AbstractTerm, ...] | None
+    load_transition: AbstractTransition | None
     excitation: Excitation
     notes: tuple[str, ...]
 
@@ -120,12 +124,32 @@ class Experiment:
             found = identify_nonlinear(self.base, logs, estimator, linear=linear, progress=progress)
             return found.better
         fit = fit_problem(rows, chosen.estimator, uncertainty=chosen.uncertainty)
+        if self.load_transition is not None:
+            return self._with_load_friction(fit, logs)
         if chosen.essential is None:
             return fit
         choice = essential_parameters(
             fit, logs, cost=chosen.essential, uncertainty=chosen.uncertainty
         )
         return dataclasses.replace(choice.fit, notes=(*choice.fit.notes, *choice.notes))
+
+    def _with_load_friction(self, fit: Fit, logs: Sequence[Observations]) -> Fit:
+        """Fit again with friction by the weight of the bodies found, until it changes no more."""
+        transition, last, count = self.load_transition or Tanh(), np.inf, self.robot.joints
+        for _ in range(LOAD_ROUNDS):
+            # The first ten columns of each body, whatever follows.
+            bodies = np.asarray(fit.full_parameters)[: 10 * count].reshape(count, 10)
+            load = LoadFriction(bodies=bodies, transition=transition)
+            model = Model(self.robot, (*self.model.terms, load))
+            rows = RegressionProblem(base_parameters(model), logs)
+            chosen = self.estimation
+            fit = fit_problem(rows, chosen.estimator, uncertainty=chosen.uncertainty)
+            found = np.asarray(fit.full_parameters)[-count:]
+            if np.abs(found - last).max() < 1e-3 * np.abs(found).max():
+                return fit
+            last = found
+        note = f"friction by load has not settled in {LOAD_ROUNDS} fits: its values are uncertain."
+        return dataclasses.replace(fit, notes=(*fit.notes, note))
 
     def read(self, log: str | Path) -> Recording:
         """Read a log as the table `[recording]` says.
@@ -268,6 +292,7 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     effects = call(Effects, content.get("model", {}), "model")
     with within("model"):
         model = Model(robot, effects.build(robot))
+        load_transition = effects.load_transition(robot)
     filters, filter_notes = build_filters(content.get("filter"))
     decimation, min_speed = call(build_rows, content.get("rows", {}), "rows", robot)
     columns, logs = None, Logs()
@@ -276,6 +301,8 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     given, bounds = decode_estimator(content.get("estimator", {}))
     with within("estimator"):
         estimation = build_estimation(model, source, folder, bounds, **given)
+        if load_transition and not isinstance(estimation.estimator, PhysicallyConsistent):
+            raise InputError('`model.load` needs the bodies that `kind = "consistent"` finds.')
     clearance, tool = None, None
     if "collision" in content:
         shapes = call(Collision, content["collision"], "collision")
@@ -298,6 +325,7 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         "decimation": decimation,
         "min_speed": min_speed,
         "estimation": estimation,
+        "load_transition": load_transition,
         "linear": effects.linear_terms(robot) if estimation.nonlinear else None,
         "excitation": call(Excitation, content.get("excitation", {}), "excitation"),
         "notes": (*filter_notes, *estimation.notes),

@@ -104,6 +104,8 @@ class Effects:
         principal_axes: Whether to leave out products of inertia (seven per body, Eq. 12).
         viscous: Whether friction grows with speed; "asymmetric": at one rate for each direction.
         square_root: Whether friction grows with the square root of speed, too.
+        load: Whether dry friction grows with the weight on a joint, too; the bodies are those that
+            are identified, until both agree.
         rotor_inertia: Whether the motors' rotors are felt through the gears.
         offset: Whether there is a constant force at each joint (sensor offsets); by default unless
             dry friction is asymmetric.
@@ -116,6 +118,7 @@ class Effects:
     principal_axes: bool = False
     viscous: bool | Literal["asymmetric"] = True
     square_root: bool = False
+    load: bool = False
     rotor_inertia: bool = True
     offset: bool | None = None
     springs: bool = False
@@ -141,6 +144,17 @@ class Effects:
             self.springs and terms.LinearSpring(),
         )
         return tuple(term for term in chosen if not isinstance(term, bool))
+
+    def load_transition(self, robot: Robot) -> terms.AbstractTransition | None:
+        """Return the transition of friction by load; None without it.
+
+        Raises:
+            InputError: If the bodies that it needs are not complete.
+        """
+        if self.load and self.principal_axes:
+            raise InputError("`load` needs complete bodies: leave `principal_axes` out.")
+        dry = self.coulomb if isinstance(self.coulomb, DryFriction) else DryFriction()
+        return dry.transition(robot) if self.load else None
 
     @property
     def _viscous_friction(self) -> terms.AbstractTerm | bool:

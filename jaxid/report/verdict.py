@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.dynamics.terms import ConstantOffset
+from jaxid.dynamics.terms import ConstantOffset, SquareRootFriction
 from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
 from jaxid.identification.filter_and_parameter_selection import FilterChoice
 from jaxid.identification.fit_result import Fit
@@ -201,6 +201,9 @@ def _judge_new_motions(
 def _judge_signs(fit: Fit) -> list[Remark]:
     """Name friction and rotor inertias that are negative beyond two deviations."""
     base, robot = fit.base, fit.base.model.robot
+    if any(isinstance(term, SquareRootFriction) for term in base.model.terms):
+        # Only the sum of all friction cannot be negative.
+        return []
     least = np.concatenate([term.lower_bounds(robot) for term in base.model.terms])
     alone = ~np.any(np.asarray(base.kappa), axis=1) & (least[list(base.indices)] == 0.0)
     below = np.asarray(fit.parameters) < -2.0 * fit.standard_deviations

@@ -1,0 +1,66 @@
+"""Friction by load in an experiment file: its bodies are those that are identified."""
+
+import numpy as np
+import pytest
+
+import jaxid as jid
+from jaxid.dynamics.dispatch import in_numpy
+from jaxid.experiment.experiment import load_experiment
+from jaxid.identification.problem import RegressionProblem
+
+ARM = """\
+[robot]
+convention = "modified"
+dh = [
+  { alpha = 0.0, a = 0.0, d = 0.3 },
+  { alpha = -90.0, a = 0.1, d = 0.0 },
+  { alpha = 0.0, a = 0.4, d = 0.1 },
+]
+[limits]
+force = [60, 80, 20]
+[model]
+load = true
+"""
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    (tmp_path / "e.toml").write_text(ARM)
+    return load_experiment(tmp_path / "e.toml")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_coefficients_are_found(experiment, seed):
+    robot, rng = experiment.robot, np.random.default_rng(seed)
+    mass, r, inertia = [6.0, 4.0, 2.0], rng.uniform(-0.1, 0.2, (3, 3)), 0.02
+    bodies = []
+    for m, c in zip(mass, r, strict=True):
+        J = inertia * np.eye(3) + m * (c @ c * np.eye(3) - np.outer(c, c))
+        bodies.append([m, *(m * c), *np.diag(J), -J[1, 2], -J[0, 2], -J[0, 1]])
+    truth = jid.Model(robot, (*experiment.model.terms, jid.terms.LoadFriction(np.array(bodies))))
+    rest = rng.uniform(0.3, 1.0, truth.size - 33)
+    coefficients = np.array([0.1, 0.15, 0.25])
+    p = np.concatenate([np.ravel(bodies), rest, coefficients])
+    t = np.arange(0.0, 20.0, 0.01)
+    motion = jid.random_fourier_series(robot, omega=0.6, seed=seed).motion(t)
+    forces = in_numpy(truth, truth.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
+    forces = forces + rng.normal(0.0, [0.1, 0.2, 0.1], forces.shape)
+    o = jid.Observations.of(motion.q, motion.qd, motion.qdd, forces, sample_time=0.01)
+    fit = experiment.fit(RegressionProblem(experiment.base, [o]))
+    # Gravity puts no load on the first joint, which turns about it.
+    assert [name for name in fit.base.names if name.startswith("fl")] == ["fl2", "fl3"]
+    for name, value in zip(("fl2", "fl3"), coefficients[1:], strict=True):
+        k = fit.base.names.index(name)
+        assert abs(fit.parameters[k] / value - 1) < 0.05
+        assert abs(fit.parameters[k] - value) < 4 * fit.standard_deviations[k]
+    assert not any("has not settled" in note for note in fit.notes)
+
+
+def test_what_it_needs_is_said(tmp_path):
+    for text, complaint in (
+        ("[estimator]\nkind = 'weighted'\n", "`model.load` needs the bodies"),
+        ("principal_axes = true\n", "`load` needs complete bodies"),
+    ):
+        (tmp_path / "e.toml").write_text(ARM + text)
+        with pytest.raises(ValueError, match=complaint):
+            load_experiment(tmp_path / "e.toml")
