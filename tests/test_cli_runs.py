@@ -20,6 +20,7 @@ from test_cli import (  # noqa: F401
 
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
+from jaxid.experiment import choose
 from jaxid.experiment.experiment import load_experiment
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -235,7 +236,9 @@ def test_essential_parameters_on_the_command_line(folder, first, run, words):  #
     assert refused(run("identify", "essential.toml", "first", "b.csv"), "for essential parameters")
 
 
-def test_a_model_is_chosen_and_its_file_identifies(shop, run):  # noqa: F811
+def test_a_model_is_chosen_and_its_file_identifies(shop, run, monkeypatch):  # noqa: F811
+    few = {name: choose.EFFECTS[name] for name in ("root of speed", "springs")}
+    monkeypatch.setattr(choose, "EFFECTS", few)
     code, out, err = run("choose", "experiment.toml", "empty.csv", "-o", "chosen.toml")
     assert (code, err) == (0, "")
     assert "viscous, dry + root of speed + springs" in out

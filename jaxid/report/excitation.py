@@ -133,10 +133,10 @@ def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         return Remark("This motion does not keep all limits.", Status.BAD)
     text = "A motion that keeps all limits, and determines all parameters."
     status = Status.GOOD
-    if plan.interrupted:
+    if any(remark.status is Status.BAD for remark in remarks):
+        text = "Do not record this motion yet: what is marked ✗ comes first."
+        status = Status.BAD
+    elif plan.interrupted:
         text = "The design of this motion was stopped."
-        status = Status.DOUBTFUL
-    elif any(remark.status is Status.BAD for remark in remarks):
-        text = "Read the remarks below before you record this motion."
         status = Status.DOUBTFUL
     return Remark(text, status)
