@@ -81,17 +81,14 @@ def row_chunks(
 ) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
 
-    Chunks without any of the `wanted` ranges of rows are left out.
+    Only the `wanted` ranges of rows are made, or all.
     """
     mask, indices = np.asarray(observations.mask), base.acting_columns
-    for chunk in observations.chunks(samples):
-        first, last = chunk.rows
-        if wanted is not None and not any(a < last and first < b for a, b in wanted):
-            continue
+    for chunk in observations.chunks(samples, wanted):
         motion, forces = observations.read(slice(*chunk.samples))
         forces = without_tool(base, motion, forces)
         columns = [chunk.reduce(theta) for theta in base.regressor_rows(motion)]
-        rows = slice(first, last)
+        rows = slice(*chunk.rows)
         yield RowChunk(0, 0, rows, indices, columns, chunk.reduce(forces), mask[rows])
 
 

@@ -149,7 +149,7 @@ class RegressionProblem:
         """Yield the rows, recording by recording, in their order.
 
         Args:
-            spans: Rows that are needed; chunks without any of them may be left out. By default all.
+            spans: Rows that are needed, in their order; others may come too. By default all.
 
         Raises:
             InputError: If only factors are known.

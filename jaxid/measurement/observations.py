@@ -248,12 +248,18 @@ class Observations(eqx.Module):
     def _reduce(self, kept: slice, wanted: slice, x: AnyArray) -> np.ndarray:
         return self.decimation(self.filter.smooth(x, self.sample_time)[kept])[wanted]
 
-    def chunks(self, samples: int = 16384) -> tuple[Chunk, ...]:
+    def chunks(
+        self, samples: int = 16384, wanted: Sequence[tuple[int, int]] | None = None
+    ) -> tuple[Chunk, ...]:
         """Divide into parts of about so many samples, each with the overlap that its filters need.
 
         For columns that do not fit into memory at the full rate: evaluate them at the motion of
         `read(slice(*chunk.samples))`, and `chunk.reduce` gives the rows `slice(*chunk.rows)` of
         `reduce`, up to rounding.
+
+        Args:
+            samples: Number of samples of a part.
+            wanted: Half-open ranges of the rows that are needed; all if None.
         """
         factor = self.decimation.factor
         edge = self.filter.edge(self.sample_time)
@@ -263,18 +269,20 @@ class Observations(eqx.Module):
         chunks, step = [], max(1, samples // factor)
         for (a, b), (r0, r1) in zip(self.segments, self.row_segments, strict=True):
             first, last = a + edge, b - edge
-            for start in range(r0, r1, step):
-                stop = min(start + step, r1)
+            ranges = [(r0, r1)] if wanted is None else wanted
+            parts = [(max(r0, low), min(r1, high)) for low, high in ranges]
+            for start, end in ((k, high) for low, high in parts for k in range(low, high, step)):
+                stop = min(start + step, end)
                 # Decimation keeps its phase: its first input sample is a row.
                 skipped = max(0, start - r0 - -(-before // factor))
                 low = first + skipped * factor
                 high = min(last, first + (stop - 1 - r0) * factor + before + 1)
                 begin = max(a, low - after)
-                end = min(b, high + after)
+                final = min(b, high + after)
                 kept = slice(low - begin, high - begin)
-                wanted = slice(start - r0 - skipped, stop - r0 - skipped)
-                reduce = functools.partial(self._reduce, kept, wanted)
-                chunks.append(Chunk((begin, end), (start, stop), reduce))
+                rows = slice(start - r0 - skipped, stop - r0 - skipped)
+                reduce = functools.partial(self._reduce, kept, rows)
+                chunks.append(Chunk((begin, final), (start, stop), reduce))
         return tuple(chunks)
 
     def split(self, fraction: float) -> tuple["Observations", "Observations"]:

@@ -75,6 +75,14 @@ def test_columns_and_forces_stay_aligned_in_one_or_many_chunks(filter, decimatio
         for chunk in chunks:
             out[slice(*chunk.rows)] = chunk.reduce(x[slice(*chunk.samples)])
         np.testing.assert_allclose(out, rows, atol=1e-11 * np.abs(x).max())
+        wanted = [(1, 2), (o.rows // 3, o.rows - 3)]
+        parts = o.chunks(size, wanted)
+        made = [k for chunk in parts for k in range(*chunk.rows)]
+        assert made == [k for ends in wanted for k in range(*ends)]
+        for chunk in parts:
+            own = chunk.reduce(x[slice(*chunk.samples)])
+            expected = rows[slice(*chunk.rows)]
+            np.testing.assert_allclose(own, expected, atol=1e-11 * np.abs(x).max())
         if o.decimation.memory() == 0:
             most = size + 2 * filter.low_pass(DT).memory()
             assert max(c.samples[1] - c.samples[0] for c in chunks) <= most

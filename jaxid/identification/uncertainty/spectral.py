@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy import fft
 
 from jaxid.arrays import AnyArray, Float
 
@@ -26,7 +27,8 @@ from .result import AbstractUncertainty, ResidualSpectra, Uncertainty
 MAX_ROWS = 2**15
 """Largest number of rows of a stretch; longer parts of a log are divided."""
 MAX_SAMPLES = 2**17
-"""Samples up to which every stretch is transformed; of longer logs some, evenly spread."""
+"""Samples up to which every stretch is transformed; of longer logs some, evenly spread, that are
+shorter and hold half as many samples together."""
 MAX_LENGTHS = 4
 """Number of different lengths up to which each has its own lines; of more, similar ones share them,
 so that memory does not grow with the number of gaps."""
@@ -143,7 +145,7 @@ def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
 def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> Lines:
     """Return the lines of one stretch; add the energies of pairs to `correlated`."""
     row_time = observations.row_time
-    frequency = np.fft.rfftfreq(n, row_time)
+    frequency = fft.rfftfreq(n, row_time)
     dt, decimation = observations.sample_time, observations.decimation
     gain = observations.filter.low_pass(dt).gain(frequency, dt)
     for k, factor in enumerate(decimation.stages):
@@ -158,25 +160,30 @@ def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> 
     energy = np.empty((size, channels, last))
     leverage, power = np.empty((channels, last)), np.empty((channels, last))
     exposure = np.empty(channels)
+    scale = np.sqrt(m / n)[:, None]
+
+    def transform(rows: np.ndarray) -> np.ndarray:
+        """Return real and imaginary parts of each line, weighted by how often it counts."""
+        found = np.asarray(fft.rfft(rows, n, axis=0))[:last]
+        return scale * np.stack([found.real, found.imag])
+
     for c, parts in enumerate(zip(*pieces, strict=True)):
         own = list(parts[0].columns)
-        Z = np.concatenate([x.instruments for x in parts])
+        B = inverse[:, own]
+        Z = transform(np.concatenate([x.instruments for x in parts]))
         u = np.concatenate([x.disturbance for x in parts])
-        Zf = np.fft.rfft(Z, n, axis=0)[:last]
-        P = Zf @ inverse[:, own].T
-        energy[:, c] = (np.abs(P) ** 2 * m[:, None]).T / n
-        weighted = P * np.sqrt(m / n)[:, None]
+        P = Z @ B.T
+        energy[:, c] = np.einsum("kfi,kfi->if", P, P)
         for k, (a, b) in zip(present, itertools.pairwise([*starts, last]), strict=True):
-            both = np.concatenate([weighted[a:b].real, weighted[a:b].imag])
-            correlated[k, c] += both.T @ both
-        Tf = Zf
+            both = Z[:, a:b].reshape(-1, len(own))
+            correlated[k, c] += B @ (both.T @ both) @ B.T
+        theta = Z
         if any(x.equations is not x.instruments for x in parts):
-            theta = np.concatenate([x.equations for x in parts])
-            Tf = np.fft.rfft(theta, n, axis=0)[:last]
-        leverage[c] = np.real(np.sum(P[:, own].conj() * Tf, axis=1)) / n
-        power[c] = np.abs(np.fft.rfft(u, n)[:last]) ** 2 / n
+            theta = transform(np.concatenate([x.equations for x in parts]))
+        leverage[c] = np.einsum("kfi,kfi->f", P[..., own], theta) / m
+        power[c] = np.abs(np.asarray(fft.rfft(u, n))[:last]) ** 2 / n
         exposure[c] = sum(x.counted for x in parts) / n
-    residual = np.abs(np.fft.rfft(residuals, n, axis=0)[:last].T) ** 2 / n
+    residual = np.abs(np.asarray(fft.rfft(residuals, n, axis=0))[:last].T) ** 2 / n
     sums = energy, leverage, power, residual, exposure
     return Lines(n, row_time, frequency, m, gain, bins, *sums, 1)
 
@@ -187,18 +194,23 @@ def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
     Rows of different stretches count as independent: the relative error is about the correlation
     time of the noise over the length of a stretch.
     """
-    stretches, samples = [], 0
+    samples = sum(o.samples for o in problem.recordings)
+    complete = samples <= MAX_SAMPLES
+    rows, stretches = MAX_ROWS if complete else MAX_ROWS // 4, []
     for number, o in enumerate(problem.recordings):
-        most = max(4, min(MAX_ROWS, 4 * MAX_ROWS // o.decimation.factor))
+        most = max(4, min(rows, 4 * rows // o.decimation.factor))
         for a, b in o.row_segments:
-            parts = np.array_split(np.arange(a, b), math.ceil((b - a) / most))
-            stretches += [(number, int(part[0]), int(part[-1]) + 1) for part in parts]
-        samples += o.samples
-    if samples <= MAX_SAMPLES:
+            if complete:
+                parts = np.array_split(np.arange(a, b), math.ceil((b - a) / most))
+                stretches += [(number, int(part[0]), int(part[-1]) + 1) for part in parts]
+            else:
+                # Equal lengths have fast transforms.
+                stretches += [(number, k, min(k + most, b)) for k in range(a, b, most)]
+    if complete:
         return stretches, True
-    count = max(1, len(stretches) * MAX_SAMPLES // samples)
-    chosen = np.linspace(0, len(stretches) - 1, count).round().astype(int)
-    return [stretches[k] for k in np.unique(chosen)], False
+    count = max(1, len(stretches) * (MAX_SAMPLES // 2) // samples)
+    chosen = (np.arange(count) + 0.5) * len(stretches) / count
+    return [stretches[k] for k in np.unique(chosen.astype(int))], False
 
 
 def window_sums(frequency: Float[np.ndarray, " lines"], longest: float):
@@ -338,7 +350,7 @@ def sandwich_of_columns(own, weights, inverse, p, columns, forces, exposure, row
     count; the columns belong to its own parameters; `exposure` is the fraction of rows that count.
     """
     length = columns[0].shape[-1]
-    frequency, m = np.fft.rfftfreq(length, row_time), multiplicity(length)
+    frequency, m = fft.rfftfreq(length, row_time), multiplicity(length)
     energy, leverage, power = [], [], []
     for k, A, Q, w in zip(own, columns, forces, weights, strict=True):
         mine = np.array(k, int)
