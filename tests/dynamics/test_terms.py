@@ -28,6 +28,7 @@ from jaxid.dynamics.terms import (
     StribeckFriction,
     Tanh,
     TemperatureScaled,
+    TorqueRipple,
     ViscousFriction,
 )
 from jaxid.errors import InputError
@@ -63,6 +64,7 @@ ALL = [
     SquareRootFriction(),
     LoadFriction(np.random.default_rng(44).uniform(0.2, 2.0, (N, 10))),
     TemperatureScaled(ViscousFriction(), rate=0.02, temperature=40.0),
+    TorqueRipple((1, 6), (2,)),
 ]
 FORCE = ("N m", "N", "N m")
 
@@ -184,6 +186,30 @@ def test_dead_zone_says_nothing_about_standstill(transition):
     each = np.asarray(transition(dead_zone=np.array([0.2, 0.4]))(jnp.asarray([0.3, 0.3])))
     assert each[0] > 0.99
     assert each[1] == 0.0
+
+
+def test_ripple_is_that_of_the_motors_and_joints(robot):
+    """Motors with torques of their own angles, through the gears: A^T M(A q)."""
+    term = TorqueRipple((1, 6), (2,))
+    a, b = np.random.default_rng(45).normal(size=(2, 2, N))
+    joint = np.random.default_rng(46).normal(size=(2, N))
+    turned = REDUCTION @ Q
+    motors = 0
+    for i, k in enumerate((1, 6)):
+        motors = motors + a[i] * np.sin(k * turned) + b[i] * np.cos(k * turned)
+    expected = REDUCTION.T @ motors + joint[0] * np.sin(2 * Q) + joint[1] * np.cos(2 * Q)
+    gears = np.diag(REDUCTION)
+    p = np.concatenate([gears * a[0], gears * b[0], gears * a[1], gears * b[1], *joint])
+    np.testing.assert_allclose(_columns(term, robot) @ p, expected, rtol=1e-12)
+    assert term.parameters(robot)[:4] == (
+        ("sm1_1", "N m"),
+        ("sm1_2", "N"),
+        ("sm1_3", "N m"),
+        ("cm1_1", "N m"),
+    )
+    for refused in ((), (0,), (1.5,)):
+        with pytest.raises(InputError, match="`TorqueRipple`"):
+            TorqueRipple(refused)
 
 
 def _motor_level(A, J, fv, fc, epsilon, qd, qdd):

@@ -5,6 +5,7 @@ from .bodies_rotors_springs import (
     LinearSpring as LinearSpring,
     RigidBodies as RigidBodies,
     RotorInertia as RotorInertia,
+    TorqueRipple as TorqueRipple,
 )
 from .friction import (
     AbstractTransition as AbstractTransition,

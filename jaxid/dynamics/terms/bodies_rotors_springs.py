@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Joints, matching, one_or_each
 from jaxid.dynamics import projection_equation, spatial_dynamics
+from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot
 
@@ -105,6 +106,50 @@ class RotorInertia(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of accelerations."""
         return jnp.diag(qdd)
+
+
+class TorqueRipple(AbstractTerm):
+    r"""Forces that repeat with the turns of the motors or of the joints.
+
+    Cogging, commutation and gears that run out of true: $\sin k\varphi_i$ and $\cos k\varphi_i$ for
+    each multiple $k$ of a turn, where $\varphi_i$ is the motor's angle $(A q)_i$ (Eq. 19) or the
+    joint's. The parameters of motor 1 at $k$ = 2 are `sm2_1` and `cm2_1`, those of joint 1 `sj2_1`
+    and `cj2_1` [N m or N], all on the side of the joints.
+
+    Attributes:
+        motor: Multiples of a motor's turn.
+        joint: Multiples of a joint's turn.
+    """
+
+    motor: tuple[int, ...] = eqx.field(static=True, default=(1,))
+    joint: tuple[int, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self):
+        multiples = (*self.motor, *self.joint)
+        if not multiples or not all(isinstance(k, int) and k > 0 for k in multiples):
+            raise InputError(f"`TorqueRipple` needs positive whole multiples, not {multiples}.")
+
+    def parameters(self, robot):
+        """Return names and units: for each multiple the sines, then the cosines."""
+        waves = [("m", k) for k in self.motor] + [("j", k) for k in self.joint]
+        return tuple(
+            (f"{wave}{side}{k}_{i + 1}", "N m" if turns else "N")
+            for side, k in waves
+            for wave in "sc"
+            for i, turns in enumerate(robot.revolute)
+        )
+
+    def columns(self, robot, q, qd, qdd):
+        """Return sines and cosines of the angles; coupled motors act on all axes they turn."""
+        A, eye = np.asarray(robot.drives.reduction), np.eye(robot.joints)
+        ratios = A / np.where(np.diag(A) == 0, 1.0, np.diag(A))[:, None]
+        waves = [(A @ q, ratios.T, k) for k in self.motor] + [(q, eye, k) for k in self.joint]
+        parts = [
+            matrix * wave(k * angles)[None]
+            for angles, matrix, k in waves
+            for wave in (jnp.sin, jnp.cos)
+        ]
+        return jnp.concatenate(parts, axis=1)
 
 
 class ConstantOffset(AbstractTerm):
