@@ -272,7 +272,7 @@ REFUSALS = [
     ('[robot]\nurdf = "no.urdf"', "`urdf`: `.*no.urdf`"),
     ("[robot]\ndh = [{alpha = 0, a = 0, d = 0}]", "`convention`"),
     ("[robot]\ndh = []\nconvention = 'standard'", "`robot`"),
-    ("[robot]\ndh = [{alpha = 0, a = 0}]", "`robot.dh[0].d`.*`[robot.dh]`"),
+    ("[robot]\ndh = [{alpha = 0, b = 0}]", "`robot.dh[0].b`.*alpha, a, d, theta"),
     (ARM + "gravity = [0, 0, 'g']", "`robot.gravity[2]`"),
     (ARM + "xyzzy = 1", "`robot.xyzzy`.*`[robot]` has urdf"),
     (ARM + 'name = "a\\u001b[31m"', "`robot.name`.*control character"),
@@ -347,6 +347,8 @@ def test_logs_that_do_not_fit_the_file(load, tmp_path):
     short = RECORDING.replace('"q{}"', '["q1", "q2"]').replace('"tau{}"', '["tau1", "tau2"]')
     with pytest.raises(ValueError, match=r"`recording`: `run` has 0 samples from 5 s"):
         load(ARM + short + "start = 5\n").read(log)
+    parts = load(ARM + short + "start = {'run.csv' = 0.2}\nstop = {'other.csv' = 0.3}\n")
+    assert parts.read(log).angles[[0, -1], 0].tolist() == [20, 99]
     experiment = load(ARM + short + "[filter]\nkind = 'butterworth'\ncutoff = 60\n")
     with pytest.raises(ValueError, match=r"experiment.toml: `filter` and `rows`: .*cutoff"):
         experiment.observe(experiment.read(log))

@@ -211,6 +211,10 @@ def _convert(value: Any, option: Any, place: str) -> Any:
             raise InputError(f"`{place}` must hold {len(hints)} values, but holds {len(value)}.")
         pairs = enumerate(zip(value, hints, strict=True))
         return origin(decode_value(x, hint, f"{place}[{k}]") for k, (x, hint) in pairs)
+    if origin is dict:
+        if not isinstance(value, dict):
+            return _OTHER
+        return {k: decode_value(x, arguments[1], f"{place}.{k}") for k, x in value.items()}
     if option not in _SCALARS:
         if isinstance(value, str | dict):
             return _OTHER

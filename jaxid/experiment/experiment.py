@@ -193,8 +193,9 @@ class Experiment:
                 raise InputError(
                     f"`{log.name}` has {rate:.3g} samples in a second: check `time_unit`."
                 )
-            if np.isfinite((logs.start, logs.stop)).any():
-                recording = recording.crop(logs.start, logs.stop)
+            start, stop = logs.part(log)
+            if np.isfinite((start, stop)).any():
+                recording = recording.crop(start, stop)
             return remove_delay(recording, logs.force_delay) if logs.force_delay else recording
 
     def observe(self, recording: Recording) -> Observations:
@@ -216,6 +217,7 @@ class Experiment:
         logs = self.logs
         if logs.force_delay:
             raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
+        start, stop = logs.part(log)
         return scan_log(
             log,
             self._columns_of(log),
@@ -224,8 +226,8 @@ class Experiment:
             self.decimation,
             self.min_speed,
             largest_gap=logs.largest_gap,
-            start=logs.start,
-            stop=logs.stop,
+            start=start,
+            stop=stop,
             **logs.files(log),
         )
 

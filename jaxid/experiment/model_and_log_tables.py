@@ -106,6 +106,8 @@ class Effects:
         square_root: Whether friction grows with the square root of speed, too.
         load: Whether dry friction grows with the weight on a joint, too; the bodies are those that
             are identified, until both agree.
+        motor_ripple: Multiples of the motors' turns at which their torques ripple, like `[1, 2]`.
+        joint_ripple: Multiples of the joints' turns at which forces ripple, like `[1]`.
         rotor_inertia: Whether the motors' rotors are felt through the gears.
         offset: Whether there is a constant force at each joint (sensor offsets); by default unless
             dry friction is asymmetric.
@@ -119,6 +121,8 @@ class Effects:
     viscous: bool | Literal["asymmetric"] = True
     square_root: bool = False
     load: bool = False
+    motor_ripple: tuple[Count, ...] = ()
+    joint_ripple: tuple[Count, ...] = ()
     rotor_inertia: bool = True
     offset: bool | None = None
     springs: bool = False
@@ -133,12 +137,14 @@ class Effects:
         coupled = self.coupled_drives
         if coupled is None:
             coupled = bool(terms.CoupledDrives().couplings(robot))
+        ripples = bool(self.motor_ripple or self.joint_ripple)
         chosen = (
             terms.RigidBodies(principal_axes=self.principal_axes),
             self._viscous_friction,
             self.coulomb is not False and dry.term(robot),
             self.square_root and terms.SquareRootFriction(dry.transition(robot)),
             self.rotor_inertia and terms.RotorInertia(),
+            ripples and terms.TorqueRipple(self.motor_ripple, self.joint_ripple),
             offset and terms.ConstantOffset(),
             coupled and terms.CoupledDrives(dry.transition(robot)),
             self.springs and terms.LinearSpring(),
@@ -186,8 +192,9 @@ class Logs:
         largest_gap: Longest pause that is bridged, in sample times; a tenth of the period of the
             filter's cut-off frequency is bridged in any case.
         bad_rows: Fraction of the rows that may be bad, and are left out.
-        start: Start of the part of every log that is used [s], like `0.0`.
-        stop: End of that part [s], like `10.0`.
+        start: Start of the part of every log that is used [s], like `0.0`; or a table with that of
+            some logs, `{ "a.csv" = 1.5 }`.
+        stop: End of that part [s], like `10.0`; or a table.
     """
 
     side: Side = "joint"
@@ -198,8 +205,14 @@ class Logs:
     force_delay: float = 0.0
     largest_gap: Annotated[float, Bounds(above=1.0)] = 1.75
     bad_rows: Annotated[float, Bounds(least=0.0, below=1.0)] = BAD_ROWS
-    start: float = -np.inf
-    stop: float = np.inf
+    start: float | dict[str, float] = -np.inf
+    stop: float | dict[str, float] = np.inf
+
+    def part(self, log: Path) -> tuple[float, float]:
+        """Return start and stop of the part of a log that is used [s]."""
+        ends = (self.start, -np.inf), (self.stop, np.inf)
+        start, stop = (x.get(log.name, own) if isinstance(x, dict) else x for x, own in ends)
+        return start, stop
 
     def files(self, log: Path) -> dict[str, Any]:
         """Return the paths of the files beside a log, as the readers take them."""

@@ -25,9 +25,9 @@ DhRow = tuple[str | None, bool, tuple[float, float, float, float]]
 
 def dh_row(
     *,
-    alpha: float,
-    a: float,
-    d: float,
+    alpha: float = 0.0,
+    a: float = 0.0,
+    d: float = 0.0,
     theta: float = 0.0,
     slides: bool = False,
     name: str | None = None,
