@@ -7,10 +7,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import tomlkit
 
 from jaxid.errors import InputError
 from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
+from jaxid.identification.presliding import identify_presliding
 
 from .experiment import Experiment, parse_experiment
 from .identify_logs import Stages, load_log, select_filter
@@ -20,6 +22,7 @@ Changes = dict[str, dict[str, Any]]
 EFFECTS: dict[str, Changes] = {
     "root of speed": {"model": {"square_root": True}},
     "Stribeck": {"model": {"coulomb": {"stribeck": 0.1}}},
+    "presliding": {"model": {"coulomb": {"presliding": True}}},
     "viscous by direction": {"model": {"viscous": "asymmetric"}},
     "springs": {"model": {"springs": True}},
 }
@@ -47,13 +50,19 @@ def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple
     observations = [load_log(experiment, path, stage)[1] for path in logs]
     stage("choosing the model")
     changes = dict(_variants(tomllib.loads(experiment.text)))
-    candidates = []
+    candidates, found = [], None
     for name, own in changes.items():
         try:
             variant = parse_experiment(_changed(experiment.text, own), experiment.path)
         except InputError:
             continue  # an effect that this robot cannot have
-        candidates.append(Candidate(name, variant.base, variant.estimation.estimator))
+        base = variant.base
+        if base.model.memory is not None:
+            # The lengths hardly depend on the other effects.
+            found = found or identify_presliding(base, observations)
+            model = base.model.with_memory(length=found.model.memory.length)
+            base = eqx.tree_at(lambda b: b.model, base, model)
+        candidates.append(Candidate(name, base, variant.estimation.estimator))
     choice = choose_model(candidates, observations, progress=stage.through)
     return choice, _changed(experiment.text, changes[choice.chosen.name])
 
@@ -69,7 +78,8 @@ def _variants(content: dict[str, Any]) -> Iterator[tuple[str, Changes]]:
             for name in names:
                 for key, value in EFFECTS[name]["model"].items():
                     inner = changes.setdefault("model", {})
-                    inner[key] = {**given.get(key, {}), **value} if key == "coulomb" else value
+                    before = inner.get(key, given.get(key, {}))
+                    inner[key] = {**before, **value} if key == "coulomb" else value
             yield " + ".join((PLAIN, *names)), changes
     for name, own in ESTIMATORS.items():
         yield f"{PLAIN}, {name}", own
