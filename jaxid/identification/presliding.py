@@ -8,6 +8,7 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
+from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations
 
 from .problem import RegressionProblem
@@ -48,12 +49,12 @@ def identify_presliding(
     # Joints that do not move keep theirs.
     longest = np.where(high > low, (high - low) / STEP, base.model.memory.length)
 
-    def changed(lengths: Float[np.ndarray, " joints"]) -> BaseParameters:
-        return eqx.tree_at(lambda b: b.model, base, base.model.with_memory(length=lengths))
-
     def errors(lengths: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
         """Return the norm of what each joint's own columns do not explain."""
-        joints = problem.with_base(changed(lengths)).factors.joints
+        trial, law = problem.with_base(base), base.model.with_memory(length=lengths).memory
+        # Only the states depend on the lengths: the compiled columns are the same.
+        trial.recordings = tuple(with_memory(o, law) for o in problem.recordings)
+        joints = trial.factors.joints
         return np.array([abs(j.R[-1, -1]) if len(j.R) > len(j.columns) else 0.0 for j in joints])
 
     tried = [longest / STEP**k for k in range(11)]
@@ -65,7 +66,8 @@ def identify_presliding(
         for x in (best / step, best * step):
             tried.append(np.minimum(x, longest))
             found.append(errors(tried[-1]))
-    return changed(_best(tried, found))
+    model = base.model.with_memory(length=_best(tried, found))
+    return eqx.tree_at(lambda b: b.model, base, model)
 
 
 def _best(tried: list[np.ndarray], found: list[np.ndarray]) -> Float[np.ndarray, " joints"]:
