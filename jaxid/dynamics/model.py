@@ -115,13 +115,9 @@ class Model(Hashable):
 
     def with_memory(self, **changes: Any) -> Self:
         """Return the model with other fields of `memory`, such as `length` or `state`."""
-
-        def changed(x: Any) -> Any:
-            return dataclasses.replace(x, **changes) if _has_memory(x) else x
-
-        return dataclasses.replace(
-            self, terms=jax.tree.map(changed, self.terms, is_leaf=_has_memory)
-        )
+        leaves, tree = jax.tree.flatten(self.terms, is_leaf=_has_memory)
+        leaves = [dataclasses.replace(x, **changes) if _has_memory(x) else x for x in leaves]
+        return dataclasses.replace(self, terms=jax.tree.unflatten(tree, leaves))
 
     def arguments(self, motion: Motion) -> tuple[AnyArray, ...]:
         """Return the arguments of `columns` at a motion: with the state if friction has memory.

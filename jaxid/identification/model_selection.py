@@ -36,12 +36,6 @@ class Candidate(NamedTuple):
     base: BaseParameters
     estimator: AbstractEstimator = WeightedLeastSquares()
 
-    @property
-    def size(self) -> int:
-        """Number of parameters, lengths of presliding included."""
-        model = self.base.model
-        return self.base.size + (0 if model.memory is None else model.robot.joints)
-
 
 class ModelChoice(eqx.Module):
     """Result of a choice of models.
@@ -79,7 +73,7 @@ class ModelChoice(eqx.Module):
         return Table(
             "models by their errors on parts that were left out",
             Column("model", [self.candidates[k].name for k in order]),
-            Column("parameters", [self.candidates[k].size for k in order]),
+            Column("parameters", [self.candidates[k].base.size for k in order]),
             Column("error", error, "%", percent),
             Column("above the best", above, "%", percent),
             Column("one deviation", deviation, "%", percent),
@@ -137,7 +131,7 @@ def choose_model(
     parts = table.shape[1]
     alone = np.arange(parts)
     squares = table[:, alone, alone]
-    sizes = [candidate.size for candidate in candidates]
+    sizes = [candidate.base.size for candidate in candidates]
     outer = []
     for out in alone:
         rest = np.setdiff1d(alone, [out])

@@ -13,10 +13,8 @@ from jaxid.measurement.observations import Observations
 
 from .problem import RegressionProblem
 
-STEP = 3.0
-"""Ratio of the lengths that are tried first."""
-HALVINGS = 4
-"""How many times this ratio is halved, on a logarithmic scale, around the best length."""
+LENGTHS = 3.0 ** np.arange(-12, 1)
+"""Lengths that are tried for each joint, before those around the best one [rad or m]."""
 
 
 def identify_presliding(
@@ -25,8 +23,7 @@ def identify_presliding(
     """Find the length of presliding friction of each joint.
 
     The rows of a joint depend on its own length only, and are fitted alone. So one pass over the
-    data tries a length of every joint. Lengths from a third of the range of a joint down to a
-    hundred-thousandth of it are tried, then those around the best one.
+    data tries a length of every joint. The best of `LENGTHS` is improved in steps that get smaller.
 
     Args:
         base: Base parameters of a model whose friction has the transition `Presliding`.
@@ -40,39 +37,25 @@ def identify_presliding(
     """
     if base.model.memory is None:
         raise InputError("the `model` has no friction with the transition `Presliding`.")
-    problem = RegressionProblem(base, observations)
-    low, high = np.inf, -np.inf
-    for recording in problem.recordings:
-        for chunk in recording.chunks():
-            q = np.asarray(recording.read(slice(*chunk.samples))[0].q)
-            low, high = np.minimum(low, q.min(axis=0)), np.maximum(high, q.max(axis=0))
-    # Joints that do not move keep theirs.
-    longest = np.where(high > low, (high - low) / STEP, base.model.memory.length)
+    problem, joints = RegressionProblem(base, observations), base.model.robot.joints
+    tried, found = [], []
 
-    def errors(lengths: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
-        """Return the norm of what each joint's own columns do not explain."""
-        trial, law = problem.with_base(base), base.model.with_memory(length=lengths).memory
-        # Only the states depend on the lengths: the compiled columns are the same.
-        trial.recordings = tuple(with_memory(o, law) for o in problem.recordings)
-        joints = trial.factors.joints
-        return np.array([abs(j.R[-1, -1]) if len(j.R) > len(j.columns) else 0.0 for j in joints])
+    def best_after(lengths: Float[np.ndarray, "lengths joints"]) -> Float[np.ndarray, " joints"]:
+        """Try lengths; return the best one of all that were tried for each joint."""
+        for one in lengths:
+            trial, law = problem.with_base(base), base.model.with_memory(length=one).memory
+            # Only the states depend on the lengths: the compiled columns are the same.
+            trial.recordings = tuple(with_memory(o, law) for o in problem.recordings)
+            tried.append(one)
+            # What a joint's own columns leave unexplained stands last in its triangle.
+            found.append([abs(x.R[-1, -1]) for x in trial.factors.joints])
+        return np.array(tried)[np.argmin(found, axis=0), np.arange(joints)]
 
-    tried = [longest / STEP**k for k in range(11)]
-    found = [errors(x) for x in tried]
-    step = STEP
-    for _ in range(HALVINGS):
-        best = _best(tried, found)
-        step = np.sqrt(step)
-        for x in (best / step, best * step):
-            tried.append(np.minimum(x, longest))
-            found.append(errors(tried[-1]))
-    model = base.model.with_memory(length=_best(tried, found))
+    best = best_after(np.outer(LENGTHS, np.ones(joints)))
+    for step in 3.0**0.5 ** np.arange(1, 5):
+        best = best_after(np.array([best / step, best * step]))
+    model = base.model.with_memory(length=best)
     return eqx.tree_at(lambda b: b.model, base, model)
-
-
-def _best(tried: list[np.ndarray], found: list[np.ndarray]) -> Float[np.ndarray, " joints"]:
-    best = np.argmin(found, axis=0)
-    return np.array(tried)[best, np.arange(len(best))]
 
 
 def presliding_note(base: BaseParameters) -> str:

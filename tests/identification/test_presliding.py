@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 import jaxid as jid
 from jaxid.dynamics.terms import CoulombFriction, Presliding, SquareRootFriction, Tanh
 from jaxid.errors import InputError
+from jaxid.identification.presliding import LENGTHS as LENGTHS_TRIED
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import PART, SamplesWithMemory, with_memory
 from jaxid.simulation.friction_and_disturbances import LuGreFriction
@@ -96,13 +97,13 @@ def test_forces_and_lengths_are_found():
     np.testing.assert_allclose(fit.predict(m), log.forces, atol=0.2)
 
 
-def test_a_joint_that_does_not_move_keeps_its_length():
+def test_a_joint_that_does_not_move_is_taken_to_slide_at_once():
     log, _ = log_of()
     m = log.motion
     still = np.array([1.0, 0.0])
     log = log.replace(motion=jid.Motion(m.q * still, m.qd * still, m.qdd * still))
-    base = jid.identify_presliding(jid.base_parameters(model_of(Presliding(7e-3))), log)
-    assert base.model.memory.length[1] == 7e-3
+    base = jid.identify_presliding(jid.base_parameters(model_of(Presliding())), log)
+    assert base.model.memory.length[1] == LENGTHS_TRIED[0]
 
 
 @pytest.mark.parametrize("filtered", [False, True])
