@@ -7,12 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import tomlkit
 
 from jaxid.errors import InputError
 from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
-from jaxid.identification.presliding import identify_presliding
 
 from .experiment import Experiment, parse_experiment
 from .identify_logs import Stages, load_log, select_filter
@@ -50,19 +48,13 @@ def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple
     observations = [load_log(experiment, path, stage)[1] for path in logs]
     stage("choosing the model")
     changes = dict(_variants(tomllib.loads(experiment.text)))
-    candidates, found = [], None
+    candidates = []
     for name, own in changes.items():
         try:
             variant = parse_experiment(_changed(experiment.text, own), experiment.path)
         except InputError:
             continue  # an effect that this robot cannot have
-        base = variant.base
-        if base.model.memory is not None:
-            # The lengths hardly depend on the other effects.
-            found = found or identify_presliding(base, observations)
-            model = base.model.with_memory(length=found.model.memory.length)
-            base = eqx.tree_at(lambda b: b.model, base, model)
-        candidates.append(Candidate(name, base, variant.estimation.estimator))
+        candidates.append(Candidate(name, variant.base, variant.estimation.estimator))
     choice = choose_model(candidates, observations, progress=stage.through)
     return choice, _changed(experiment.text, changes[choice.chosen.name])
 

@@ -11,6 +11,7 @@ from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations
 
+from .factors import Blocks, Factors
 from .problem import RegressionProblem
 
 LENGTHS = 3.0 ** np.arange(-12, 1)
@@ -43,13 +44,9 @@ def identify_presliding(
     def best_after(lengths: Float[np.ndarray, "lengths joints"]) -> Float[np.ndarray, " joints"]:
         """Try lengths; return the best one of all that were tried for each joint."""
         for one in lengths:
-            trial, law = problem.with_base(base), base.model.with_memory(length=one).memory
-            # Only the states depend on the lengths: the compiled columns are the same.
-            trial.recordings = tuple(with_memory(o, law) for o in problem.recordings)
             tried.append(one)
-            # What a joint's own columns leave unexplained stands last in its triangle.
-            found.append([abs(x.R[-1, -1]) for x in trial.factors.joints])
-        return np.array(tried)[np.argmin(found, axis=0), np.arange(joints)]
+            found.append(blocks_with(problem, one))
+        return np.array(tried)[best_of(found), np.arange(joints)]
 
     best = best_after(np.outer(LENGTHS, np.ones(joints)))
     for step in 3.0**0.5 ** np.arange(1, 5):
@@ -58,10 +55,34 @@ def identify_presliding(
     return eqx.tree_at(lambda b: b.model, base, model)
 
 
+def blocks_with(problem: RegressionProblem, length: np.ndarray | float) -> Blocks:
+    """Return the factors with another length: compiled columns stay, only states differ."""
+    base = problem.base
+    law, trial = base.model.with_memory(length=length).memory, problem.with_base(base)
+    trial.recordings = tuple(with_memory(o, law) for o in problem.recordings)
+    return trial.blocks
+
+
+def best_of(blocks: Sequence[Blocks]) -> list[int]:
+    """Return for each joint which of several factors its own columns explain best."""
+    # What they leave unexplained stands last in the triangle.
+    left = [[abs(joint.R[-1, -1]) for joint in x.total.joints] for x in blocks]
+    return np.argmin(left, axis=0).tolist()
+
+
+def pick(blocks: Sequence[Blocks], best: Sequence[int]) -> Blocks:
+    """Return the factors of each joint from those that are best for it."""
+    parts = []
+    for part in zip(*(x.parts for x in blocks), strict=True):
+        joints = tuple(part[k].joints[j] for j, k in enumerate(best))
+        parts.append(Factors(joints, part[0].size))
+    return Blocks(tuple(parts))
+
+
 def presliding_note(base: BaseParameters) -> str:
     """Return the lengths of presliding in words."""
     robot, law = base.model.robot, base.model.memory
     lengths = np.broadcast_to(getattr(law, "length", np.nan), robot.joints)
-    named = zip(robot.joint_names, lengths.tolist(), range(robot.joints), strict=True)
-    shown = ", ".join(f"{name} {x:.2g} {robot.joint_unit(j)}" for name, x, j in named)
+    named = enumerate(zip(robot.joint_names, lengths.tolist(), strict=True))
+    shown = ", ".join(f"{name} {x:.2g} {robot.joint_unit(j)}" for j, (name, x) in named)
     return f"lengths of presliding, whose uncertainty is not in the intervals: {shown}."
