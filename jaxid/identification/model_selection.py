@@ -176,15 +176,15 @@ def _held_out_squares(
     On the diagonal only that part was left out. Each joint has the length of presliding, if there
     is one, that suits the other parts best.
     """
-    count = len(each[0])
-    found = np.zeros((count, count))
+    count, found = len(each[0]), np.zeros((len(each[0]),) * 2)
+    totals = [[Blocks((fold.total,)) for fold in folds] for folds in each]
     for i, k in itertools.combinations_with_replacement(range(count), 2):
         kept = [n for n in range(count) if n not in (i, k)]
         rest = [_joined([folds[n] for n in kept]) for folds in each]
-        best = best_of(rest)
+        best = best_of([_joined([own[n] for n in kept]) for own in totals])
         rows = RegressionProblem(candidate.base, blocks=pick(rest, best))
         p = candidate.estimator(rows).parameters
-        parts = (pick([folds[n] for folds in each], best).total for n in (k, i))
+        parts = (pick([own[n] for own in totals], best).total for n in (k, i))
         found[i, k], found[k, i] = (weights @ part.residual_squares(p) for part in parts)
     return found
 

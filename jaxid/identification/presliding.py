@@ -14,7 +14,7 @@ from jaxid.measurement.observations import Observations
 from .factors import Blocks, Factors
 from .problem import RegressionProblem
 
-LENGTHS = 3.0 ** np.arange(-12, 1)
+LENGTHS = 3.0 ** np.arange(-9, 0)
 """Lengths that are tried for each joint, before those around the best one [rad or m]."""
 
 

@@ -32,7 +32,7 @@ class SamplesWithMemory(AbstractSamples):
             self.starts[a] = np.asarray(law(source.read(slice(a, a + 1))[0].qd[0]))
             for k in range(a, b, PART):
                 motion, _ = self.read(slice(k, min(k + PART + 1, b)))
-                self.starts[min(k + PART, b)] = motion.state[-1]
+                self.starts[min(k + PART, b)] = np.asarray(motion.state)[-1]
 
     def read(self, samples):  # noqa: D102
         begin = max(k for k in self.starts if k <= samples.start)
