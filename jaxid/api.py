@@ -50,6 +50,7 @@ from .identification.nonlinear_friction import (
 from .identification.operating_states import identify_states as identify_states
 from .identification.parameter_changes import compare as compare
 from .identification.payload import identify_payload as identify_payload
+from .identification.presliding import identify_presliding as identify_presliding
 from .identification.problem import RegressionProblem as RegressionProblem
 from .measurement import filters as filters
 from .measurement.columns import Columns as Columns

@@ -8,6 +8,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.fit_result import Fit
+from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.result_table import Column, Remark, Status, Table, percent, significant
 
@@ -188,6 +189,7 @@ def torque_errors(
     rows every n-th is compared.
     """
     known = fit.base.model.robot.known_max_forces
+    observations = with_memory(observations, fit.base.model.memory)
     step = comparison_step(observations)
     mask = np.asarray(observations.mask)
     measured, predicted = np.zeros((2, len(mask[::step]), observations.joints))

@@ -22,6 +22,7 @@ import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.experiment import choose
 from jaxid.experiment.experiment import load_experiment
+from jaxid.simulation.virtual import random_bodies
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -251,3 +252,35 @@ def test_a_model_is_chosen_and_its_file_identifies(shop, run, monkeypatch):  # n
     assert run("identify", "chosen.toml", "empty.csv", "-o", "c")[0] in (0, 3)
     again = run("choose", "experiment.toml", "empty.csv", "-o", "chosen.toml")
     assert refused(again, "`chosen.toml` is there already")
+
+
+PRESLIDING = SPATIAL.replace("[recording]", "[model.coulomb]\npresliding = true\n[recording]")
+
+
+def test_friction_with_memory_from_the_choice_to_the_report(shop, run, words, monkeypatch):  # noqa: F811
+    (shop / "memory.toml").write_text(PRESLIDING)
+    model = load_experiment("memory.toml").model.with_memory(length=0.05)
+    p, t = np.random.default_rng(0).uniform(0.2, 1.0, model.size), np.arange(0.0, 20.0, 0.005)
+    p[:30] = random_bodies(model.robot, np.array([3.0, 2.0, 1.0]), np.random.default_rng(0)).ravel()
+    motion = jid.random_fourier_series(model.robot, omega=1.2, seed=8).motion(t)
+    forces = model.inverse_dynamics(
+        p, jid.Motion(*map(np.asarray, (motion.q, motion.qd, motion.qdd)))
+    )
+    forces = forces + np.random.default_rng(1).normal(0.0, 0.03, forces.shape)
+    table, header = np.column_stack([t, motion.q, forces]), "t,q1,q2,q3,tau1,tau2,tau3"
+    np.savetxt("memory.csv", table, "%.7f", ",", header=header, comments="")
+    monkeypatch.setattr(choose, "EFFECTS", {"presliding": choose.EFFECTS["presliding"]})
+    out = words("choose", "experiment.toml", "memory.csv", "-o", "chosen.toml")
+    assert "`viscous, dry + presliding` is the simplest model" in out
+    assert load_experiment("chosen.toml").model.memory is not None
+    said = words("identify", "chosen.toml", "memory.csv", "-o", "report", "--split", "0.6")
+    fit = jid.load("report/model.json")
+    np.testing.assert_allclose(fit.base.model.memory.length, 0.05, rtol=0.1)
+    shown = re.findall(r"joint\d (0\.\d+) rad", said[said.index("lengths of presliding") :])
+    np.testing.assert_allclose([float(x) for x in shown[:3]], 0.05, rtol=0.12)
+    for errors in result(shop, "report")["errors"].values():
+        assert all(joint["rms"] < 0.05 for joint in errors[0]["joints"])
+    (shop / "both.toml").write_text(PRESLIDING + "[estimator]\nnonlinear_friction = true\n")
+    assert refused(run("identify", "both.toml", "memory.csv"), "but not both")
+    words("export", "report", "--to", "c", "-o", "arm.c")
+    assert "arm_advance" in (shop / "arm.h").read_text()

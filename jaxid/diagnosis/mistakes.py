@@ -214,16 +214,16 @@ class _AnyGeometry(eqx.Module):
 
     model: Model
 
-    def columns(self, axis, gravity, q, qd, qdd):
+    def columns(self, axis, gravity, q, qd, qdd, s=None):
         """Return the regressor of one sample, and the forces of the known tool behind it."""
         model = Model(self.model.robot.replace(axis=axis, gravity=gravity), self.model.terms)
         known = model.known_forces(q, qd, qdd)[:, None]
-        return jnp.concatenate([model.columns(q, qd, qdd), known], axis=1)
+        return jnp.concatenate([model.columns(q, qd, qdd, s), known], axis=1)
 
     def __call__(self, robot: Robot, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
         """Return the regressor of each sample, and the forces of the tool."""
         shared = np.asarray(robot.axis), np.asarray(robot.gravity)
-        samples = motion.q, motion.qd, motion.qdd
+        samples = self.model.arguments(motion)
         columns = in_numpy(self, self.columns, *samples, shared=shared)
         return columns[..., :-1], columns[..., -1]
 

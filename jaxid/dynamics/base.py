@@ -101,13 +101,13 @@ class BaseParameters(Hashable):
         """Values of the letters in the expressions: lengths [m], and `g` [m/s²]."""
         return dict(self.closed_forms.lengths)
 
-    def columns(self, q, qd, qdd) -> Float[AnyArray, "joints base"]:
+    def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints base"]:
         """Return the base regressor of one sample by definition (Eq. 23)."""
-        return self.model.columns(q, qd, qdd)[:, np.array(self.indices)]
+        return self.model.columns(q, qd, qdd, s)[:, np.array(self.indices)]
 
-    def forces(self, p, q, qd, qdd) -> Joints:
+    def forces(self, p, q, qd, qdd, s=None) -> Joints:
         """Return the generalised forces of one sample by definition (Eq. 39)."""
-        return self.model.forces(self.to_standard(p), q, qd, qdd)
+        return self.model.forces(self.to_standard(p), q, qd, qdd, s)
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
@@ -139,14 +139,15 @@ class BaseParameters(Hashable):
         Args:
             motion: Joint motion [samples, joints].
         """
-        arrays = [np.asarray(x, np.float64).T for x in (motion.q, motion.qd, motion.qdd)]
-        return [rows.T for rows in self.joint_regressor.in_numpy(*arrays)]
+        arrays = [np.asarray(x, np.float64).T for x in self.model.arguments(motion)]
+        regressor = JointRegressor(self, self.columns, *(x.shape[:1] for x in arrays))
+        return [rows.T for rows in regressor.in_numpy(*arrays)]
 
     def forces_in_numpy(
         self, p: Float[AnyArray, " base"], motion: Motion
     ) -> Float[np.ndarray, "samples joints"]:
         r"""Return the generalised forces $\Theta_B p_B$ [N m or N] in float64 (Eq. 39)."""
-        return in_numpy(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
+        return in_numpy(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
     def tool_forces(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Return the forces of the known tool [N m or N] in float64; zero without a tool."""
@@ -157,7 +158,7 @@ class BaseParameters(Hashable):
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
         r"""Return the base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
         self.model.check(motion.q)
-        return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
+        return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
         r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26).
@@ -167,7 +168,7 @@ class BaseParameters(Hashable):
                 robot's geometry.
         """
         self.model.check(motion.q)
-        return PackedRegressor(self, self.columns, motion)
+        return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 
     def from_standard(
         self, p: Float[AnyArray, "*batch standard"] | Sequence[Any]
@@ -199,7 +200,7 @@ class BaseParameters(Hashable):
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
         self.model.check(motion.q)
-        return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
+        return on_samples(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
     def mass_matrix(
         self,

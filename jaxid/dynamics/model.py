@@ -1,9 +1,10 @@
 """Model: a robot and the terms of its equations of motion, linear in the parameters."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from .packed_regressor import PackedRegressor, gram
 from .terms import (
     AbstractTerm,
     CoulombFriction,
+    Presliding,
     RigidBodies,
     RotorInertia,
     ViscousFriction,
@@ -29,6 +31,10 @@ Coordinates = Float[AnyArray, "*batch joints"] | Sequence[Any]
 Parameters = Float[AnyArray, " standard"] | Sequence[float | int]
 
 DEFAULT_TERMS = (RigidBodies(), ViscousFriction(), CoulombFriction(), RotorInertia())
+
+
+def _has_memory(x: Any) -> bool:
+    return isinstance(x, Presliding)
 
 
 class Model(Hashable):
@@ -95,21 +101,53 @@ class Model(Hashable):
         ends = np.cumsum(sizes)
         return [(t, p[e - s : e]) for t, s, e in zip(self.terms, sizes, ends, strict=True)]
 
-    def columns(self, q, qd, qdd) -> Float[AnyArray, "joints standard"]:
-        r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
-        return jnp.concatenate([t.columns(self.robot, q, qd, qdd) for t in self.terms], axis=1)
+    @property
+    def memory(self) -> Presliding | None:
+        """Law of the friction that depends on the path of the joints; None without such friction.
 
-    def forces(self, p, q, qd, qdd) -> Joints:
+        Raises:
+            InputError: If terms have different lengths.
+        """
+        laws = {x for x in jax.tree.leaves(self.terms, is_leaf=_has_memory) if _has_memory(x)}
+        if len(laws) > 1:
+            raise InputError("all terms with `Presliding` must have the same one.")
+        return next(iter(laws), None)
+
+    def with_memory(self, **changes: Any) -> Self:
+        """Return the model with other fields of `memory`, such as `length` or `state`."""
+        leaves, tree = jax.tree.flatten(self.terms, is_leaf=_has_memory)
+        leaves = [dataclasses.replace(x, **changes) if _has_memory(x) else x for x in leaves]
+        return dataclasses.replace(self, terms=jax.tree.unflatten(tree, leaves))
+
+    def arguments(self, motion: Motion) -> tuple[AnyArray, ...]:
+        """Return the arguments of `columns` at a motion: with the state if friction has memory.
+
+        Where a motion does not have the state, its samples are a path in the order of time.
+        """
+        law, qd, s = self.memory, motion.qd, motion.state
+        if law is None:
+            return motion.q, qd, motion.qdd
+        if s is None:
+            s = law(qd) if qd.ndim == 1 else law.states(motion.q, law(qd[..., 0, :]))
+        return motion.q, qd, motion.qdd, s
+
+    def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints standard"]:
+        r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
+        terms = self.terms if s is None else self.with_memory(state=s).terms
+        return jnp.concatenate([t.columns(self.robot, q, qd, qdd) for t in terms], axis=1)
+
+    def forces(self, p, q, qd, qdd, s=None) -> Joints:
         """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
-        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in self.split(p)))
+        own = self if s is None else self.with_memory(state=s)
+        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in own.split(p)))
 
     def inertia(self, p, q) -> Float[AnyArray, "joints joints"]:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
         return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in self.split(p)))
 
-    def bias(self, p, q, qd) -> Joints:
+    def bias(self, p, q, qd, s=None) -> Joints:
         """Return the bias forces of one sample by definition (Eq. 38)."""
-        return self.forces(p, q, qd, jnp.zeros_like(q))
+        return self.forces(p, q, qd, jnp.zeros_like(q), s)
 
     def acceleration(self, p, q, qd, forces) -> Joints:
         """Return the accelerations of one sample that forces cause (Eq. 38)."""
@@ -141,7 +179,7 @@ class Model(Hashable):
             motion: Joint motion at any number of instants.
         """
         self.check(motion.q)
-        return on_samples(self, self.columns, motion.q, motion.qd, motion.qdd)
+        return on_samples(self, self.columns, *self.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
         r"""Return the stacked regressor $\bar\Theta$ of many samples without its zeros (Eq. 26).
@@ -156,7 +194,7 @@ class Model(Hashable):
                 robot's geometry.
         """
         self.check(motion.q)
-        return PackedRegressor(self, self.columns, motion)
+        return PackedRegressor(self, self.columns, *self.arguments(motion))
 
     def gram(
         self, motion: Motion, weights: Joints | None = None
@@ -169,7 +207,7 @@ class Model(Hashable):
             motion: Joint motion [samples, joints].
             weights: Weight of each joint's rows [1/(N m) or 1/N]; 1 if None.
         """
-        return gram(self, self.columns, motion, weights)
+        return gram(self, self.columns, weights, *self.arguments(motion))
 
     def inverse_dynamics(
         self,
@@ -183,7 +221,7 @@ class Model(Hashable):
             motion: Joint motion at any number of instants.
         """
         self.check(motion.q)
-        return on_samples(self, self.forces, motion.q, motion.qd, motion.qdd, shared=(p,))
+        return on_samples(self, self.forces, *self.arguments(motion), shared=(p,))
 
     def mass_matrix(
         self,

@@ -19,15 +19,18 @@ class Motion(eqx.Module):
         q: Joint coordinates [rad or m].
         qd: Velocities [rad/s or m/s].
         qdd: Accelerations [rad/s² or m/s²].
+        state: States of friction with memory; None where they follow from the path `q`.
     """
 
     q: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
     qd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
     qdd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
+    state: Float[AnyArray, "*batch joints"] | None = None
 
     def __getitem__(self, index) -> "Motion":
         """Return the motion at some of its instants, by an index of the leading axis."""
-        return Motion(self.q[index], self.qd[index], self.qdd[index])
+        state = None if self.state is None else self.state[index]
+        return Motion(self.q[index], self.qd[index], self.qdd[index], state)
 
     @property
     def joints(self) -> int:

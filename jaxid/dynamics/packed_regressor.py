@@ -18,7 +18,6 @@ from jaxid.program import Program, evaluate_packed, lower
 from jaxid.program.blocks import row_products
 
 from .dispatch import FEW, KEPT, program_of
-from .motion import Motion
 
 
 class JointRegressor(eqx.Module):
@@ -91,7 +90,7 @@ def _compiled_gram(regressor: JointRegressor) -> Callable:
 
 
 def gram(
-    owner: eqx.Module, definition: Callable, motion: Motion, weights: AnyArray | None
+    owner: eqx.Module, definition: Callable, weights: AnyArray | None, *arrays: AnyArray
 ) -> Float[Array, "columns columns"]:
     """Return the Gram matrix of a model's columns over a motion; see `Model.gram`.
 
@@ -99,24 +98,21 @@ def gram(
         InputError: If the motion does not have one axis of samples, or JAX is tracing the model's
             own numbers.
     """
-    arrays = motion.q, motion.qd, motion.qdd
-    n = _require_rows(owner, motion)
+    n = _require_rows(owner, arrays[0])
     weights = np.ones(n) if weights is None else as_array("weights", weights)
-    regressor = JointRegressor(owner, definition, (n,), (n,), (n,))
+    regressor = JointRegressor(owner, definition, *((n,) for _ in arrays))
     run = regressor.gram if is_traced(arrays, weights) else _compiled_gram(regressor)
-    return run(jnp.asarray(weights, motion.q.dtype), *arrays)
+    return run(jnp.asarray(weights, arrays[0].dtype), *arrays)
 
 
-def _require_rows(owner: eqx.Module, motion: Motion) -> int:
-    if motion.q.ndim != 2:
-        raise InputError(
-            f"`motion` must have the shape [samples, joints], but has {motion.q.shape}."
-        )
+def _require_rows(owner: eqx.Module, q: AnyArray) -> int:
+    if q.ndim != 2:
+        raise InputError(f"`motion` must have the shape [samples, joints], but has {q.shape}.")
     if is_traced(owner):
         raise InputError(
             "a packed regressor needs a robot whose geometry is known: use `regressor`."
         )
-    return motion.joints
+    return q.shape[1]
 
 
 class PackedRegressor(eqx.Module):
@@ -128,7 +124,7 @@ class PackedRegressor(eqx.Module):
     Args:
         owner: Model.
         definition: Method of the model that returns the regressor of one sample.
-        motion: Joint motion [samples, joints].
+        samples: Arguments of the definition [samples, joints].
 
     Attributes:
         values: Distinct entries that vary with the motion, over the samples.
@@ -147,12 +143,12 @@ class PackedRegressor(eqx.Module):
     samples: int = eqx.field(static=True)
     columns: int = eqx.field(static=True)
 
-    def __init__(self, owner: eqx.Module, definition: Callable, motion: Motion):
-        arrays = [x.T for x in (motion.q, motion.qd, motion.qdd)]
-        _require_rows(owner, motion)
+    def __init__(self, owner: eqx.Module, definition: Callable, *samples: AnyArray):
+        _require_rows(owner, samples[0])
+        arrays = [x.T for x in samples]
         program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
         varying, self.places = _layout(program)
-        self.samples, self.columns = len(motion.q), program.output_shapes[0][1]
+        self.samples, self.columns = len(samples[0]), program.output_shapes[0][1]
         if self.samples > FEW or is_traced(arrays):
             self.values = _compiled(program)(*arrays)
         else:

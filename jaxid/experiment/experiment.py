@@ -24,6 +24,7 @@ from jaxid.identification.filter_and_parameter_selection import (
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.nonlinear_friction import identify_nonlinear
+from jaxid.identification.presliding import identify_presliding, presliding_note
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import AbstractDecimation, AbstractFilter
@@ -123,7 +124,12 @@ class Experiment:
             estimator = NonlinearFriction(chosen.plain)
             found = identify_nonlinear(self.base, logs, estimator, linear=linear, progress=progress)
             return found.better
+        notes = ()
+        if self.model.memory is not None:
+            rows = rows.with_base(identify_presliding(rows.base, logs))
+            notes = (presliding_note(rows.base),)
         fit = fit_problem(rows, chosen.estimator, uncertainty=chosen.uncertainty)
+        fit = dataclasses.replace(fit, notes=(*notes, *fit.notes))
         if self.load_transition is not None:
             return self._with_load_friction(fit, logs)
         if chosen.essential is None:
@@ -135,12 +141,13 @@ class Experiment:
 
     def _with_load_friction(self, fit: Fit, logs: Sequence[Observations]) -> Fit:
         """Fit again with friction by the weight of the bodies found, until it changes no more."""
-        transition, last, count = self.load_transition or Tanh(), np.inf, self.robot.joints
+        terms, last, count = fit.base.model.terms, np.inf, self.robot.joints
+        transition = fit.base.model.memory or self.load_transition or Tanh()
         for _ in range(LOAD_ROUNDS):
             # The first ten columns of each body, whatever follows.
             bodies = np.asarray(fit.full_parameters)[: 10 * count].reshape(count, 10)
             load = LoadFriction(bodies=bodies, transition=transition)
-            model = Model(self.robot, (*self.model.terms, load))
+            model = Model(self.robot, (*terms, load))
             rows = RegressionProblem(base_parameters(model), logs)
             chosen = self.estimation
             fit = fit_problem(rows, chosen.estimator, uncertainty=chosen.uncertainty)
@@ -305,6 +312,8 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         estimation = build_estimation(model, source, folder, bounds, **given)
         if load_transition and not isinstance(estimation.estimator, PhysicallyConsistent):
             raise InputError('`model.load` needs the bodies that `kind = "consistent"` finds.')
+    if estimation.nonlinear and model.memory is not None:
+        raise InputError("give `coulomb.presliding` or `nonlinear_friction`, but not both.")
     clearance, tool = None, None
     if "collision" in content:
         shapes = call(Collision, content["collision"], "collision")

@@ -51,6 +51,8 @@ class DryFriction:
         dead_zone: Speed below which there is no dry friction [rad/s or m/s]; or a list.
         hard: Whether to take a sign instead of tanh(speed / epsilon).
         asymmetric: Whether each direction has a level of its own (then there is no `offset`).
+        presliding: Whether friction has memory: it builds up along a path, whose length is found
+            from the logs, and rest keeps it.
         stribeck: Speed about which friction falls from a static level [rad/s or m/s], like `0.1`;
             or a list.
     """
@@ -59,10 +61,14 @@ class DryFriction:
     dead_zone: Magnitude | list[Magnitude] = 0.0
     hard: bool = False
     asymmetric: bool = False
+    presliding: bool = False
     stribeck: Positive | list[Positive] | None = None
 
     def transition(self, robot: Robot) -> terms.AbstractTransition:
         """Return the transition between the directions."""
+        if self.presliding:
+            steady = dataclasses.replace(self, presliding=False).transition(robot)
+            return terms.Presliding(steady=steady)
         dead_zone = _speed(robot, "coulomb.dead_zone", self.dead_zone)
         if self.hard:
             return terms.HardSign(dead_zone)

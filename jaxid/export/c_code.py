@@ -65,7 +65,8 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
     """Return all functions of a model, with its estimates as constants."""
     model, base = fit.base.model, fit.base
     one, rest = (model.robot.joints,), np.zeros(model.robot.joints)
-    torque, others = torques(fit), other_forces(fit)
+    torque, others, law = torques(fit), other_forces(fit), model.memory
+    relaxed = None if law is None else rest
     # Only the base parameters: composite bodies have fewer operations then.
     own = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
 
@@ -73,11 +74,11 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
         "torque": ("Feed-forward torques on base parameters (Eq. 39, factored)", torque),
         "torque_of_parameters": (
             "The same for given base parameters p, as Theta_B p (Eq. 39)",
-            lambda q, qd, qdd, p: base.columns(q, qd, qdd) @ p,
+            lambda q, qd, qdd, p, s=None: base.columns(q, qd, qdd, s) @ p,
         ),
         "torque_of_masses": (
             "The same as M qdd + h, with M by composite bodies (Eq. 38)",
-            lambda q, qd, qdd: model.inertia(own, q) @ qdd + model.bias(own, q, qd),
+            lambda q, qd, qdd, s=None: model.inertia(own, q) @ qdd + model.bias(own, q, qd, s),
         ),
         "mass_matrix": (
             "Mass matrix M, rotors included, row by row (Eq. 38)",
@@ -85,22 +86,25 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
         ),
         "bias": (
             "Forces h without accelerations: Coriolis, gravity, friction (Eq. 38)",
-            lambda q, qd: torque(q, qd, rest),
+            lambda q, qd, s=None: torque(q, qd, rest, s),
         ),
         "gravity": (
             "Forces at rest: gravity, springs, offsets",
-            lambda q: torque(q, rest, rest),
+            lambda q: torque(q, rest, rest, relaxed),
         ),
         "friction": (
             "Friction: the forces that motion adds to those at rest",
-            lambda q, qd: others(q, qd, rest) - others(q, rest, rest),
+            lambda q, qd, s=None: others(q, qd, rest, s) - others(q, rest, rest, relaxed),
         ),
         "regressor": ("Base regressor Theta_B, row by row (Eq. 23)", base.columns),
     }
-    outputs = {"mass_matrix": "m", "bias": "h", "regressor": "theta"}
+    if law is not None:
+        functions["advance"] = "State of dry friction behind a step of the joints", law.advance
+    outputs = {"mass_matrix": "m", "bias": "h", "regressor": "theta", "advance": "s_next"}
     written = []
     for name, (summary, function) in functions.items():
-        inputs = tuple(inspect.signature(function).parameters)
+        inputs = (x for x in inspect.signature(function).parameters if x != "s" or law)
+        inputs = tuple(inputs)
         program = trace(function, *((base.size,) if x == "p" else one for x in inputs))
         written.append(CFunction(name, summary, program, inputs, outputs.get(name, "tau")))
     return tuple(written)
@@ -114,6 +118,12 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
         for j, turns in enumerate(robot.revolute)
     )
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
+    memory = ""
+    if fit.base.model.memory is not None:
+        memory = f"""
+   s: state of dry friction, one number between -1 and 1 for each joint, which the caller keeps.
+   Begin with zeros, and call {name}_advance(q_before, q, s, s) at every sample, before the others.
+"""
     terms = _ascii(", ".join(type(t).__name__ for t in fit.base.model.terms))
     prototypes = []
     for x in functions:
@@ -137,8 +147,8 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
 
    q, qd, qdd: positions, velocities and accelerations [rad or m, per s, per s^2].
    tau: generalised forces on the side of the joints [N m or N], without a known tool.
-
-   Nothing is allocated, there is no state and no branch on data: every call takes the same time,
+{memory}
+   Nothing is allocated, nothing remembered, and no branch on data: every call takes the same time,
    and functions can be called from any thread. All inputs are read before an output is written.
    Numbers that are not finite, and angles beyond {writer.turns:.0f} turns, give NaN.
 
@@ -202,7 +212,8 @@ def _self_test(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> s
     """Return a C program that compares all functions with their results in Python."""
     name, kind, n, samples = writer.prefix, writer.type, fit.base.model.robot.joints, 4
     random = np.random.default_rng(0)
-    states = {x: np.round(random.uniform(-2.0, 2.0, (samples, n)), 3) for x in ("q", "qd", "qdd")}
+    used = dict.fromkeys(x for f in functions for x in f.inputs if x != "p")
+    states = {x: np.round(random.uniform(-2.0, 2.0, (samples, n)), 3) for x in used}
     given = {**states, "p": np.tile(np.asarray(fit.parameters, np.float64), (samples, 1))}
     tables, calls = [_table(f"{name}_{x}", writer, rows) for x, rows in states.items()], []
     for function in functions:

@@ -39,7 +39,8 @@ def joint_dynamics(
         the names of the parameters in `armature`; and the names of those in none of the three.
     """
     model = fit.base.model
-    robot, total, rotors, left_out = model.robot, np.zeros((3, model.robot.joints)), [], []
+    robot, total, rotors = model.robot, np.zeros((3, model.robot.joints)), []
+    left_out = [] if model.memory is None else ["the memory of dry friction"]
     for term, p in model.split(fit.standard_parameters):
         if term.body_parameters:
             continue

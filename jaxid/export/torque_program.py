@@ -186,12 +186,12 @@ def body_parameters(
 def other_forces(fit: Fit) -> Callable[..., Any]:
     """Return the function of one sample that gives the forces of all terms but the bodies."""
     model = fit.base.model
-    parts = [part for part in model.split(fit.standard_parameters) if not part[0].body_parameters]
 
-    def forces(q, qd, qdd):
-        total = jnp.zeros_like(q)
-        for term, own in parts:
-            total = total + term.forces(model.robot, own, q, qd, qdd)
+    def forces(q, qd, qdd, s=None):
+        total, given = jnp.zeros_like(q), model if s is None else model.with_memory(state=s)
+        for term, own in given.split(fit.standard_parameters):
+            if not term.body_parameters:
+                total = total + term.forces(model.robot, own, q, qd, qdd)
         return total
 
     return forces
@@ -202,33 +202,35 @@ def torques(fit: Fit) -> Callable[..., Any]:
     model = fit.base.model
     bodies = body_parameters(model, fit.standard_parameters)
     description, others = simplest_description(model.robot, bodies), other_forces(fit)
-    return lambda q, qd, qdd: description.forces(q, qd, qdd) + others(q, qd, qdd)
+    return lambda q, qd, qdd, s=None: description.forces(q, qd, qdd) + others(q, qd, qdd, s)
 
 
 def torque_program(fit: Fit) -> Program:
     """Return the program of the feed-forward on base parameters (Eq. 39)."""
-    one = (fit.base.model.robot.joints,)
-    return trace(torques(fit), one, one, one)
+    inputs = 3 if fit.base.model.memory is None else 4
+    return trace(torques(fit), *[(fit.base.model.robot.joints,)] * inputs)
 
 
 def exported_function(fit: Fit) -> export.Exported:
     """Return the forces of any number of samples as an exported function of JAX (Eq. 39).
 
     `exported.call(q, qd, qdd)` takes arrays [samples, joints] of float64 and returns forces of the
-    same shape; `exported.serialize()` gives bytes that `jax.export.deserialize` reads elsewhere.
+    same shape (with friction that has memory also its states, as `Presliding.states` gives them);
+    `exported.serialize()` gives bytes that `jax.export.deserialize` reads elsewhere.
 
     Args:
         fit: Identified model.
     """
-    lowered = lower(torque_program(fit))
+    program = torque_program(fit)
+    lowered = lower(program)
     joints = fit.base.model.robot.joints
 
     # One sample at a time, since the number of samples is not known here.
     on_samples = jax.jit(jax.vmap(lambda *sample: lowered.dense(*sample)))
     with double_precision():
         (samples,) = export.symbolic_shape("samples")
-        shape = jax.ShapeDtypeStruct((samples, joints), np.float64)
-        return export.export(on_samples, platforms=("cpu", "cuda"))(shape, shape, shape)
+        shapes = [jax.ShapeDtypeStruct((samples, joints), np.float64)] * len(program.input_shapes)
+        return export.export(on_samples, platforms=("cpu", "cuda"))(*shapes)
 
 
 def export_jax(fit: Fit, path: str | Path) -> Path:

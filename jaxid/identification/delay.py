@@ -232,7 +232,8 @@ def without_delay(observations: Observations, seconds: float) -> Observations:
     lost = math.ceil(abs(seconds) / dt - 1e-9)
     edge = observations.filter.edge(dt)
     mask, instants = np.array(observations.mask), observations.instants
-    motion = Motion(*(np.array(x, np.float64) for x in vars(observations.motion).values()))
+    given = observations.motion
+    motion = Motion(*(np.array(x, np.float64) for x in (given.q, given.qd, given.qdd)))
     for (a, b), (r0, r1) in zip(observations.segments, observations.row_segments, strict=True):
         # Beyond the ends the nearest motion is used, in rows that do not count.
         at = np.clip(time[a:b] - seconds, time[a], time[b - 1])

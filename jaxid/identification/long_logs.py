@@ -156,8 +156,8 @@ class _Stream:
             for h, f in stages
         ]
         self._devices = jax.local_devices(backend="cpu")
-        n = (base.model.robot.joints,)
-        columns = program_of(base, base.columns, n, n, n)
+        inputs = 3 if base.model.memory is None else 4
+        columns = program_of(base, base.columns, *[(base.model.robot.joints,)] * inputs)
         self._loop = _compiled(columns, tuple(base.acting_columns), self._shape)
         segments = range(len(observations.segments))
         self._pieces = [piece for k in segments for piece in self._divide(k)]
@@ -271,9 +271,10 @@ class _Stream:
         # The first rows come late, and do not count.
         mask = np.pad(self._mask[slice(*piece[1])], ((shape.delay, 0), (0, 0)))
         length = shape.iterations * shape.samples
+        together = np.hstack([np.asarray(x) for x in self._base.model.arguments(motion)])
         arrays = [
             _filled_up(np.asarray(x, np.float64), length)
-            for x in (motion.q, motion.qd, motion.qdd, without_tool(self._base, motion, forces))
+            for x in (together, without_tool(self._base, motion, forces))
         ]
         arrays.append(_filled_up(mask, shape.iterations * shape.rows))
         return [*arrays, np.asarray(-(-len(mask) // shape.rows), np.int32)]
@@ -347,15 +348,15 @@ def _compiled(
     ]
     height = len(first) + joints
 
-    def evaluate(q: Array, qd: Array, qdd: Array, forces: Array) -> list[Array]:
-        packed = base_columns(q, qd, qdd)
-        columns = [jnp.broadcast_to(jnp.asarray(packed[i], float), q.shape[1:]) for i in first]
+    def evaluate(motion: Array, forces: Array) -> list[Array]:
+        packed = base_columns(*jnp.split(motion, len(motion) // joints))
+        columns = [jnp.broadcast_to(jnp.asarray(packed[i], float), motion.shape[1:]) for i in first]
         return columns + list(forces)
 
-    def run(q, qd, qdd, forces, mask, count, mixing, matrices) -> list[Array]:
+    def run(motion, forces, mask, count, mixing, matrices) -> list[Array]:
         def iteration(k: Array, state: tuple) -> tuple:
             carried, grams = state
-            parts = [_part(x, k, shape.samples) for x in (q, qd, qdd, forces)]
+            parts = [_part(x, k, shape.samples) for x in (motion, forces)]
             # Results of a branch are stored: no consumer computes them again.
             columns = jax.lax.cond(count > 0, evaluate, lambda *_: nothing, *parts)
             new = jnp.stack(columns)
@@ -398,4 +399,4 @@ def _part(x: AnyArray, k: Array, length: int) -> Array:
 @functools.lru_cache(maxsize=16)
 def _on_devices(run: Callable, devices: tuple) -> Callable:
     """Return the loop for one piece on each device, compiled once for all."""
-    return jax.pmap(run, in_axes=(*(0,) * 6, None, None), devices=devices)
+    return jax.pmap(run, in_axes=(*(0,) * 4, None, None), devices=devices)

@@ -92,6 +92,8 @@ def identify_batch(
         None if mask is None else jnp.asarray(mask, float),
         None,
     )
+    if base.model.memory is not None and estimator is None:
+        raise InputError("friction with memory needs one data set at a time: give an `estimator`.")
     if estimator is not None:
         fit = _estimate_each(base, batch, estimator, row_time)
     else:

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
+from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot
 
@@ -60,7 +61,9 @@ class RegressionProblem:
     ):
         self.base, self.progress = base, progress
         alone = isinstance(recordings, Observations)
-        self.recordings = (recordings,) if alone else tuple(recordings)
+        given = (recordings,) if alone else tuple(recordings)
+        law = base.model.memory
+        self.recordings = tuple(with_memory(o, law) for o in given)
         own = (o.name for o in self.recordings)
         self.names = tuple(own if names is None else names)
         self._given = blocks

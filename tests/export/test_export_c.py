@@ -1,5 +1,6 @@
 """The C code against NumPy on the same model, against itself, and against its own promises."""
 
+import itertools
 import re
 import shutil
 import subprocess
@@ -13,7 +14,7 @@ from export_samples import fit_of, motion, possible
 import jaxid as jid
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
-from jaxid.export.torque_program import torque_program
+from jaxid.export.torque_program import exported_function, torque_program
 
 pytestmark = pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler (gcc)")
 STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror", "-O1"]
@@ -175,3 +176,43 @@ def test_numbers_that_are_not_finite_give_nan(compiled, fit):
         q[0, 2] = bad
         found = compiled.torque(q, np.zeros((1, n)), np.zeros((1, n)))
         assert np.isnan(found).any()
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_friction_with_memory_follows_the_path_in_c_as_in_numpy(tmp_path, double):
+    law = jid.terms.Presliding(length=np.array([3e-2, 0.1]))
+    dry = (jid.CoulombFriction(law), jid.terms.SquareRootFriction(law))
+    model = jid.Model(jid.robots.planar_arm(2, 0.4), (jid.RigidBodies(), *dry))
+    fit = fit_of(model, possible(model))
+    t = np.linspace(0.0, 6.0, 400)[:, None]
+    q = np.sin(t * [1.1, 2.3]) * np.minimum(t, 3.0)  # ends with a slow part
+    q[200:260] = q[200]
+    m = jid.Motion(q, np.gradient(q, 0.015, axis=0), np.cos(3 * t) * [2.0, 1.0])
+    wanted = fit.predict(m)
+    compiled = CompiledModel(fit, double=double, flags=["-O1"])
+    s = [np.tanh(m.qd[:1] / 0.01)]
+    for before, now in itertools.pairwise(q):
+        s.append(compiled.advance(before[None], now[None], s[-1]))
+    s, p = np.concatenate(s), np.tile(np.asarray(fit.parameters), (len(q), 1))
+    tolerance = 1e-12 if double else 2e-4
+    for found in (
+        compiled.torque(q, m.qd, m.qdd, s),
+        compiled.torque_of_parameters(q, m.qd, m.qdd, p, s),
+        compiled.torque_of_masses(q, m.qd, m.qdd, s),
+        compiled.bias(q, m.qd, s)
+        + compiled.torque(q, m.qd, m.qdd, s)
+        - compiled.torque(q, m.qd, 0 * q, s),
+    ):
+        close(found, wanted, tolerance)
+    # At rest dry friction holds what the path has left.
+    held = compiled.torque(q, 0 * q, 0 * q, s) - compiled.gravity(q)
+    levels = [fit.base.names.index(f"fc{j}") for j in (1, 2)]
+    close(held, np.asarray(fit.parameters)[levels] * s, max(tolerance, 1e-3))
+    source = jid.export_c(fit, tmp_path, double=double)
+    assert "arm_advance(q_before, q, s, s)" in (tmp_path / "arm.h").read_text()
+    command = ["gcc", "-std=c99", *STRICT, "-DARM_SELF_TEST", str(source), "-lm"]
+    subprocess.run([*command, "-o", str(tmp_path / "check")], check=True)
+    subprocess.run([str(tmp_path / "check")], check=True, capture_output=True)
+    if double:
+        out = exported_function(fit).call(q, m.qd, m.qdd, s)
+        close(out, wanted)

@@ -15,6 +15,7 @@ from .friction import (
     CoupledDrives as CoupledDrives,
     HardSign as HardSign,
     LoadFriction as LoadFriction,
+    Presliding as Presliding,
     Reversal as Reversal,
     SquareRootFriction as SquareRootFriction,
     StribeckFriction as StribeckFriction,

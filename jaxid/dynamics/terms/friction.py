@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Joints, matching, one_or_each
+from jaxid.arrays import AnyArray, Float, Hashable, Joints, matching, namespace, one_or_each
 from jaxid.dynamics import projection_equation
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES
@@ -74,6 +74,57 @@ class HardSign(AbstractTransition):
     def __call__(self, qd):
         """Return the sign of the speed."""
         return _outside_dead_zone(self.dead_zone, qd, jnp.sign(qd))
+
+
+class Presliding(AbstractTransition):
+    r"""Dry friction with memory: a state that follows the motion, and that rest keeps.
+
+    A joint deforms its contacts before it slides: the state $s$ between -1 and 1 obeys Dahl's law
+    $\mathrm{d}s = (\mathrm{d}q - s\,|\mathrm{d}q|) / \delta$ (Dahl, AIAA Journal 14(12), 1976).
+    It depends on the path alone, not on time. Where no path is known, as at single samples and in
+    the design of motions, the state is that of steady motion.
+
+    Attributes:
+        length: Length $\delta$ of the deformation, one for all joints or one for each [rad or m].
+        steady: Transition that gives the state of steady motion, and that at the start of a path.
+        state: State at one sample, where it is known.
+    """
+
+    length: EachJoint = eqx.field(converter=one_or_each, default=1e-3)
+    steady: AbstractTransition = Tanh()
+    state: Joints | None = None
+
+    def __check_init__(self):
+        if not isinstance(self.length, jax.Array) and not np.all(np.asarray(self.length) > 0):
+            raise InputError(f"`length` must be positive, but is {self.length}.")
+
+    def __call__(self, qd):
+        """Return the state: where it is not known, that of steady motion."""
+        return self.steady(qd) if self.state is None else self.state
+
+    def advance(self, q_before: Joints, q: Joints, s: Joints) -> Joints:
+        """Return the state behind a step of one direction [rad or m], from that before it."""
+        way = jnp.sign(q - q_before)
+        kept = jnp.exp(-jnp.abs(q - q_before) / matching("length", self.length, q))
+        return way + (s - way) * kept
+
+    def states(
+        self, q: Float[AnyArray, "*batch samples joints"], start: Float[AnyArray, "*batch joints"]
+    ) -> Float[AnyArray, "*batch samples joints"]:
+        """Return the states along a path, from that at its first sample."""
+        xp = namespace(q)
+        change = xp.diff(xp.moveaxis(q, -2, 0), axis=0)
+        length = xp.broadcast_to(xp.asarray(self.length), change.shape)
+        kept = xp.exp(-xp.abs(change) / length)
+        s = xp.concatenate([xp.asarray(start)[None], xp.sign(change) * (1 - kept)])
+        kept = xp.concatenate([xp.zeros_like(s[:1]), kept])
+        reach = 1
+        # Each turn joins twice as many steps to one, which is affine in the state before it.
+        while reach < len(s):
+            s = xp.concatenate([s[:reach], s[reach:] + kept[reach:] * s[:-reach]])
+            kept = xp.concatenate([kept[:reach], kept[reach:] * kept[:-reach]])
+            reach *= 2
+        return xp.moveaxis(s, 0, -2)
 
 
 class Reversal(AbstractTransition):
@@ -353,7 +404,7 @@ class CoupledDrives(AbstractTerm):
 
     Attributes:
         transition: Transition of the Coulomb friction, at speeds measured on the side of the
-            motor's own joint [rad/s or m/s].
+            motor's own joint [rad/s or m/s]; the `steady` one of `Presliding`.
     """
 
     transition: AbstractTransition = Tanh()
@@ -403,7 +454,7 @@ class CoupledDrives(AbstractTerm):
             r = ratios.astype(qd.dtype)
             # The motor's speed takes the place of its joint's, whose transition width it has.
             speeds = jnp.stack([jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))])
-            dry.append(r * self.transition(speeds)[i])
+            dry.append(r * getattr(self.transition, "steady", self.transition)(speeds)[i])
         return jnp.stack([*inertia, *viscous, *dry], axis=1)
 
     def lower_bounds(self, robot):

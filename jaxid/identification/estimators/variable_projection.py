@@ -143,6 +143,8 @@ def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
     Raises:
         InputError: If there are none.
     """
+    if base.model.memory is not None:
+        raise InputError("shapes are not searched for beside `Presliding`: take `Tanh`.")
     members = []
     for i, term in enumerate(base.model.terms):
         for shape in term.nonlinear_parameters:
