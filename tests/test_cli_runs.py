@@ -257,7 +257,7 @@ def test_a_model_is_chosen_and_its_file_identifies(shop, run, monkeypatch):  # n
 PRESLIDING = SPATIAL.replace("[recording]", "[model.coulomb]\npresliding = true\n[recording]")
 
 
-def test_friction_with_memory_from_the_choice_to_the_report(shop, run, words, monkeypatch):  # noqa: F811
+def test_friction_with_memory_from_the_log_to_the_report(shop, run, words):  # noqa: F811
     (shop / "memory.toml").write_text(PRESLIDING)
     model = load_experiment("memory.toml").model.with_memory(length=0.05)
     p, t = np.random.default_rng(0).uniform(0.2, 1.0, model.size), np.arange(0.0, 20.0, 0.005)
@@ -269,11 +269,7 @@ def test_friction_with_memory_from_the_choice_to_the_report(shop, run, words, mo
     forces = forces + np.random.default_rng(1).normal(0.0, 0.03, forces.shape)
     table, header = np.column_stack([t, motion.q, forces]), "t,q1,q2,q3,tau1,tau2,tau3"
     np.savetxt("memory.csv", table, "%.7f", ",", header=header, comments="")
-    monkeypatch.setattr(choose, "EFFECTS", {"presliding": choose.EFFECTS["presliding"]})
-    out = words("choose", "experiment.toml", "memory.csv", "-o", "chosen.toml")
-    assert "`viscous, dry + presliding` is the simplest model" in out
-    assert load_experiment("chosen.toml").model.memory is not None
-    said = words("identify", "chosen.toml", "memory.csv", "-o", "report", "--split", "0.6")
+    said = words("identify", "memory.toml", "memory.csv", "-o", "report", "--split", "0.6")
     fit = jid.load("report/model.json")
     np.testing.assert_allclose(fit.base.model.memory.length, 0.05, rtol=0.1)
     shown = re.findall(r"joint\d (0\.\d+) rad", said[said.index("lengths of presliding") :])

@@ -20,7 +20,6 @@ Changes = dict[str, dict[str, Any]]
 EFFECTS: dict[str, Changes] = {
     "root of speed": {"model": {"square_root": True}},
     "Stribeck": {"model": {"coulomb": {"stribeck": 0.1}}},
-    "presliding": {"model": {"coulomb": {"presliding": True}}},
     "viscous by direction": {"model": {"viscous": "asymmetric"}},
     "springs": {"model": {"springs": True}},
 }
@@ -70,8 +69,7 @@ def _variants(content: dict[str, Any]) -> Iterator[tuple[str, Changes]]:
             for name in names:
                 for key, value in EFFECTS[name]["model"].items():
                     inner = changes.setdefault("model", {})
-                    before = inner.get(key, given.get(key, {}))
-                    inner[key] = {**before, **value} if key == "coulomb" else value
+                    inner[key] = {**given.get(key, {}), **value} if key == "coulomb" else value
             yield " + ".join((PLAIN, *names)), changes
     for name, own in ESTIMATORS.items():
         yield f"{PLAIN}, {name}", own

@@ -15,7 +15,6 @@ from jaxid.result_table import Column, Remark, Status, Table, percent
 
 from .estimators import AbstractEstimator, WeightedLeastSquares
 from .factors import Blocks
-from .presliding import LENGTHS, best_of, blocks_with, pick
 from .problem import RegressionProblem
 
 FOLDS = 5
@@ -124,10 +123,8 @@ def choose_model(
     total = float(np.mean([weights @ fold.total.force_squares for fold in folds]))
     tables = []
     for number, candidate in enumerate(candidates):
-        memory = candidate.base.model.memory is not None
-        lengths = LENGTHS if memory else [None] * (number > 0)
-        each = [_folds(candidate.base, logs, by_log, length) for length in lengths]
-        tables.append(_held_out_squares(candidate, each or [folds], weights) / total)
+        folds = folds if number == 0 else _folds(candidate.base, logs, by_log)
+        tables.append(_held_out_squares(candidate, folds, weights) / total)
         if progress is not None:
             progress((number + 1) / len(candidates))
     table = np.array(tables)
@@ -148,16 +145,11 @@ def choose_model(
     )
 
 
-def _folds(base: BaseParameters, logs, by_log: bool, length=None) -> list[Blocks]:
+def _folds(base: BaseParameters, logs: Sequence[Observations], by_log: bool) -> list[Blocks]:
     """Return the factors of the parts that are left out in turn."""
-
-    def blocks_of(own: Sequence[Observations]) -> Blocks:
-        problem = RegressionProblem(base, own)
-        return problem.blocks if length is None else blocks_with(problem, length)
-
     if by_log:
-        return [blocks_of([log]) for log in logs]
-    blocks = blocks_of(logs)
+        return [RegressionProblem(base, [log]).blocks for log in logs]
+    blocks = RegressionProblem(base, logs).blocks
     count = len(blocks.parts)
     if count < 3:
         raise InputError("a choice of models needs at least three blocks of rows: record longer.")
@@ -168,24 +160,16 @@ def _joined(folds: Sequence[Blocks]) -> Blocks:
     return Blocks(tuple(itertools.chain(*(fold.parts for fold in folds))))
 
 
-def _held_out_squares(
-    candidate: Candidate, each: list[list[Blocks]], weights: np.ndarray
-) -> np.ndarray:
+def _held_out_squares(candidate: Candidate, folds: list[Blocks], weights: np.ndarray) -> np.ndarray:
     """Return the squared errors on the second part of fits without both [parts, parts].
 
-    On the diagonal only that part was left out. Each joint has the length of presliding, if there
-    is one, that suits the other parts best.
+    On the diagonal only that part was left out.
     """
-    count, found = len(each[0]), np.zeros((len(each[0]),) * 2)
-    totals = [[Blocks((fold.total,)) for fold in folds] for folds in each]
-    for i, k in itertools.combinations_with_replacement(range(count), 2):
-        kept = [n for n in range(count) if n not in (i, k)]
-        rest = [_joined([folds[n] for n in kept]) for folds in each]
-        best = best_of([_joined([own[n] for n in kept]) for own in totals])
-        rows = RegressionProblem(candidate.base, blocks=pick(rest, best))
-        p = candidate.estimator(rows).parameters
-        parts = (pick([own[n] for own in totals], best).total for n in (k, i))
-        found[i, k], found[k, i] = (weights @ part.residual_squares(p) for part in parts)
+    found = np.zeros((len(folds), len(folds)))
+    for i, k in itertools.combinations_with_replacement(range(len(folds)), 2):
+        rest = [fold for number, fold in enumerate(folds) if number not in (i, k)]
+        p = candidate.estimator(RegressionProblem(candidate.base, blocks=_joined(rest))).parameters
+        found[i, k], found[k, i] = (weights @ folds[n].total.residual_squares(p) for n in (k, i))
     return found
 
 

@@ -11,7 +11,7 @@ from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations
 
-from .factors import Blocks, Factors
+from .factors import Blocks
 from .problem import RegressionProblem
 
 LENGTHS = 3.0 ** np.arange(-9, 0)
@@ -68,15 +68,6 @@ def best_of(blocks: Sequence[Blocks]) -> list[int]:
     # What they leave unexplained stands last in the triangle.
     left = [[abs(joint.R[-1, -1]) for joint in x.total.joints] for x in blocks]
     return np.argmin(left, axis=0).tolist()
-
-
-def pick(blocks: Sequence[Blocks], best: Sequence[int]) -> Blocks:
-    """Return the factors of each joint from those that are best for it."""
-    parts = []
-    for part in zip(*(x.parts for x in blocks), strict=True):
-        joints = tuple(part[k].joints[j] for j, k in enumerate(best))
-        parts.append(Factors(joints, part[0].size))
-    return Blocks(tuple(parts))
 
 
 def presliding_note(base: BaseParameters) -> str:

@@ -165,7 +165,7 @@ def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> 
     def transform(rows: np.ndarray) -> np.ndarray:
         """Return real and imaginary parts of each line, weighted by how often it counts."""
         found = np.asarray(fft.rfft(rows, n, axis=0))[:last]
-        return scale * np.stack([found.real, found.imag])
+        return scale * np.stack([np.real(found), np.imag(found)])
 
     for c, parts in enumerate(zip(*pieces, strict=True)):
         own = list(parts[0].columns)
