@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Program, evaluate_packed, lower
+from jaxid.program import Lowered, Program, evaluate_packed, lower, on_any_platform
 from jaxid.program.blocks import row_products
 
 from .dispatch import FEW, KEPT, program_of
@@ -188,10 +188,10 @@ def _layout(program: Program) -> tuple[list[int], tuple]:
 
 @functools.lru_cache(maxsize=KEPT)
 def _compiled(program: Program) -> Callable:
-    lowered, (varying, _) = lower(program), _layout(program)
+    varying, _ = _layout(program)
 
-    def run(*arrays: AnyArray) -> tuple:
+    def run(lowered: Lowered, *arrays: AnyArray) -> tuple:
         outputs = lowered(*arrays)
         return tuple(outputs[k] for k in varying)
 
-    return jax.jit(run)
+    return jax.jit(functools.partial(on_any_platform, program, run))

@@ -153,9 +153,11 @@ def map_starts(function: Callable, *arguments: Any) -> Any:
 
     There the matrices of one start stay in the cache, and its products are not loops of XLA.
     """
-    if jax.default_backend() == "cpu":
+
+    def one_by_one(*arguments: Any) -> Any:
         return jax.lax.map(lambda one: function(*one), arguments)
-    return jax.vmap(function)(*arguments)
+
+    return jax.lax.platform_dependent(*arguments, cpu=one_by_one, default=jax.vmap(function))
 
 
 def _begin_stage(grid: Grid, stage: Stage, one: State) -> State:

@@ -11,6 +11,7 @@ description is chosen that leaves few operations:
 """
 
 import dataclasses
+import functools
 import importlib.util
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -28,7 +29,7 @@ from jaxid.dynamics.model import Model
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters, pseudo_inertia
 from jaxid.identification.fit_result import Fit
 from jaxid.io import write_bytes
-from jaxid.program import Program, lower, trace
+from jaxid.program import Lowered, Program, on_any_platform, trace
 from jaxid.robot.robot import Robot
 
 
@@ -222,11 +223,11 @@ def exported_function(fit: Fit) -> export.Exported:
         fit: Identified model.
     """
     program = torque_program(fit)
-    lowered = lower(program)
     joints = fit.base.model.robot.joints
 
     # One sample at a time, since the number of samples is not known here.
-    on_samples = jax.jit(jax.vmap(lambda *sample: lowered.dense(*sample)))
+    one = functools.partial(on_any_platform, program, Lowered.dense)
+    on_samples = jax.jit(jax.vmap(one))
     with double_precision():
         (samples,) = export.symbolic_shape("samples")
         shapes = [jax.ShapeDtypeStruct((samples, joints), np.float64)] * len(program.input_shapes)

@@ -22,4 +22,5 @@ from .trace import FREE as FREE, trace as trace
 from .xla import (
     Lowered as Lowered,
     lower as lower,
+    on_any_platform as on_any_platform,
 )

@@ -193,17 +193,21 @@ def primitives(like: Array) -> dict[Operation, Callable]:
 
 
 @functools.lru_cache(maxsize=64)
-def lower(program: Program, fence: bool | None = None) -> Lowered:
+def lower(program: Program, fence: bool = True) -> Lowered:
     """Prepare a program for JAX arrays.
 
     Args:
         program: Program made by `trace`.
-        fence: Whether fences stand behind shared values; by default on a CPU. On a GPU they would
-            break the program into many kernels, and float64 divisions are slow.
+        fence: Whether fences stand behind shared values. On a GPU they would break the program into
+            many kernels, and float64 divisions are slow.
     """
-    if fence is None:
-        fence = jax.default_backend() == "cpu"
     return Lowered(program, fence, fenced_nodes(program) if fence else frozenset())
+
+
+def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> Any:
+    """Return `evaluate(lowered, *arrays)`, with fences where it runs on a CPU."""
+    fenced, plain = (functools.partial(evaluate, lower(program, fence)) for fence in (True, False))
+    return jax.lax.platform_dependent(*map(jnp.asarray, arrays), cpu=fenced, default=plain)
 
 
 @jax.custom_jvp

@@ -400,6 +400,9 @@ def consistent_batch(
 
 @functools.partial(jax.jit, static_argnums=0)
 def _solve_many(one: ConsistentSolver, R: Array, z: Array, rows: Array) -> ConsistentBatch:
+    def solve(together: int | None, *data: Array) -> ConsistentBatch:
+        return jax.lax.map(lambda x: one(*x), data, batch_size=together)
+
     # A core gains nothing from solving data sets in step: it waits for the slowest.
-    together = None if jax.default_backend() == "cpu" else 256
-    return jax.lax.map(lambda x: one(*x), (R, z, rows), batch_size=together)
+    alone, in_step = functools.partial(solve, None), functools.partial(solve, 256)
+    return jax.lax.platform_dependent(R, z, rows, cpu=alone, default=in_step)
