@@ -16,13 +16,7 @@ from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, Progress
 
 from .estimators.regularisation_and_weights import Decomposition
-from .estimators.variable_projection import (
-    NonlinearFriction,
-    SeparableProblem,
-    Shapes,
-    project,
-    search_shapes,
-)
+from .estimators.variable_projection import NonlinearFriction, Shapes, ShapeSearch
 from .fit_result import Fit
 from .identify import fit_problem
 from .problem import RegressionProblem
@@ -122,8 +116,8 @@ def identify_nonlinear(
     before = fit_problem(linear_problem, estimator.linear)
     weights = np.asarray(before.weights)
     problem = linear_problem.with_base(base)
-    separable, x, notes = estimator.search(problem, weights)
-    shapes, size = separable.shapes, base.size
+    search, x, notes = estimator.search(problem, weights)
+    shapes, size = search.shapes, base.size
     shaped = shapes.set(base, x)
     fit = fit_problem(problem.with_base(shaped), estimator.linear)
     # Small changes of the shapes are further parameters.
@@ -146,13 +140,13 @@ def identify_nonlinear(
         shapes=x,
         shape_covariance=both.covariance[size:, size:],
         linear=before,
-        held_out=_held_out_errors(linear_problem.blocks, separable, x, weights, progress),
+        held_out=_held_out_errors(linear_problem.blocks, search, x, weights, progress),
     )
 
 
 def _held_out_errors(
     blocks,
-    problem: SeparableProblem,
+    search: ShapeSearch,
     found,
     weights,
     progress,
@@ -163,13 +157,13 @@ def _held_out_errors(
     for out in folds:
         rest = np.setdiff1d(every, out)
         p = Decomposition.of(*blocks.select(rest).total.weighted(weights)).solve()
-        x, _ = search_shapes(problem, weights, problem.shapes.values, found, rest)
-        shaped = problem.blocks(x)
-        c = np.zeros(problem.size)
-        c[: problem.base.size] = project(problem, shaped.select(rest).total, weights)[0]
-        tests = blocks.select(out).total, shaped.select(out).total
-        own = [t.residual_squares(y) for t, y in zip(tests, (p, c), strict=True)]
-        errors.append([squares @ y for y in (*own, tests[0].force_squares)])
+        kept = np.isin(every, rest).astype(float)
+        x, _ = eqx.filter_jit(search)(weights, found, kept)
+        _, left = eqx.filter_jit(search.fit)(x, search.row_weights(weights, kept))
+        nonlinear = np.sum((search.row_weights(weights, 1.0 - kept) * left) ** 2)
+        test = blocks.select(out).total
+        linear, forces = (squares @ y for y in (test.residual_squares(p), test.force_squares))
+        errors.append([linear, nonlinear, forces])
         if progress is not None:
             progress(len(errors) / len(folds))
     linear, nonlinear, forces = np.array(errors).T

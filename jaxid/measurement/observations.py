@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import AnyArray, Bool, Float
+from jaxid.arrays import AnyArray, Bool, Float, namespace
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
@@ -234,18 +234,18 @@ class Observations(eqx.Module):
         """Return motion and forces of some samples of one segment."""
         return self.source.read(samples)
 
-    def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Float[np.ndarray, "rows *columns"]:
+    def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Any:
         """Turn forces or columns at all samples into rows: smooth, trim and decimate (Eq. 26).
 
         Linear, and the same for every column: what holds between columns and forces at the samples
-        holds between the rows.
+        holds between the rows. JAX can compile and differentiate it.
         """
         edge = self.filter.edge(self.sample_time)
         every = slice(None)
         parts = [self._reduce(slice(edge, b - a - edge), every, x[a:b]) for a, b in self.segments]
-        return np.concatenate(parts)
+        return namespace(x).concatenate(parts)
 
-    def _reduce(self, kept: slice, wanted: slice, x: AnyArray) -> np.ndarray:
+    def _reduce(self, kept: slice, wanted: slice, x: AnyArray) -> Any:
         return self.decimation(self.filter.smooth(x, self.sample_time)[kept])[wanted]
 
     def chunks(

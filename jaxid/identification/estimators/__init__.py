@@ -29,4 +29,8 @@ from .regularisation_and_weights import (
     Ridge as Ridge,
     Truncated as Truncated,
 )
-from .variable_projection import NonlinearFriction as NonlinearFriction
+from .variable_projection import (
+    NonlinearFriction as NonlinearFriction,
+    ShapeSearch as ShapeSearch,
+    select_shapes as select_shapes,
+)

@@ -1,13 +1,11 @@
 r"""Nonlinear friction by variable projection: shapes of friction laws beside linear parameters.
 
-For shapes $x$ the best linear parameters are $c = N^+ z$, where $N = [A \; \Phi(x)]$. The residual,
-$r = z - N c = P^\perp z$, is a function of the shapes alone. Its Jacobian is that of Golub and
-Pereyra (1973), $-P^\perp \partial N\, c - (N^+)^T \partial N^T r$, exact since JAX differentiates
-the friction laws. Everything is computed from the triangles of the rows.
+For shapes $x$ the best linear parameters are $c = N^+ z$, where $N = [A \; \Phi(x)]$, so the
+residual $r = z - N c$ is a function of the shapes alone (Golub and Pereyra, 1973). Everything is
+JAX: the search can be compiled, mapped over draws of the forces, and differentiated.
 """
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Sequence
 
@@ -15,22 +13,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import optimize
+import optimistix as optx
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Array, Float, require_float64
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import program_of
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, NonlinearParameter
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
-from jaxid.program import evaluate_packed
 
-from ..factors import Blocks, Factors, JointFactor, RowChunk
 from ..problem import RegressionProblem
 from .estimate import AbstractEstimator
 from .least_squares import WeightedLeastSquares
-from .regularisation_and_weights import Decomposition
+
+RIDGE = 64 * np.finfo(float).eps
+"""Ridge of the products of columns of length one, which may depend on each other."""
+PULL = np.log(10.0)
+"""Change of a shape's logarithm that costs as much as one row that is wrong by its deviation."""
+STEPS = 60
+"""Largest number of steps of a search."""
 
 
 class NonlinearFriction(AbstractEstimator):
@@ -52,19 +53,27 @@ class NonlinearFriction(AbstractEstimator):
 
     def __call__(self, problem):
         """Search for the shapes, and estimate with them."""
-        separable, x, notes = self.search(problem, np.asarray(self.linear(problem).weights))
-        base = separable.shapes.set(problem.base, x)
+        search, x, notes = self.search(problem, np.asarray(self.linear(problem).weights))
+        base = search.shapes.set(problem.base, x)
         estimate = self.linear(problem.with_base(base))
         return dataclasses.replace(estimate, notes=(*estimate.notes, *notes))
 
     def search(self, problem: RegressionProblem, weights: np.ndarray):
-        """Return the separable problem, the shapes found, and notes about the search."""
-        shapes = select_shapes(problem.base, self.shapes)
-        separable = SeparableProblem(problem, shapes)
-        start = separable.shapes.values
-        begin = _best_multiples(separable, weights, start)
-        x, notes = search_shapes(separable, weights, start, begin)
-        return separable, x, notes
+        """Return the search, the shapes found, and notes about it."""
+        search = ShapeSearch.of(problem, select_shapes(problem.base, self.shapes))
+        begin, every = (
+            eqx.filter_jit(search.best_multiples)(weights),
+            np.ones(max(search.blocks) + 1),
+        )
+        x, converged = eqx.filter_jit(search)(weights, begin, every)
+        notes = ()
+        if not converged:
+            notes = (
+                f"the search for the shapes of friction has not converged in {STEPS} steps: the "
+                "logs hardly determine some of them; look at their standard deviations, or select "
+                "fewer.",
+            )
+        return search, np.asarray(x), notes
 
 
 class Shapes(eqx.Module):
@@ -131,11 +140,6 @@ class Shapes(eqx.Module):
         parts = [terms[i].columns(self.model.robot, q, qd, qdd) for i in self._terms]
         return jnp.concatenate(parts, axis=1)
 
-    def columns_and_slopes(self, x, q, qd, qdd) -> jax.Array:
-        """Return the columns, and their derivatives behind them [joints, columns, 1 + shapes]."""
-        slopes = jax.jacfwd(self.columns)(x, q, qd, qdd)
-        return jnp.concatenate([self.columns(x, q, qd, qdd)[..., None], slopes], axis=-1)
-
 
 def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
     """Return the shapes of these names; without names, those that the terms propose.
@@ -155,163 +159,207 @@ def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
     return Shapes(base.model, tuple(members))
 
 
-class SeparableProblem:
-    r"""The rows $[A \; \Phi(x) \; \partial\Phi(x) \; Q]$ of recordings, as factors for any $x$.
+class ShapeSearch(eqx.Module):
+    """Search for the shapes that explain the rows of some recordings best.
 
-    The first columns are those of the base parameters, then comes for each pair of a varying column
-    and a shape the derivative. The fixed columns $A$ are evaluated and factored once. For new
-    shapes only friction is evaluated, at the full rate, filtered and decimated like all columns.
+    It is a function of JAX: `eqx.filter_jit(search)(weights)`. Replace `forces` to map over draws
+    or to differentiate by the measurements. Only friction is evaluated and filtered again.
 
     Attributes:
-        base: Base parameters of the model.
         shapes: Shapes to be found.
-        pairs: For each derivative the column, as an index of a base parameter, and the shape.
-        size: Number of columns.
+        start: Their values in the model.
+        recordings: Observations whose rows they are.
+        fixed: Columns that do not depend on shapes; zero in rows that do not count.
+        forces: Measured forces of the rows [N m or N], likewise.
+        counted: One for rows that count, otherwise zero.
+        blocks: Block of time of each row.
+        entries: Joint, base parameter, and column of the shaped terms, of what depends on shapes.
     """
 
-    def __init__(self, problem: RegressionProblem, shapes: Shapes):
-        base, n = problem.base, (problem.robot.joints,)
-        self._problem, self.base, self.shapes = problem, base, shapes
-        shaped = shapes.columns_of_terms
-        # Place among the base parameters, and among the shaped terms' columns.
-        varying = [(k, shaped.index(i)) for k, i in enumerate(base.indices) if i in shaped]
-        self._varying = {place for place, _ in varying}
-        self._program = program_of(shapes, shapes.columns_and_slopes, (shapes.size,), n, n, n)
-        acts = np.asarray(self._program.nonzeros)
-        pairs = []
-        for k, c in varying:
-            changing = np.flatnonzero(acts[:, c, 1:].any(axis=0))
-            pairs += [(k, c, i) for i in changing.tolist()]
-        self.pairs = [(k, i) for k, _, i in pairs]
-        self.size = base.size + len(pairs)
-        # For each joint the columns that vary, with their places in the output of the program.
-        columns = [(k, c, 0) for k, c in varying]
-        columns += [(base.size + place, c, 1 + i) for place, (_, c, i) in enumerate(pairs)]
-        at = np.arange(acts.size).reshape(acts.shape)
-        self._entries = []
-        for own, acting in zip(at, acts, strict=True):
-            self._entries.append([(k, int(own[c, i])) for k, c, i in columns if acting[c, i]])
-        self._pieces = [self._factor(chunk) for chunk in problem.chunks()]
+    shapes: Shapes
+    start: Float[AnyArray, " shapes"]
+    recordings: tuple[Observations, ...]
+    fixed: Float[AnyArray, "rows joints base"]
+    forces: Float[AnyArray, "rows joints"]
+    counted: Float[AnyArray, "rows joints"]
+    blocks: AnyArray
+    entries: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
 
-    def _factor(self, chunk: RowChunk) -> tuple[RowChunk, list[np.ndarray], list[np.ndarray]]:
-        """Return orthonormal bases of each joint's fixed columns, triangles, and other forces."""
-        bases, triangles, rests, indices = [], [], [], []
-        joints = zip(chunk.indices, chunk.columns, chunk.forces.T, chunk.mask.T, strict=True)
-        for own, theta, force, mask in joints:
-            fixed = [place for place, k in enumerate(own) if k not in self._varying]
-            Q, R = np.linalg.qr(theta[mask][:, fixed])
-            along = Q.T @ force[mask]
-            bases.append(Q)
-            triangles.append(np.column_stack([R, along]))
-            rests.append(force[mask] - Q @ along)
-            indices.append(tuple(own[place] for place in fixed))
-        return chunk._replace(columns=bases, indices=indices), triangles, rests
+    @classmethod
+    def of(cls, problem: RegressionProblem, shapes: Shapes) -> "ShapeSearch":
+        """Evaluate and filter the columns that do not depend on the shapes."""
+        require_float64("a search for shapes of friction")
+        base, shaped = problem.base, shapes.columns_of_terms
+        place = {k: shaped.index(i) for k, i in enumerate(base.indices) if i in shaped}
+        starts = np.cumsum([0, *(o.rows for o in problem.recordings)])
+        fixed = np.zeros((starts[-1], problem.robot.joints, base.size))
+        forces, counted = np.zeros((2, *fixed.shape[:2]))
+        blocks = np.zeros(len(fixed), int)
+        for chunk in problem.chunks():
+            rows = slice(*(starts[chunk.recording] + [chunk.rows.start, chunk.rows.stop]))
+            for j, (own, columns) in enumerate(zip(chunk.indices, chunk.columns, strict=True)):
+                kept = [i for i, k in enumerate(own) if k not in place]
+                fixed[rows, j, [own[i] for i in kept]] = columns[:, kept]
+            counted[rows], blocks[rows] = chunk.mask, chunk.block
+            forces[rows] = chunk.forces
+        fixed *= counted[..., None]
+        entries = [
+            (j, k, place[k]) for j, own in enumerate(base.acting_columns) for k in own if k in place
+        ]
+        logs = tuple(problem.recordings)
+        start = shapes.values
+        return cls(shapes, start, logs, fixed, forces * counted, counted, blocks, tuple(entries))
 
-    def blocks(self, x: Float[np.ndarray, " shapes"]) -> Blocks:
-        """Return the factors by blocks of time for some shapes."""
-        shaped = [self._shaped_rows(observations, x) for observations in self._problem.recordings]
-        parts: dict[int, list[Factors]] = {}
-        for chunk, triangles, rests in self._pieces:
-            joints = []
-            for j, (Q, R, rest) in enumerate(zip(chunk.columns, triangles, rests, strict=True)):
-                own = shaped[chunk.recording][j][chunk.rows][chunk.mask[:, j]]
-                along = Q.T @ own
-                below = np.linalg.qr(np.column_stack([own - Q @ along, rest]), mode="r")
-                above = np.column_stack([R[:, :-1], along, R[:, -1]])
-                left = np.zeros((len(below), R.shape[1] - 1))
-                whole = np.vstack([above, np.column_stack([left, below])])
-                columns = (*chunk.indices[j], *(column for column, _ in self._entries[j]))
-                joints.append(JointFactor(columns, whole, len(own)))
-            parts.setdefault(chunk.block, []).append(Factors(tuple(joints), self.size))
-        return Blocks(tuple(functools.reduce(lambda a, b: a + b, parts[k]) for k in sorted(parts)))
+    def __call__(
+        self,
+        weights: Float[AnyArray, " joints"],
+        begin: Float[AnyArray, " shapes"] | None = None,
+        kept: Float[AnyArray, " blocks"] | None = None,
+    ) -> tuple[Float[Array, " shapes"], Array]:
+        """Search by Levenberg-Marquardt over logarithms; return shapes, and whether it converged.
 
-    def _shaped_rows(self, observations: Observations, x: np.ndarray) -> list[np.ndarray]:
-        """Return the rows of everything that depends on shapes, for each joint."""
-        entries = [entry for own in self._entries for _, entry in own]
-        rows = np.empty((observations.rows, len(entries)))
-        for chunk in observations.chunks(RegressionProblem.samples_per_chunk):
-            motion, _ = observations.read(slice(*chunk.samples))
-            arrays = (np.asarray(a, np.float64).T for a in (motion.q, motion.qd, motion.qdd))
-            packed = evaluate_packed(self._program, x, *arrays)
-            samples = np.empty((len(motion.q), len(entries)), order="F")
-            for place, entry in enumerate(entries):
-                samples[:, place] = packed[entry]
-            rows[slice(*chunk.rows)] = chunk.reduce(samples)
-        return np.split(rows, np.cumsum([len(own) for own in self._entries])[:-1], axis=1)
+        Where the rows hardly determine a shape, a weak pull keeps it near that of the model: as
+        strong as one row that tells that it differs by a factor of ten.
+
+        Args:
+            weights: Weight of each joint [1/(N m) or 1/N].
+            begin: Shapes at which the search begins; by default the best of a few multiples.
+            kept: One for each block of time that counts, zero for others; by default all count.
+        """
+        start = jnp.asarray(self.start)
+        begin = self.best_multiples(weights) if begin is None else begin
+        rows = self.row_weights(weights, kept)
+        count = jnp.sum(jnp.where(rows > 0, 1.0, 0.0)) - float(self.fixed.shape[-1])
+        information = self.information(rows)
+        solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-3)
+
+        def weighted(u: Array) -> Array:
+            return rows * self.fit(start * jnp.exp(u), rows, information)[1]
+
+        def left(u: Array, scale: Array) -> Array:
+            return jnp.append(weighted(u) / scale, u / PULL)
+
+        def search(u: Array, _) -> tuple[Array, Array]:
+            deviation = jnp.sqrt(jnp.sum(weighted(u) ** 2) / jnp.maximum(count, 1.0))
+            scale = jnp.maximum(deviation, 1e-150)
+            found = optx.least_squares(left, solver, u, args=scale, max_steps=STEPS, throw=False)
+            return found.value, found.result == optx.RESULTS.successful
+
+        # Twice: the strength of the pull depends on the noise, which is known at the end only.
+        u, successes = jax.lax.scan(search, jnp.log(begin / start), length=2)
+        return start * jnp.exp(u), successes[-1]
+
+    def best_multiples(self, weights: Float[AnyArray, " joints"]) -> Float[Array, " shapes"]:
+        """Return for each joint the multiples of its shapes that explain its own rows best."""
+        kinds = len(self.shapes.members)
+        multiples = np.ones((3 ** min(kinds, 2), kinds, 1))
+        multiples[:, :2, 0] = list(itertools.product((0.2, 1.0, 5.0), repeat=min(kinds, 2)))
+        grid = jnp.reshape(self.start, (1, kinds, -1)) * multiples
+        rows = self.row_weights(weights)
+
+        def squares(x: Array) -> Array:
+            return jnp.sum((rows * self.fit(x.ravel(), rows)[1]) ** 2, axis=0)
+
+        best = jnp.argmin(jax.lax.map(squares, grid), axis=0)
+        return jnp.asarray(grid)[best, :, np.arange(grid.shape[-1])].T.ravel()
+
+    def row_weights(self, weights: AnyArray, kept: AnyArray | None = None) -> Array:
+        """Return the weight of each row [rows, joints]; zero for rows that do not count."""
+        rows = jnp.asarray(self.counted) * jnp.asarray(weights)[None]
+        return rows if kept is None else rows * jnp.asarray(kept)[self.blocks, None]
+
+    def columns(self, x: Float[AnyArray, " shapes"]) -> Float[Array, "rows entries"]:
+        """Return the rows of everything that depends on shapes."""
+        joint, _, column = self._entries
+        rows = _filtered_columns(jnp.asarray(x), self.shapes, self.recordings, joint, column)
+        return rows * jnp.asarray(self.counted)[:, joint]
+
+    @property
+    def _entries(self) -> list[np.ndarray]:
+        return [np.array(part) for part in zip(*self.entries, strict=True)]
+
+    def information(self, rows: Float[AnyArray, "rows joints"]) -> Float[Array, "base base"]:
+        """Return the products of the fixed columns of rows with these weights."""
+        weighted = (jnp.asarray(self.fixed) * rows[..., None]).reshape(-1, self.fixed.shape[-1])
+        return weighted.T @ weighted
+
+    def fit(
+        self,
+        x: Float[AnyArray, " shapes"],
+        rows: Float[AnyArray, "rows joints"],
+        information: Float[Array, "base base"] | None = None,
+    ) -> tuple[Float[Array, " base"], Float[Array, "rows joints"]]:
+        """Return the best linear parameters, and what they leave of the forces [N m or N].
+
+        Args:
+            x: Shapes.
+            rows: Weights of the rows to which the linear parameters are fitted.
+            information: That of the fixed columns, if it is known.
+        """
+        own = self.columns(x)
+        joint, place, _ = self._entries
+        fixed, forces, squares = jnp.asarray(self.fixed), jnp.asarray(self.forces), rows**2
+
+        def predict(c: Array) -> Array:
+            whole = jnp.zeros_like(forces).at[:, joint].add(own * c[place][None])
+            return whole + fixed @ c
+
+        def project(r: Array) -> Array:
+            weighted = squares * r
+            along = jnp.sum(own * weighted[:, joint], axis=0)
+            return jnp.einsum("rjk,rj->k", fixed, weighted).at[place].add(along)
+
+        information = self.information(rows) if information is None else information
+        spread = jnp.zeros((*rows.shape, len(place))).at[:, joint, np.arange(len(place))].set(own)
+        spread = (spread * squares[..., None]).reshape(-1, len(place))
+        cross = spread.T @ fixed.reshape(-1, fixed.shape[-1])
+        both = jnp.where(joint == joint[:, None], own.T @ (own * squares[:, joint]), 0.0)
+        information = information.at[place].add(cross).at[:, place].add(cross.T)
+        information = information.at[place[:, None], place].add(both)
+        information = jax.lax.stop_gradient(information)
+        length = jnp.sqrt(jnp.diagonal(information))
+        length = jnp.where(length > 0, length, 1.0)
+        scaled = information / jnp.outer(length, length) + RIDGE * len(length) * jnp.eye(
+            len(length)
+        )
+        root = jax.scipy.linalg.cho_factor(scaled)
+
+        def refine(c: Array) -> Array:
+            along = project(forces - predict(c)) / length
+            return c + jax.scipy.linalg.cho_solve(root, along) / length
+
+        c = jax.lax.stop_gradient(refine(refine(jnp.zeros(len(length)))))
+        # A step of Newton with a constant matrix has the derivatives of the solution.
+        c = refine(c)
+        return c, forces - predict(c)
 
 
-def search_shapes(problem: SeparableProblem, weights, start, begin, blocks=None):
-    """Search for shapes by Levenberg-Marquardt over their logarithms; return notes as well.
-
-    Where the rows of some blocks of time (by default all) hardly determine a shape, a weak pull
-    keeps it near `start`: as strong as one row that tells that it differs by a factor of ten.
-    """
-    pull = np.log(10.0)
-
-    @functools.lru_cache(maxsize=1)
-    def projected(u: bytes) -> tuple[Factors, np.ndarray, np.ndarray]:
-        x = start * np.exp(np.frombuffer(u))
-        found = problem.blocks(x)
-        factors = found.total if blocks is None else found.select(blocks).total
-        _, residual, jacobian = project(problem, factors, weights)
-        return factors, residual, jacobian * x
-
-    u, steps, success = np.log(begin / start), 0, False
-    # Twice, since the strength of the pull depends on the noise, which is known at the end only.
-    for _ in range(2):
-        factors, left, _ = projected(u.tobytes())
-        dof = max(float(factors.rows.sum()) - problem.base.size, 1.0)
-        scale = max(float(np.linalg.norm(left)) / np.sqrt(dof), 1e-300)
-
-        def residual(u: np.ndarray, scale: float = scale) -> np.ndarray:
-            return np.append(projected(u.tobytes())[1] / scale, u / pull)
-
-        def jacobian(u: np.ndarray, scale: float = scale) -> np.ndarray:
-            return np.vstack([projected(u.tobytes())[2] / scale, np.eye(len(u)) / pull])
-
-        options = {"jac": jacobian, "method": "lm", "xtol": 1e-4, "ftol": 1e-6, "max_nfev": 60}
-        found = optimize.least_squares(residual, u, **options)
-        u, steps, success = found.x, steps + found.nfev, bool(found.success)
-    if success:
-        return start * np.exp(u), ()
-    return start * np.exp(u), (
-        f"the search for the shapes of friction has not converged in {steps} steps: the logs "
-        "hardly determine some of them; look at their standard deviations, or select fewer.",
-    )
+def _filter_columns(
+    x: Array, shapes: Shapes, recordings: tuple[Observations, ...], joint, column
+) -> Float[Array, "rows entries"]:
+    """Return the filtered columns of the shaped terms, of these joints."""
+    parts = []
+    for o in recordings:
+        motion = [jnp.asarray(x) for x in (o.motion.q, o.motion.qd, o.motion.qdd)]
+        at_samples = jax.vmap(shapes.columns, (None, 0, 0, 0))(x, *motion)
+        parts.append(o.reduce(at_samples[:, joint, column]))
+    return jnp.concatenate(parts)
 
 
-def project(problem: SeparableProblem, factors: Factors, weights: np.ndarray):
-    """Return the best linear parameters, the weighted residual, and its derivatives by shapes."""
-    size = problem.base.size
-    R, z = factors.weighted(weights)
-    missing = problem.size + 1 - len(R)
-    R, z = np.pad(R, ((0, missing), (0, 0))), np.pad(z, (0, missing))
-    N, slopes = R[:, :size], R[:, size:]
-    decomposition = Decomposition.of(N, z)
-    B, c = decomposition.inverse_information(), decomposition.solve()
-    residual = z - N @ c
-    # Derivatives of N c, and of N^T times the residual.
-    forces = np.zeros((len(R), problem.shapes.size))
-    products = np.zeros((size, problem.shapes.size))
-    for place, (column, k) in enumerate(problem.pairs):
-        forces[:, k] += c[column] * slopes[:, place]
-        products[column, k] += slopes[:, place] @ residual
-    orthogonal = forces - N @ (B @ (N.T @ forces))
-    return c, residual, -orthogonal - N @ (B @ products)
+_filtered_columns = eqx.filter_custom_jvp(_filter_columns)
 
 
-def _best_multiples(problem: SeparableProblem, weights: np.ndarray, start: np.ndarray):
-    """Return for each joint the multiples of its shapes that explain its own rows best."""
-    kinds, joints = len(problem.shapes.members), problem.shapes.model.robot.joints
-    candidates = np.array(list(itertools.product((0.2, 1.0, 5.0), repeat=min(kinds, 2))))
-    multiples = np.ones((len(candidates), kinds))
-    multiples[:, : candidates.shape[1]] = candidates
-    grid = start.reshape(kinds, joints) * multiples[:, :, None]
-    squares = []
-    for x in grid:
-        factors = problem.blocks(x.ravel()).total
-        linear = project(problem, factors, weights)[0]
-        p = np.append(linear, np.zeros(factors.size - problem.base.size))
-        squares.append(factors.residual_squares(p))
-    best = np.argmin(squares, axis=0)
-    return np.stack([grid[k, :, j] for j, k in enumerate(best)], axis=1).ravel()
+@_filtered_columns.def_jvp
+def _(primals, tangents):
+    """Differentiate by the shapes of all joints together: each acts on its own joint only."""
+    x, shapes, recordings, joint, column = primals
+    kinds = len(shapes.members)
+    together = jnp.repeat(jnp.eye(kinds), shapes.size // kinds, axis=1)
+
+    def along(direction: Array) -> tuple[Array, Array]:
+        other = shapes, recordings, joint, column
+        return jax.jvp(lambda x: _filter_columns(x, *other), (x,), (direction,))
+
+    rows, slopes = jax.vmap(along, out_axes=(None, 0))(together)
+    change = tangents[0].reshape(kinds, -1)[:, joint]
+    return rows, jnp.einsum("ike,ie->ke", slopes, change)

@@ -3,8 +3,10 @@
 import abc
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from scipy import signal
 
@@ -38,11 +40,9 @@ class AbstractDecimation(eqx.Module):
         """Number of samples for each row."""
         return math.prod(self.stages)
 
-    def __call__(
-        self, x: Float[AnyArray, "samples *columns"]
-    ) -> Float[np.ndarray, "rows *columns"]:
+    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> Any:
         """Decimate along the first axis: the first row is that of the first sample."""
-        x = np.asarray(x, np.float64)
+        x = x if isinstance(x, jax.Array) else np.asarray(x, np.float64)
         for i, factor in enumerate(self.stages):
             x = self.low_pass(i)(x)[::factor]
         return x

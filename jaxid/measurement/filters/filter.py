@@ -8,13 +8,15 @@ sides that belong together: `motion` for the angles, `smooth` for forces and col
 import abc
 import math
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy import signal
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Array, Float
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
@@ -49,16 +51,19 @@ class LowPass(eqx.Module):
     sections: tuple[tuple[float, ...], ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
 
-    def __call__(
-        self, x: Float[AnyArray, "samples *columns"]
-    ) -> Float[np.ndarray, "samples *columns"]:
-        """Filter along the first axis, by blocks of columns that keep scipy's copies small."""
-        x = np.asarray(x, np.float64)
+    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> Any:
+        """Filter along the first axis, by blocks of columns that keep scipy's copies small.
+
+        Arrays of JAX stay such, and can be differentiated.
+        """
+        x = x if isinstance(x, jax.Array) else np.asarray(x, np.float64)
         if not self.sections or x.size == 0:
             return x
         sos = np.array(self.sections)
         flat = x.reshape(len(x), -1)
         padding = min(3 * (2 * len(sos) + 1), len(x) - 1)
+        if isinstance(flat, jax.Array):
+            return _filter_both_ways(sos, flat, padding).reshape(x.shape)
         out = np.empty_like(flat)
         width = max(1, 2**22 // len(flat))
         for start in range(0, flat.shape[1], width):
@@ -92,6 +97,29 @@ class LowPass(eqx.Module):
         # Rounding hides smaller tails: continue the slowest pole (multiplied by the time it lasts).
         near = self.memory(2e-6)
         return near + math.ceil(1.1 * math.log(tolerance / 2e-6) / math.log(slowest))
+
+
+def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
+    """Filter forward and backward with odd extensions, as `scipy.signal.sosfiltfilt` does."""
+    before = 2 * x[:1] - x[padding:0:-1]
+    after = 2 * x[-1:] - x[-2 : -2 - padding : -1]
+    extended = jnp.concatenate([before, x, after])
+    steady = signal.sosfilt_zi(sos)
+
+    def step(state: list[tuple[Array, Array]], x: Array) -> tuple[list[tuple[Array, Array]], Array]:
+        following = []
+        for (b0, b1, b2, _, a1, a2), (first, second) in zip(sos, state, strict=True):
+            y = b0 * x + first
+            following.append((b1 * x - a1 * y + second, b2 * x - a2 * y))
+            x = y
+        return following, x
+
+    def one_way(x: Array, reverse: bool) -> Array:
+        first = x[-1 if reverse else 0]
+        state = [(low * first, high * first) for low, high in steady]
+        return jax.lax.scan(step, state, x, reverse=reverse, unroll=4)[1]
+
+    return one_way(one_way(extended, False), True)[padding : padding + len(x)]
 
 
 def butterworth(cutoff: float, order: int, sample_time: float, name: str = "cutoff") -> LowPass:
@@ -151,9 +179,7 @@ class AbstractFilter(eqx.Module):
     def edge(self, sample_time: float) -> int:
         """Return the number of samples to drop at both ends of a segment, until filters settle."""
 
-    def smooth(
-        self, x: Float[AnyArray, "samples *columns"], sample_time: float
-    ) -> Float[np.ndarray, "samples *columns"]:
+    def smooth(self, x: Float[AnyArray, "samples *columns"], sample_time: float) -> Any:
         """Filter forces or columns of one segment: linear, without phase, constants unchanged."""
         return self.low_pass(sample_time)(x)
 
