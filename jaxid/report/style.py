@@ -13,6 +13,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine, PlaceHolderLayoutEngine
 from matplotlib.lines import Line2D
@@ -114,7 +115,10 @@ def svg_text(figure: Figure) -> str:
         file = io.StringIO()
         with house_style(svg_fonttype="none", svg_hashsalt=figure.get_suptitle()):
             _lay_out(figure)
-            figure.savefig(file, format="svg", metadata={"Date": None})
+            # Unlike `savefig`, which draws twice.
+            canvas = figure.canvas
+            FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None})
+            figure.set_canvas(canvas)
         _SVG[figure] = file.getvalue()
     return _SVG[figure]
 
