@@ -16,6 +16,8 @@ POSES = 2000
 """Random poses in which the mass matrix is evaluated."""
 ROWS = 2**18
 """Largest number of rows that are compared."""
+STANDING = 0.01
+"""Fraction of a joint's largest speed up to which it stands."""
 
 
 class TorqueErrors(eqx.Module):
@@ -28,6 +30,7 @@ class TorqueErrors(eqx.Module):
         predicted: Forces of the model, filtered and decimated alike [N m or N].
         counted: Rows that count, for each joint.
         max_forces: Largest force of each joint [N m or N]; NaN where not known.
+        moving: Rows in which each joint moves faster than a hundredth of its largest speed.
     """
 
     name: str = eqx.field(static=True)
@@ -36,6 +39,7 @@ class TorqueErrors(eqx.Module):
     predicted: Float[AnyArray, "rows joints"]
     counted: Bool[AnyArray, "rows joints"]
     max_forces: Float[AnyArray, " joints"]
+    moving: Bool[AnyArray, "rows joints"]
 
     @property
     def errors(self) -> Float[np.ndarray, "rows joints"]:
@@ -61,6 +65,26 @@ class TorqueErrors(eqx.Module):
     def rms_percent(self) -> Float[np.ndarray, " joints"]:
         """RMS errors in percent of the largest force."""
         return 100.0 * self.rms / np.asarray(self.max_forces)
+
+    @property
+    def offset(self) -> Float[np.ndarray, " joints"]:
+        """Mean error of each joint [N m or N]: what a constant offset of the log would explain."""
+        return np.nanmean(self.errors, axis=0)
+
+    @property
+    def rms_at_rest(self) -> Float[np.ndarray, " joints"]:
+        """RMS error about the offset while the joint stands [N m or N]; NaN if it never does."""
+        return self._rms_where(~np.asarray(self.moving))
+
+    @property
+    def rms_in_motion(self) -> Float[np.ndarray, " joints"]:
+        """RMS error about the offset while the joint moves [N m or N]; NaN if it never does."""
+        return self._rms_where(np.asarray(self.moving))
+
+    def _rms_where(self, chosen: np.ndarray) -> np.ndarray:
+        squares = (self.errors - self.offset) ** 2
+        chosen = chosen & np.isfinite(squares)
+        return np.sqrt(_ratio(np.sum(squares, axis=0, where=chosen), np.sum(chosen, axis=0)))
 
     @property
     def force_rms(self) -> Float[np.ndarray, " joints"]:
@@ -192,7 +216,7 @@ def torque_errors(
     observations = with_memory(observations, fit.base.model.memory)
     step = comparison_step(observations)
     mask = np.asarray(observations.mask)
-    measured, predicted = np.zeros((2, len(mask[::step]), observations.joints))
+    measured, predicted, speeds = np.zeros((3, len(mask[::step]), observations.joints))
     for chunk in observations.chunks(65536):
         first, stop = chunk.rows
         # Masked parts are not evaluated.
@@ -203,6 +227,7 @@ def torque_errors(
             taken = slice(rows.start * step - first, None, step)
             measured[rows] = chunk.reduce(forces)[taken]
             predicted[rows] = chunk.reduce(model_forces)[taken]
+            speeds[rows] = np.abs(chunk.reduce(motion.qd)[taken])
         if progress is not None:
             progress(stop / observations.rows)
     return TorqueErrors(
@@ -212,6 +237,7 @@ def torque_errors(
         predicted=predicted,
         counted=mask[::step],
         max_forces=np.where(np.isfinite(known), known, np.nan),
+        moving=speeds > STANDING * speeds.max(axis=0),
     )
 
 

@@ -299,6 +299,9 @@ def payload(
     body: Annotated[
         str | None, typer.Option(metavar="JOINT", help="The joint that moves the payload.")
     ] = None,
+    mass: Annotated[
+        float | None, typer.Option(metavar="KG", min=1e-6, help="Its mass, if a scale told it.")
+    ] = None,
     output: options.OutputFolder = Path("payload"),
     force: options.Force = False,
 ) -> None:
@@ -309,7 +312,7 @@ def payload(
     console = options.start(experiment, *logs, *loaded, output=output, force=force)
     from . import commands
 
-    commands.payload(console, experiment, logs, loaded, body, output)
+    commands.payload(console, experiment, logs, loaded, body, mass, output)
 
 
 @app.command()

@@ -273,13 +273,14 @@ def payload(
     logs: list[Path],
     loaded: list[Path],
     body: str | None,
+    mass: float | None,
     output: Path,
 ) -> None:
     """Find a payload, and print the table of the experiment file that subtracts it."""
     experiment = load_experiment(path)
     carrier = None if body is None else joint_number(experiment.robot, body, "--body")
     (empty, full), doubts = _pair(experiment, logs, loaded)
-    found = identify_payload(empty, full, body=carrier)
+    found = identify_payload(empty, full, body=carrier, mass=mass)
     name = experiment.robot.joint_names[found.body]
     keys = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
     content = {"body": name, **{key: getattr(found, key) for key in keys}}

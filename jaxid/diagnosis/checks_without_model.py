@@ -7,11 +7,11 @@ from scipy import ndimage
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.motion import Motion
+from jaxid.measurement.observations import unlike_derivatives
 from jaxid.measurement.recording import Recording
+from jaxid.model_validation import STANDING
 from jaxid.robot.robot import Robot
 
-STANDING = 0.01
-"""Fraction of a joint's largest speed below which it stands."""
 LATE = 1.5
 """Samples by which velocities may stand later than the derivatives of the angles."""
 SURE = 15.0
@@ -67,20 +67,14 @@ class LogStatistics:
         return float(power / np.sqrt(forces * velocities)) if forces * velocities > 0 else 0.0
 
     def velocity_findings(self, joint: int, name: str, sample_time: float) -> Iterator[str]:
-        """Yield what is wrong with measured velocities: their scale, or their time."""
+        """Yield whether measured velocities are late."""
         P = self._products[joint]
         if P[0, 0] <= 0 or P[1, 1] <= 0:
             return
-        ratio = P[0, 2] / P[0, 0]
         scale, lead = np.linalg.lstsq(P[:2, :2], P[:2, 2], rcond=1e-12)[0]
         late, text = -lead / scale if scale else 0.0, f"the velocities of joint `{name}` "
-        if abs(ratio - 1.0) > 0.2:
-            yield (
-                f"{text}are {ratio:.3g} times the derivatives of its angles: check "
-                "`recording.velocity_unit` and the order of the columns."
-            )
         # A shift must explain most of the difference.
-        elif abs(late) > LATE * sample_time and lead**2 * P[1, 1] > 0.5 * (
+        if abs(late) > LATE * sample_time and lead**2 * P[1, 1] > 0.5 * (
             P[2, 2] - 2 * P[0, 2] + P[0, 0]
         ):
             yield (
@@ -225,6 +219,15 @@ def channel_findings(
         found += [(j, angle, text), (j, f"the forces of joint `{name}`", held)]
     faults = [(j, f"{channel} {text}") for j, channel, text in found if text]
     if statistics is not None and r.velocities is not None:
+        faults += [
+            (
+                j,
+                f"the velocities of {owner} `{robot.joint_names[j]}` are {ratio:.3g} times the "
+                "derivatives of its angles: check `recording.velocity_unit` and the order of the "
+                "columns.",
+            )
+            for j, ratio in unlike_derivatives(r).items()
+        ]
         for j, name in enumerate(robot.joint_names):
             late = statistics.velocity_findings(j, name, r.sample_time)
             faults += [(j, text) for text in late]

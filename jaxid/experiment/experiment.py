@@ -100,7 +100,7 @@ class Experiment:
     clearance: Clearance | None
     columns: Columns | None
     logs: Logs
-    load: Tool | None
+    load: Tool | float | None
     filter: AbstractFilter
     candidates: tuple[FilterCandidate, ...]
     decimation: AbstractDecimation

@@ -70,16 +70,16 @@ def inertia_tensor(
 def known_load(
     *,
     mass: Positive,
-    centre_of_mass: Vector,
+    centre_of_mass: Vector | None = None,
     inertia: Annotated[np.ndarray, inertia_tensor] | None = None,
     body: str | None = None,
-) -> Callable[[Robot], Tool]:
+) -> Callable[[Robot], Tool | float]:
     """Known load, whose forces are subtracted and not identified.
 
     Args:
         mass: Mass [kg], like `1.5`.
         centre_of_mass: Centre of mass in the frame of the end-effector, or of `body` [m], like
-            `[0.0, 0.0, 0.05]`.
+            `[0.0, 0.0, 0.05]`. `jaxid gains` needs only the mass of a load on the end-effector.
         inertia: Inertia tensor about the centre of mass [kg m²], like
             `{ xx = 1e-3, yy = 1e-3, zz = 1e-3, xy = 0.0, xz = 0.0, yz = 0.0 }`; a point mass by
             default.
@@ -87,10 +87,17 @@ def known_load(
             by default.
 
     Returns:
-        Function from a robot to the load as a tool of it.
-    """
+        Function from a robot to the load as a tool of it; to the mass if nothing else is known.
 
-    def on(robot: Robot) -> Tool:
+    Raises:
+        InputError: If the centre of mass is missing beside `inertia` or `body`.
+    """
+    if centre_of_mass is None and (inertia is not None or body is not None):
+        raise InputError("`centre_of_mass` is missing.")
+
+    def on(robot: Robot) -> Tool | float:
+        if centre_of_mass is None:
+            return mass
         content: Any = {"mass": mass, "centre_of_mass": centre_of_mass, "inertia": inertia}
         if body is None:
             return cast(Tool, robot.with_tool(**content).tool)
@@ -149,7 +156,7 @@ class RobotSource:
     base_rotation: Vector | None = None
     base_position: Vector | None = None
     snap_tolerance: Magnitude | None = None
-    tool: Annotated[Callable[[Robot], Tool], known_load] | None = None
+    tool: Annotated[Callable[[Robot], Tool | float], known_load] | None = None
 
     def __post_init__(self) -> None:
         given = [k for k in ("urdf", "builtin", "dh") if getattr(self, k) is not None]
@@ -196,7 +203,10 @@ class RobotSource:
             robot = robot.replace(gravity=np.array(self.gravity))
         if self.name is not None:
             robot = robot.replace(name=self.name)
-        return robot if self.tool is None else robot.replace(tool=self.tool(robot))
+        tool = None if self.tool is None else self.tool(robot)
+        if isinstance(tool, float):
+            raise InputError("`robot.tool.centre_of_mass` is missing.")
+        return robot if tool is None else robot.replace(tool=tool)
 
     def parameters(self, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
         """Return the bodies' parameters that the URDF file claims; None if there is no such file.

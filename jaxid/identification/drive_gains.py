@@ -54,7 +54,7 @@ class DriveGains(eqx.Module):
 
 
 def identify_drive_gains(
-    unloaded: Fit, loaded: Fit, load: Tool, *, varying: Sequence[str] | None = None
+    unloaded: Fit, loaded: Fit, load: Tool | float, *, varying: Sequence[str] | None = None
 ) -> DriveGains:
     r"""Identify drive gains from a run without and a run with a known load.
 
@@ -66,7 +66,8 @@ def identify_drive_gains(
     Args:
         unloaded: Fit of the run without the load; forces by nominal gains.
         loaded: Fit of the run with it, and with the same nominal gains.
-        load: Load that was mounted between the runs.
+        load: Load that was mounted between the runs. If only its mass [kg] on the end-effector is
+            given, its centre and inertia are identified too.
         varying: Names of base parameters that may differ between the runs beside the load. If None,
             friction and offsets.
 
@@ -84,7 +85,13 @@ def identify_drive_gains(
         raise InputError(f"`{robot.name}` has a known tool: leave it out (`tool=None`).")
     fits = (as_least_squares(unloaded), as_least_squares(loaded))
     maps = state_maps(base.size, varying_parameters(base, varying), 2)
-    offsets = (np.zeros(base.size), body_columns(base, load.body) @ load.parameters)
+    if isinstance(load, Tool):
+        added = body_columns(base, load.body) @ load.parameters
+    else:
+        columns = body_columns(base, robot.tip_body)
+        added, rest = load * columns[:, 0], columns[:, 1:]
+        maps = [np.hstack([E, known * rest]) for E, known in zip(maps, (0.0, 1.0), strict=True)]
+    offsets = (np.zeros(base.size), added)
     runs = list(zip(fits, maps, offsets, strict=True))
     size = maps[0].shape[1]
 

@@ -20,6 +20,8 @@ from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
 from .uncertainty import Uncertainty
 
+SCALE = 1e-3
+"""Relative standard deviation of a mass that a scale has told."""
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
 CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
 
@@ -108,6 +110,7 @@ def identify_payload(
     loaded: Fit,
     *,
     body: int | None = None,
+    mass: float | None = None,
     varying: Sequence[str] | None = None,
     bounds: BodyBounds | None = None,
 ) -> Payload:
@@ -121,6 +124,8 @@ def identify_payload(
         unloaded: Fit of the run without the payload.
         loaded: Fit of the run with it.
         body: Index of the body that carries it; that of the end-effector if None.
+        mass: Mass of the payload [kg] if a scale has told it (to 0.1 %): the rest is then known
+            better.
         varying: Names of base parameters that may differ between the runs beside the payload. If
             None, friction and offsets: they change with load and temperature.
         bounds: Bounds of the payload, such as `BodyBounds(mass_max=..., radius=...)`. If None,
@@ -140,7 +145,12 @@ def identify_payload(
     x, both = combine([as_least_squares(unloaded), as_least_squares(loaded)], maps)
     covariance = both.covariance[-10:, -10:]
     dof = np.full(10, np.min(both.dof[-10:]))
-    estimate, uncertainty = x[-10:], Uncertainty(covariance, dof, covariance)
+    estimate = x[-10:]
+    if mass is not None:
+        gain = covariance[:, 0] / (covariance[0, 0] + (SCALE * mass) ** 2)
+        estimate = estimate + gain * (mass - estimate[0])
+        covariance = covariance - np.outer(gain, covariance[0])
+    uncertainty = Uncertainty(covariance, dof, covariance)
     known = np.isfinite(covariance).all()
     if not known or (bounds is None and consistency_margin(estimate) >= 0):
         return Payload(body, estimate, estimate, uncertainty, 0.0 if known else np.nan)

@@ -34,6 +34,12 @@ from .recording import (
 
 FEWEST_ROWS = 4
 """Smallest number of rows for which a segment is used."""
+WAY_TIME = 0.2
+"""Time in which measured velocities must make the way of the angles [s]."""
+UNLIKE = 0.2
+"""Relative error of this way from which on velocities are not used."""
+WELL_ABOVE = 10.0
+"""Ratio of the way to the angles' second differences from which on velocities are judged."""
 
 Progress = Callable[[float], None]
 """Callback, called with the completed fraction (0 to 1)."""
@@ -358,7 +364,14 @@ def observe(
         InputError: If the numbers of joints differ, forces and columns would be aliased, nothing
             is left between the edges of the segments, or some joint is never fast enough.
     """
-    r = recording
+    r, notes = recording, ()
+    if r.velocities is not None and (unlike := unlike_derivatives(r)):
+        numbers = ", ".join(str(j + 1) for j in unlike)
+        notes = (
+            f"the velocities of channels {numbers} are not the derivatives of their angles: all "
+            "velocities are taken from the angles",
+        )
+        r = dataclasses.replace(r, velocities=None)
 
     def load(segments: list[tuple[int, int]]) -> SamplesInMemory:
         q, qd, forces = joint_side(robot, r, r.angles, r.velocities, r.forces)
@@ -370,7 +383,29 @@ def observe(
 
     name = r.name if name is None else name
     measured = r.velocities is not None
-    return prepare(load, r.grid, r.joints, measured, robot, filter, decimation, min_speed, name)
+    found = prepare(load, r.grid, r.joints, measured, robot, filter, decimation, min_speed, name)
+    return found.replace(notes=(*found.notes, *notes))
+
+
+def unlike_derivatives(recording: Recording) -> dict[int, float]:
+    """Return the channels whose velocities do not make the way of their angles within 0.2 s.
+
+    Only channels whose way is well above the noise of their angles are judged. Each comes with the
+    factor by which its velocities are too large.
+    """
+    r, squares, products = recording, np.zeros((3, recording.joints)), np.zeros(recording.joints)
+    steps = max(1, round(WAY_TIME / r.sample_time))
+    for a, b in r.grid.ranges:
+        q, qd = np.asarray(r.angles)[a:b], np.asarray(r.velocities)[a:b]
+        way = r.sample_time * np.cumsum(0.5 * (qd[1:] + qd[:-1]), axis=0)
+        ends = np.concatenate([np.zeros((1, r.joints)), way])
+        moved, expected = q[steps:] - q[:-steps], ends[steps:] - ends[:-steps]
+        noise = np.diff(q, 2, axis=0)
+        products += np.sum(moved * expected, axis=0)
+        squares += [np.sum(x**2, axis=0) for x in (moved - expected, moved, noise)]
+    wrong, way, noise = squares
+    unlike = np.flatnonzero((wrong > UNLIKE**2 * way) & (way > WELL_ABOVE**2 * noise)).tolist()
+    return {k: float(products[k] / way[k]) for k in unlike}
 
 
 def prepare(

@@ -59,7 +59,9 @@ def identification_page(report: Report, figures: Mapping[str, Figure], suffix: s
             "Errors",
             [
                 "Predicted less measured forces. Bars: the mean of their absolute values (Eq. 37, "
-                "Fig. 10 of the paper); marks: their RMS.",
+                "Fig. 10 of the paper); marks: their RMS. In the tables, the offset is the mean "
+                "error, which a constant of the log explains; RMS values at rest and in motion are "
+                "those about it.",
                 figures["errors"],
                 tuple(error_table(e, robot) for e in errors),
             ],
@@ -146,6 +148,9 @@ def error_table(errors: TorqueErrors, robot: Robot) -> Table:
         Column("mean", errors.mean_percent, "% of max"),
         Column("RMS", errors.rms_percent, "% of max"),
         Column("RMS", 100 * errors.rms_relative, "% of RMS force"),
+        Column("offset", errors.offset),
+        Column("RMS at\nrest", errors.rms_at_rest),
+        Column("RMS in\nmotion", errors.rms_in_motion),
     )
 
 

@@ -395,6 +395,9 @@ def _error_record(errors: TorqueErrors, robot: Robot) -> dict[str, Any]:
             name=robot.joint_names,
             unit=[robot.force_unit(j) for j in range(robot.joints)],
             rows=np.asarray(errors.counted).sum(axis=0),
-            **_entries(errors, "mean rms mean_percent rms_percent rms_relative"),
+            **_entries(
+                errors,
+                "mean rms mean_percent rms_percent rms_relative offset rms_at_rest rms_in_motion",
+            ),
         ),
     }

@@ -99,6 +99,27 @@ def test_gains_come_back(base):
     np.testing.assert_allclose(np.mean(sizes, axis=0) / scatter, 1.0, atol=0.6)
 
 
+def test_the_mass_of_a_load_is_enough_for_gains(base):
+    """Its centre and inertia come out beside; noise only makes the intervals wider."""
+    found = jid.identify_drive_gains(*pair(base, gains=GAINS), 3.0)
+    np.testing.assert_allclose(found.gains, GAINS, rtol=1e-6)
+    noisy = pair(base, np.array([0.5, 0.5, 0.2]), 1, gains=GAINS)
+    found, known = (jid.identify_drive_gains(*noisy, load) for load in (3.0, LOAD))
+    deviations = found.uncertainty.standard_deviations
+    assert (np.abs(found.gains - GAINS) < 4 * deviations).all()
+    assert (deviations > known.uncertainty.standard_deviations).all()
+
+
+def test_a_known_mass_makes_the_rest_of_a_payload_better_known(base):
+    noisy = pair(base, np.array([0.5, 0.5, 0.2]), 2)
+    found, weighed = (jid.identify_payload(*noisy, mass=mass) for mass in (None, 3.0))
+    assert abs(weighed.estimate[0] - 3.0) < 0.01
+    s, t = (x.uncertainty.standard_deviations for x in (found, weighed))
+    assert (t <= s * (1 + 1e-9)).all()
+    assert t[3] < 0.99 * s[3]
+    assert (np.abs(weighed.estimate - LOAD.parameters) < 4 * t).all()
+
+
 def late(base, seconds, **options):
     """Observations whose forces stand `seconds` too late in the log."""
     options = {"samples": 2000, "filter": jid.ZeroPhaseButterworth(10.0), **options}

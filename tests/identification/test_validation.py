@@ -14,7 +14,8 @@ def errors(counted=None):
     measured, predicted = np.random.default_rng(0).normal(size=(2, 50, 2)) * [10.0, 1.0]
     counted = np.ones((50, 2), bool) if counted is None else counted
     limits = np.array([100.0, 5.0])
-    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits)
+    moving = np.arange(50)[:, None] >= [20, 0]
+    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits, moving)
 
 
 def test_errors_are_those_of_the_paper():
@@ -28,6 +29,11 @@ def test_errors_are_those_of_the_paper():
     relative = np.linalg.norm(e.predicted - e.measured) / np.linalg.norm(e.measured)
     np.testing.assert_allclose(e.relative, relative)
     assert dataclasses.replace(e, predicted=e.measured).relative == 0.0
+    np.testing.assert_allclose(e.offset, e.errors.mean(axis=0))
+    about = e.errors[:, 0] - e.offset[0]
+    np.testing.assert_allclose(e.rms_at_rest[0], np.sqrt(np.mean(about[:20] ** 2)))
+    np.testing.assert_allclose(e.rms_in_motion[0], np.sqrt(np.mean(about[20:] ** 2)))
+    assert np.isnan(e.rms_at_rest[1])
 
 
 def test_rows_that_do_not_count_change_nothing():
@@ -35,7 +41,7 @@ def test_rows_that_do_not_count_change_nothing():
     counted[10:20, 0] = False
     e = errors(counted)
     spoilt = dataclasses.replace(e, measured=np.where(counted, e.measured, 1e9))
-    for name in ("mean", "rms", "rms_relative", "relative"):
+    for name in ("mean", "rms", "rms_relative", "relative", "offset", "rms_at_rest"):
         np.testing.assert_allclose(getattr(spoilt, name), getattr(e, name))
     np.testing.assert_allclose(e.mean[0], np.abs(e.errors[counted[:, 0], 0]).mean())
 

@@ -155,6 +155,22 @@ def test_remarks_say_what_was_left_out():
     assert "measured velocities are not used" in observe(r, a_robot(), PaperFilter()).notes[-1]
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize("wrong", [-1.0, 1.5, 0.0, 180 / np.pi])
+def test_velocities_that_are_no_derivatives_are_left_out(wrong, noise):
+    """One channel is wrong; one that stands, with noise in both signals, is not judged."""
+    r, rng = a_recording(gaps=(2500,)), np.random.default_rng(2)
+    quiet = np.asarray(r.angles) * [1.0, 0.0] + noise * rng.normal(size=r.angles.shape)
+    good = np.asarray(r.velocities) * [1.0, 0.0] + 10 * noise * rng.normal(size=r.angles.shape)
+    settings = a_robot(), ZeroPhaseButterworth(20.0)
+    right = dataclasses.replace(r, angles=quiet, velocities=good)
+    assert not any("not the derivatives" in note for note in observe(right, *settings).notes)
+    bad = observe(dataclasses.replace(right, velocities=good * [wrong, 1.0]), *settings)
+    assert "velocities of channels 1 are not the derivatives" in bad.notes[-1]
+    without = observe(dataclasses.replace(right, velocities=None), *settings)
+    np.testing.assert_array_equal(bad.motion.qd, without.motion.qd)
+
+
 def test_arrays_that_are_filtered_already_become_observations():
     o = observe(a_recording(), a_robot(), ZeroPhaseButterworth(20.0, margin=0.0), Subsample(5))
     m = o.motion
