@@ -1,12 +1,12 @@
-"""Cost of the regressor and of `identify` against the numbers of samples, joints and devices.
+"""Cost of the regressor and of `identify` against the numbers of samples, joints and cores.
 
     python benchmarks/scaling.py [--quick] [--json FILE]
 
 Writes `benchmarks/scaling.png` (nothing with `--quick`). Samples and joints: the regressor on one
 core, ten parameters for each body, in a process of its own; from 16 384 samples on, ours goes
 through chunks of that size. A tree: the humanoid Talos with 32 joints (with `--quick` one arm).
-Devices: `identify` of one log with every sample a row, on several CPU devices of JAX, one process
-for each number, with a core for each device as far as there are cores. Medians.
+Cores: `identify` of one log with every sample a row, on several cores, one process
+for each number. Medians.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from timing import HERE, Row, hand_over, interleaved
 
 CHUNK = 16384
 LOG = 400_000
-DEVICES = (1, 2, 4, 8)
+CORES = (1, 2)
 SAMPLES = (1, 30, 1000, 16_384, 131_072, 1_048_576)
 JOINTS = (2, 4, 7, 12, 20, 30)
 PYTHON_UP_TO, CPP_UP_TO = 1000, 131_072
@@ -166,8 +166,7 @@ def humanoid(quick):
 
 
 def identified(samples, turns):
-    """Return the number of devices of this process, seconds for one log, scaled estimates."""
-    import jax
+    """Return seconds for one log, and scaled estimates."""
     import numpy as np
     from batches import motions, seven_axes
 
@@ -188,23 +187,23 @@ def identified(samples, turns):
     fit = identify()
     seconds = interleaved({"identify": identify}, turns)["identify"].median
     scaled = np.asarray(fit.parameters) / np.asarray(fit.standard_deviations)
-    return len(jax.devices()), seconds, scaled.tolist()
+    return seconds, scaled.tolist()
 
 
-def by_devices(numbers, samples, turns):
-    """Return nanoseconds per sample for each number of devices, and the distance of estimates."""
+def by_cores(numbers, samples, turns):
+    """Return nanoseconds per sample for each number of cores, and the distance of estimates."""
     import numpy as np
 
     found, scaled = [], []
-    for devices in numbers:
-        given = ["--devices", str(devices), "--samples", str(samples), "--turns", str(turns)]
+    for cores in numbers:
+        given = ["--cores", str(cores), "--samples", str(samples), "--turns", str(turns)]
         done = subprocess.run([sys.executable, __file__, *given], capture_output=True, text=True)
         if done.returncode:
-            sys.exit(f"{devices} devices: {done.stderr[-2000:]}")
-        count, seconds, estimates = json.loads(done.stdout.splitlines()[-1])
-        found.append((count, seconds / samples * 1e9))
+            sys.exit(f"{cores} cores: {done.stderr[-2000:]}")
+        seconds, estimates = json.loads(done.stdout.splitlines()[-1])
+        found.append((cores, seconds / samples * 1e9))
         scaled.append(np.array(estimates))
-        print(f"{count} device(s): {seconds:.3f} s for {samples} samples", flush=True)
+        print(f"{cores} core(s): {seconds:.3f} s for {samples} samples", flush=True)
     away = max(np.linalg.norm(x - scaled[0]) / np.linalg.norm(scaled[0]) for x in scaled)
     return found, float(away)
 
@@ -218,7 +217,7 @@ STYLES = {
 }
 
 
-def plot(samples, joints, compiling, devices, path):
+def plot(samples, joints, compiling, cores, path):
     """Draw the four curves."""
     import matplotlib
 
@@ -240,12 +239,12 @@ def plot(samples, joints, compiling, devices, path):
     third.plot(*zip(*compiling, strict=True), "o-", color="#0072B2")
     third.set(xlabel="joints", ylabel="trace and compile, once [s]", ylim=(0, None))
     third.set_title("serial arms, one core")
-    numbers, costs = zip(*devices, strict=True)
+    numbers, costs = zip(*cores, strict=True)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     ideal = [costs[0] / min(n, cores or 1) for n in numbers]
     fourth.plot(numbers, costs, "o-", color="#0072B2", label="`identify`, measured")
     fourth.plot(numbers, ideal, ":", color="black", label=f"ideal on {cores} cores")
-    fourth.set(xscale="log", xlabel="CPU devices", ylabel="time per sample [ns]", ylim=(0, None))
+    fourth.set(xscale="log", xlabel="cores", ylabel="time per sample [ns]", ylim=(0, None))
     fourth.set_title(f"{LOG} samples, seven joints with friction")
     fourth.set_xticks(numbers)
     fourth.xaxis.set_major_formatter(ScalarFormatter())
@@ -275,7 +274,7 @@ def elsewhere(quick):
         return json.loads(path.read_text())
 
 
-def table(samples, joints, compiling, devices, away):
+def table(samples, joints, compiling, cores, away):
     """Return the rows of all curves."""
     ten = "ten parameters per body, one core, median of 5 turns"
 
@@ -302,11 +301,11 @@ def table(samples, joints, compiling, devices, away):
     rows.append(
         Row(
             "9d",
-            "`identify` by devices, per sample",
-            f"Panda with friction, {LOG} samples, each a row, a core for each device as far as "
-            f"there are cores; estimates of all are {away:.0e} apart (columns of length one)",
+            "`identify` by cores, per sample",
+            f"Panda with friction, {LOG} samples, each a row; "
+            f"estimates of all are {away:.0e} apart (columns of length one)",
             "the same to 1e-12",
-            line(devices),
+            line(cores),
             away <= 1e-12,
         )
     )
@@ -317,16 +316,14 @@ def main():
     """Measure rows 7 and 9, and draw the plot."""
     parser = timing.parser(__doc__, "few points, no plot")
     parser.add_argument("--one-core", help=argparse.SUPPRESS)
-    parser.add_argument("--devices", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--cores", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--samples", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--turns", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.devices:
-        timing.pin_to(options.devices)
+    if options.cores:
+        timing.pin_to(options.cores)
         for name in timing.THREADS:
             os.environ[name] = "1"
-        count = f"--xla_force_host_platform_device_count={options.devices}"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}".strip()
         print(json.dumps(identified(options.samples, options.turns)))
         return
     if options.one_core:
@@ -335,11 +332,11 @@ def main():
         return
     samples, joints, compiling, trees = elsewhere(options.quick)
     if options.quick:
-        devices, away = by_devices((1, 2), 110_000, 3)
+        cores, away = by_cores((1, 2), 110_000, 3)
     else:
-        devices, away = by_devices(DEVICES, LOG, 5)
-        plot(samples, joints, compiling, devices, HERE / "scaling.png")
-    rows = [Row(**row) for row in trees] + table(samples, joints, compiling, devices, away)
+        cores, away = by_cores(CORES, LOG, 5)
+        plot(samples, joints, compiling, cores, HERE / "scaling.png")
+    rows = [Row(**row) for row in trees] + table(samples, joints, compiling, cores, away)
     hand_over(rows, options.json)
 
 

@@ -5,8 +5,9 @@ regressor), `samples` (rows of a log), `rows` (rows left after filtering), `batc
 """
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from types import ModuleType
 from typing import Any
@@ -92,6 +93,24 @@ def namespace(*arrays: AnyArray) -> ModuleType:
     return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
 
 
+def on_cores(
+    function: Callable[[Any], Any], items: Iterable, cores: int | None = None
+) -> Iterator[Any]:
+    """Yield the results of a function for some items in their order, computed on all cores.
+
+    The calling thread makes the items, at most one more than there are cores ahead of the results.
+    """
+    cores = cores or os.cpu_count() or 1
+    waiting: deque[Future] = deque()
+    with ThreadPoolExecutor(cores) as pool:
+        for item in items:
+            if len(waiting) >= cores:
+                yield waiting.popleft().result()
+            waiting.append(pool.submit(function, item))
+        while waiting:
+            yield waiting.popleft().result()
+
+
 def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
     """Return the results of a compiled function, called for so many entries of data at a time.
 
@@ -107,8 +126,8 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
         return jax.block_until_ready(solve(jax.tree.map(lambda x: x[chosen], data)))
 
     # The first call compiles, and the others wait for it.
-    with ThreadPoolExecutor(os.cpu_count() if jax.default_backend() == "cpu" else 1) as pool:
-        found = list(pool.map(part, range(0, count, size)))
+    cores = None if jax.default_backend() == "cpu" else 1
+    found = on_cores(part, range(0, count, size), cores)
     return jax.tree.map(lambda *x: jnp.concatenate(x)[:count], *found)
 
 

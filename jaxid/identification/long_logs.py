@@ -1,4 +1,4 @@
-"""Factors of long logs: one compiled loop over the samples, on all devices of the processor.
+"""Factors of long logs: one compiled loop over the samples, on all cores of the processor.
 
 The loop evaluates the columns of a chunk, filters and decimates them to rows by matrix products
 with the impulse responses, and adds up the Gram matrix of each joint's rows; columns live only
@@ -12,14 +12,13 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, double_precision
+from jaxid.arrays import AnyArray, Array, Float, double_precision, on_cores
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import program_of
 from jaxid.measurement.filters import LowPass
@@ -124,9 +123,8 @@ def stream_blocks(
 ) -> list[Factors]:
     """Return the factors of blocks of time by the compiled loop, for logs of any length.
 
-    All CPU devices of this process share the log. Products are added up in the order of the pieces:
-    the number of devices changes no digit but those that a compiler may change. `edges` are the
-    first row of each block, and the end of the last one.
+    All cores share the log. Products are added up in the order of the pieces, so that the number of
+    cores changes no digit. `edges` are the first row of each block, and the end of the last one.
     """
     mask, indices = np.asarray(observations.mask), base.acting_columns
     stream = _Stream(base, observations, edges, progress)
@@ -155,7 +153,6 @@ class _Stream:
             np.stack([np.pad(h, (k * f, (TILE - 1 - k) * f)) for k in range(TILE)])
             for h, f in stages
         ]
-        self._devices = jax.local_devices(backend="cpu")
         inputs = 3 if base.model.memory is None else 4
         columns = program_of(base, base.columns, *[(base.model.robot.joints,)] * inputs)
         self._loop = _compiled(columns, tuple(base.acting_columns), self._shape)
@@ -248,22 +245,10 @@ class _Stream:
                 total += mixed.T @ mixed
 
     def _run(self, pieces: Sequence[Piece], mixing: Grams) -> Iterator[tuple[Piece, Grams]]:
-        """Call the loop for some pieces, one on each device, and read the next ones meanwhile."""
-        size = len(self._devices)
-        groups = [pieces[k : k + size] for k in range(0, len(pieces), size)]
-
-        def read(group: Sequence[Piece]) -> list:
-            return [self._observations.read(samples) for _, _, samples in group]
-
-        # The thread only reads: memory that a thread allocates comes back late.
-        with ThreadPoolExecutor(1) as reader:
-            coming = [reader.submit(read, group) for group in groups[:1]]
-            for group, following in itertools.zip_longest(groups, groups[1:]):
-                found = coming.pop().result()
-                if following is not None:
-                    coming.append(reader.submit(read, following))
-                arrays = [self._fill(*x) for x in zip(group, found, strict=True)]
-                yield from zip(group, self._call(arrays, mixing), strict=True)
+        """Call the loop for some pieces, each on one core, and read the next ones meanwhile."""
+        arrays = (self._fill(piece, self._observations.read(piece[2])) for piece in pieces)
+        grams = on_cores(lambda x: self._call(x, mixing), arrays)
+        return zip(pieces, grams, strict=True)
 
     def _fill(self, piece: Piece, read: tuple) -> list[np.ndarray]:
         """Return the arrays of one piece, filled up to the shape of the loop."""
@@ -279,18 +264,10 @@ class _Stream:
         arrays.append(_filled_up(mask, shape.iterations * shape.rows))
         return [*arrays, np.asarray(-(-len(mask) // shape.rows), np.int32)]
 
-    def _call(self, pieces: list[list[np.ndarray]], mixing: Grams) -> list[Grams]:
-        """Return the Gram matrices of some pieces, at most one for each device."""
-        count, devices = len(pieces), self._devices
-        with double_precision(), jax.default_device(devices[0]):
-            if len(devices) == 1:
-                grams = [self._loop(*x, mixing, self._matrices) for x in pieces]
-                return [[np.asarray(G) for G in joints] for joints in grams]
-            pieces = pieces + [[np.zeros_like(x) for x in pieces[0]]] * (len(devices) - count)
-            run = _on_devices(self._loop, tuple(devices))
-            stacked = (np.stack(x) for x in zip(*pieces, strict=True))
-            grams = [np.asarray(G) for G in run(*stacked, mixing, self._matrices)]
-        return [[G[k] for G in grams] for k in range(count)]
+    def _call(self, arrays: list[np.ndarray], mixing: Grams) -> Grams:
+        """Return the Gram matrices of a piece."""
+        with double_precision(), jax.default_device(jax.local_devices(backend="cpu")[0]):
+            return [np.asarray(G) for G in self._loop(*arrays, mixing, self._matrices)]
 
 
 def _filled_up(x: np.ndarray, length: int) -> np.ndarray:
@@ -394,9 +371,3 @@ def _part(x: AnyArray, k: Array, length: int) -> Array:
     """Return the samples of one iteration, on the last axis."""
     start = (k * length, jnp.zeros_like(k))
     return jax.lax.dynamic_slice(x, start, (length, x.shape[1])).T
-
-
-@functools.lru_cache(maxsize=16)
-def _on_devices(run: Callable, devices: tuple) -> Callable:
-    """Return the loop for one piece on each device, compiled once for all."""
-    return jax.pmap(run, in_axes=(*(0,) * 4, None, None), devices=devices)

@@ -7,16 +7,14 @@ that loses digits, a refinement with the residuals, or orthogonal factors, bring
 """
 
 import itertools
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, in_parts, is_traced, require_float64
+from jaxid.arrays import AnyArray, Bool, Float, in_parts, is_traced, on_cores, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.open_model import opened
@@ -165,8 +163,7 @@ def _estimate_each(base, batch: DataSets, estimator: AbstractEstimator, row_time
         return identify(base, o, estimator, uncertainty=uncertainty)
 
     cases = itertools.product(range(len(Q)), range(Q.shape[1]))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        fits = list(pool.map(one, cases))
+    fits = list(on_cores(one, cases))
     known = np.array([np.isfinite(fit.naive_standard_deviations).all() for fit in fits])
     condition = np.array([fit.condition_numbers.scaled for fit in fits])
     names = ("parameters", "standard_deviations", "residual_rms", "naive_standard_deviations")

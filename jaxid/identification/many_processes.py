@@ -2,7 +2,7 @@
 
 Processes, on one host or many, read recordings of their own and exchange only factors: some tens of
 kilobytes for each block of time. Factors are joined in a fixed order, so that every process gets
-the same answer. The devices of one process need no function: `identify` uses all CPU devices.
+the same answer. The cores of one process need no function: `identify` uses all of them.
 """
 
 import itertools

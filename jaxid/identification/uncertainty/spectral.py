@@ -10,15 +10,15 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy import fft
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, on_cores
 
-from ..estimators.estimate import Estimate
+from ..estimators.estimate import Channel, Estimate
 from ..factors import RowChunk
 from ..problem import RegressionProblem, Span
 from .blocks import BlockJackknife, jackknife
@@ -113,7 +113,7 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
         lengths[n, row_time] = longest[row_time]
     found: dict[tuple, Lines] = {}
     B, p = np.asarray(estimate.inverse), np.asarray(estimate.parameters)
-    correlated = np.zeros((0, 0, *B.shape))
+    correlated: Any = 0.0
 
     def pieces_of_stretches() -> Iterator[tuple[Span, RowChunk, np.ndarray]]:
         for chunk, residuals in problem.residuals(p, stretches):
@@ -126,11 +126,10 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
     for (number, a, b), group in itertools.groupby(pieces_of_stretches(), lambda x: x[0]):
         o, parts = problem.recordings[number], [(chunk, r) for _, chunk, r in group]
         pieces = [estimate.influence(chunk, residuals) for chunk, residuals in parts]
-        if not len(correlated):
-            correlated = np.zeros((len(BIN_EDGES) + 1, len(pieces[0]), *B.shape))
         r = np.concatenate([np.where(chunk.mask, r, 0.0) for chunk, r in parts])
         n = lengths[b - a, o.row_time]
-        lines = _transform(n, pieces, r, B, o, correlated)
+        lines, pairs = _transform(n, pieces, r, B, o)
+        correlated = correlated + pairs
         key = (n, o.row_time, len(lines.frequency))
         found[key] = found[key].add(lines) if key in found else lines
     return list(found.values()), correlated, complete
@@ -142,8 +141,8 @@ def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
     return np.bincount(np.minimum(k, length - k)).astype(float)
 
 
-def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> Lines:
-    """Return the lines of one stretch; add the energies of pairs to `correlated`."""
+def _transform(n: int, pieces, residuals, inverse, observations) -> tuple[Lines, np.ndarray]:
+    """Return the lines of one stretch, and its energies of pairs of parameters by bins."""
     row_time = observations.row_time
     frequency = fft.rfftfreq(n, row_time)
     dt, decimation = observations.sample_time, observations.decimation
@@ -156,10 +155,6 @@ def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> 
     frequency, gain, m = frequency[:last], gain[:last], multiplicity(n)[:last]
     bins = np.searchsorted(BIN_EDGES, frequency, side="right")
     present, starts = np.unique(bins, return_index=True)
-    size, channels = len(inverse), len(pieces[0])
-    energy = np.empty((size, channels, last))
-    leverage, power = np.empty((channels, last)), np.empty((channels, last))
-    exposure = np.empty(channels)
     scale = np.sqrt(m / n)[:, None]
 
     def transform(rows: np.ndarray) -> np.ndarray:
@@ -167,25 +162,29 @@ def _transform(n: int, pieces, residuals, inverse, observations, correlated) -> 
         found = np.asarray(fft.rfft(rows, n, axis=0))[:last]
         return scale * np.stack([np.real(found), np.imag(found)])
 
-    for c, parts in enumerate(zip(*pieces, strict=True)):
+    def channel(parts: Sequence[Channel]) -> tuple:
+        """Return the sums of `Lines` and the energies of pairs of one channel."""
         own = list(parts[0].columns)
         B = inverse[:, own]
-        Z = transform(np.concatenate([x.instruments for x in parts]))
-        u = np.concatenate([x.disturbance for x in parts])
-        P = Z @ B.T
-        energy[:, c] = np.einsum("kfi,kfi->if", P, P)
-        for k, (a, b) in zip(present, itertools.pairwise([*starts, last]), strict=True):
-            both = Z[:, a:b].reshape(-1, len(own))
-            correlated[k, c] += B @ (both.T @ both) @ B.T
-        theta = Z
+        Z = theta = transform(np.concatenate([x.instruments for x in parts]))
         if any(x.equations is not x.instruments for x in parts):
             theta = transform(np.concatenate([x.equations for x in parts]))
-        leverage[c] = np.einsum("kfi,kfi->f", P[..., own], theta) / m
-        power[c] = np.abs(np.asarray(fft.rfft(u, n))[:last]) ** 2 / n
-        exposure[c] = sum(x.counted for x in parts) / n
+        P = Z @ B.T
+        leverage = np.sum(P[..., own] * theta, axis=(0, 2)) / m
+        energy = np.sum(np.square(P, out=P), axis=0).T
+        pairs = np.zeros((len(BIN_EDGES) + 1, *inverse.shape))
+        for k, (a, b) in zip(present, itertools.pairwise([*starts, last]), strict=True):
+            both = Z[:, a:b].reshape(-1, len(own))
+            pairs[k] = B @ (both.T @ both) @ B.T
+        u = np.concatenate([x.disturbance for x in parts])
+        power = np.abs(np.asarray(fft.rfft(u, n))[:last]) ** 2 / n
+        return energy, leverage, power, sum(x.counted for x in parts) / n, pairs
+
+    channels = zip(*on_cores(channel, zip(*pieces, strict=True)), strict=True)
+    energy, leverage, power, exposure, pairs = map(np.array, channels)
     residual = np.abs(np.asarray(fft.rfft(residuals, n, axis=0))[:last].T) ** 2 / n
-    sums = energy, leverage, power, residual, exposure
-    return Lines(n, row_time, frequency, m, gain, bins, *sums, 1)
+    sums = energy.swapaxes(0, 1), leverage, power, residual, exposure
+    return Lines(n, row_time, frequency, m, gain, bins, *sums, 1), pairs.swapaxes(0, 1)
 
 
 def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
@@ -257,7 +256,9 @@ class SpectralTable:
         rest = self._sums(half * (exposure - leverage))
         least = 0.02 * self._sums(half * exposure)
         self._rest = xp.maximum(rest, xp.maximum(least, 1e-300))
-        C = half[None] * transposed_sums(energy / self._rest[None])
+        # Channel by channel: fewer numbers at once.
+        pairs = [(energy[:, c], self._rest[c]) for c in range(len(self._rest))]
+        C = xp.stack([half * transposed_sums(x / rest[None]) for x, rest in pairs], axis=1)
         self._map = C.reshape((len(C), -1))
         # From a line's power to the scatter of its mean over the stretches.
         scatter = xp.sqrt(2.0 / (half * (1.0 + xp.maximum(exposure, 1.0))))
