@@ -36,6 +36,11 @@ class Candidate(NamedTuple):
     base: BaseParameters
     estimator: AbstractEstimator = WeightedLeastSquares()
 
+    @property
+    def size(self) -> int:
+        """Number of parameters, with the lengths of friction that has memory."""
+        return self.base.size + (self.base.model.memory is not None) * self.base.model.robot.joints
+
 
 class ModelChoice(eqx.Module):
     """Result of a choice of models.
@@ -73,7 +78,7 @@ class ModelChoice(eqx.Module):
         return Table(
             "models by their errors on parts that were left out",
             Column("model", [self.candidates[k].name for k in order]),
-            Column("parameters", [self.candidates[k].base.size for k in order]),
+            Column("parameters", [self.candidates[k].size for k in order]),
             Column("error", error, "%", percent),
             Column("above the best", above, "%", percent),
             Column("one deviation", deviation, "%", percent),
@@ -102,7 +107,8 @@ def choose_model(
     fitted to the rest and predicts the part. Of all candidates whose mean squared error exceeds the
     smallest one by at most one standard deviation of the difference, the one with the fewest
     parameters is chosen (Breiman et al., 1984). The promise comes from a second loop around this
-    choice, so that choosing does not make it too small.
+    choice, so that choosing does not make it too small. Lengths of presliding are those of the
+    candidates: find them before, with `identify_presliding`.
 
     Args:
         candidates: Models of one robot, and their estimators.
@@ -131,7 +137,7 @@ def choose_model(
     parts = table.shape[1]
     alone = np.arange(parts)
     squares = table[:, alone, alone]
-    sizes = [candidate.base.size for candidate in candidates]
+    sizes = [candidate.size for candidate in candidates]
     outer = []
     for out in alone:
         rest = np.setdiff1d(alone, [out])

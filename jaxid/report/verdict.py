@@ -73,6 +73,7 @@ def verdict(report: Report) -> list[Remark]:
         *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
         *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
         *_judge_fit(fit, report.identification),
+        *_judge_friction(fit, report.identification),
         *_judge_new_motions(report.identification, report.verification),
         dataclasses.replace(
             fit.determination[0],
@@ -138,6 +139,23 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
             f"{FIT_ERROR[1]:g} %. Bartlett's test compares the cumulative spectrum with a "
             "straight line. The intervals account for correlated residuals, not for what the model "
             "lacks.",
+        )
+    ]
+
+
+def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
+    """Warn if errors on the logs of a fit depend on the speeds of the joints."""
+    found = np.any([e.depend_on_speed for e in logs], axis=0) if logs else []
+    names = [f"`{n}`" for n, x in zip(fit.base.model.robot.joint_names, found, strict=False) if x]
+    if not names:
+        return []
+    return [
+        Remark(
+            f"Errors depend on speed (joints {', '.join(names)}): friction has another shape than "
+            "in the model, and the intervals of friction parameters are too narrow.",
+            Status.DOUBTFUL,
+            "Means over classes of speed predict the errors of times that they have not seen. "
+            "`jaxid choose` compares shapes of friction.",
         )
     ]
 

@@ -14,8 +14,8 @@ def errors(counted=None):
     measured, predicted = np.random.default_rng(0).normal(size=(2, 50, 2)) * [10.0, 1.0]
     counted = np.ones((50, 2), bool) if counted is None else counted
     limits = np.array([100.0, 5.0])
-    moving = np.arange(50)[:, None] >= [20, 0]
-    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits, moving)
+    speeds = np.where(np.arange(50)[:, None] >= [20, 0], 1.0, 0.0)
+    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits, speeds)
 
 
 def test_errors_are_those_of_the_paper():
