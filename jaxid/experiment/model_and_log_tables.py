@@ -68,7 +68,11 @@ class DryFriction:
         """Return the transition between the directions."""
         if self.presliding:
             steady = dataclasses.replace(self, presliding=False).transition(robot)
-            return terms.Presliding(steady=steady)
+            coupled = bool(terms.CoupledDrives().couplings(robot))
+            A = np.asarray(robot.drives.reduction)
+            return terms.Presliding(
+                steady=steady, motors=A / np.diag(A)[:, None] if coupled else None
+            )
         dead_zone = _speed(robot, "coulomb.dead_zone", self.dead_zone)
         if self.hard:
             return terms.HardSign(dead_zone)

@@ -36,11 +36,6 @@ class Candidate(NamedTuple):
     base: BaseParameters
     estimator: AbstractEstimator = WeightedLeastSquares()
 
-    @property
-    def size(self) -> int:
-        """Number of parameters, with the lengths of friction that has memory."""
-        return self.base.size + (self.base.model.memory is not None) * self.base.model.robot.joints
-
 
 class ModelChoice(eqx.Module):
     """Result of a choice of models.
@@ -78,7 +73,7 @@ class ModelChoice(eqx.Module):
         return Table(
             "models by their errors on parts that were left out",
             Column("model", [self.candidates[k].name for k in order]),
-            Column("parameters", [self.candidates[k].size for k in order]),
+            Column("parameters", [self.candidates[k].base.size for k in order]),
             Column("error", error, "%", percent),
             Column("above the best", above, "%", percent),
             Column("one deviation", deviation, "%", percent),
@@ -106,7 +101,9 @@ def choose_model(
     Parts of time are left out in turn, or whole logs if there are at least four. Each candidate is
     fitted to the rest and predicts the part. Of all candidates whose mean squared error exceeds the
     smallest one by at most one standard deviation of the difference, the one with the fewest
-    parameters is chosen (Breiman et al., 1984). The promise comes from a second loop around this
+    parameters is chosen (Breiman et al., 1984); of equally many the one whose friction has memory,
+    since no other says which force a joint at rest keeps, even where no part holds rest. The
+    promise comes from a second loop around this
     choice, so that choosing does not make it too small. Lengths of presliding are those of the
     candidates: find them before, with `identify_presliding`.
 
@@ -137,15 +134,15 @@ def choose_model(
     parts = table.shape[1]
     alone = np.arange(parts)
     squares = table[:, alone, alone]
-    sizes = [candidate.size for candidate in candidates]
+    ranks = [(c.base.size, c.base.model.memory is None) for c in candidates]
     outer = []
     for out in alone:
         rest = np.setdiff1d(alone, [out])
-        outer.append(squares[_simplest(table[:, out, rest], sizes), out])
+        outer.append(squares[_simplest(table[:, out, rest], ranks), out])
     return ModelChoice(
         tuple(candidates),
         np.sqrt(squares),
-        _simplest(squares, sizes),
+        _simplest(squares, ranks),
         float(np.sqrt(np.mean(outer))),
         f"{parts} logs" if by_log else f"{parts} parts of time",
     )
@@ -186,8 +183,8 @@ def _excess(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return differences.mean(axis=1), deviations
 
 
-def _simplest(squares: np.ndarray, sizes: Sequence[int]) -> int:
-    """Return the candidate with the fewest parameters that is about as good as the best one."""
+def _simplest(squares: np.ndarray, ranks: Sequence[tuple[int, bool]]) -> int:
+    """Return the candidate of the lowest rank that is about as good as the best one."""
     excess, deviations = _excess(squares)
     good = np.flatnonzero(excess <= deviations).tolist()
-    return int(min(good, key=lambda k: (sizes[k], excess[k])))
+    return int(min(good, key=lambda k: (*ranks[k], excess[k])))
