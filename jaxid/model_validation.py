@@ -1,10 +1,10 @@
 """Validation of a model: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
 
+import itertools
 from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
-from scipy import special
 
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.dispatch import in_numpy
@@ -23,8 +23,8 @@ OCTAVES = 6
 """Number of times that a joint's largest speed is halved for classes of its speed."""
 FALSE_ALARM = 0.01
 """Probability that errors which do not depend on speed seem to, at any joint of a log."""
-BLOCKS = 10
-"""Parts of time whose errors the others predict."""
+BLOCKS = 12
+"""Blocks of time whose errors are compared."""
 
 
 class TorqueErrors(eqx.Module):
@@ -98,13 +98,12 @@ class TorqueErrors(eqx.Module):
     def depend_on_speed(self) -> tuple[bool, ...]:
         """Whether the errors of each joint depend on its speed: friction of another shape.
 
-        Means over classes of speed, taken from nine tenths of the time, predict the errors of the
-        last tenth. Errors depend on speed if this removes more of their squares than chance does
-        (one-sided t-test over the tenths).
+        Then means over classes of speed agree between blocks of time: more than after nearly any
+        change of the blocks' signs, which leaves noise as it is (randomization test, Fisher).
         """
-        limit = special.stdtrit(BLOCKS - 1, 1.0 - FALSE_ALARM / self.errors.shape[1])
+        limit = FALSE_ALARM / self.errors.shape[1]
         pairs = zip(self.errors.T, np.asarray(self.speeds).T, strict=True)
-        return tuple(_statistic(e, v) > limit for e, v in pairs)
+        return tuple(_chance(e, v) <= limit for e, v in pairs)
 
     def _rms_where(self, chosen: np.ndarray) -> np.ndarray:
         squares = (self.errors - self.offset) ** 2
@@ -131,24 +130,22 @@ class TorqueErrors(eqx.Module):
         return np.where(self.counted, np.asarray(self.measured), np.nan)
 
 
-def _statistic(errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows"]) -> float:
-    """Return by how many standard deviations means over classes of speed reduce squared errors."""
+def _chance(errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows"]) -> float:
+    """Return the probability of errors whose means over classes of speed agree as much."""
     counted = np.isfinite(errors)
     e, v = errors[counted], speeds[counted]
-    if len(e) < BLOCKS or not v.any():
-        return 0.0
+    if len(e) < BLOCKS or not v.any() or not e.any():
+        return 1.0
     octave = np.log2(np.maximum(np.abs(v) / np.abs(v).max(), 0.5**OCTAVES))
     classes = (2 * np.round(octave + OCTAVES) + (v < 0)).astype(int)
-    block = np.arange(len(e)) * BLOCKS // len(e)
-    cells = np.zeros((2, BLOCKS, classes.max() + 1))
-    np.add.at(cells[0], (block, classes), e)
-    np.add.at(cells[1], (block, classes), 1.0)
-    sums, counts = cells
-    others = cells.sum(axis=1, keepdims=True) - cells
-    means = others[0] / np.maximum(others[1], 1.0)
-    # Of the squares of a block, e^2 - (e - mean)^2 in each class.
-    gains = np.sum(2.0 * means * sums - counts * means**2, axis=1)
-    return float(gains.mean() / (gains.std(ddof=1) / np.sqrt(BLOCKS) + 1e-300))
+    sums = np.zeros((BLOCKS, 2 * OCTAVES + 2))
+    np.add.at(sums, (np.arange(len(e)) * BLOCKS // len(e), classes), e)
+    sums /= np.sqrt(np.maximum(np.bincount(classes, minlength=sums.shape[1]), 1))
+    products = np.triu(sums @ sums.T, 1)
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=BLOCKS - 1)))
+    signs = np.column_stack([np.ones(len(signs)), signs])
+    agreement = np.sum((signs @ products) * signs, axis=1)
+    return float(np.mean(agreement >= agreement[0] - 1e-9 * np.abs(products).sum()))
 
 
 def _ratio(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray:

@@ -154,8 +154,8 @@ def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
             f"Errors depend on speed (joints {', '.join(names)}): friction has another shape than "
             "in the model, and the intervals of friction parameters are too narrow.",
             Status.DOUBTFUL,
-            "Means over classes of speed predict the errors of times that they have not seen. "
-            "`jaxid choose` compares shapes of friction.",
+            "Means over classes of speed agree between blocks of time. `jaxid choose` compares "
+            "shapes of friction.",
         )
     ]
 

@@ -36,6 +36,21 @@ def test_errors_are_those_of_the_paper():
     assert np.isnan(e.rms_at_rest[1])
 
 
+def test_errors_that_depend_on_speed_are_told_from_noise():
+    rng, t = np.random.default_rng(1), np.arange(2000) * 0.01
+    speeds = np.stack([np.sin(t), np.sin(1.3 * t), np.sin(0.7 * t)], axis=1)
+    # The last error is that of a Stribeck effect, well below the noise.
+    shape = 0.5 * np.sign(speeds) * np.exp(-((speeds / 0.1) ** 2)) * [0.0, 0.0, 1.0]
+    false = 0
+    for _ in range(50):
+        noise = rng.normal(size=shape.shape)
+        e = TorqueErrors("", t, noise + shape, 0 * t[:, None], shape < 9.0, np.ones(3), speeds)
+        *steady, found = e.depend_on_speed
+        assert found
+        false += any(steady)
+    assert false <= 3
+
+
 def test_rows_that_do_not_count_change_nothing():
     counted = np.ones((50, 2), bool)
     counted[10:20, 0] = False
