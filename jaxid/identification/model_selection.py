@@ -101,11 +101,11 @@ def choose_model(
     Parts of time are left out in turn, or whole logs if there are at least four. Each candidate is
     fitted to the rest and predicts the part. Of all candidates whose mean squared error exceeds the
     smallest one by at most one standard deviation of the difference, the one with the fewest
-    parameters is chosen (Breiman et al., 1984); of equally many the one whose friction has memory,
-    since no other says which force a joint at rest keeps, even where no part holds rest. The
-    promise comes from a second loop around this
-    choice, so that choosing does not make it too small. Lengths of presliding are those of the
-    candidates: find them before, with `identify_presliding`.
+    parameters is chosen (Breiman et al., 1984). Of equally many parameters one whose friction has
+    memory is preferred by the same rule: no other says which force a joint at rest keeps, even
+    where no part holds rest. The promise comes from a second loop around this choice, so that
+    choosing does not make it too small. Lengths of presliding are those of the candidates: find
+    them before, with `identify_presliding`.
 
     Args:
         candidates: Models of one robot, and their estimators.
@@ -184,7 +184,13 @@ def _excess(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _simplest(squares: np.ndarray, ranks: Sequence[tuple[int, bool]]) -> int:
-    """Return the candidate of the lowest rank that is about as good as the best one."""
-    excess, deviations = _excess(squares)
-    good = np.flatnonzero(excess <= deviations).tolist()
-    return int(min(good, key=lambda k: (*ranks[k], excess[k])))
+    """Return the candidate of the lowest rank that is about as good as the best one.
+
+    The last comparison is between candidates with equally many parameters.
+    """
+    good = np.arange(len(squares))
+    for key in zip(*ranks, strict=True):
+        excess, deviations = _excess(squares[good])
+        good = good[excess <= deviations]
+        good = good[np.array(key)[good] == min(np.array(key)[good])]
+    return int(good[np.argmin(squares[good].mean(axis=1))])

@@ -131,7 +131,8 @@ class Presliding(AbstractTransition):
 
     def _strain(self, change: AnyArray) -> AnyArray:
         """Return steps of joints and motors, relative to their lengths [1]."""
-        length = namespace(change).asarray(self.length)
+        xp = namespace(change)
+        length = xp.broadcast_to(xp.asarray(self.length), change.shape)
         return self._with_motors(change, lambda x: x / length)
 
     def advance(
