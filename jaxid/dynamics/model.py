@@ -116,8 +116,8 @@ class Model(Hashable):
     @property
     def input_shapes(self) -> list[tuple[int, ...]]:
         """Shapes of the arguments of `columns`."""
-        n, law = self.robot.joints, self.memory
-        return [(n,)] * 3 + ([] if law is None else [(law.size(n),)])
+        rest, law = np.zeros(self.robot.joints), self.memory
+        return [rest.shape] * 3 + ([] if law is None else [law.settled(rest).shape])
 
     def with_memory(self, **changes: Any) -> Self:
         """Return the model with other fields of `memory`, such as `length` or `state`."""
@@ -134,9 +134,8 @@ class Model(Hashable):
         if law is None:
             return motion.q, qd, motion.qdd
         if s is None:
-            one = qd.ndim == 1
-            s = law.settled(qd if one else qd[..., 0, :])
-            s = s if one else law.states(motion.q, s)
+            s = law.settled(qd if qd.ndim == 1 else qd[..., 0, :])
+            s = s if qd.ndim == 1 else law.states(motion.q, s)
         return motion.q, qd, motion.qdd, s
 
     def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints standard"]:

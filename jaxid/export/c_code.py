@@ -66,7 +66,7 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
     model, base = fit.base.model, fit.base
     one, rest = (model.robot.joints,), np.zeros(model.robot.joints)
     torque, others, law = torques(fit), other_forces(fit), model.memory
-    relaxed = None if law is None else np.zeros(law.size(len(rest)))
+    relaxed = None if law is None else np.zeros(model.input_shapes[-1])
     # Only the base parameters: composite bodies have fewer operations then.
     own = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
 

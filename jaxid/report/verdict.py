@@ -147,17 +147,15 @@ def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
     """Warn if errors on the logs of a fit depend on the speeds of the joints."""
     found = np.any([e.depend_on_speed for e in logs], axis=0) if logs else []
     names = [f"`{n}`" for n, x in zip(fit.base.model.robot.joint_names, found, strict=False) if x]
-    if not names:
-        return []
-    return [
+    remarks = [
         Remark(
-            f"Errors depend on speed (joints {', '.join(names)}): friction has another shape than "
-            "in the model, and the intervals of friction parameters are too narrow.",
+            f"Errors depend on speed (joints {', '.join(names)}): friction has another shape, and "
+            "the intervals of its parameters are too narrow.",
             Status.DOUBTFUL,
-            "Means over classes of speed agree between blocks of time. `jaxid choose` compares "
-            "shapes of friction.",
+            "Means over classes of speed agree between blocks of time: try `jaxid choose`.",
         )
     ]
+    return remarks if names else []
 
 
 def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:

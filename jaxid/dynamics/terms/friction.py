@@ -91,8 +91,8 @@ class Presliding(AbstractTransition):
     Attributes:
         length: Length $\delta$ of the deformation, one for all joints or one for each [rad or m].
         steady: Transition that gives the state of steady motion, and that at the start of a path.
-        motors: Motions of the motors relative to those of their own joints, if motors turn several
-            axes: then states of the motors follow those of the joints, as far as they are.
+        motors: Turns of the motors for those of the joints, 1 for their own, if motors turn several
+            axes: their states follow those of the joints.
         state: State at one sample, where it is known.
     """
 
@@ -114,10 +114,6 @@ class Presliding(AbstractTransition):
         if self.state is None or self.motors is None:
             return self.steady(speeds)
         return self.state[..., speeds.shape[-1] :]
-
-    def size(self, joints: int) -> int:
-        """Return the number of states of a robot."""
-        return joints if self.motors is None else 2 * joints
 
     def settled(self, qd: Float[AnyArray, "*batch joints"]) -> Float[AnyArray, "*batch states"]:
         """Return the states of steady motion."""
