@@ -18,6 +18,8 @@ from .term import AbstractTerm, NonlinearParameter
 
 EachJoint = float | Float[AnyArray, "..."]
 """One number for all joints, or one for each."""
+States = Float[AnyArray, " states"]
+"""States of friction with memory."""
 
 
 class AbstractTransition(Hashable):
@@ -91,15 +93,14 @@ class Presliding(AbstractTransition):
     Attributes:
         length: Length $\delta$ of the deformation, one for all joints or one for each [rad or m].
         steady: Transition that gives the state of steady motion, and that at the start of a path.
-        motors: Turns of the motors for those of the joints, 1 for their own, if motors turn several
-            axes: their states follow those of the joints.
+        motors: Turns of motors for those of joints, if motors turn several axes: they have states.
         state: State at one sample, where it is known.
     """
 
     length: EachJoint = eqx.field(converter=one_or_each, default=1e-3)
     steady: AbstractTransition = Tanh()
     motors: Float[AnyArray, "joints joints"] | None = None
-    state: Float[AnyArray, " states"] | None = None
+    state: States | None = None
 
     def __check_init__(self):
         if not isinstance(self.length, jax.Array) and not np.all(np.asarray(self.length) > 0):
@@ -131,9 +132,7 @@ class Presliding(AbstractTransition):
         length = xp.broadcast_to(xp.asarray(self.length), change.shape)
         return self._with_motors(change, lambda x: x / length)
 
-    def advance(
-        self, q_before: Joints, q: Joints, s: Float[AnyArray, " states"]
-    ) -> Float[AnyArray, " states"]:
+    def advance(self, q_before: Joints, q: Joints, s: States) -> States:
         """Return the state behind a step of one direction [rad or m], from that before it."""
         strain = self._strain(q - q_before)
         way = jnp.sign(strain)
