@@ -38,7 +38,7 @@ def test_errors_are_those_of_the_paper():
 
 def test_errors_that_depend_on_speed_are_told_from_noise():
     rng, t = np.random.default_rng(1), np.arange(4000) * 0.01
-    speeds = np.stack([np.sin(t), np.sin(1.3 * t), np.sin(0.7 * t)], axis=1)
+    speeds = np.stack([np.sin(t), np.sin(1.3 * t), np.sin(2.1 * t)], axis=1)
     # The last error is that of a Stribeck effect, twice as large as the noise at most.
     shape = 2.0 * np.sign(speeds) * np.exp(-((speeds / 0.1) ** 2)) * [0.0, 0.0, 1.0]
     false = 0

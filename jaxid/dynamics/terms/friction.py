@@ -112,9 +112,8 @@ class Presliding(AbstractTransition):
 
     def of_motors(self, speeds: Joints) -> Joints:
         """Return the states of the motors: where they are not known, those of steady motion."""
-        if self.state is None or self.motors is None:
-            return self.steady(speeds)
-        return self.state[..., speeds.shape[-1] :]
+        unknown = self.state is None or self.motors is None
+        return self.steady(speeds) if unknown else self.state[..., speeds.shape[-1] :]
 
     def settled(self, qd: Float[AnyArray, "*batch joints"]) -> Float[AnyArray, "*batch states"]:
         """Return the states of steady motion."""
@@ -128,8 +127,7 @@ class Presliding(AbstractTransition):
 
     def _strain(self, change: AnyArray) -> AnyArray:
         """Return steps of joints and motors, relative to their lengths [1]."""
-        xp = namespace(change)
-        length = xp.broadcast_to(xp.asarray(self.length), change.shape)
+        length = namespace(change).broadcast_to(self.length, change.shape)
         return self._with_motors(change, lambda x: x / length)
 
     def advance(self, q_before: Joints, q: Joints, s: States) -> States:
