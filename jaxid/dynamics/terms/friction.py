@@ -112,8 +112,8 @@ class Presliding(AbstractTransition):
 
     def of_motors(self, speeds: Joints) -> Joints:
         """Return the states of the motors: where they are not known, those of steady motion."""
-        unknown = self.state is None or self.motors is None
-        return self.steady(speeds) if unknown else self.state[..., speeds.shape[-1] :]
+        s = None if self.motors is None else self.state
+        return self.steady(speeds) if s is None else s[..., speeds.shape[-1] :]
 
     def settled(self, qd: Float[AnyArray, "*batch joints"]) -> Float[AnyArray, "*batch states"]:
         """Return the states of steady motion."""
