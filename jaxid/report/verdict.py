@@ -73,8 +73,8 @@ def verdict(report: Report) -> list[Remark]:
         *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
         *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
         *_judge_fit(fit, report.identification),
-        *_judge_friction(fit, report.identification),
         *_judge_new_motions(report.identification, report.verification),
+        *_judge_friction(fit, report.identification),
         dataclasses.replace(
             fit.determination[0],
             detail="A combination counts as undetermined if it leaves more than "
