@@ -65,6 +65,7 @@ METHODS = (
     Script("coverage", 20),
     Script("robustness", 10),
     Script("held_out", 10),
+    Script("friction", 60),
     Script("stepwise", 10),
     Script("states", 5),
     Script("excitation", 60),

@@ -1,5 +1,6 @@
 """Validation of a model: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
 
+import itertools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -18,6 +19,12 @@ ROWS = 2**18
 """Largest number of rows that are compared."""
 STANDING = 0.01
 """Fraction of a joint's largest speed up to which it stands."""
+OCTAVES = 6
+"""Number of times that a joint's largest speed is halved for classes of its speed."""
+FALSE_ALARM = 0.01
+"""Probability that errors which do not depend on speed seem to, at any joint of a log."""
+BLOCKS = 12
+"""Blocks of time whose errors are compared."""
 
 
 class TorqueErrors(eqx.Module):
@@ -30,7 +37,7 @@ class TorqueErrors(eqx.Module):
         predicted: Forces of the model, filtered and decimated alike [N m or N].
         counted: Rows that count, for each joint.
         max_forces: Largest force of each joint [N m or N]; NaN where not known.
-        moving: Rows in which each joint moves faster than a hundredth of its largest speed.
+        speeds: Velocities, filtered and decimated alike [rad/s or m/s].
     """
 
     name: str = eqx.field(static=True)
@@ -39,7 +46,13 @@ class TorqueErrors(eqx.Module):
     predicted: Float[AnyArray, "rows joints"]
     counted: Bool[AnyArray, "rows joints"]
     max_forces: Float[AnyArray, " joints"]
-    moving: Bool[AnyArray, "rows joints"]
+    speeds: Float[AnyArray, "rows joints"]
+
+    @property
+    def moving(self) -> Bool[np.ndarray, "rows joints"]:
+        """Rows in which each joint moves faster than a hundredth of its largest speed."""
+        sizes = np.abs(self.speeds)
+        return sizes > STANDING * sizes.max(axis=0)
 
     @property
     def errors(self) -> Float[np.ndarray, "rows joints"]:
@@ -81,6 +94,17 @@ class TorqueErrors(eqx.Module):
         """RMS error about the offset while the joint moves [N m or N]; NaN if it never does."""
         return self._rms_where(np.asarray(self.moving))
 
+    @property
+    def depend_on_speed(self) -> tuple[bool, ...]:
+        """Whether the errors of each joint depend on its speed: friction of another shape.
+
+        Then means over classes of speed agree between blocks of time: more than after nearly any
+        change of the blocks' signs, which leaves noise as it is (randomization test, Fisher).
+        """
+        limit = FALSE_ALARM / self.errors.shape[1]
+        pairs = zip(self.errors.T, np.asarray(self.speeds).T, strict=True)
+        return tuple(_chance(e, v) <= limit for e, v in pairs)
+
     def _rms_where(self, chosen: np.ndarray) -> np.ndarray:
         squares = (self.errors - self.offset) ** 2
         chosen = chosen & np.isfinite(squares)
@@ -104,6 +128,24 @@ class TorqueErrors(eqx.Module):
     @property
     def _measured(self) -> np.ndarray:
         return np.where(self.counted, np.asarray(self.measured), np.nan)
+
+
+def _chance(errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows"]) -> float:
+    """Return the probability of errors whose means over classes of speed agree as much."""
+    counted = np.isfinite(errors)
+    e, v = errors[counted], speeds[counted]
+    if len(e) < BLOCKS or not v.any() or not e.any():
+        return 1.0
+    octave = np.log2(np.maximum(np.abs(v) / np.abs(v).max(), 0.5**OCTAVES))
+    classes = (2 * np.round(octave + OCTAVES) + (v < 0)).astype(int)
+    sums = np.zeros((BLOCKS, 2 * OCTAVES + 2))
+    np.add.at(sums, (np.arange(len(e)) * BLOCKS // len(e), classes), e)
+    sums /= np.sqrt(np.maximum(np.bincount(classes, minlength=sums.shape[1]), 1))
+    products = np.triu(sums @ sums.T, 1)
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=BLOCKS - 1)))
+    signs = np.column_stack([np.ones(len(signs)), signs])
+    agreement = np.sum((signs @ products) * signs, axis=1)
+    return float(np.mean(agreement >= agreement[0] - 1e-9 * np.abs(products).sum()))
 
 
 def _ratio(part: np.ndarray | float, whole: np.ndarray | float) -> np.ndarray:
@@ -227,7 +269,7 @@ def torque_errors(
             taken = slice(rows.start * step - first, None, step)
             measured[rows] = chunk.reduce(forces)[taken]
             predicted[rows] = chunk.reduce(model_forces)[taken]
-            speeds[rows] = np.abs(chunk.reduce(motion.qd)[taken])
+            speeds[rows] = chunk.reduce(motion.qd)[taken]
         if progress is not None:
             progress(stop / observations.rows)
     return TorqueErrors(
@@ -237,7 +279,7 @@ def torque_errors(
         predicted=predicted,
         counted=mask[::step],
         max_forces=np.where(np.isfinite(known), known, np.nan),
-        moving=speeds > STANDING * speeds.max(axis=0),
+        speeds=speeds,
     )
 
 

@@ -113,6 +113,12 @@ class Model(Hashable):
             raise InputError("all terms with `Presliding` must have the same one.")
         return next(iter(laws), None)
 
+    @property
+    def input_shapes(self) -> list[tuple[int, ...]]:
+        """Shapes of the arguments of `columns`."""
+        rest, law = np.zeros(self.robot.joints), self.memory
+        return [rest.shape] * 3 + ([] if law is None else [law.settled(rest).shape])
+
     def with_memory(self, **changes: Any) -> Self:
         """Return the model with other fields of `memory`, such as `length` or `state`."""
         leaves, tree = jax.tree.flatten(self.terms, is_leaf=_has_memory)
@@ -128,7 +134,8 @@ class Model(Hashable):
         if law is None:
             return motion.q, qd, motion.qdd
         if s is None:
-            s = law(qd) if qd.ndim == 1 else law.states(motion.q, law(qd[..., 0, :]))
+            s = law.settled(qd if qd.ndim == 1 else qd[..., 0, :])
+            s = s if qd.ndim == 1 else law.states(motion.q, s)
         return motion.q, qd, motion.qdd, s
 
     def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints standard"]:

@@ -25,7 +25,7 @@ class Motion(eqx.Module):
     q: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
     qd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
     qdd: Float[AnyArray, "*batch joints"] = eqx.field(converter=_coordinates)
-    state: Float[AnyArray, "*batch joints"] | None = None
+    state: Float[AnyArray, "*batch states"] | None = None
 
     def __getitem__(self, index) -> "Motion":
         """Return the motion at some of its instants, by an index of the leading axis."""

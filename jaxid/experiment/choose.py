@@ -11,6 +11,8 @@ import tomlkit
 
 from jaxid.errors import InputError
 from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
+from jaxid.identification.presliding import identify_presliding
+from jaxid.measurement.observations import Observations, Progress
 
 from .experiment import Experiment, parse_experiment
 from .identify_logs import Stages, load_log, select_filter
@@ -20,6 +22,7 @@ Changes = dict[str, dict[str, Any]]
 EFFECTS: dict[str, Changes] = {
     "root of speed": {"model": {"square_root": True}},
     "Stribeck": {"model": {"coulomb": {"stribeck": 0.1}}},
+    "presliding": {"model": {"coulomb": {"presliding": True}}},
     "viscous by direction": {"model": {"viscous": "asymmetric"}},
     "springs": {"model": {"springs": True}},
 }
@@ -46,6 +49,13 @@ def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple
     experiment, _ = select_filter(experiment, logs, stage)
     observations = [load_log(experiment, path, stage)[1] for path in logs]
     stage("choosing the model")
+    return choose_variant(experiment, observations, stage.through)
+
+
+def choose_variant(
+    experiment: Experiment, observations: Sequence[Observations], progress: Progress | None = None
+) -> tuple[ModelChoice, str]:
+    """Choose between variants of an experiment file; return the choice and the text of its file."""
     changes = dict(_variants(tomllib.loads(experiment.text)))
     candidates = []
     for name, own in changes.items():
@@ -53,8 +63,11 @@ def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple
             variant = parse_experiment(_changed(experiment.text, own), experiment.path)
         except InputError:
             continue  # an effect that this robot cannot have
-        candidates.append(Candidate(name, variant.base, variant.estimation.estimator))
-    choice = choose_model(candidates, observations, progress=stage.through)
+        base = variant.base
+        if base.model.memory is not None:
+            base = identify_presliding(base, observations)
+        candidates.append(Candidate(name, base, variant.estimation.estimator))
+    choice = choose_model(candidates, observations, progress=progress)
     return choice, _changed(experiment.text, changes[choice.chosen.name])
 
 
@@ -69,7 +82,8 @@ def _variants(content: dict[str, Any]) -> Iterator[tuple[str, Changes]]:
             for name in names:
                 for key, value in EFFECTS[name]["model"].items():
                     inner = changes.setdefault("model", {})
-                    inner[key] = {**given.get(key, {}), **value} if key == "coulomb" else value
+                    before = inner.get(key, given.get(key, {}))
+                    inner[key] = {**before, **value} if key == "coulomb" else value
             yield " + ".join((PLAIN, *names)), changes
     for name, own in ESTIMATORS.items():
         yield f"{PLAIN}, {name}", own

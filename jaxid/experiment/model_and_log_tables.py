@@ -68,7 +68,9 @@ class DryFriction:
         """Return the transition between the directions."""
         if self.presliding:
             steady = dataclasses.replace(self, presliding=False).transition(robot)
-            return terms.Presliding(steady=steady)
+            A, coupled = np.asarray(robot.drives.reduction), terms.CoupledDrives().couplings(robot)
+            motors = A / np.diag(A)[:, None] if coupled else None
+            return terms.Presliding(steady=steady, motors=motors)
         dead_zone = _speed(robot, "coulomb.dead_zone", self.dead_zone)
         if self.hard:
             return terms.HardSign(dead_zone)

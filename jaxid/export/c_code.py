@@ -66,7 +66,7 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
     model, base = fit.base.model, fit.base
     one, rest = (model.robot.joints,), np.zeros(model.robot.joints)
     torque, others, law = torques(fit), other_forces(fit), model.memory
-    relaxed = None if law is None else rest
+    relaxed = None if law is None else np.zeros(model.input_shapes[-1])
     # Only the base parameters: composite bodies have fewer operations then.
     own = np.asarray(base.to_standard(np.asarray(fit.parameters, np.float64)))
 
@@ -105,7 +105,8 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
     for name, (summary, function) in functions.items():
         inputs = (x for x in inspect.signature(function).parameters if x != "s" or law)
         inputs = tuple(inputs)
-        program = trace(function, *((base.size,) if x == "p" else one for x in inputs))
+        shapes = {"p": (base.size,), "s": model.input_shapes[-1]}
+        program = trace(function, *(shapes.get(x, one) for x in inputs))
         written.append(CFunction(name, summary, program, inputs, outputs.get(name, "tau")))
     return tuple(written)
 
@@ -121,7 +122,8 @@ def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
     memory = ""
     if fit.base.model.memory is not None:
         memory = f"""
-   s: state of dry friction, one number between -1 and 1 for each joint, which the caller keeps.
+   s: state of dry friction, one number between -1 and 1 for each joint, then for each motor if some
+   turn several axes, which the caller keeps.
    Begin with zeros, and call {name}_advance(q_before, q, s, s) at every sample, before the others.
 """
     terms = _ascii(", ".join(type(t).__name__ for t in fit.base.model.terms))

@@ -208,8 +208,7 @@ def torques(fit: Fit) -> Callable[..., Any]:
 
 def torque_program(fit: Fit) -> Program:
     """Return the program of the feed-forward on base parameters (Eq. 39)."""
-    inputs = 3 if fit.base.model.memory is None else 4
-    return trace(torques(fit), *[(fit.base.model.robot.joints,)] * inputs)
+    return trace(torques(fit), *fit.base.model.input_shapes)
 
 
 def exported_function(fit: Fit) -> export.Exported:
@@ -223,14 +222,14 @@ def exported_function(fit: Fit) -> export.Exported:
         fit: Identified model.
     """
     program = torque_program(fit)
-    joints = fit.base.model.robot.joints
 
     # One sample at a time, since the number of samples is not known here.
     one = functools.partial(on_any_platform, program, Lowered.dense)
     on_samples = jax.jit(jax.vmap(one))
     with double_precision():
         (samples,) = export.symbolic_shape("samples")
-        shapes = [jax.ShapeDtypeStruct((samples, joints), np.float64)] * len(program.input_shapes)
+        sizes = [(samples, *own) for own in program.input_shapes]
+        shapes = [jax.ShapeDtypeStruct(size, np.float64) for size in sizes]
         return export.export(on_samples, platforms=("cpu", "cuda"))(*shapes)
 
 

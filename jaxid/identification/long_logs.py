@@ -153,8 +153,7 @@ class _Stream:
             np.stack([np.pad(h, (k * f, (TILE - 1 - k) * f)) for k in range(TILE)])
             for h, f in stages
         ]
-        inputs = 3 if base.model.memory is None else 4
-        columns = program_of(base, base.columns, *[(base.model.robot.joints,)] * inputs)
+        columns = program_of(base, base.columns, *base.model.input_shapes)
         self._loop = _compiled(columns, tuple(base.acting_columns), self._shape)
         segments = range(len(observations.segments))
         self._pieces = [piece for k in segments for piece in self._divide(k)]

@@ -101,8 +101,11 @@ def choose_model(
     Parts of time are left out in turn, or whole logs if there are at least four. Each candidate is
     fitted to the rest and predicts the part. Of all candidates whose mean squared error exceeds the
     smallest one by at most one standard deviation of the difference, the one with the fewest
-    parameters is chosen (Breiman et al., 1984). The promise comes from a second loop around this
-    choice, so that choosing does not make it too small.
+    parameters is chosen (Breiman et al., 1984). Of equally many parameters one whose friction has
+    memory is preferred by the same rule: no other says which force a joint at rest keeps, even
+    where no part holds rest. The promise comes from a second loop around this choice, so that
+    choosing does not make it too small. Lengths of presliding are those of the candidates: find
+    them before, with `identify_presliding`.
 
     Args:
         candidates: Models of one robot, and their estimators.
@@ -131,15 +134,15 @@ def choose_model(
     parts = table.shape[1]
     alone = np.arange(parts)
     squares = table[:, alone, alone]
-    sizes = [candidate.base.size for candidate in candidates]
+    ranks = [(c.base.size, c.base.model.memory is None) for c in candidates]
     outer = []
     for out in alone:
         rest = np.setdiff1d(alone, [out])
-        outer.append(squares[_simplest(table[:, out, rest], sizes), out])
+        outer.append(squares[_simplest(table[:, out, rest], ranks), out])
     return ModelChoice(
         tuple(candidates),
         np.sqrt(squares),
-        _simplest(squares, sizes),
+        _simplest(squares, ranks),
         float(np.sqrt(np.mean(outer))),
         f"{parts} logs" if by_log else f"{parts} parts of time",
     )
@@ -180,8 +183,14 @@ def _excess(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return differences.mean(axis=1), deviations
 
 
-def _simplest(squares: np.ndarray, sizes: Sequence[int]) -> int:
-    """Return the candidate with the fewest parameters that is about as good as the best one."""
-    excess, deviations = _excess(squares)
-    good = np.flatnonzero(excess <= deviations).tolist()
-    return int(min(good, key=lambda k: (sizes[k], excess[k])))
+def _simplest(squares: np.ndarray, ranks: Sequence[tuple[int, bool]]) -> int:
+    """Return the candidate of the lowest rank that is about as good as the best one.
+
+    The last comparison is between candidates with equally many parameters.
+    """
+    good = np.arange(len(squares))
+    for key in zip(*ranks, strict=True):
+        excess, deviations = _excess(squares[good])
+        good = good[excess <= deviations]
+        good = good[np.array(key)[good] == min(np.array(key)[good])]
+    return int(good[np.argmin(squares[good].mean(axis=1))])

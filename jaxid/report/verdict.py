@@ -74,6 +74,7 @@ def verdict(report: Report) -> list[Remark]:
         *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
         *_judge_fit(fit, report.identification),
         *_judge_new_motions(report.identification, report.verification),
+        *_judge_friction(fit, report.identification),
         dataclasses.replace(
             fit.determination[0],
             detail="A combination counts as undetermined if it leaves more than "
@@ -140,6 +141,21 @@ def _judge_fit(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
             "lacks.",
         )
     ]
+
+
+def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
+    """Warn if errors on the logs of a fit depend on the speeds of the joints."""
+    found = np.any([e.depend_on_speed for e in logs], axis=0) if logs else []
+    names = [f"`{n}`" for n, x in zip(fit.base.model.robot.joint_names, found, strict=False) if x]
+    remarks = [
+        Remark(
+            f"Errors depend on speed (joints {', '.join(names)}): friction has another shape, and "
+            "the intervals of its parameters are too narrow.",
+            Status.DOUBTFUL,
+            "Means over classes of speed agree between blocks of time: try `jaxid choose`.",
+        )
+    ]
+    return remarks if names else []
 
 
 def _relative(logs: Sequence[TorqueErrors]) -> np.ndarray:

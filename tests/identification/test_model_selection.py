@@ -73,6 +73,18 @@ def test_the_promise_is_what_comes(candidates):
     assert 0.9 < np.median(ratios) < 1.15
 
 
+@pytest.mark.parametrize("memory", [0, 1])
+def test_of_equally_good_models_that_with_memory_is_chosen(memory):
+    laws = [jid.terms.Tanh(), jid.terms.Presliding(0.01)][:: 1 - 2 * memory]
+    terms = [(jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction(x)) for x in laws]
+    models = [jid.Model(ROBOT, x) for x in terms]
+    names, p = models[0].parameter_names, virtual.standard_parameters(models[0])
+    p[[names.index(x) for x in ("fc1", "fc2")]] = 0.0
+    log = virtual.observations(models[0], p, samples=1500, noise=0.3)
+    choice = jid.choose_model([jid.Candidate("", jid.base_parameters(x)) for x in models], log)
+    assert choice.chosen.base.model.memory is not None
+
+
 def test_nothing_to_choose_from_is_refused(candidates):
     with pytest.raises(ValueError, match="at least one model"):
         jid.choose_model([], logs("plain"))

@@ -97,6 +97,22 @@ def test_forces_and_lengths_are_found():
     np.testing.assert_allclose(fit.predict(m), log.forces, atol=0.2)
 
 
+def test_a_motor_that_turns_two_axes_has_a_state_of_its_own():
+    A = np.array([[1.0, 0.0], [0.6, 1.0]])
+    drives = jid.Drives(reduction=np.diag([50.0, 80.0]) @ A)
+    law, m = Presliding(LENGTHS, motors=A), virtual.motion(2, 4000, seed=4)
+    terms = (CoulombFriction(law), jid.terms.CoupledDrives(law))
+    model = jid.Model(ROBOT.replace(drives=drives), terms)
+    q, qd = np.asarray(m.q), np.asarray(m.qd)
+    start = np.tanh(qd[0] / 0.01), np.tanh(qd[0] @ A.T / 0.01)
+    joints, motors = (step_by_step(x, LENGTHS, s) for x, s in zip((q, q @ A.T), start, strict=True))
+    names = model.parameter_names
+    p = np.zeros(len(names))
+    p[[names.index(x) for x in ("fc1", "fc2", "fcm2")]] = 2.0, 1.5, 0.7
+    wanted = joints * [2.0, 1.5] + 0.7 * motors[:, 1:] * A[1]
+    np.testing.assert_allclose(model.inverse_dynamics(p, m), wanted, atol=1e-9)
+
+
 def test_a_joint_that_does_not_move_is_taken_to_slide_at_once():
     log, _ = log_of()
     m = log.motion

@@ -14,8 +14,8 @@ def errors(counted=None):
     measured, predicted = np.random.default_rng(0).normal(size=(2, 50, 2)) * [10.0, 1.0]
     counted = np.ones((50, 2), bool) if counted is None else counted
     limits = np.array([100.0, 5.0])
-    moving = np.arange(50)[:, None] >= [20, 0]
-    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits, moving)
+    speeds = np.where(np.arange(50)[:, None] >= [20, 0], 1.0, 0.0)
+    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits, speeds)
 
 
 def test_errors_are_those_of_the_paper():
@@ -34,6 +34,21 @@ def test_errors_are_those_of_the_paper():
     np.testing.assert_allclose(e.rms_at_rest[0], np.sqrt(np.mean(about[:20] ** 2)))
     np.testing.assert_allclose(e.rms_in_motion[0], np.sqrt(np.mean(about[20:] ** 2)))
     assert np.isnan(e.rms_at_rest[1])
+
+
+def test_errors_that_depend_on_speed_are_told_from_noise():
+    rng, t = np.random.default_rng(1), np.arange(4000) * 0.01
+    speeds = np.stack([np.sin(t), np.sin(1.3 * t), np.sin(2.1 * t)], axis=1)
+    # The last error is that of a Stribeck effect, twice as large as the noise at most.
+    shape = 2.0 * np.sign(speeds) * np.exp(-((speeds / 0.1) ** 2)) * [0.0, 0.0, 1.0]
+    false = 0
+    for _ in range(50):
+        noise = rng.normal(size=shape.shape)
+        e = TorqueErrors("", t, noise + shape, 0 * t[:, None], shape < 9.0, np.ones(3), speeds)
+        *steady, found = e.depend_on_speed
+        assert found
+        false += any(steady)
+    assert false <= 3
 
 
 def test_rows_that_do_not_count_change_nothing():

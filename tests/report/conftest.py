@@ -27,7 +27,7 @@ def errors_of():
             predicted=measured + random.standard_normal((rows, joints)),
             counted=np.ones((rows, joints), bool),
             max_forces=np.full(joints, 50.0),
-            moving=random.random((rows, joints)) < 0.8,
+            speeds=np.where(random.random((rows, joints)) < 0.8, 1.0, 0.0),
         )
 
     return errors_of

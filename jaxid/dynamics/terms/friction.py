@@ -18,6 +18,8 @@ from .term import AbstractTerm, NonlinearParameter
 
 EachJoint = float | Float[AnyArray, "..."]
 """One number for all joints, or one for each."""
+States = Float[AnyArray, " states"]
+"""States of friction with memory."""
 
 
 class AbstractTransition(Hashable):
@@ -26,6 +28,10 @@ class AbstractTransition(Hashable):
     @abstractmethod
     def __call__(self, qd: Joints) -> Joints:
         """Return a number between -1 and 1 for each speed [rad/s or m/s]."""
+
+    def of_motors(self, speeds: Joints) -> Joints:
+        """Return the same for the speeds of the motors, on the side of their own joints."""
+        return self(speeds)
 
     @property
     def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
@@ -87,12 +93,14 @@ class Presliding(AbstractTransition):
     Attributes:
         length: Length $\delta$ of the deformation, one for all joints or one for each [rad or m].
         steady: Transition that gives the state of steady motion, and that at the start of a path.
+        motors: Turns of motors for those of joints, if motors turn several axes: they have states.
         state: State at one sample, where it is known.
     """
 
     length: EachJoint = eqx.field(converter=one_or_each, default=1e-3)
     steady: AbstractTransition = Tanh()
-    state: Joints | None = None
+    motors: Float[AnyArray, "joints joints"] | None = None
+    state: States | None = None
 
     def __check_init__(self):
         if not isinstance(self.length, jax.Array) and not np.all(np.asarray(self.length) > 0):
@@ -100,23 +108,42 @@ class Presliding(AbstractTransition):
 
     def __call__(self, qd):
         """Return the state: where it is not known, that of steady motion."""
-        return self.steady(qd) if self.state is None else self.state
+        return self.steady(qd) if self.state is None else self.state[..., : qd.shape[-1]]
 
-    def advance(self, q_before: Joints, q: Joints, s: Joints) -> Joints:
+    def of_motors(self, speeds: Joints) -> Joints:
+        """Return the states of the motors: where they are not known, those of steady motion."""
+        s = None if self.motors is None else self.state
+        return self.steady(speeds) if s is None else s[..., speeds.shape[-1] :]
+
+    def settled(self, qd: Float[AnyArray, "*batch joints"]) -> Float[AnyArray, "*batch states"]:
+        """Return the states of steady motion."""
+        return self._with_motors(qd, self.steady)
+
+    def _with_motors(self, x: AnyArray, function: Any) -> AnyArray:
+        """Return a function of the joints, followed by that of their motors."""
+        if self.motors is None:
+            return function(x)
+        return namespace(x).concatenate([function(x), function(x @ self.motors.T)], axis=-1)
+
+    def _strain(self, change: AnyArray) -> AnyArray:
+        """Return steps of joints and motors, relative to their lengths [1]."""
+        length = namespace(change).broadcast_to(self.length, change.shape)
+        return self._with_motors(change, lambda x: x / length)
+
+    def advance(self, q_before: Joints, q: Joints, s: States) -> States:
         """Return the state behind a step of one direction [rad or m], from that before it."""
-        way = jnp.sign(q - q_before)
-        kept = jnp.exp(-jnp.abs(q - q_before) / matching("length", self.length, q))
-        return way + (s - way) * kept
+        strain = self._strain(q - q_before)
+        way = jnp.sign(strain)
+        return way + (s - way) * jnp.exp(-jnp.abs(strain))
 
     def states(
-        self, q: Float[AnyArray, "*batch samples joints"], start: Float[AnyArray, "*batch joints"]
-    ) -> Float[AnyArray, "*batch samples joints"]:
+        self, q: Float[AnyArray, "*batch samples joints"], start: Float[AnyArray, "*batch states"]
+    ) -> Float[AnyArray, "*batch samples states"]:
         """Return the states along a path, from that at its first sample."""
         xp = namespace(q)
-        change = xp.diff(xp.moveaxis(q, -2, 0), axis=0)
-        length = xp.broadcast_to(xp.asarray(self.length), change.shape)
-        kept = xp.exp(-xp.abs(change) / length)
-        s = xp.concatenate([xp.asarray(start)[None], xp.sign(change) * (1 - kept)])
+        strain = self._strain(xp.diff(xp.moveaxis(q, -2, 0), axis=0))
+        kept = xp.exp(-xp.abs(strain))
+        s = xp.concatenate([xp.asarray(start)[None], xp.sign(strain) * (1 - kept)])
         kept = xp.concatenate([xp.zeros_like(s[:1]), kept])
         reach = 1
         # Each turn joins twice as many steps to one, which is affine in the state before it.
@@ -404,7 +431,7 @@ class CoupledDrives(AbstractTerm):
 
     Attributes:
         transition: Transition of the Coulomb friction, at speeds measured on the side of the
-            motor's own joint [rad/s or m/s]; the `steady` one of `Presliding`.
+            motor's own joint [rad/s or m/s].
     """
 
     transition: AbstractTransition = Tanh()
@@ -454,7 +481,7 @@ class CoupledDrives(AbstractTerm):
             r = ratios.astype(qd.dtype)
             # The motor's speed takes the place of its joint's, whose transition width it has.
             speeds = jnp.stack([jnp.dot(r, qd) if j == i else qd[j] for j in range(len(r))])
-            dry.append(r * getattr(self.transition, "steady", self.transition)(speeds)[i])
+            dry.append(r * self.transition.of_motors(speeds)[i])
         return jnp.stack([*inertia, *viscous, *dry], axis=1)
 
     def lower_bounds(self, robot):
