@@ -16,7 +16,7 @@ from jaxid.arrays import Array, Float
 
 from .program import Program
 from .rules import ALWAYS, differing_alike
-from .xla import hidden_one, lower, primitives
+from .xla import fenced, hidden_one, lower, primitives
 
 BLOCK = 256
 """Samples of one evaluation."""
@@ -46,7 +46,7 @@ def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
     def evaluate(arrays: tuple[Array, ...]) -> tuple[Array, ...]:
         # Transposed once, behind a fence of its own.
         whole = jnp.concatenate([x.T for x in arrays if x.ndim == 2])
-        rows = iter(whole / hidden_one(whole[0, 0]))
+        rows = iter(fenced(whole, hidden_one(whole[0, 0])))
         inputs = [
             [next(rows) for _ in x.T] if x.ndim == 2 else [jnp.broadcast_to(y, (block,)) for y in x]
             for x in arrays

@@ -23,6 +23,8 @@ from .scalar import Operation
 ELEMENTWISE: dict[Operation, Callable] = {
     o: getattr(jnp, o.numpy.__name__) for o in Operation if o is not Operation.INPUT
 }
+HOLDS = jax.__version_info__ >= (0, 12)
+"""Whether an optimization barrier stops XLA's CPU backend."""
 CIRCULAR = (Operation.SINE, Operation.COSINE)
 Groups = tuple[tuple[int, ...], ...]
 Entries = Sequence[Array | Sequence[Array]]
@@ -35,8 +37,8 @@ def hidden_one(reference: Array) -> Array:
     """Return (sign bit of a number | 1), which is 1 for any number, NaN included.
 
     XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for NaN and
-    infinities: division by a one that XLA cannot recognise is a fence. (An optimization barrier
-    does not stop XLA's CPU backend before JAX 0.12.)
+    infinities: division by a one that XLA cannot recognise is a fence. From JAX 0.12 on an
+    optimization barrier does the same at no cost.
 
     Args:
         reference: Number known only at run time, in the precision of the program.
@@ -44,6 +46,11 @@ def hidden_one(reference: Array) -> Array:
     width = 8 * reference.dtype.itemsize
     bits = jax.lax.stop_gradient(reference).view(f"uint{width}")
     return (bits >> (width - 1) | 1).astype(reference.dtype)
+
+
+def fenced(x: Array, one: Array) -> Array:
+    """Return a value behind a fence, which XLA does not compute again for each of its uses."""
+    return jax.lax.optimization_barrier(x) if HOLDS else x / one
 
 
 def fenced_nodes(program: Program) -> frozenset[int]:
@@ -159,7 +166,7 @@ class Lowered(eqx.Module):
                 if node.operation is Operation.SELECT:
                     operands[1:] = [jnp.asarray(x, dtype) for x in operands[1:]]
                 value = operations[node.operation](*operands)
-                values.append(value / anchor if position in self.fenced else value)
+                values.append(fenced(value, anchor) if position in self.fenced else value)
         return values, pairs, anchor
 
 
@@ -214,7 +221,7 @@ def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> 
 def _circular(x: Array, anchor: Array | None) -> tuple[Array, Array]:
     """Return sine and cosine behind fences; their derivatives are made from the fenced values."""
     sine, cosine = sine_cosine(x)
-    return (sine, cosine) if anchor is None else (sine / anchor, cosine / anchor)
+    return (sine, cosine) if anchor is None else (fenced(sine, anchor), fenced(cosine, anchor))
 
 
 @_circular.defjvp
@@ -261,7 +268,7 @@ def _stacked_derivative(lowered: Lowered, groups: Groups, primals: tuple, tangen
             real = [jnp.asarray(x, zero.dtype) if isinstance(x, float) else x for x in operands]
             change = _slope(operation, real, own)
         fence = anchor if position in lowered.fenced else None
-        changes.append(change if fence is None else change / fence)
+        changes.append(change if fence is None else fenced(change, fence))
     found = (_in_groups(program, groups, x, first, k) for k, x in enumerate((values, changes)))
     values, changes = found
     return values, changes
