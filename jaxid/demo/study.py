@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -217,7 +218,10 @@ def _design(
             throw=False,
         )
 
-    return design(jid.criteria.ConditionNumber()), design(jid.criteria.DOptimal())
+    # Most of the time is that of the compiler, which works on one core at a time.
+    with ThreadPoolExecutor() as pool:
+        both = pool.map(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal()))
+        return tuple(both)
 
 
 def _follow(
