@@ -45,6 +45,8 @@ def main() -> NoReturn:
     """Run a command; Ctrl-C and SIGTERM end it within two seconds, with one sentence."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _receive)
+    # Threads of BLAS wait busily for each other at small matrices; large work has its own threads.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Imports, tracing and drawing make many small objects, of which few are in cycles.
     gc.set_threshold(GARBAGE, 20, 100)
     codes, done = [], threading.Event()
