@@ -115,7 +115,7 @@ def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
     if primitive in _IN_NUMPY and exact and len(operands) <= 3:
         with np.errstate(all="ignore"):
             result = _IN_NUMPY[primitive](*operands)
-            return [np.asarray(result, equation.outvars[0].aval.dtype)]
+            return [np.asarray(result, getattr(equation.outvars[0].aval, "dtype", None))]
     if primitive == "iota":
         shape, axis = params["shape"], params["dimension"]
         return [np.indices(shape, params["dtype"])[axis]]
