@@ -11,6 +11,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.arrays import Float
+from jaxid.excitation.design import DesignProgress
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.model_validation import Validation
 from jaxid.simulation.virtual import Tracking
@@ -200,9 +201,15 @@ def _design(
     low[2], high[2], most[2] = -0.4, 0.4, 3.0
     limits = dataclasses.replace(limits, position_min=low, position_max=high, acceleration=most)
 
+    name, done = "designing two motions", {}
+    progress(name, 0.0)
+
     def design(criterion: jid.criteria.AbstractCriterion) -> jid.ExcitationPlan:
-        name = f"designing the motion: {criterion.name}"
-        progress(name, 0.0)
+        def report(now: DesignProgress) -> None:
+            done[criterion.name] = now.fraction
+            if any(done.values()):  # zero would begin the stage anew
+                progress(name, sum(done.values()) / 2)
+
         return jid.design_excitation(
             base,
             criterion=criterion,
@@ -214,7 +221,7 @@ def _design(
             polish=0,
             samples=SAMPLES,
             key=jax.random.key(seed),
-            progress=lambda now: progress(name, now.fraction),
+            progress=report,
             throw=False,
         )
 
