@@ -8,7 +8,9 @@ are texts for two columns of `kind="number"`.
 
 import dataclasses
 import enum
+import importlib.metadata
 import math
+import platform
 import re
 import shutil
 import textwrap
@@ -266,3 +268,13 @@ def _shrink(widths: list[int], numbers: Sequence[bool], available: int) -> None:
         if widths[widest] <= 12:
             return
         widths[widest] -= 1
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software that computed a result."""
+    try:
+        own = importlib.metadata.version("jaxid-robotics")
+    except importlib.metadata.PackageNotFoundError:
+        own = "not installed"
+    others = {name: importlib.metadata.version(name) for name in ("jax", "numpy")}
+    return {"jaxid": own, **others, "python": platform.python_version()}

@@ -12,6 +12,7 @@ import typer
 from rich.text import Text
 
 from jaxid.errors import InputError
+from jaxid.result_table import versions
 
 from . import options
 
@@ -47,8 +48,6 @@ def _options(
     version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
 ) -> None:
     if version:
-        from jaxid.report.page import versions
-
         typer.echo(f"jaxid {versions()['jaxid']}")
         raise typer.Exit
 

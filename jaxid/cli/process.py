@@ -6,6 +6,7 @@ Files are written under temporary names and renamed, so that a process may end a
 """
 
 import contextlib
+import gc
 import os
 import shutil
 import signal
@@ -17,6 +18,8 @@ from typing import NoReturn
 
 GRACE = 1.3
 """Time after Ctrl-C in which a command may still hand over what it has [s]."""
+GARBAGE = 50_000
+"""Number of new objects after which cycles among them are looked for: by default hundreds."""
 STOP = threading.Event()
 """Set when a signal has asked the command to stop."""
 _farewells: list[str] = []
@@ -42,6 +45,10 @@ def main() -> NoReturn:
     """Run a command; Ctrl-C and SIGTERM end it within two seconds, with one sentence."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _receive)
+    # Threads of BLAS wait busily for each other at small matrices; large work has its own threads.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Imports, tracing and drawing make many small objects, of which few are in cycles.
+    gc.set_threshold(GARBAGE, 20, 100)
     codes, done = [], threading.Event()
 
     def work() -> None:

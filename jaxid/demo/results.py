@@ -9,9 +9,18 @@ import jaxid as jid
 from jaxid.io import atomic_folder
 from jaxid.report.excitation import side_by_side_table
 from jaxid.report.identification import parameter_table
-from jaxid.report.page import Section, folded, picture, render_page, versions
+from jaxid.report.page import Section, folded, picture, render_page
 from jaxid.report.result_files import SCHEMAS, plain, write_json
-from jaxid.result_table import MISSING, Column, Remark, Status, Table, significant, with_deviation
+from jaxid.result_table import (
+    MISSING,
+    Column,
+    Remark,
+    Status,
+    Table,
+    significant,
+    versions,
+    with_deviation,
+)
 from jaxid.simulation.tx90l import COLD, WARM
 
 from . import study as settings

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 
 import jaxid as jid
 from jaxid.arrays import Float
+from jaxid.excitation.design import DesignProgress
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.model_validation import Validation
 from jaxid.simulation.virtual import Tracking
@@ -199,9 +201,15 @@ def _design(
     low[2], high[2], most[2] = -0.4, 0.4, 3.0
     limits = dataclasses.replace(limits, position_min=low, position_max=high, acceleration=most)
 
+    name, done = "designing two motions", {}
+    progress(name, 0.0)
+
     def design(criterion: jid.criteria.AbstractCriterion) -> jid.ExcitationPlan:
-        name = f"designing the motion: {criterion.name}"
-        progress(name, 0.0)
+        def report(now: DesignProgress) -> None:
+            done[criterion.name] = now.fraction
+            if any(done.values()):  # zero would begin the stage anew
+                progress(name, sum(done.values()) / 2)
+
         return jid.design_excitation(
             base,
             criterion=criterion,
@@ -213,11 +221,14 @@ def _design(
             polish=0,
             samples=SAMPLES,
             key=jax.random.key(seed),
-            progress=lambda now: progress(name, now.fraction),
+            progress=report,
             throw=False,
         )
 
-    return design(jid.criteria.ConditionNumber()), design(jid.criteria.DOptimal())
+    # Most of the time is that of the compiler, which works on one core at a time.
+    with ThreadPoolExecutor() as pool:
+        both = pool.map(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal()))
+        return tuple(both)
 
 
 def _follow(

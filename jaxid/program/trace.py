@@ -84,6 +84,18 @@ _MOVEMENTS: dict[str, Callable] = {
     "unstack": lambda x, *, axis: list(np.moveaxis(x, axis, 0)),
 }
 
+_IN_NUMPY: dict[str, Callable] = {
+    "add": np.add,
+    "div": np.divide,
+    "eq": np.equal,
+    "mul": np.multiply,
+    "neg": np.negative,
+    "select_n": lambda which, *cases: np.where(which, cases[-1], cases[0]),
+    "sub": np.subtract,
+    "tanh": np.tanh,
+}
+"""Primitives that known numbers go through in NumPy: JAX would compile each shape."""
+
 _INDEXED = {
     "dynamic_slice": (0,),
     "dynamic_update_slice": (0, 1),
@@ -96,11 +108,21 @@ _INDEXED = {
 
 
 def _on_numbers(equation: JaxprEqn, *operands: np.ndarray) -> list[np.ndarray]:
-    """Run one equation with JAX on known numbers, also inside another trace."""
+    """Run one equation on known numbers, in NumPy where it suffices, also inside another trace."""
+    primitive, params = equation.primitive.name, equation.params
+    # Division of whole numbers differs.
+    exact = primitive != "div" or operands[0].dtype == np.float64
+    if primitive in _IN_NUMPY and exact and len(operands) <= 3:
+        with np.errstate(all="ignore"):
+            result = _IN_NUMPY[primitive](*operands)
+            return [np.asarray(result, getattr(equation.outvars[0].aval, "dtype", None))]
+    if primitive == "iota":
+        shape, axis = params["shape"], params["dimension"]
+        return [np.indices(shape, params["dtype"])[axis]]
     with jax.ensure_compile_time_eval():
         # A NumPy array would take the precision of the process; a JAX array keeps its own.
         arrays = [jax.numpy.asarray(x, x.dtype) for x in operands]
-        results = equation.primitive.bind(*arrays, **equation.params)
+        results = equation.primitive.bind(*arrays, **params)
         results = results if equation.primitive.multiple_results else [results]
         return [np.asarray(x) for x in results]
 

@@ -1,21 +1,17 @@
 """Results for people: HTML pages that need nothing else, and tables in the terminal."""
 
 import functools
-import importlib.metadata
-import platform
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import Remark, Status, Table, printable
+from jaxid.result_table import Remark, Status, Table, printable, versions
 
 from .style import svg_text
 
@@ -99,20 +95,6 @@ def provenance(settings: Mapping[str, Any]) -> Section:
     if settings.get("experiment_text"):
         blocks.append(folded("The experiment file", code(str(settings["experiment_text"]))))
     return "To repeat this", blocks
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of the software that computed a result."""
-    try:
-        own = importlib.metadata.version("jaxid-robotics")
-    except importlib.metadata.PackageNotFoundError:
-        own = "not installed"
-    return {
-        "jaxid": own,
-        "jax": jax.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
 
 
 @functools.cache

@@ -21,7 +21,7 @@ from jaxid.identification.parameter_changes import LEVEL, Comparison, parameter_
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.model_validation import TorqueErrors
-from jaxid.result_table import Status
+from jaxid.result_table import Status, versions
 from jaxid.robot.robot import Robot
 
 from .estimates_and_residuals import (
@@ -32,7 +32,6 @@ from .estimates_and_residuals import (
     residual_figure,
 )
 from .identification import identification_page
-from .page import versions
 from .style import save, write_figures
 from .torques import error_figure, torque_figure
 from .verdict import Report, verdict

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine, PlaceHolderLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 # The palette of Okabe and Ito, which colour-blind readers can tell apart.
 BLUE, ORANGE, VERMILION = "#0072B2", "#E69F00", "#D55E00"
@@ -82,8 +82,9 @@ def logarithmic(axes: Axes, which: str) -> None:
 
     def label_between(value: float, _: int | None) -> str:
         low, high = sorted(axis.get_view_interval())
-        return plain_number(value) if f"{value:e}"[0] in "25" and high < 30.0 * low else ""
+        return plain_number(value) if high < 30.0 * low else ""
 
+    axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
     axis.set_minor_formatter(FuncFormatter(label_between))
 
 

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
 from jaxid.arrays import AnyArray, Array, Float, require_float64
 from jaxid.dynamics.base import BaseParameters
@@ -226,6 +225,9 @@ class ShapeSearch(eqx.Module):
             begin: Shapes at which the search begins; by default the best of a few multiples.
             kept: One for each block of time that counts, zero for others; by default all count.
         """
+        # Fits without nonlinear friction do not wait for it.
+        import optimistix as optx
+
         start = jnp.asarray(self.start)
         begin = self.best_multiples(weights) if begin is None else begin
         rows = self.row_weights(weights, kept)
