@@ -41,8 +41,8 @@ def filtered(c):
 
 def drive_filter(c):
     """Low-pass the forces as drives do: they are 1.6 ms late."""
-    c.tau = signal.lfilter(*signal.butter(1, 100.0, fs=1 / spoilt.DT), c.tau - c.tau[0], axis=0)
-    c.tau += c.first
+    first, drive = c.tau[0].copy(), signal.butter(1, 100.0, fs=1 / spoilt.DT)
+    c.tau = signal.lfilter(*drive, c.tau - first, axis=0) + first
 
 
 def interpolated(c):
@@ -76,20 +76,21 @@ LATE = {"drive filter": 1.6, "held": 4.5}
 def recorded(robot, file, log, seed, folder):
     """Return the clean logs of a robot."""
     settings, change = LOGS[log]
-    ceiling = {"gravity": (0.0, 0.0, 9.81)} if robot == "ceiling" else {}
-    name = log if settings else "ordinary"
-    case = spoilt.recorded(
-        file, folder / f"{robot}-{name}-{seed}.npz", seed=seed, **settings, **ceiling
-    )
-    cases = [case]
+    settings = {**settings, "seed": seed}
+    if robot == "ceiling":
+        settings["gravity"] = (0.0, 0.0, 9.81)
+    name = log if LOGS[log][0] else "ordinary"
+    cache = folder / f"{robot}-{name}-{seed}.npz"
+    cases = [spoilt.recorded(file, cache, **settings)]
     if change is not None:
-        case.first = case.tau[0]
-        change(case)
+        change(cases[0])
     if log == "two rates":
-        cases += recorded(robot, file, "short", seed, folder)
+        with np.load(cache) as first:
+            settings |= {"friction": first["friction"], "seconds": 5.0, "seed": seed + 100}
+        cases += [spoilt.recorded(file, folder / f"{robot}-second-{seed}.npz", **settings)]
         cases[0].rows(slice(None, None, 10))
-    if ceiling:
-        case.key("gravity", "[0.0, 0.0, 9.81]")
+    if robot == "ceiling":
+        cases[0].key("gravity", "[0.0, 0.0, 9.81]")
     return cases
 
 

@@ -170,6 +170,7 @@ def simulate(
     gravity=(0.0, 0.0, -9.81),
     amplitude=0.5,
     pace=1.0,
+    friction=None,
     steps=8,
 ):
     """Simulate a robot that follows a reference by feed-forward and PD control.
@@ -191,6 +192,7 @@ def simulate(
         gravity: Gravity that acts on the robot [m/s²].
         amplitude: Used part of the ranges of the joints.
         pace: Frequencies of the motion over those of five harmonics of 10 s.
+        friction: Viscous and Coulomb coefficients of each joint, in place of their fractions.
         steps: Steps of integration in each sample.
     """
     model = pin.buildModelFromUrdf(str(urdf))
@@ -200,6 +202,7 @@ def simulate(
     rd, ideal, _ = _ideal(model, t, r)
     size = np.sqrt(np.mean(ideal**2, axis=0)) + 1e-3 * np.abs(ideal).max()
     fv, fc, fs = viscous * size / np.sqrt(np.mean(rd**2, axis=0)), coulomb * size, stribeck * size
+    fv, fc = (fv, fc) if friction is None else friction
     rng = np.random.default_rng(seed + 10**6)
     low = signal.butter(1, disturbance_hz, fs=1 / dt, output="sos")
     unknown = signal.sosfilt(low, rng.standard_normal((len(t), n)), axis=0)

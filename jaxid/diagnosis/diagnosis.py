@@ -1,13 +1,13 @@
 """Diagnosis of a log: signs of wrong units, signs, channels, sensors and delays, as sentences."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.arrays import AnyArray
-from jaxid.dynamics.terms import SquareRootFriction
 from jaxid.errors import InputError
 from jaxid.identification.delay import estimate_delay
 from jaxid.identification.estimators import GivenWeights
@@ -23,15 +23,18 @@ from .checks_without_model import (
     LogStatistics,
     channel_findings,
     clock_findings,
+    force_notes,
     limit_findings,
     stuck_findings,
 )
-from .mistakes import likely_mistakes
+from .mistakes import MOST, likely_mistakes
 
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
 EXAMINED = 2**17
 """Largest number of samples of a long log that are examined."""
+MATERIAL = 0.02
+"""Fraction (0 to 1) of the forces by which a delay must change them to be a mistake."""
 APART = 5.0
 """Ratio of a force's departure from the model to all others from which it is an event."""
 
@@ -71,15 +74,7 @@ class Diagnosis:
         Args:
             fit: Fit of the robot's model, to this log or to several.
         """
-        o = self.observations
-        # Faults of channels explain the rest.
-        if self.faulty or o is None:
-            return ()
-        if moments := departures(fit, o):
-            return moments
-        step = -(-o.rows // 300)
-        motion = o.motion[o.instants[::step]]
-        return likely_mistakes(fit, motion, o.reduced_forces[::step], self.motor_sides)
+        return _mistakes([self], fit)
 
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
@@ -90,8 +85,8 @@ class Diagnosis:
         """
         found, notes = (() if self.faulty else self.mistakes(fit)), self.notes
         if not found and not self.faulty:
-            found = negative_friction(fit)
             if self.observations is not None:
+                found = negative_friction(fit, [self.observations])
                 late, more = delay_finding(self.observations, fit, commanded)
                 found, notes = (*found, *late), (*notes, *more)
         return dataclasses.replace(self, findings=(*found, *self.findings), notes=notes)
@@ -208,15 +203,27 @@ def diagnose(
         cure = "check `recording.time_unit` or `sample_time`."
         findings.append(f"the log has {rate:.3g} samples in a second: {cure}")
     found = tuple(findings)
+    if not faulty:
+        notes = (*notes, *force_notes(robot, statistics))
     faulty = tuple(range(robot.joints)) if clock else faulty
     diagnosis = Diagnosis(log, robot, statistics, found, faulty, observations, sides, notes)
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
 
 def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
-    """Return what a fit to several logs reveals, apart from delays, with the names of the logs."""
-    friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit)
-    return (*friction, *(f"{d.log.name}: {text}" for d in diagnoses for text in d.mistakes(fit)))
+    """Return what a fit to several logs reveals; they are judged together."""
+    logs = [d.observations for d in diagnoses if d.observations is not None]
+    friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit, logs)
+    return (*friction, *_mistakes(diagnoses, fit))
+
+
+def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
+    """Return the likely mistake in logs, or moments at which forces depart from the model."""
+    # Faults of channels explain the rest.
+    logs = [d.observations for d in diagnoses if d.observations is not None and not d.faulty]
+    named = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
+    moments = tuple(named.format(log, text) for log in logs for text in departures(fit, log))
+    return moments or (likely_mistakes(fit, logs, diagnoses[0].motor_sides) if logs else ())
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
@@ -251,7 +258,7 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     """Report forces that depart from the model for one moment, and at no other time nearly as far.
 
     Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the log at
-    most, beside what the filter spreads.
+    most, beside what the filter spreads. Uncertain parameters do not explain it.
     """
     o, robot = observations, fit.base.model.robot
     motion, forces = o.motion[o.instants], np.asarray(o.reduced_forces)
@@ -262,7 +269,11 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     for j, (name, error) in enumerate(zip(robot.joint_names, errors.T, strict=True)):
         k = int(np.argmax(error))
         others = error[np.abs(o.instants - o.instants[k]) > length]
-        if error[k] > max(0.5 * size[j], APART * others.max(initial=0.0)):
+        if error[k] <= max(0.5 * size[j], APART * others.max(initial=0.0)):
+            continue
+        row = np.asarray(fit.base.regressor(motion[k]))[j]
+        deviation = float(np.sqrt(row @ np.asarray(fit.covariance) @ row))
+        if error[k] - SURE * deviation > max(0.5 * size[j], APART * others.max(initial=0.0)):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "
@@ -272,20 +283,34 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     return tuple(found)
 
 
-def negative_friction(fit: Fit) -> tuple[str, ...]:
-    """Report joints whose friction is negative beyond doubt: the model or the log is wrong."""
-    robot, names = fit.base.model.robot, fit.base.names
-    if any(isinstance(term, SquareRootFriction) for term in fit.base.model.terms):
-        # Only the sum of all friction cannot be negative.
-        return ()
-    certain = np.asarray(fit.parameters) < -SURE * np.asarray(fit.standard_deviations)
-    wrong = {name for name, negative in zip(names, certain, strict=True) if negative}
-    return tuple(
-        f"friction of joint `{label}` comes out negative ({' and '.join(found)}), as no friction "
-        "is: something in the model or the log of this joint is wrong."
-        for j, label in enumerate(robot.joint_names)
-        if (found := [f"{kind}{j + 1}" for kind in ("fv", "fc") if f"{kind}{j + 1}" in wrong])
-    )
+def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:
+    """Report joints that friction drives, beyond doubt: the model or a log is wrong.
+
+    A single parameter may be negative, as where friction falls with speed.
+    """
+    base, robot = fit.base, fit.base.model.robot
+    p, covariance = np.asarray(fit.parameters), np.asarray(fit.covariance)
+    motions = [log.motion[log.instants[:: _step(log)]] for log in logs]
+    rows = [base.regressor_rows(motion) for motion in motions]
+    found = []
+    for j, (name, own) in enumerate(zip(robot.joint_names, base.acting_columns, strict=True)):
+        friction = [k for k, i in enumerate(own) if re.fullmatch(rf"f[a-z]+{j + 1}", base.names[i])]
+        power, columns = np.zeros(len(friction)), [own[k] for k in friction]
+        for motion, each in zip(motions, rows, strict=True):
+            power += np.asarray(motion.qd)[:, j] @ each[j][:, friction]
+        deviation = np.sqrt(power @ covariance[np.ix_(columns, columns)] @ power)
+        if power @ p[columns] < -SURE * deviation:
+            named = " and ".join(base.names[i] for i in columns if p[i] < 0)
+            found.append(
+                f"friction of joint `{name}` comes out negative ({named}): it would drive the "
+                "joint; something in the model or the log of this joint is wrong."
+            )
+    return tuple(found)
+
+
+def _step(observations: Observations) -> int:
+    """Return the distance of rows of which a few hundred tell enough."""
+    return -(-observations.rows // 300)
 
 
 def delay_finding(
@@ -309,12 +334,15 @@ def delay_finding(
     text = f"the forces stand {between}"
     if delay.p_value <= 0.001:
         least, most = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))
-        return (
-            f"{text}, but {least:.3g} to {most:.3g} ms joint by joint: as likely, the model lacks "
-            "an effect.",
-        ), ()
+        apart = f"{least:.3g} to {most:.3g} ms joint by joint"
+        return (), (f"{text}, but {apart}: as likely, the model lacks an effect.",)
     if commanded is None and delay.feedback > 0.1 * abs(delay.seconds):
         cure = "name the commanded angles (`recording.commands`) to tell how much"
     else:
         cure = f"`force_delay = {delay.seconds:.3g}` in `[recording]` removes that"
-    return (f"{text}: {cure}.",), ()
+    text = f"{text}: {cure}."
+    # As of other mistakes: what matters, and explains most of what the model misses.
+    with_delay, without = delay.missed
+    explained = np.sqrt(max(without**2 - with_delay**2, 0.0))
+    matters = explained > MATERIAL and with_delay < MOST * without
+    return ((text,), ()) if matters else ((), (text,))

@@ -100,7 +100,8 @@ def load_log(
     stage(f"filtering {path.name}")
     observations = experiment.observe(recording)
     diagnosis = diagnose(recording, experiment.robot, observations=observations)
-    return recording, observations.replace(notes=(*observations.notes, *notes)), diagnosis
+    notes = (*observations.notes, *notes, *(f"{recording.name}: {x}" for x in diagnosis.notes))
+    return recording, observations.replace(notes=notes), diagnosis
 
 
 def _findings(logs: Sequence[LoadedLog]) -> list[str]:
