@@ -41,8 +41,8 @@ MOST = 0.5
 """Fraction (0 to 1) of what a model misses that may be left by the correction of a mistake."""
 MANY = 12
 """Number of joints above which no two joints, and no axes, are examined: they would be too many."""
-ALIKE, CLEAR = 1.05, 1.5
-"""Ratios of what two corrections leave up to which they are the same, and from which one is not."""
+CLEAR = 1.5
+"""Ratio of what two corrections leave from which one of them is not likely."""
 
 
 class Correction(NamedTuple):
@@ -89,12 +89,11 @@ def likely_mistakes(
             candidates += _of_kinds(robot, motion, forces) if left > FAR else ()
         tried = sorted(((samples.missed(c, part), k) for k, c in enumerate(candidates)))
         best = tried[0][0]
-        likely = [candidates[k] for value, k in tried if value <= ALIKE * best]
-        others = [value for value, _ in tried[len(likely) :]]
+        likely = [candidates[k] for value, k in tried if value < CLEAR * best]
         unseen = samples.missed(likely[0], part, FOLDS)
         # With more than three candidates nothing is known.
-        clear = len(likely) <= 3 and min(others, default=np.inf) >= CLEAR * best
-        if clear and best <= min(MOST * left, FAR) and unseen <= MOST * left_unseen:
+        known = len(likely) <= 3 and best <= min(MOST * left, FAR)
+        if known and unseen <= MOST * left_unseen:
             return (
                 f"{name}{', or '.join(c.text for c in likely)}: the model then misses "
                 f"{100 * best:.2g} % of the forces instead of {100 * left:.2g} %.",
