@@ -108,6 +108,7 @@ def swap(*names):
 
 def gain(c, j, by):
     c.tau[:, j] *= by
+    c.cure = (f"gain of the force of joint `{{{j}}}`",)
 
 
 def offset(c, j, by):
@@ -118,7 +119,7 @@ def offset(c, j, by):
 def delay_all(c, j, by):
     k = round(by / DT)
     c.tau = np.vstack([np.repeat(c.tau[:1], k, axis=0), c.tau[:-k]])
-    c.cure = ("delay",)
+    c.cure = ("force_delay",)
 
 
 def delay_one(c, j, by):

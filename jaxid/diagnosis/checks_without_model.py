@@ -141,22 +141,6 @@ def _joint_findings(
         yield f"the forces of joint `{name}` are zero throughout: is it the right column?"
 
 
-def force_notes(robot: Robot, statistics: LogStatistics) -> Iterator[str]:
-    """Yield which joints exceed their largest forces.
-
-    A wrong unit or side changes all of them: single ones may have a limit for continuous operation.
-    """
-    if _force_findings(robot, statistics):
-        return
-    limits = robot.known_max_forces
-    for j in np.flatnonzero(statistics.force > 1.2 * limits):
-        force, limit, unit = statistics.force[j], float(limits[j]), robot.force_unit(int(j))
-        yield (
-            f"joint `{robot.joint_names[j]}` needs {force:.3g} {unit}, more than its limit in the "
-            f"robot's description, {limit:.3g} {unit}"
-        )
-
-
 def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:
     """Report forces that are all too large or all too small: one unit or side is wrong."""
     ratio = statistics.force / robot.known_max_forces

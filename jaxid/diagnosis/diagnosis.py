@@ -23,18 +23,15 @@ from .checks_without_model import (
     LogStatistics,
     channel_findings,
     clock_findings,
-    force_notes,
     limit_findings,
     stuck_findings,
 )
-from .mistakes import MOST, likely_mistakes
+from .mistakes import INSTANTS, likely_mistakes
 
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
 EXAMINED = 2**17
 """Largest number of samples of a long log that are examined."""
-MATERIAL = 0.02
-"""Fraction (0 to 1) of the forces by which a delay must change them to be a mistake."""
 APART = 5.0
 """Ratio of a force's departure from the model to all others from which it is an event."""
 
@@ -74,7 +71,7 @@ class Diagnosis:
         Args:
             fit: Fit of the robot's model, to this log or to several.
         """
-        return _mistakes([self], fit)
+        return _mistakes([self], fit)[0]
 
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
@@ -83,13 +80,13 @@ class Diagnosis:
             fit: Fit to this log.
             commanded: The log with commanded angles in place of the measured ones, filtered alike.
         """
-        found, notes = (() if self.faulty else self.mistakes(fit)), self.notes
-        if not found and not self.faulty:
-            if self.observations is not None:
-                found = negative_friction(fit, [self.observations])
-                late, more = delay_finding(self.observations, fit, commanded)
-                found, notes = (*found, *late), (*notes, *more)
-        return dataclasses.replace(self, findings=(*found, *self.findings), notes=notes)
+        found, more = _mistakes([self], fit)
+        if not found and not self.faulty and self.observations is not None:
+            found = negative_friction(fit, [self.observations])
+            more = (*more, *delay_notes(self.observations, fit, commanded))
+        return dataclasses.replace(
+            self, findings=(*found, *self.findings), notes=(*self.notes, *more)
+        )
 
     def summary(self) -> Table:
         """Return a table: motion and forces of each joint beside its limits, and the findings."""
@@ -203,27 +200,30 @@ def diagnose(
         cure = "check `recording.time_unit` or `sample_time`."
         findings.append(f"the log has {rate:.3g} samples in a second: {cure}")
     found = tuple(findings)
-    if not faulty:
-        notes = (*notes, *force_notes(robot, statistics))
     faulty = tuple(range(robot.joints)) if clock else faulty
     diagnosis = Diagnosis(log, robot, statistics, found, faulty, observations, sides, notes)
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
 
-def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
-    """Return what a fit to several logs reveals; they are judged together."""
+def mistakes_in_logs(
+    diagnoses: Sequence[Diagnosis], fit: Fit
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return findings and notes that a fit to several logs reveals; they are judged together."""
     logs = [d.observations for d in diagnoses if d.observations is not None]
     friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit, logs)
-    return (*friction, *_mistakes(diagnoses, fit))
+    found, notes = _mistakes(diagnoses, fit)
+    return (*friction, *found), notes
 
 
-def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
-    """Return the likely mistake in logs, or moments at which forces depart from the model."""
+def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the likely mistake in logs, or moments that depart from the model, and notes."""
     # Faults of channels explain the rest.
     logs = [d.observations for d in diagnoses if d.observations is not None and not d.faulty]
     named = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
     moments = tuple(named.format(log, text) for log in logs for text in departures(fit, log))
-    return moments or (likely_mistakes(fit, logs, diagnoses[0].motor_sides) if logs else ())
+    if moments or not logs:
+        return moments, ()
+    return likely_mistakes(fit, logs, diagnoses[0].motor_sides)
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
@@ -269,11 +269,9 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     for j, (name, error) in enumerate(zip(robot.joint_names, errors.T, strict=True)):
         k = int(np.argmax(error))
         others = error[np.abs(o.instants - o.instants[k]) > length]
-        if error[k] <= max(0.5 * size[j], APART * others.max(initial=0.0)):
-            continue
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = float(np.sqrt(row @ np.asarray(fit.covariance) @ row))
-        if error[k] - SURE * deviation > max(0.5 * size[j], APART * others.max(initial=0.0)):
+        if error[k] > max(0.5 * size[j], APART * max(deviation, others.max(initial=0.0))):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "
@@ -290,7 +288,7 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
     """
     base, robot = fit.base, fit.base.model.robot
     p, covariance = np.asarray(fit.parameters), np.asarray(fit.covariance)
-    motions = [log.motion[log.instants[:: _step(log)]] for log in logs]
+    motions = [log.motion[log.instants[:: -(-log.rows // INSTANTS)]] for log in logs]
     rows = [base.regressor_rows(motion) for motion in motions]
     found = []
     for j, (name, own) in enumerate(zip(robot.joint_names, base.acting_columns, strict=True)):
@@ -308,41 +306,31 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
     return tuple(found)
 
 
-def _step(observations: Observations) -> int:
-    """Return the distance of rows of which a few hundred tell enough."""
-    return -(-observations.rows // 300)
-
-
-def delay_finding(
+def delay_notes(
     observations: Observations, fit: Fit, commanded: Observations | None = None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return findings and notes about a delay of the forces that the model sees."""
+) -> tuple[str, ...]:
+    """Return a note about a delay of the forces, which is too small to be a mistake."""
     # A model that explains too little sees no delay.
     if not fit.residual < 0.3:
-        return (), ()
+        return ()
     weights = GivenWeights(np.asarray(fit.weights))
     try:
         delay = estimate_delay(fit.base, observations, weights, commanded=commanded)
     except ValueError:
-        return (), ()
+        return ()
     # What is advised must be sure.
     low, high = (1e3 * x for x in delay.interval(0.9999))
     between = f"between {low:.2g} and {high:.2g} ms later in the log than the angles"
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     if low <= 0.0 <= high or abs(delay.seconds) < float(np.std(delay.of_joints)):
-        return (), (f"the forces stand {between}: a delay cannot be told from none.",)
+        return (f"the forces stand {between}: a delay cannot be told from none.",)
     text = f"the forces stand {between}"
     if delay.p_value <= 0.001:
         least, most = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))
         apart = f"{least:.3g} to {most:.3g} ms joint by joint"
-        return (), (f"{text}, but {apart}: as likely, the model lacks an effect.",)
+        return (f"{text}, but {apart}: as likely, the model lacks an effect.",)
     if commanded is None and delay.feedback > 0.1 * abs(delay.seconds):
         cure = "name the commanded angles (`recording.commands`) to tell how much"
     else:
         cure = f"`force_delay = {delay.seconds:.3g}` in `[recording]` removes that"
-    text = f"{text}: {cure}."
-    # As of other mistakes: what matters, and explains most of what the model misses.
-    with_delay, without = delay.missed
-    explained = np.sqrt(max(without**2 - with_delay**2, 0.0))
-    matters = explained > MATERIAL and with_delay < MOST * without
-    return ((text,), ()) if matters else ((), (text,))
+    return (f"{text}: {cure}.",)

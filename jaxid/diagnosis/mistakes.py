@@ -27,7 +27,7 @@ from jaxid.measurement.observations import Observations
 from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
 
-BAD = 0.01
+BAD = 0.005
 """Fraction (0 to 1) of the forces left unexplained from which mistakes are looked for."""
 INSTANTS = 300
 """Number of instants of all logs that tell enough."""
@@ -35,6 +35,10 @@ FOLDS = 5
 """Parts of the time that are left out in turn."""
 LATEST, FARTHEST, GAIN = 0.05, 0.8, 3.0
 """Largest delay [s], error of an angle [rad] and gain that are looked for."""
+TURNED, SCALED = 0.2, 1.2
+"""Error of an angle [rad] and gain of a force of which a note says where they would not show."""
+MATERIAL = 0.02
+"""Fraction (0 to 1) of the forces by which a delay must change them to be a mistake."""
 FAR = 0.15
 """Fraction (0 to 1) of the forces that no model misses whose description is right."""
 MOST = 0.5
@@ -63,10 +67,11 @@ class Correction(NamedTuple):
 
 def likely_mistakes(
     fit: Fit, logs: Sequence[Observations], motor_sides: tuple[bool, bool]
-) -> tuple[str, ...]:
-    """Return a sentence about the mistake that explains most of what a model misses, or nothing.
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return a sentence about the mistake that explains most of what a model misses, and notes.
 
-    A mistake is looked for in all logs alike, then in the columns of each.
+    A mistake is looked for in all logs alike, then in the columns of each. The notes say which
+    mistakes would not show.
 
     Args:
         fit: Fit of the robot's model.
@@ -77,13 +82,17 @@ def likely_mistakes(
     robot, motion, forces = fit.base.model.robot, samples.motion, samples.forces
     as_given = Correction("", robot, motion, forces)
     left, left_unseen = samples.missed(as_given), samples.missed(as_given, folds=FOLDS)
+    notes = samples.hidden(max(left / MOST, BAD))
     if left < BAD:
-        return ()
+        return (), notes
     parts = [slice(0, len(forces)), *(samples.parts if len(logs) > 1 else [])]
     for name, part in zip(("", *(f"{log.name}: " for log in logs)), parts, strict=False):
         motion, forces = samples.motion[part], samples.forces[part]
         candidates = [*_of_columns(robot, motion, forces, motor_sides)]
-        candidates += [samples.best(x, part) for x in _of_amounts(robot, motion, forces)]
+        amounts = [*samples.amounts(part)]
+        if left**2 - samples.missed(amounts[0], part) ** 2 < MATERIAL**2:
+            del amounts[0]
+        candidates += amounts
         if not name:
             candidates += _of_robot(robot, motion, forces)
             candidates += _of_kinds(robot, motion, forces) if left > FAR else ()
@@ -94,11 +103,12 @@ def likely_mistakes(
         # With more than three candidates nothing is known.
         known = len(likely) <= 3 and best <= min(MOST * left, FAR)
         if known and unseen <= MOST * left_unseen:
-            return (
+            text = (
                 f"{name}{', or '.join(c.text for c in likely)}: the model then misses "
-                f"{100 * best:.2g} % of the forces instead of {100 * left:.2g} %.",
+                f"{100 * best:.2g} % of the forces instead of {100 * left:.2g} %."
             )
-    return _misfit(fit, samples.motion, samples.forces, left)
+            return (text,), ()
+    return _misfit(fit, samples.motion, samples.forces, left), notes
 
 
 class _Samples:
@@ -126,21 +136,69 @@ class _Samples:
         rows[part] = self._rows_of(c)
         return _missed(rows, self._braking, folds)
 
-    def best(self, mistake: "_Amount", part: slice) -> Correction:
-        """Return the correction of a mistake with the amount that leaves least."""
+    def best(
+        self, correction: Callable[[float], Correction], part: slice, largest: float
+    ) -> Correction:
+        """Return the correction of a mistake by the amount that leaves least."""
 
-        def correction(amount: float) -> Correction:
-            motion, forces = mistake.correct(amount)
-            if mistake.late:
-                forces = self._later(amount)[part]
-            text = mistake.text.format(mistake.shown(amount))
-            return Correction(text, self._model.robot, motion, forces)
+        def left(amount: float) -> float:
+            return self.missed(correction(amount), part)
 
-        bounds = -mistake.largest, mistake.largest
-        found = optimize.minimize_scalar(
-            lambda x: self.missed(correction(x), part), bounds=bounds, options={"maxiter": 10}
-        )
-        return correction(found.x)
+        bounds, options = (-largest, largest), {"maxiter": 10}
+        return correction(optimize.minimize_scalar(left, bounds=bounds, options=options).x)
+
+    def hidden(self, shown: float) -> tuple[str, ...]:
+        """Return a note about mistakes with which the model would miss less than what is shown."""
+        angles = f"an angle that is off by {np.rad2deg(TURNED):.0f} degrees"
+        unseen = {angles: [], f"forces that are {SCALED:g} times too large": []}
+        for j, name in enumerate(self._model.robot.joint_names[:MANY]):
+            changes = self.turned(j)(TURNED), self.scaled(j)(-np.log(SCALED))
+            for change, names in zip(changes, unseen.values(), strict=True):
+                names += [f"`{name}`"] * (self.missed(change) < shown)
+        texts = [f"{what} ({', '.join(names)})" for what, names in unseen.items() if names]
+        return (f"these logs would not show {' or '.join(texts)}",) if texts else ()
+
+    def amounts(self, part: slice) -> Iterator[Correction]:
+        """Yield corrections by any amount: of a delay, of zeros of angles, of gains of forces."""
+        yield self.best(self.late(part), part, LATEST)
+        for j in range(min(self._model.robot.joints, MANY)):
+            if self._model.robot.revolute[j]:
+                yield self.best(self.turned(j, part), part, FARTHEST)
+            yield self.best(self.scaled(j, part), part, float(np.log(GAIN)))
+
+    def turned(self, j: int, part: slice = slice(None)) -> Callable[[float], Correction]:
+        """Return the correction of a joint's zero, by an angle [rad]."""
+        robot, own, motion = self._model.robot, np.eye(self._model.robot.joints)[j], self.motion
+
+        def correction(x: float) -> Correction:
+            text = f"the angle of joint `{robot.joint_names[j]}` seems to lack {np.rad2deg(x):.2g}"
+            moved = Motion((motion.q + x * own)[part], motion.qd[part], motion.qdd[part])
+            text = f"{text} degrees (`recording.angle_offsets`)"
+            return Correction(text, robot, moved, self.forces[part])
+
+        return correction
+
+    def scaled(self, j: int, part: slice = slice(None)) -> Callable[[float], Correction]:
+        """Return the correction of the gain of a joint's forces, by its logarithm."""
+        robot, own = self._model.robot, np.eye(self._model.robot.joints)[j]
+
+        def correction(x: float) -> Correction:
+            text = f"the gain of the force of joint `{robot.joint_names[j]}` seems to be wrong: its"
+            text = f"{text} forces are {np.exp(x):.2g} times the others'"
+            forces = (self.forces * np.exp(-x * own))[part]
+            return Correction(text, robot, self.motion[part], forces)
+
+        return correction
+
+    def late(self, part: slice) -> Callable[[float], Correction]:
+        """Return the correction of a delay of all forces [s]."""
+        text = "the forces of the log seem to be late (`recording.force_delay = {:.2g}`)"
+
+        def correction(x: float) -> Correction:
+            forces, robot = self._later(x)[part], self._model.robot
+            return Correction(text.format(x), robot, self.motion[part], forces)
+
+        return correction
 
     def _later(self, seconds: float) -> np.ndarray:
         """Return the forces that stand later in the logs."""
@@ -237,44 +295,6 @@ def _of_columns(
         owner = "motor" if motors else "joint"
         text = f"the {what} of the log seem to be the {owner}s' (`recording.{key.format(owner)}"
         yield without(text, sides=other)
-
-
-class _Amount(NamedTuple):
-    """Mistake of some amount.
-
-    Attributes:
-        text: Clause about the mistake, with its amount in braces.
-        correct: Motion and forces without it, for an amount.
-        largest: Largest amount.
-        shown: Amount that is shown.
-        late: Whether the amount is a delay of the forces [s].
-    """
-
-    text: str
-    correct: Callable[[float], tuple[Motion, np.ndarray]]
-    largest: float
-    shown: Callable[[float], float]
-    late: bool = False
-
-
-def _of_amounts(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[_Amount]:
-    """Yield mistakes of any amount: a delay of all forces, zeros of angles, gains of forces."""
-    text = "the forces of the log seem to be late (`recording.force_delay = {:.2g}`)"
-    yield _Amount(text, lambda _: (motion, forces), LATEST, float, late=True)
-    for j, name in enumerate(robot.joint_names[:MANY]):
-        own = np.arange(robot.joints) == j
-
-        def moved(x: float, own=own) -> tuple[Motion, np.ndarray]:
-            return Motion(motion.q + x * own, motion.qd, motion.qdd), forces
-
-        def scaled(x: float, own=own) -> tuple[Motion, np.ndarray]:
-            return motion, forces * np.exp(-x * own)
-
-        if robot.revolute[j]:
-            text = f"the angle of joint `{name}` seems to lack {{:.2g}} degrees (`recording."
-            yield _Amount(f"{text}angle_offsets`)", moved, FARTHEST, np.rad2deg)
-        text = f"the gain of the force of joint `{name}` seems to be wrong: its forces are {{:.2g}}"
-        yield _Amount(f"{text} times the others'", scaled, np.log(GAIN), np.exp)
 
 
 def _of_robot(robot: Robot, motion: Motion, forces: np.ndarray) -> Iterator[Correction]:

@@ -41,7 +41,6 @@ class Delay(eqx.Module):
             model does not follow a filtered motion exactly.
         of_joints: Each joint's own delay [s].
         p_value: Probability that joints with one common delay would differ so much.
-        missed: Fractions (0 to 1) of the forces that the model misses with and without the delay.
     """
 
     seconds: float
@@ -51,7 +50,6 @@ class Delay(eqx.Module):
     resolution: float
     of_joints: Float[AnyArray, " joints"]
     p_value: float
-    missed: tuple[float, float]
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the lower and upper limit of the delay [s], with `feedback` and `resolution`.
@@ -106,9 +104,7 @@ def estimate_delay(
     w = (MaximumForces() if weights is None else weights)(base.model.robot, problem.factors)
     together = linalg.block_diag(np.eye(base.size), np.ones((n, 1)))
     p, seconds, step, damping = np.zeros(base.size), 0.0, 0.0, 1.0
-    plain = _equations(base, recordings, recordings, w, p).select(base.size)
-    p = plain.solve()
-    without = plain.missed(p)
+    p = _equations(base, recordings, recordings, w, p).select(base.size).solve()
     for _ in range(PASSES):
         moved = ([without_delay(o, seconds) for o in logs] for logs in (recordings, instruments))
         each = _equations(base, *moved, w, p)
@@ -131,8 +127,7 @@ def estimate_delay(
     p_value = joint_test(contrast @ delays, differences, BLOCKS - 1.0)[1]
     feedback = common.feedback(x) if commanded is None else 0.0
     limits = feedback, 0.1 * recordings[0].sample_time
-    own, missed = seconds - step + delays, (common.missed(x), without)
-    return Delay(seconds, deviation, BLOCKS - 1.0, *limits, own, p_value, missed)
+    return Delay(seconds, deviation, BLOCKS - 1.0, *limits, seconds - step + delays, p_value)
 
 
 class _Equations(NamedTuple):
@@ -172,12 +167,6 @@ class _Equations(NamedTuple):
         count = len(self.products)
         estimates = np.array([self.solve(block) for block in range(count)])
         return (count - 1) ** 2 / count * np.cov(estimates.T)
-
-    def missed(self, x: np.ndarray) -> float:
-        """Return the fraction (0 to 1) of the forces that parameters miss."""
-        residual = np.append(x, -1.0)
-        squares = float(residual @ self.squares @ residual)
-        return float(np.sqrt(max(squares, 0.0) / self.squares[-1, -1]))
 
     def feedback(self, x: np.ndarray) -> float:
         """Return the largest effect of fed-back disturbances on the last parameter."""
