@@ -65,6 +65,16 @@ class Correction(NamedTuple):
     forces: np.ndarray
 
 
+class _Amount(NamedTuple):
+    """Mistake of any amount in a joint, or in all if the name is empty; and two of its amounts."""
+
+    joint: str
+    what: str
+    correction: Callable[[float, slice], Correction]
+    largest: float
+    small: float
+
+
 def likely_mistakes(
     fit: Fit, logs: Sequence[Observations], motor_sides: tuple[bool, bool]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -89,7 +99,7 @@ def likely_mistakes(
     for name, part in zip(("", *(f"{log.name}: " for log in logs)), parts, strict=False):
         motion, forces = samples.motion[part], samples.forces[part]
         candidates = [*_of_columns(robot, motion, forces, motor_sides)]
-        amounts = [*samples.amounts(part)]
+        amounts = [samples.best(x, part) for x in samples.amounts()]
         if left**2 - samples.missed(amounts[0], part) ** 2 < MATERIAL**2:
             del amounts[0]
         candidates += amounts
@@ -136,69 +146,55 @@ class _Samples:
         rows[part] = self._rows_of(c)
         return _missed(rows, self._braking, folds)
 
-    def best(
-        self, correction: Callable[[float], Correction], part: slice, largest: float
-    ) -> Correction:
+    def best(self, mistake: _Amount, part: slice) -> Correction:
         """Return the correction of a mistake by the amount that leaves least."""
 
         def left(amount: float) -> float:
-            return self.missed(correction(amount), part)
+            return self.missed(mistake.correction(amount, part), part)
 
-        bounds, options = (-largest, largest), {"maxiter": 10}
-        return correction(optimize.minimize_scalar(left, bounds=bounds, options=options).x)
+        bounds, options = (-mistake.largest, mistake.largest), {"maxiter": 10}
+        found = optimize.minimize_scalar(left, bounds=bounds, options=options).x
+        return mistake.correction(found, part)
 
     def hidden(self, shown: float) -> tuple[str, ...]:
         """Return a note about mistakes with which the model would miss less than what is shown."""
-        angles = f"an angle that is off by {np.rad2deg(TURNED):.0f} degrees"
-        unseen = {angles: [], f"forces that are {SCALED:g} times too large": []}
-        for j, name in enumerate(self._model.robot.joint_names[:MANY]):
-            changes = self.turned(j)(TURNED), self.scaled(j)(-np.log(SCALED))
-            for change, names in zip(changes, unseen.values(), strict=True):
-                names += [f"`{name}`"] * (self.missed(change) < shown)
-        texts = [f"{what} ({', '.join(names)})" for what, names in unseen.items() if names]
+        unseen: dict[str, list[str]] = {}
+        for mistake in self.amounts():
+            change = mistake.correction(mistake.small, slice(None))
+            if mistake.joint and self.missed(change) < shown:
+                unseen.setdefault(mistake.what, []).append(f"`{mistake.joint}`")
+        texts = [f"{what} ({', '.join(names)})" for what, names in unseen.items()]
         return (f"these logs would not show {' or '.join(texts)}",) if texts else ()
 
-    def amounts(self, part: slice) -> Iterator[Correction]:
-        """Yield corrections by any amount: of a delay, of zeros of angles, of gains of forces."""
-        yield self.best(self.late(part), part, LATEST)
-        for j in range(min(self._model.robot.joints, MANY)):
-            if self._model.robot.revolute[j]:
-                yield self.best(self.turned(j, part), part, FARTHEST)
-            yield self.best(self.scaled(j, part), part, float(np.log(GAIN)))
-
-    def turned(self, j: int, part: slice = slice(None)) -> Callable[[float], Correction]:
-        """Return the correction of a joint's zero, by an angle [rad]."""
-        robot, own, motion = self._model.robot, np.eye(self._model.robot.joints)[j], self.motion
-
-        def correction(x: float) -> Correction:
-            text = f"the angle of joint `{robot.joint_names[j]}` seems to lack {np.rad2deg(x):.2g}"
-            moved = Motion((motion.q + x * own)[part], motion.qd[part], motion.qdd[part])
-            text = f"{text} degrees (`recording.angle_offsets`)"
-            return Correction(text, robot, moved, self.forces[part])
-
-        return correction
-
-    def scaled(self, j: int, part: slice = slice(None)) -> Callable[[float], Correction]:
-        """Return the correction of the gain of a joint's forces, by its logarithm."""
-        robot, own = self._model.robot, np.eye(self._model.robot.joints)[j]
-
-        def correction(x: float) -> Correction:
-            text = f"the gain of the force of joint `{robot.joint_names[j]}` seems to be wrong: its"
-            text = f"{text} forces are {np.exp(x):.2g} times the others'"
-            forces = (self.forces * np.exp(-x * own))[part]
-            return Correction(text, robot, self.motion[part], forces)
-
-        return correction
-
-    def late(self, part: slice) -> Callable[[float], Correction]:
-        """Return the correction of a delay of all forces [s]."""
+    def amounts(self) -> Iterator[_Amount]:
+        """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""
+        robot, q, forces = self._model.robot, self.motion.q, self.forces
         text = "the forces of the log seem to be late (`recording.force_delay = {:.2g}`)"
 
-        def correction(x: float) -> Correction:
-            forces, robot = self._later(x)[part], self._model.robot
-            return Correction(text.format(x), robot, self.motion[part], forces)
+        def correction(text: str, part: slice, q=q, forces=forces) -> Correction:
+            moved = Motion(q[part], self.motion.qd[part], self.motion.qdd[part])
+            return Correction(text, robot, moved, forces[part])
 
-        return correction
+        def late(x: float, part: slice) -> Correction:
+            return correction(text.format(x), part, forces=self._later(x))
+
+        yield _Amount("", "", late, LATEST, LATEST)
+        for j, name in enumerate(robot.joint_names[:MANY]):
+            own = np.eye(robot.joints)[j]
+
+            def turned(x: float, part: slice, own=own, name=name) -> Correction:
+                said = f"the angle of joint `{name}` seems to lack {np.rad2deg(x):.2g} degrees"
+                return correction(f"{said} (`recording.angle_offsets`)", part, q + x * own)
+
+            def scaled(x: float, part: slice, own=own, name=name) -> Correction:
+                said = f"the gain of the force of joint `{name}` seems to be {np.exp(x):.2g}"
+                return correction(said, part, forces=forces * np.exp(-x * own))
+
+            if robot.revolute[j]:
+                what = f"an angle that is off by {np.rad2deg(TURNED):.0f} degrees"
+                yield _Amount(name, what, turned, FARTHEST, TURNED)
+            what = f"forces that are {SCALED:g} times too large"
+            yield _Amount(name, what, scaled, float(np.log(GAIN)), -float(np.log(SCALED)))
 
     def _later(self, seconds: float) -> np.ndarray:
         """Return the forces that stand later in the logs."""
