@@ -139,7 +139,7 @@ def slip(robot, file, name, j, seed, folder, work):
         return "named", marked
     # The note names joints behind the kind of mistake.
     note = next((x for x in notes if "would not show" in x), "")
-    kind = {"offset": r"angle that is off[^)]*", "gain": r"too large \([^)]*"}.get(name, "^$")
+    kind = {"offset": r"zero that is off[^)]*", "gain": r"too large \([^)]*"}.get(name, "^$")
     hidden = re.search(f"{kind}`{names[j]}`", note) is not None
     return "hidden" if hidden else "missed", [*marked, *filter(None, [note])]
 

@@ -34,9 +34,9 @@ INSTANTS = 300
 FOLDS = 5
 """Parts of the time that are left out in turn."""
 LATEST, FARTHEST, GAIN = 0.05, 0.8, 3.0
-"""Largest delay [s], error of an angle [rad] and gain that are looked for."""
-TURNED, SCALED = 0.2, 1.2
-"""Error of an angle [rad] and gain of a force of which a note says where they would not show."""
+"""Largest delay [s], error of a zero [rad or m] and gain that are looked for."""
+MOVED, SCALED = 0.2, 1.2
+"""Error of a zero [rad or m] and gain of a force of which a note says where they do not show."""
 MATERIAL = 0.02
 """Fraction (0 to 1) of the forces by which a delay must change them to be a mistake."""
 FAR = 0.15
@@ -182,17 +182,18 @@ class _Samples:
         for j, name in enumerate(robot.joint_names[:MANY]):
             own = np.eye(robot.joints)[j]
 
-            def turned(x: float, part: slice, own=own, name=name) -> Correction:
-                said = f"the angle of joint `{name}` seems to lack {np.rad2deg(x):.2g} degrees"
+            unit, per = ("degrees", np.pi / 180) if robot.revolute[j] else ("m", 1.0)
+
+            def moved(x: float, part: slice, own=own, name=name, unit=unit, per=per) -> Correction:
+                said = f"the angle of joint `{name}` seems to lack {x / per:.2g} {unit}"
                 return correction(f"{said} (`recording.angle_offsets`)", part, q + x * own)
 
             def scaled(x: float, part: slice, own=own, name=name) -> Correction:
                 said = f"the gain of the force of joint `{name}` seems to be {np.exp(x):.2g}"
                 return correction(said, part, forces=forces * np.exp(-x * own))
 
-            if robot.revolute[j]:
-                what = f"an angle that is off by {np.rad2deg(TURNED):.0f} degrees"
-                yield _Amount(name, what, turned, FARTHEST, TURNED)
+            what = f"a zero that is off by {MOVED / per:.2g} {unit}"
+            yield _Amount(name, what, moved, FARTHEST, MOVED)
             what = f"forces that are {SCALED:g} times too large"
             yield _Amount(name, what, scaled, float(np.log(GAIN)), -float(np.log(SCALED)))
 

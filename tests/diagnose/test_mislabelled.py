@@ -134,13 +134,17 @@ def test_mistakes_of_any_amount_are_found(motors, said):
     (sentence,) = said(angles, forces * [1.0, 1.5, 1.0, 1.0])
     assert sentence.startswith("the gain of the force of joint `joint2` seems to be 1.5")
     (sentence,) = said(angles[8:], forces[:-8])
-    assert sentence.startswith("the forces of the log seem to be late (`recording.force_delay = 0.0")
+    assert sentence.startswith(
+        "the forces of the log seem to be late (`recording.force_delay = 0.0"
+    )
 
 
 def test_logs_are_judged_together_and_the_wrong_one_is_named(motors):
     angles, forces = motors
     pairs = [log_of(angles, forces), log_of(angles, forces * [1.0, 1.0, 1.0, -1.0])]
-    logs = [observations.replace(name=name) for name, (_, observations) in zip("ab", pairs, strict=True)]
+    logs = [
+        observations.replace(name=name) for name, (_, observations) in zip("ab", pairs, strict=True)
+    ]
     examined = [
         diagnose(log, ROBOT, observations=o) for (log, _), o in zip(pairs, logs, strict=True)
     ]
@@ -152,7 +156,7 @@ def test_logs_are_judged_together_and_the_wrong_one_is_named(motors):
     found, notes = mistakes_in_logs([examined[0], examined[0]], identify(BASE, logs[:1]))
     assert found == ()
     # No gravity acts around the first, vertical axis: its zero does not matter.
-    assert "an angle that is off by 11 degrees (`joint1`" in notes[0]
+    assert "a zero that is off by 11 degrees (`joint1`" in notes[0]
 
 
 def test_a_force_that_departs_for_a_moment_is_found(motors, said):
