@@ -181,7 +181,6 @@ class _Samples:
         yield _Amount("", "", late, LATEST, LATEST)
         for j, name in enumerate(robot.joint_names[:MANY]):
             own = np.eye(robot.joints)[j]
-
             unit, per = ("degrees", np.pi / 180) if robot.revolute[j] else ("m", 1.0)
 
             def moved(x: float, part: slice, own=own, name=name, unit=unit, per=per) -> Correction:
