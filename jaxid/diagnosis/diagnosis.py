@@ -221,9 +221,7 @@ def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[tuple[str, ...]
     logs = [d.observations for d in diagnoses if d.observations is not None and not d.faulty]
     named = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
     moments = tuple(named.format(log, text) for log in logs for text in departures(fit, log))
-    if moments or not logs:
-        return moments, ()
-    return likely_mistakes(fit, logs, diagnoses[0].motor_sides)
+    return likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments) if logs else ((), ())
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
@@ -292,7 +290,9 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
     rows = [base.regressor_rows(motion) for motion in motions]
     found = []
     for j, (name, own) in enumerate(zip(robot.joint_names, base.acting_columns, strict=True)):
-        friction = [k for k, i in enumerate(own) if re.fullmatch(rf"f[a-z]+{j + 1}", base.names[i])]
+        friction = [
+            k for k, i in enumerate(own) if re.fullmatch(rf"f[^o\\W\\d]+{j + 1}", base.names[i])
+        ]
         power, columns = np.zeros(len(friction)), [own[k] for k in friction]
         for motion, each in zip(motions, rows, strict=True):
             power += np.asarray(motion.qd)[:, j] @ each[j][:, friction]

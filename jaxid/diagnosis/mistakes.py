@@ -76,7 +76,10 @@ class _Amount(NamedTuple):
 
 
 def likely_mistakes(
-    fit: Fit, logs: Sequence[Observations], motor_sides: tuple[bool, bool]
+    fit: Fit,
+    logs: Sequence[Observations],
+    motor_sides: tuple[bool, bool],
+    events: tuple[str, ...] = (),
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return a sentence about the mistake that explains most of what a model misses, and notes.
 
@@ -87,6 +90,7 @@ def likely_mistakes(
         fit: Fit of the robot's model.
         logs: Logs of one experiment.
         motor_sides: Whether angles and forces of the logs are taken for the motors'.
+        events: Sentences about moments, which are returned if no mistake explains them.
     """
     samples = _Samples(fit.base.model, logs)
     robot, motion, forces = fit.base.model.robot, samples.motion, samples.forces
@@ -94,7 +98,7 @@ def likely_mistakes(
     left, left_unseen = samples.missed(as_given), samples.missed(as_given, folds=FOLDS)
     notes = samples.hidden(max(left / MOST, BAD))
     if left < BAD:
-        return (), notes
+        return events, notes
     parts = [slice(0, len(forces)), *(samples.parts if len(logs) > 1 else [])]
     for name, part in zip(("", *(f"{log.name}: " for log in logs)), parts, strict=False):
         motion, forces = samples.motion[part], samples.forces[part]
@@ -118,7 +122,7 @@ def likely_mistakes(
                 f"{100 * best:.2g} % of the forces instead of {100 * left:.2g} %."
             )
             return (text,), ()
-    return _misfit(fit, samples.motion, samples.forces, left), notes
+    return events or _misfit(fit, samples.motion, samples.forces, left), notes
 
 
 class _Samples:
