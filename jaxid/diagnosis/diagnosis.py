@@ -291,7 +291,7 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
     found = []
     for j, (name, own) in enumerate(zip(robot.joint_names, base.acting_columns, strict=True)):
         friction = [
-            k for k, i in enumerate(own) if re.fullmatch(rf"f[^o\\W\\d]+{j + 1}", base.names[i])
+            k for k, i in enumerate(own) if re.fullmatch(rf"f(?!o)[a-z]+{j + 1}", base.names[i])
         ]
         power, columns = np.zeros(len(friction)), [own[k] for k in friction]
         for motion, each in zip(motions, rows, strict=True):
