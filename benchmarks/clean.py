@@ -6,7 +6,7 @@ Robots and logs: `closed_loop.py` (simulated by Pinocchio), each kind of log wit
 `jaxid identify` and `jaxid inspect` say of a clean log is an alarm if it is a finding, a likely
 mistake, a doubt about a sign or about gravity, or advice on a delay that the log does not have.
 Slips: those of `spoilt.py` in ordinary logs, in the first, the middle and the last joint. A slip is
-named if a finding says what it is, alone or beside others that have the same effect; it is stated
+named if a finding, or a note on a delay, says what it is, alone or beside others that have the same effect; it is stated
 as hidden if a note says that these logs would not show it.
 """
 
@@ -135,12 +135,13 @@ def slip(robot, file, name, j, seed, folder, work):
         _, marked, notes = said([case], work)
     except ValueError as refusal:
         marked, notes = [str(refusal)], []
-    if any(cure in x for cure in cures for x in marked):
+    if any(cure in x for cure in cures for x in (*marked, *notes)):
         return "named", marked
     # The note names joints behind the kind of mistake.
     note = next((x for x in notes if "would not show" in x), "")
-    kind = {"offset": r"zero that is off[^)]*", "gain": r"too large \([^)]*"}.get(name, "^$")
-    hidden = re.search(f"{kind}`{names[j]}`", note) is not None
+    words = {"offset": "zero that is off", "gain": "too large", "mirrored": "reversed axis"}
+    pattern = rf"{words.get(name, '^$')}[^(]*\([^)]*`{names[j]}`"
+    hidden = re.search(pattern, note) is not None
     return "hidden" if hidden else "missed", [*marked, *filter(None, [note])]
 
 

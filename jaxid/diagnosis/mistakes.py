@@ -167,6 +167,15 @@ class _Samples:
             change = mistake.correction(mistake.small, slice(None))
             if mistake.joint and self.missed(change) < shown:
                 unseen.setdefault(mistake.what, []).append(f"`{mistake.joint}`")
+        for signs, name in zip(
+            1 - 2 * np.eye(self.motion.joints), self._model.robot.joint_names, strict=True
+        ):
+            reversed_one = Motion(
+                *(x * signs for x in (self.motion.q, self.motion.qd, self.motion.qdd))
+            )
+            change = Correction("", self._model.robot, reversed_one, self.forces * signs)
+            if self.missed(change) < shown:
+                unseen.setdefault("a reversed axis", []).append(f"`{name}`")
         texts = [f"{what} ({', '.join(names)})" for what, names in unseen.items()]
         return (f"these logs would not show {' or '.join(texts)}",) if texts else ()
 
