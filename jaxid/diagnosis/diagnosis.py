@@ -269,7 +269,7 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
         others = error[np.abs(o.instants - o.instants[k]) > length]
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = float(np.sqrt(row @ np.asarray(fit.covariance) @ row))
-        if error[k] > max(0.5 * size[j], APART * max(deviation, others.max(initial=0.0))):
+        if error[k] > max(0.5 * size[j], APART * (deviation + others.max(initial=0.0))):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "
