@@ -224,7 +224,7 @@ class _Samples:
         if kinds not in self._geometries:
             self._geometries[kinds] = _AnyGeometry(Model(c.robot, self._model.terms))
         columns, known = self._geometries[kinds](c.robot, c.motion)
-        friction = _any_friction(c.motion.qd, self._fastest)
+        friction = _any_friction(np.asarray(c.motion.qd), self._fastest)
         return np.concatenate([columns, friction, (c.forces - known)[..., None]], axis=2)
 
 
@@ -393,7 +393,8 @@ def _missed(rows: np.ndarray, braking: np.ndarray, folds: int = 1) -> float:
     factors, squares = [np.linalg.qr(x.reshape(-1, x.shape[2]), mode="r") for x in parts], 0.0
     for k, unseen in enumerate(factors):
         seen = [*factors[:k], *factors[k + 1 :]] or factors
-        found = _with_braking(np.linalg.qr(np.concatenate(seen), mode="r"), braking)
+        R = np.asarray(np.linalg.qr(np.concatenate(seen), mode="r"))
+        found = _with_braking(R, braking)
         squares += float(np.sum((unseen @ np.append(found, -1.0)) ** 2))
     return np.sqrt(squares) / max(length[-1], 1e-300)
 
