@@ -268,7 +268,7 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
         k = int(np.argmax(error))
         others = error[np.abs(o.instants - o.instants[k]) > length]
         row = np.asarray(fit.base.regressor(motion[k]))[j]
-        deviation = float(np.sqrt(row @ np.asarray(fit.covariance) @ row))
+        deviation = _deviation(fit, row)
         if error[k] > max(0.5 * size[j], APART * (deviation + others.max(initial=0.0))):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
@@ -279,13 +279,22 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _deviation(fit: Fit, row: np.ndarray) -> float:
+    """Return the standard deviation of a combination of parameters; infinite if undetermined."""
+    used = np.flatnonzero(row)
+    covariance = np.asarray(fit.covariance)[np.ix_(used, used)]
+    if not np.isfinite(covariance).all():
+        return np.inf
+    return float(np.sqrt(row[used] @ covariance @ row[used]))
+
+
 def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:
     """Report joints that friction drives, beyond doubt: the model or a log is wrong.
 
     A single parameter may be negative, as where friction falls with speed.
     """
     base, robot = fit.base, fit.base.model.robot
-    p, covariance = np.asarray(fit.parameters), np.asarray(fit.covariance)
+    p = np.asarray(fit.parameters)
     motions = [log.motion[log.instants[:: -(-log.rows // INSTANTS)]] for log in logs]
     rows = [base.regressor_rows(motion) for motion in motions]
     found = []
@@ -293,11 +302,10 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
         friction = [
             k for k, i in enumerate(own) if re.fullmatch(rf"f(?!o)[a-z]+{j + 1}", base.names[i])
         ]
-        power, columns = np.zeros(len(friction)), [own[k] for k in friction]
+        power, columns = np.zeros(base.size), [own[k] for k in friction]
         for motion, each in zip(motions, rows, strict=True):
-            power += np.asarray(motion.qd)[:, j] @ each[j][:, friction]
-        deviation = np.sqrt(power @ covariance[np.ix_(columns, columns)] @ power)
-        if power @ p[columns] < -SURE * deviation:
+            power[columns] += np.asarray(motion.qd)[:, j] @ each[j][:, friction]
+        if power @ p < -SURE * _deviation(fit, power):
             named = " and ".join(base.names[i] for i in columns if p[i] < 0)
             found.append(
                 f"friction of joint `{name}` comes out negative ({named}): it would drive the "
