@@ -140,7 +140,7 @@ def slip(robot, file, name, j, seed, folder, work):
     # The note names joints behind the kind of mistake.
     note = next((x for x in notes if "would not show" in x), "")
     words = {"offset": "zero that is off", "gain": "too large", "mirrored": "reversed axis"}
-    pattern = rf"{words.get(name, '^$')}[^(]*\([^)]*`{names[j]}`"
+    pattern = rf"{words.get(name, '^$')}[^(]*\((any joint|[^)]*`{names[j]}`)"
     hidden = re.search(pattern, note) is not None
     return "hidden" if hidden else "missed", [*marked, *filter(None, [note])]
 

@@ -176,7 +176,10 @@ class _Samples:
             change = Correction("", self._model.robot, reversed_one, self.forces * signs)
             if self.missed(change) < shown:
                 unseen.setdefault("a reversed axis", []).append(f"`{name}`")
-        texts = [f"{what} ({', '.join(names)})" for what, names in unseen.items()]
+        texts = [
+            f"{what} ({'any joint' if len(names) == self.motion.joints > 1 else ', '.join(names)})"
+            for what, names in unseen.items()
+        ]
         return (f"these logs would not show {' or '.join(texts)}",) if texts else ()
 
     def amounts(self) -> Iterator[_Amount]:
