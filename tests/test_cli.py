@@ -203,7 +203,7 @@ def test_a_single_slip_that_explains_a_bad_fit_is_named(folder, run, words):
     assert "!" not in words("inspect", "experiment.toml", "a.csv")
     assert slip in words("inspect", "experiment.toml", "turned.csv")
     said = words("identify", "experiment.toml", "turned.csv", ends=3)
-    assert f"✗ {slip}" in said
+    assert f"✗ turned: {slip}" in said
     assert "Do not rely on this model yet" in said
     found = json.loads((folder / "report" / "result.json").read_text("utf-8"))["verdict"]
     assert [r["status"] for r in found[:2]] == ["bad", "bad"]

@@ -212,7 +212,8 @@ def mistakes_in_logs(
     logs = [d.observations for d in diagnoses if d.observations is not None]
     friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit, logs)
     found, notes = _mistakes(diagnoses, fit)
-    return (*friction, *found), notes
+    name = f"{diagnoses[0].log.name}: " if len(diagnoses) == 1 else ""
+    return (*friction, *(f"{name}{text}" for text in found)), notes
 
 
 def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -155,8 +155,8 @@ def test_logs_are_judged_together_and_the_wrong_one_is_named(motors):
     )
     found, notes = mistakes_in_logs([examined[0], examined[0]], identify(BASE, logs[:1]))
     assert found == ()
-    # No gravity acts around the first, vertical axis: its zero does not matter.
-    assert "a zero that is off by 11 degrees (`joint1`" in notes[0]
+    # With so much noise, not even twice of what is missed would be sure.
+    assert "a zero that is off by 11 degrees (any joint)" in notes[0]
 
 
 def test_a_force_that_departs_for_a_moment_is_found(motors, said):
