@@ -37,6 +37,25 @@ KINDS = {
         ("revolute", "0.5 0 0", "0 0 1", 3.0),
         ("revolute", "0.4 0 0", "0 0 1", 1.5),
     ],
+    "four": [
+        ("revolute", "0 0 0.4", "0 0 1", 20.0),
+        ("revolute", "0.15 0 0", "0 1 0", 12.0),
+        ("revolute", "0 0 0.6", "0 1 0", 8.0),
+        ("revolute", "0.6 0 0", "1 0 0", 2.0),
+    ],
+    "five": [
+        ("revolute", "0 0 0.2", "0 0 1", 4.0),
+        ("revolute", "0 0 0.1", "0 1 0", 2.5),
+        ("revolute", "0.3 0 0", "0 1 0", 1.5),
+        ("revolute", "0.25 0 0", "0 1 0", 0.7),
+        ("revolute", "0.05 0 0", "1 0 0", 0.3),
+    ],
+    "vertical": [
+        ("revolute", "0 0 0.2", "0 0 1", 10.0),
+        ("revolute", "0.4 0 0", "0 0 1", 6.0),
+        ("revolute", "0.4 0 0.1", "0 0 1", 4.0),
+        ("revolute", "0.2 0 0", "0 0 1", 1.0),
+    ],
     "six": [
         ("revolute", "0 0 0.3", "0 0 1", 14.0),
         ("revolute", "0.1 0 0", "0 1 0", 10.0),
@@ -106,7 +125,7 @@ def _urdf(name, joints, efforts):
     return "\n".join([*parts, "</robot>"])
 
 
-def reference(model, seconds, dt, seed, amplitude=0.5):
+def reference(model, seconds, dt, seed, amplitude=0.5, pace=1.0):
     """Return a commanded motion of five harmonics that starts and ends at rest."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, seconds, dt)
@@ -115,7 +134,7 @@ def reference(model, seconds, dt, seed, amplitude=0.5):
     )
     phases = rng.uniform(0, 2 * np.pi, (model.nv, 5))
     sizes = rng.uniform(0.3, 1.0, (model.nv, 5)) / np.arange(1, 6)
-    waves = 2 * np.pi * np.arange(1, 6) / 10.0 * (1 + 0.2 * rng.random((model.nv, 1)))
+    waves = 0.2 * np.pi * pace * np.arange(1, 6) * (1 + 0.2 * rng.random((model.nv, 1)))
     q = np.einsum("jk,tjk->tj", sizes, np.sin(t[:, None, None] * waves + phases))
     q = q / np.abs(q).max(axis=0) * amplitude * (high - low) / 2 * 0.6
     ramp = np.clip(np.minimum(t, seconds - t) / 0.5, 0, 1)[:, None]
@@ -150,6 +169,8 @@ def simulate(
     bits=17,
     gravity=(0.0, 0.0, -9.81),
     amplitude=0.5,
+    pace=1.0,
+    friction=None,
     steps=8,
 ):
     """Simulate a robot that follows a reference by feed-forward and PD control.
@@ -170,15 +191,18 @@ def simulate(
         bits: Resolution of the encoders per turn (or metre); None is exact.
         gravity: Gravity that acts on the robot [m/s²].
         amplitude: Used part of the ranges of the joints.
+        pace: Frequencies of the motion over those of five harmonics of 10 s.
+        friction: Viscous and Coulomb coefficients of each joint, in place of their fractions.
         steps: Steps of integration in each sample.
     """
     model = pin.buildModelFromUrdf(str(urdf))
     model.gravity.linear = np.array(gravity)
     data, n = model.createData(), model.nv
-    t, r = reference(model, seconds, dt, seed, amplitude)
+    t, r = reference(model, seconds, dt, seed, amplitude, pace)
     rd, ideal, _ = _ideal(model, t, r)
     size = np.sqrt(np.mean(ideal**2, axis=0)) + 1e-3 * np.abs(ideal).max()
     fv, fc, fs = viscous * size / np.sqrt(np.mean(rd**2, axis=0)), coulomb * size, stribeck * size
+    fv, fc = (fv, fc) if friction is None else friction
     rng = np.random.default_rng(seed + 10**6)
     low = signal.butter(1, disturbance_hz, fs=1 / dt, output="sos")
     unknown = signal.sosfilt(low, rng.standard_normal((len(t), n)), axis=0)

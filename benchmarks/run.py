@@ -76,6 +76,7 @@ METHODS = (
     Script("doctor", 20),
     Script("faults", 30),
     Script("spoilt", 25),
+    Script("clean", 40),
     Script("delay", 40),
     Script("resolution", 10),
 )

@@ -108,6 +108,7 @@ def swap(*names):
 
 def gain(c, j, by):
     c.tau[:, j] *= by
+    c.cure = (f"gain of the force of joint `{{{j}}}`",)
 
 
 def offset(c, j, by):
@@ -118,7 +119,7 @@ def offset(c, j, by):
 def delay_all(c, j, by):
     k = round(by / DT)
     c.tau = np.vstack([np.repeat(c.tau[:1], k, axis=0), c.tau[:-k]])
-    c.cure = ("delay",)
+    c.cure = ("force_delay",)
 
 
 def delay_one(c, j, by):
@@ -366,10 +367,10 @@ def cases(n):
                 yield kind, change, j, amount
 
 
-def recorded(urdf, cache):
+def recorded(urdf, cache, **settings):
     """Return a clean log with measured velocities."""
     if not cache.exists():
-        log = closed_loop.simulate(urdf)
+        log = closed_loop.simulate(urdf, **settings)
         np.savez(cache, **vars(log))
     with np.load(cache) as log:
         log = {key: log[key] for key in log}
@@ -378,15 +379,12 @@ def recorded(urdf, cache):
     return Case(log["time"], log["angles"], rate, log["forces"], log["commands"], urdf.read_text())
 
 
-def judged(case, folder):
-    """Return the verdict on a case, the likely mistakes, and the largest share of missed forces."""
-    from rich.console import Console
-
-    from jaxid.experiment import identify_logs  # private: what the command line runs
-    from jaxid.experiment.experiment import load_experiment
+def written(cases, folder):
+    """Write the logs of cases; return them and the experiment, which the first case describes."""
+    from jaxid.experiment.experiment import load_experiment  # private: what the command line runs
     from jaxid.experiment.template import write_template
-    from jaxid.report.verdict import Report, verdict
 
+    case, paths = cases[0], []
     (folder / "arm.urdf").write_text(case.urdf)
     text = write_template(folder / "arm.urdf", folder=folder).replace('"time"', '"t"')
     for pattern, replacement in case.edits:
@@ -394,12 +392,24 @@ def judged(case, folder):
         if not count:
             raise LookupError(pattern)
     (folder / "e.toml").write_text(text)
-    table = {"q": case.q, "dq": case.qd, "tau": case.tau}
-    columns = {f"{k}{j + 1}": x[:, j] for k, x in table.items() for j in range(x.shape[1])}
-    np.savez(folder / "log.npz", t=case.t, **columns)
-    experiment = load_experiment(folder / "e.toml")
+    for k, c in enumerate(cases):
+        table = {"q": c.q, "dq": c.qd, "tau": c.tau}
+        columns = {f"{k}{j + 1}": x[:, j] for k, x in table.items() for j in range(x.shape[1])}
+        paths.append(folder / (f"log{k + 1}.npz" if k else "log.npz"))
+        np.savez(paths[-1], t=c.t, **columns)
+    return load_experiment(folder / "e.toml"), paths
+
+
+def judged(cases, folder):
+    """Return the verdict on logs, the likely mistakes, and the largest share of missed forces."""
+    from rich.console import Console
+
+    from jaxid.experiment import identify_logs  # private: what the command line runs
+    from jaxid.report.verdict import Report, verdict
+
+    experiment, paths = written(cases, folder)
     with open("/dev/null", "w") as nowhere, identify_logs.stages(Console(file=nowhere)) as stage:
-        r = identify_logs.identify_logs(experiment, [folder / "log.npz"], [], 0.6, stage)
+        r = identify_logs.identify_logs(experiment, paths, [], 0.6, stage)
     errors = r.validation.errors
     fitted, unseen = errors[: r.fitted], errors[r.fitted :]
     report = Report(
@@ -417,7 +427,7 @@ def one(robot, urdf, change, j, amount, folder):
         if change is not None:
             change(case, j, amount)
         try:
-            remarks, r, missed = judged(case, folder)
+            remarks, r, missed = judged([case], folder)
         except ValueError as refusal:
             return "refused", False, np.nan, [str(refusal)]
         said = [str(x.text) for x in remarks if x.status.name in ("DOUBTFUL", "BAD")]

@@ -97,7 +97,7 @@ def limit_findings(
     for j in range(robot.joints):
         if j in faulty:
             continue
-        findings += _joint_findings(robot, j, s, not angles, not forces)
+        findings += _joint_findings(robot, j, s, not angles)
     # Over a whole log, friction makes a robot consume energy.
     if not faulty and s.power < -0.05:
         findings.append(
@@ -113,9 +113,9 @@ def limit_findings(
 
 
 def _joint_findings(
-    robot: Robot, j: int, statistics: LogStatistics, with_range: bool, with_force: bool
+    robot: Robot, j: int, statistics: LogStatistics, with_range: bool
 ) -> Iterator[str]:
-    """Compare the range, speed and force of a joint with its limits."""
+    """Compare the range and speed of a joint with its limits."""
     name = robot.joint_names[j]
     unit = robot.joint_unit(j)
     limits = robot.limits
@@ -139,13 +139,6 @@ def _joint_findings(
         yield (f"joint `{name}` moves by {b - a:.2g} {unit} only: is it the right column and unit?")
     if force == 0.0:
         yield f"the forces of joint `{name}` are zero throughout: is it the right column?"
-    known = float(robot.known_max_forces[j])
-    unit = robot.force_unit(j)
-    if with_force and force > 1.2 * known:
-        yield (
-            f"joint `{name}` needs {force:.3g} {unit}, but its limit is {known:.3g} {unit}: check "
-            "`recording.force_unit` and `forces_side`."
-        )
 
 
 def _force_findings(robot: Robot, statistics: LogStatistics) -> list[str]:

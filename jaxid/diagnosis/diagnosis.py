@@ -1,13 +1,13 @@
 """Diagnosis of a log: signs of wrong units, signs, channels, sensors and delays, as sentences."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxid.arrays import AnyArray
-from jaxid.dynamics.terms import SquareRootFriction
 from jaxid.errors import InputError
 from jaxid.identification.delay import estimate_delay
 from jaxid.identification.estimators import GivenWeights
@@ -26,7 +26,7 @@ from .checks_without_model import (
     limit_findings,
     stuck_findings,
 )
-from .mistakes import likely_mistakes
+from .mistakes import INSTANTS, likely_mistakes
 
 SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
@@ -71,15 +71,7 @@ class Diagnosis:
         Args:
             fit: Fit of the robot's model, to this log or to several.
         """
-        o = self.observations
-        # Faults of channels explain the rest.
-        if self.faulty or o is None:
-            return ()
-        if moments := departures(fit, o):
-            return moments
-        step = -(-o.rows // 300)
-        motion = o.motion[o.instants[::step]]
-        return likely_mistakes(fit, motion, o.reduced_forces[::step], self.motor_sides)
+        return _mistakes([self], fit)[0]
 
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
@@ -88,13 +80,13 @@ class Diagnosis:
             fit: Fit to this log.
             commanded: The log with commanded angles in place of the measured ones, filtered alike.
         """
-        found, notes = (() if self.faulty else self.mistakes(fit)), self.notes
-        if not found and not self.faulty:
-            found = negative_friction(fit)
-            if self.observations is not None:
-                late, more = delay_finding(self.observations, fit, commanded)
-                found, notes = (*found, *late), (*notes, *more)
-        return dataclasses.replace(self, findings=(*found, *self.findings), notes=notes)
+        found, more = _mistakes([self], fit)
+        if not found and not self.faulty and self.observations is not None:
+            found = negative_friction(fit, [self.observations])
+            more = (*more, *delay_notes(self.observations, fit, commanded))
+        return dataclasses.replace(
+            self, findings=(*found, *self.findings), notes=(*self.notes, *more)
+        )
 
     def summary(self) -> Table:
         """Return a table: motion and forces of each joint beside its limits, and the findings."""
@@ -213,10 +205,24 @@ def diagnose(
     return diagnosis if fit is None else diagnosis.with_fit(fit)
 
 
-def mistakes_in_logs(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[str, ...]:
-    """Return what a fit to several logs reveals, apart from delays, with the names of the logs."""
-    friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit)
-    return (*friction, *(f"{d.log.name}: {text}" for d in diagnoses for text in d.mistakes(fit)))
+def mistakes_in_logs(
+    diagnoses: Sequence[Diagnosis], fit: Fit
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return findings and notes that a fit to several logs reveals; they are judged together."""
+    logs = [d.observations for d in diagnoses if d.observations is not None]
+    friction = () if any(d.faulty for d in diagnoses) else negative_friction(fit, logs)
+    found, notes = _mistakes(diagnoses, fit)
+    name = f"{diagnoses[0].log.name}: " if len(diagnoses) == 1 else ""
+    return (*friction, *(f"{name}{text}" for text in found)), notes
+
+
+def _mistakes(diagnoses: Sequence[Diagnosis], fit: Fit) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the likely mistake in logs, or moments that depart from the model, and notes."""
+    # Faults of channels explain the rest.
+    logs = [d.observations for d in diagnoses if d.observations is not None and not d.faulty]
+    named = "{0.name}: {1}" if len(diagnoses) > 1 else "{1}"
+    moments = tuple(named.format(log, text) for log in logs for text in departures(fit, log))
+    return likely_mistakes(fit, logs, diagnoses[0].motor_sides, moments) if logs else ((), ())
 
 
 def _excerpt(log: Observations, source: SamplesOnDisk) -> Recording:
@@ -251,7 +257,7 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     """Report forces that depart from the model for one moment, and at no other time nearly as far.
 
     Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the log at
-    most, beside what the filter spreads.
+    most, beside what the filter spreads. Uncertain parameters do not explain it.
     """
     o, robot = observations, fit.base.model.robot
     motion, forces = o.motion[o.instants], np.asarray(o.reduced_forces)
@@ -262,7 +268,9 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     for j, (name, error) in enumerate(zip(robot.joint_names, errors.T, strict=True)):
         k = int(np.argmax(error))
         others = error[np.abs(o.instants - o.instants[k]) > length]
-        if error[k] > max(0.5 * size[j], APART * others.max(initial=0.0)):
+        row = np.asarray(fit.base.regressor(motion[k]))[j]
+        deviation = _deviation(fit, row)
+        if error[k] > max(0.5 * size[j], APART * (deviation + others.max(initial=0.0))):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "
@@ -272,49 +280,66 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     return tuple(found)
 
 
-def negative_friction(fit: Fit) -> tuple[str, ...]:
-    """Report joints whose friction is negative beyond doubt: the model or the log is wrong."""
-    robot, names = fit.base.model.robot, fit.base.names
-    if any(isinstance(term, SquareRootFriction) for term in fit.base.model.terms):
-        # Only the sum of all friction cannot be negative.
-        return ()
-    certain = np.asarray(fit.parameters) < -SURE * np.asarray(fit.standard_deviations)
-    wrong = {name for name, negative in zip(names, certain, strict=True) if negative}
-    return tuple(
-        f"friction of joint `{label}` comes out negative ({' and '.join(found)}), as no friction "
-        "is: something in the model or the log of this joint is wrong."
-        for j, label in enumerate(robot.joint_names)
-        if (found := [f"{kind}{j + 1}" for kind in ("fv", "fc") if f"{kind}{j + 1}" in wrong])
-    )
+def _deviation(fit: Fit, row: np.ndarray) -> float:
+    """Return the standard deviation of a combination of parameters; infinite if undetermined."""
+    used = np.flatnonzero(row)
+    covariance = np.asarray(fit.covariance)[np.ix_(used, used)]
+    if not np.isfinite(covariance).all():
+        return np.inf
+    return float(np.sqrt(row[used] @ covariance @ row[used]))
 
 
-def delay_finding(
+def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:
+    """Report joints that friction drives, beyond doubt: the model or a log is wrong.
+
+    A single parameter may be negative, as where friction falls with speed.
+    """
+    base, robot = fit.base, fit.base.model.robot
+    p = np.asarray(fit.parameters)
+    motions = [log.motion[log.instants[:: -(-log.rows // INSTANTS)]] for log in logs]
+    rows = [base.regressor_rows(motion) for motion in motions]
+    found = []
+    for j, (name, own) in enumerate(zip(robot.joint_names, base.acting_columns, strict=True)):
+        friction = [
+            k for k, i in enumerate(own) if re.fullmatch(rf"f(?!o)[a-z]+{j + 1}", base.names[i])
+        ]
+        power, columns = np.zeros(base.size), [own[k] for k in friction]
+        for motion, each in zip(motions, rows, strict=True):
+            power[columns] += np.asarray(motion.qd)[:, j] @ each[j][:, friction]
+        if power @ p < -SURE * _deviation(fit, power):
+            named = " and ".join(base.names[i] for i in columns if p[i] < 0)
+            found.append(
+                f"friction of joint `{name}` comes out negative ({named}): it would drive the "
+                "joint; something in the model or the log of this joint is wrong."
+            )
+    return tuple(found)
+
+
+def delay_notes(
     observations: Observations, fit: Fit, commanded: Observations | None = None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return findings and notes about a delay of the forces that the model sees."""
+) -> tuple[str, ...]:
+    """Return a note about a delay of the forces, which is too small to be a mistake."""
     # A model that explains too little sees no delay.
     if not fit.residual < 0.3:
-        return (), ()
+        return ()
     weights = GivenWeights(np.asarray(fit.weights))
     try:
         delay = estimate_delay(fit.base, observations, weights, commanded=commanded)
     except ValueError:
-        return (), ()
+        return ()
     # What is advised must be sure.
     low, high = (1e3 * x for x in delay.interval(0.9999))
     between = f"between {low:.2g} and {high:.2g} ms later in the log than the angles"
     # A delay of a bus is that of all joints; other effects differ from joint to joint.
     if low <= 0.0 <= high or abs(delay.seconds) < float(np.std(delay.of_joints)):
-        return (), (f"the forces stand {between}: a delay cannot be told from none.",)
+        return (f"the forces stand {between}: a delay cannot be told from none.",)
     text = f"the forces stand {between}"
     if delay.p_value <= 0.001:
         least, most = (1e3 * float(x) for x in (np.min(delay.of_joints), np.max(delay.of_joints)))
-        return (
-            f"{text}, but {least:.3g} to {most:.3g} ms joint by joint: as likely, the model lacks "
-            "an effect.",
-        ), ()
+        apart = f"{least:.3g} to {most:.3g} ms joint by joint"
+        return (f"{text}, but {apart}: as likely, the model lacks an effect.",)
     if commanded is None and delay.feedback > 0.1 * abs(delay.seconds):
         cure = "name the commanded angles (`recording.commands`) to tell how much"
     else:
         cure = f"`force_delay = {delay.seconds:.3g}` in `[recording]` removes that"
-    return (f"{text}: {cure}.",), ()
+    return (f"{text}: {cure}.",)

@@ -1,36 +1,52 @@
 """Likely mistakes in the description of a log or a robot, found by the model itself.
 
-Every possible mistake is corrected in turn, and the model is fitted anew to some instants of the
-log, with friction that takes energy from the robot, as all friction does. Without that condition a
-wrong sign would only change signs of parameters where joints are hardly coupled.
+Every possible mistake is corrected in turn, and the model is fitted anew to some instants of all
+logs, with any friction that takes energy from the robot, as all friction does. Without that
+condition a wrong sign would only change signs of parameters where joints are hardly coupled; with
+less friction, a mistake might be named where the model lacks some. What counts is also missed in
+stretches of time that were left out of the fit.
 """
 
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import optimize
+from scipy.interpolate import CubicSpline
 
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit_result import Fit
+from jaxid.measurement.observations import Observations
 from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
 
-BAD = 0.03
+BAD = 0.005
 """Fraction (0 to 1) of the forces left unexplained from which mistakes are looked for."""
+INSTANTS = 300
+"""Number of instants of all logs that tell enough."""
+FOLDS = 5
+"""Parts of the time that are left out in turn."""
+LATEST, FARTHEST, GAIN = 0.05, 0.8, 3.0
+"""Largest delay [s], error of a zero [rad or m] and gain that are looked for."""
+MOVED, SCALED = 0.2, 1.2
+"""Error of a zero [rad or m] and gain of a force of which a note says where they do not show."""
+MATERIAL = 0.02
+"""Fraction (0 to 1) of the forces by which a delay must change them to be a mistake."""
 FAR = 0.15
 """Fraction (0 to 1) of the forces that no model misses whose description is right."""
 MOST = 0.5
 """Fraction (0 to 1) of what a model misses that may be left by the correction of a mistake."""
 MANY = 12
 """Number of joints above which no two joints, and no axes, are examined: they would be too many."""
-ALIKE, CLEAR = 1.05, 1.5
-"""Ratios of what two corrections leave up to which they are the same, and from which one is not."""
+CLEAR = 1.5
+"""Ratio of what two corrections leave from which one of them is not likely."""
 
 
 class Correction(NamedTuple):
@@ -49,48 +65,178 @@ class Correction(NamedTuple):
     forces: np.ndarray
 
 
+class _Amount(NamedTuple):
+    """Mistake of any amount in a joint, or in all if the name is empty; and two of its amounts."""
+
+    joint: str
+    what: str
+    correction: Callable[[float, slice], Correction]
+    largest: float
+    small: float
+
+
 def likely_mistakes(
-    fit: Fit, motion: Motion, forces: np.ndarray, motor_sides: tuple[bool, bool]
-) -> tuple[str, ...]:
-    """Return a sentence about the mistake that explains most of what a model misses, or nothing.
+    fit: Fit,
+    logs: Sequence[Observations],
+    motor_sides: tuple[bool, bool],
+    events: tuple[str, ...] = (),
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return a sentence about the mistake that explains most of what a model misses, and notes.
+
+    A mistake is looked for in all logs alike, then in the columns of each. The notes say which
+    mistakes would not show.
 
     Args:
         fit: Fit of the robot's model.
-        motion: Joint motion at some instants of a log.
-        forces: Forces at these instants [N m or N].
-        motor_sides: Whether angles and forces of the log are taken for the motors'.
+        logs: Logs of one experiment.
+        motor_sides: Whether angles and forces of the logs are taken for the motors'.
+        events: Sentences about moments, which are returned if no mistake explains them.
     """
-    model = fit.base.model
-    robot = model.robot
-    geometries: dict[tuple[bool, ...], _AnyGeometry] = {}
-
-    def rest(c: Correction) -> float:
-        kinds = c.robot.revolute
-        if kinds not in geometries:
-            geometries[kinds] = _AnyGeometry(Model(c.robot, model.terms))
-        columns = geometries[kinds](c.robot, c.motion)
-        return _unexplained(*columns, c.forces, model.parameter_names)
-
-    left = rest(Correction("", robot, motion, forces))
+    samples = _Samples(fit.base.model, logs)
+    robot, motion, forces = fit.base.model.robot, samples.motion, samples.forces
+    as_given = Correction("", robot, motion, forces)
+    left, left_unseen = samples.missed(as_given), samples.missed(as_given, folds=FOLDS)
+    notes = samples.hidden(max(left / MOST, BAD))
     if left < BAD:
-        return ()
-    candidates = [
-        *_of_columns(robot, motion, forces, motor_sides),
-        *_of_robot(robot, motion, forces),
-        *(_of_kinds(robot, motion, forces) if left > FAR else ()),
-    ]
-    tried = sorted(((rest(c), c.text) for c in candidates), key=lambda pair: pair[0])
-    best = tried[0][0]
-    likely = [text for value, text in tried if value <= ALIKE * best]
-    others = [value for value, _ in tried[len(likely) :]]
-    # With more than three candidates nothing is known.
-    clear = len(likely) <= 3 and min(others, default=np.inf) >= CLEAR * best
-    if clear and best <= min(MOST * left, FAR):
-        return (
-            f"{', or '.join(likely)}: the model then misses {100 * best:.2g} % of the forces "
-            f"instead of {100 * left:.2g} %.",
-        )
-    return _misfit(fit, motion, forces, left)
+        return events, notes
+    parts = [slice(0, len(forces)), *(samples.parts if len(logs) > 1 else [])]
+    for name, part in zip(("", *(f"{log.name}: " for log in logs)), parts, strict=False):
+        motion, forces = samples.motion[part], samples.forces[part]
+        candidates = [*_of_columns(robot, motion, forces, motor_sides)]
+        amounts = [samples.best(x, part) for x in samples.amounts()]
+        if left**2 - samples.missed(amounts[0], part) ** 2 < MATERIAL**2:
+            del amounts[0]
+        candidates += amounts
+        if not name:
+            candidates += _of_robot(robot, motion, forces)
+            candidates += _of_kinds(robot, motion, forces) if left > FAR else ()
+        tried = sorted(((samples.missed(c, part), k) for k, c in enumerate(candidates)))
+        best = tried[0][0]
+        likely = [candidates[k] for value, k in tried if value < CLEAR * best]
+        unseen = samples.missed(likely[0], part, FOLDS)
+        # With more than three candidates nothing is known.
+        known = len(likely) <= 3 and best <= min(MOST * left, FAR)
+        if known and unseen <= MOST * left_unseen:
+            text = (
+                f"{name}{', or '.join(c.text for c in likely)}: the model then misses "
+                f"{100 * best:.2g} % of the forces instead of {100 * left:.2g} %."
+            )
+            return (text,), ()
+    return events or _misfit(fit, samples.motion, samples.forces, left), notes
+
+
+class _Samples:
+    """Some instants of all logs, and what a model with any friction misses of their forces."""
+
+    def __init__(self, model: Model, logs: Sequence[Observations]):
+        step = -(-sum(log.rows for log in logs) // INSTANTS)
+        instants = [log.instants[::step] for log in logs]
+        motions = [log.motion[at] for log, at in zip(logs, instants, strict=True)]
+        self.motion = jax.tree.map(lambda *x: np.concatenate(x), *motions)
+        self.forces = np.concatenate([np.asarray(log.reduced_forces)[::step] for log in logs])
+        ends = np.cumsum([0, *map(len, instants)]).tolist()
+        self.parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+        self._logs, self._instants, self._model = logs, instants, model
+        self._fastest = np.abs(self.motion.qd).max(axis=0)
+        self._geometries: dict[tuple[bool, ...], _AnyGeometry] = {}
+        self._rows = self._rows_of(Correction("", model.robot, self.motion, self.forces))
+        braking = [re.fullmatch(r"f[vc]\d+", name) is not None for name in model.parameter_names]
+        self._braking = np.ones(self._rows.shape[2] - 1, bool)
+        self._braking[: len(braking)] = braking
+
+    def missed(self, c: Correction, part: slice = slice(None), folds: int = 1) -> float:
+        """Return what is missed (0 to 1) if a part of the instants is corrected."""
+        rows = self._rows.copy()
+        rows[part] = self._rows_of(c)
+        return _missed(rows, self._braking, folds)
+
+    def best(self, mistake: _Amount, part: slice) -> Correction:
+        """Return the correction of a mistake by the amount that leaves least."""
+
+        def left(amount: float) -> float:
+            return self.missed(mistake.correction(amount, part), part)
+
+        bounds, options = (-mistake.largest, mistake.largest), {"maxiter": 10}
+        found = optimize.minimize_scalar(left, bounds=bounds, options=options).x
+        return mistake.correction(found, part)
+
+    def hidden(self, shown: float) -> tuple[str, ...]:
+        """Return a note about mistakes with which the model would miss less than what is shown."""
+        unseen: dict[str, list[str]] = {}
+        for mistake in self.amounts():
+            change = mistake.correction(mistake.small, slice(None))
+            if mistake.joint and self.missed(change) < shown:
+                unseen.setdefault(mistake.what, []).append(f"`{mistake.joint}`")
+        for signs, name in zip(
+            1 - 2 * np.eye(self.motion.joints), self._model.robot.joint_names, strict=True
+        ):
+            reversed_one = Motion(
+                *(x * signs for x in (self.motion.q, self.motion.qd, self.motion.qdd))
+            )
+            change = Correction("", self._model.robot, reversed_one, self.forces * signs)
+            if self.missed(change) < shown:
+                unseen.setdefault("a reversed axis", []).append(f"`{name}`")
+        texts = [
+            f"{what} ({'any joint' if len(names) == self.motion.joints > 1 else ', '.join(names)})"
+            for what, names in unseen.items()
+        ]
+        return (f"these logs would not show {' or '.join(texts)}",) if texts else ()
+
+    def amounts(self) -> Iterator[_Amount]:
+        """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""
+        robot, q, forces = self._model.robot, self.motion.q, self.forces
+        text = "the forces of the log seem to be late (`recording.force_delay = {:.2g}`)"
+
+        def correction(text: str, part: slice, q=q, forces=forces) -> Correction:
+            moved = Motion(q[part], self.motion.qd[part], self.motion.qdd[part])
+            return Correction(text, robot, moved, forces[part])
+
+        def late(x: float, part: slice) -> Correction:
+            return correction(text.format(x), part, forces=self._later(x))
+
+        yield _Amount("", "", late, LATEST, LATEST)
+        for j, name in enumerate(robot.joint_names[:MANY]):
+            own = np.eye(robot.joints)[j]
+            unit, per = ("degrees", np.pi / 180) if robot.revolute[j] else ("m", 1.0)
+
+            def moved(x: float, part: slice, own=own, name=name, unit=unit, per=per) -> Correction:
+                said = f"the angle of joint `{name}` seems to lack {x / per:.2g} {unit}"
+                return correction(f"{said} (`recording.angle_offsets`)", part, q + x * own)
+
+            def scaled(x: float, part: slice, own=own, name=name) -> Correction:
+                said = f"the gain of the force of joint `{name}` seems to be {np.exp(x):.2g}"
+                return correction(said, part, forces=forces * np.exp(-x * own))
+
+            what = f"a zero that is off by {MOVED / per:.2g} {unit}"
+            yield _Amount(name, what, moved, FARTHEST, MOVED)
+            what = f"forces that are {SCALED:g} times too large"
+            yield _Amount(name, what, scaled, float(np.log(GAIN)), -float(np.log(SCALED)))
+
+    def _later(self, seconds: float) -> np.ndarray:
+        """Return the forces that stand later in the logs."""
+        shifted = []
+        for log, at in zip(self._logs, self._instants, strict=True):
+            time = log.reduced_time
+            curve = CubicSpline(time, np.asarray(log.reduced_forces))
+            shifted.append(curve(np.clip(log.time[at] + seconds, time[0], time[-1])))
+        return np.concatenate(shifted)
+
+    def _rows_of(self, c: Correction) -> np.ndarray:
+        """Return the regressor, with any friction, and the forces as last column."""
+        kinds = c.robot.revolute
+        if kinds not in self._geometries:
+            self._geometries[kinds] = _AnyGeometry(Model(c.robot, self._model.terms))
+        columns, known = self._geometries[kinds](c.robot, c.motion)
+        friction = _any_friction(np.asarray(c.motion.qd), self._fastest)
+        return np.concatenate([columns, friction, (c.forces - known)[..., None]], axis=2)
+
+
+def _any_friction(speeds: np.ndarray, fastest: np.ndarray) -> np.ndarray:
+    """Return columns of friction of each joint that brakes: dry, with peaks, and quadratic."""
+    v = speeds / np.where(fastest > 0, fastest, 1.0)
+    shapes = [np.tanh(v / width) for width in (0.01, 0.1)]
+    shapes += [np.tanh(v / 0.01) * np.exp(-((v / width) ** 2)) for width in (0.05, 0.2)]
+    return np.concatenate([x[..., None] * np.eye(v.shape[1]) for x in (*shapes, v * abs(v))], 2)
 
 
 def _misfit(fit: Fit, motion: Motion, forces: np.ndarray, left: float) -> tuple[str, ...]:
@@ -228,30 +374,41 @@ class _AnyGeometry(eqx.Module):
         return columns[..., :-1], columns[..., -1]
 
 
-def _unexplained(
-    regressor: np.ndarray, tool_forces: np.ndarray, forces: np.ndarray, names: Sequence[str]
-) -> float:
-    """Return the fraction (0 to 1) of the forces that least squares leave unexplained.
+def _missed(rows: np.ndarray, braking: np.ndarray, folds: int = 1) -> float:
+    """Return the fraction (0 to 1) of the forces that least squares miss.
 
-    All joints count equally. Friction terms that would come out negative are left out.
+    All joints count equally. Friction that would come out negative is left out. With several
+    `folds`, each of these parts of the time is left out of the fit that it is compared with.
+
+    Args:
+        rows: Regressor with the forces as last column [instants, joints, columns].
+        braking: Whether each column is friction.
+        folds: Number of parts, each of several stretches.
     """
-    wanted = forces - tool_forces
-    size = np.sqrt(np.mean(wanted**2, axis=0))
-    scale = 1.0 / np.where(size > 0, size, np.inf)
-    theta = np.concatenate([regressor, wanted[..., None]], axis=2) * scale[:, None]
-    theta = theta.reshape(-1, theta.shape[2])
-    if not np.isfinite(theta).all():
+    size = np.sqrt(np.mean(rows[..., -1] ** 2, axis=0))
+    theta = rows / np.where(size > 0, size, np.inf)[:, None]
+    length = np.sqrt(np.sum(theta**2, axis=(0, 1)))
+    if not np.isfinite(length).all():
         return np.inf
-    R = np.asarray(np.linalg.qr(theta, mode="r"))
-    length = np.linalg.norm(R, axis=0)
-    R, target = R[:, :-1] / np.where(length[:-1] > 0, length[:-1], 1.0), R[:, -1]
-    braking = np.array([re.fullmatch(r"f[vc]\d+", name) is not None for name in names])
-    used = np.ones(len(names), bool)
+    theta[..., :-1] /= np.where(length[:-1] > 0, length[:-1], 1.0)
+    stretches = np.array_split(theta, 4 * folds)
+    parts = [np.concatenate(stretches[k::folds]) for k in range(folds)]
+    factors, squares = [np.linalg.qr(x.reshape(-1, x.shape[2]), mode="r") for x in parts], 0.0
+    for k, unseen in enumerate(factors):
+        seen = [*factors[:k], *factors[k + 1 :]] or factors
+        R = np.asarray(np.linalg.qr(np.concatenate(seen), mode="r"))
+        found = _with_braking(R, braking)
+        squares += float(np.sum((unseen @ np.append(found, -1.0)) ** 2))
+    return np.sqrt(squares) / max(length[-1], 1e-300)
+
+
+def _with_braking(R: np.ndarray, braking: np.ndarray) -> np.ndarray:
+    """Return the least-squares parameters, without friction that would not brake."""
+    used = np.ones(len(braking), bool)
     while True:
-        found = np.zeros(len(names))
-        found[used] = np.linalg.lstsq(R[:, used], target, rcond=1e-9)[0]
+        found = np.zeros(len(braking))
+        found[used] = np.linalg.lstsq(R[:, :-1][:, used], R[:, -1], rcond=1e-9)[0]
         pushing = braking & (found < 0)
         if not pushing.any():
-            break
+            return found
         used &= ~pushing
-    return float(np.linalg.norm(R @ found - target) / max(length[-1], 1e-300))

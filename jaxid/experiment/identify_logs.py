@@ -205,7 +205,7 @@ def read_runs(
             observations = [log for _, log, _ in logs]
             rows = RegressionProblem(experiment.base, observations, stage.through)
             fits.append(fit_problem(rows, estimation.plain))
-            doubts += mistakes_in_logs([diagnosis for *_, diagnosis in logs], fits[-1])
+            doubts += mistakes_in_logs([diagnosis for *_, diagnosis in logs], fits[-1])[0]
         runs.append(dataclasses.replace(functools.reduce(update, fits), name=name))
     return runs, doubts
 
@@ -276,8 +276,8 @@ def identify_logs(
     stage("looking for mistakes")
     # Bounds would hide what is wrong.
     free, diagnoses = without_bounds(fit), [diagnosis for *_, diagnosis in loaded[: len(logs)]]
-    mistakes = mistakes_in_logs(diagnoses, free)
-    notes = [note for o in every for note in o.notes]
+    mistakes, more = mistakes_in_logs(diagnoses, free)
+    notes = [*(note for o in every for note in o.notes), *more]
     for log, whole, diagnosis in loaded[: len(logs)]:
         if isinstance(log, Recording) and not diagnosis.faulty:
             notes += [f"{log.name}: {x}" for x in resolution_note(fit, log, whole)]

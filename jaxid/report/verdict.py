@@ -256,11 +256,13 @@ def _judge_bounds(fit: Fit) -> list[Remark]:
 def _judge_offsets(fit: Fit) -> list[Remark]:
     """Judge constant forces: a large one is a weight that gravity does not explain."""
     robot, found = fit.base.model.robot, []
-    values = dict(zip(fit.base.names, np.asarray(fit.parameters).tolist(), strict=True))
+    estimates = zip(np.asarray(fit.parameters), fit.standard_deviations, strict=True)
+    values = dict(zip(fit.base.names, estimates, strict=True))
     (symbol, *_), *_ = ConstantOffset.symbols
     for j, name in enumerate(robot.joint_names):
-        value, largest = values.get(f"{symbol}{j + 1}", 0.0), float(robot.known_max_forces[j])
-        if abs(value) > OFFSET * largest:
+        value, deviation = map(float, values.get(f"{symbol}{j + 1}", (0.0, 0.0)))
+        largest = float(robot.known_max_forces[j])
+        if abs(value) - 2.0 * deviation > OFFSET * largest:
             unit = robot.force_unit(j)
             found.append(
                 Remark(

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxid.diagnosis import diagnose
+from jaxid.diagnosis.diagnosis import mistakes_in_logs
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import CoulombFriction, RigidBodies, ViscousFriction
@@ -123,6 +124,39 @@ def test_whole_joints_and_zeros_of_angles_are_found(motors, said):
     q = np.asarray(ROBOT.drives.joint_angles(angles)) - np.pi / 2 * (np.arange(4) == 2)
     (sentence,) = said(np.asarray(ROBOT.drives.motor_angles(q)), forces)
     assert sentence.startswith("the angle of joint `joint3` seems to lack 90 degrees")
+
+
+def test_mistakes_of_any_amount_are_found(motors, said):
+    angles, forces = motors
+    q = np.asarray(ROBOT.drives.joint_angles(angles)) - 0.3 * (np.arange(4) == 2)
+    (sentence,) = said(np.asarray(ROBOT.drives.motor_angles(q)), forces)
+    assert "the angle of joint `joint3` seems to lack 17 degrees" in sentence
+    (sentence,) = said(angles, forces * [1.0, 1.5, 1.0, 1.0])
+    assert sentence.startswith("the gain of the force of joint `joint2` seems to be 1.5")
+    (sentence,) = said(angles[8:], forces[:-8])
+    assert sentence.startswith(
+        "the forces of the log seem to be late (`recording.force_delay = 0.0"
+    )
+
+
+def test_logs_are_judged_together_and_the_wrong_one_is_named(motors):
+    angles, forces = motors
+    pairs = [log_of(angles, forces), log_of(angles, forces * [1.0, 1.0, 1.0, -1.0])]
+    logs = [
+        observations.replace(name=name) for name, (_, observations) in zip("ab", pairs, strict=True)
+    ]
+    examined = [
+        diagnose(log, ROBOT, observations=o) for (log, _), o in zip(pairs, logs, strict=True)
+    ]
+    found, _ = mistakes_in_logs(examined, identify(BASE, logs))
+    assert any(
+        text.startswith("b: the sign of the force of joint `joint4` seems to be wrong")
+        for text in found
+    )
+    found, notes = mistakes_in_logs([examined[0], examined[0]], identify(BASE, logs[:1]))
+    assert found == ()
+    # With so much noise, not even twice of what is missed would be sure.
+    assert "a zero that is off by 11 degrees (any joint)" in notes[0]
 
 
 def test_a_force_that_departs_for_a_moment_is_found(motors, said):

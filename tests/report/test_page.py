@@ -183,9 +183,12 @@ def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
     robot = fit.base.model.robot
     base = SimpleNamespace(model=SimpleNamespace(robot=robot), names=("m1", "fo1", "fo2"))
     limits = np.asarray(robot.known_max_forces)
-    for share, count in ((0.1, 0), (-0.8, 1)):
+    for share, spread, count in ((0.1, 0.0, 0), (-0.8, 0.3, 0), (-0.8, 0.0, 1)):
         p = np.array([1e6, share * limits[0], 0.01 * limits[1]])
-        found = _judge_offsets(SimpleNamespace(base=base, parameters=p))
+        deviations = spread * np.abs(p)
+        deviations[1] = spread * limits[0]
+        sick = SimpleNamespace(base=base, parameters=p, standard_deviations=deviations)
+        found = _judge_offsets(sick)
         assert [r.status for r in found] == [Status.DOUBTFUL] * count
     assert f"joint `{robot.joint_names[0]}`" in found[0].text.lower()
 
