@@ -48,8 +48,10 @@ def hidden_one(reference: Array) -> Array:
     return (bits >> (width - 1) | 1).astype(reference.dtype)
 
 
-def fenced(x: Array, one: Array) -> Array:
-    """Return a value behind a fence, which XLA does not compute again for each of its uses."""
+def fenced(x: Array, one: Array | None) -> Array:
+    """Return a value behind a fence (none if `one` is None): XLA does not compute it again."""
+    if one is None:
+        return x
     return jax.lax.optimization_barrier(x) if HOLDS else x / one
 
 
@@ -221,7 +223,7 @@ def on_any_platform(program: Program, evaluate: Callable, *arrays: AnyArray) -> 
 def _circular(x: Array, anchor: Array | None) -> tuple[Array, Array]:
     """Return sine and cosine behind fences; their derivatives are made from the fenced values."""
     sine, cosine = sine_cosine(x)
-    return (sine, cosine) if anchor is None else (fenced(sine, anchor), fenced(cosine, anchor))
+    return fenced(sine, anchor), fenced(cosine, anchor)
 
 
 @_circular.defjvp
@@ -268,7 +270,7 @@ def _stacked_derivative(lowered: Lowered, groups: Groups, primals: tuple, tangen
             real = [jnp.asarray(x, zero.dtype) if isinstance(x, float) else x for x in operands]
             change = _slope(operation, real, own)
         fence = anchor if position in lowered.fenced else None
-        changes.append(change if fence is None else fenced(change, fence))
+        changes.append(fenced(change, fence))
     found = (_in_groups(program, groups, x, first, k) for k, x in enumerate((values, changes)))
     values, changes = found
     return values, changes
