@@ -93,11 +93,11 @@ class SampleMethod:
 
     @functools.cached_property
     def on_rows(self) -> Callable:
-        """The method on rows of samples: [samples, results] from arrays as in `on_rows`."""
-        plain = functools.partial(plain_rows, self.plain)
-        if self.is_long:
-            return plain
-        return with_derivatives_of(plain, functools.partial(on_rows, self.program))
+        """The method on rows of samples: [samples, ...] from arrays as in `on_rows`."""
+        run = plain = functools.partial(plain_rows, self.plain)
+        if not self.is_long:
+            run = with_derivatives_of(plain, functools.partial(on_rows, self.program))
+        return lambda *arrays: run(*arrays).reshape(-1, *self.output_shape)
 
     @functools.cached_property
     def compiled(self) -> Callable:
@@ -193,7 +193,6 @@ def on_samples(
             return jnp.asarray(out, dtype) if in_jax else out
     run = method.compiled if known else method.on_rows
     out = _over_batches(run, batch, [jnp.asarray(x, dtype) for x in arrays], len(shared))
-    out = jnp.reshape(out, (*batch, *method.output_shape))
     return np.asarray(out) if known and not in_jax else out
 
 
@@ -208,14 +207,14 @@ def _in_numpy(program: Program, arrays: list, batch: tuple[int, ...]) -> np.ndar
 
 def _over_batches(
     run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int
-) -> Float[Array, "*batch out"]:
+) -> Array:
     """Apply a function of rows of samples, by `vmap` over the leading axes of parameters."""
     ranks = [x.ndim - 1 for x in arrays[:shared]]
     if not any(ranks):
         rows = [jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in arrays[shared:]]
         rows = [x.reshape(math.prod(batch), x.shape[-1]) for x in rows]
         out = run(*arrays[:shared], *rows)
-        return out.reshape((*batch, out.shape[-1]))
+        return out if len(batch) == 1 else out.reshape((*batch, *out.shape[1:]))
     rank = len(batch)
     full = [x.reshape(*(1,) * (rank + 1 - x.ndim), *x.shape) for x in arrays]
     axes = [0 if x.shape[0] > 1 else None for x in full]
