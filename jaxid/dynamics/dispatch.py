@@ -205,9 +205,7 @@ def _in_numpy(program: Program, arrays: list, batch: tuple[int, ...]) -> np.ndar
     return dense_rows(program, evaluate_rows(program, *given), dtype)
 
 
-def _over_batches(
-    run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int
-) -> Array:
+def _over_batches(run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int) -> Array:
     """Apply a function of rows of samples, by `vmap` over the leading axes of parameters."""
     ranks = [x.ndim - 1 for x in arrays[:shared]]
     if not any(ranks):
