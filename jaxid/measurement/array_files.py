@@ -8,16 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from jaxid.errors import InputError
 
 
 def library(module: str, source: str) -> Any:
-    """Return a module of the extra `logs`.
-
-    Raises:
-        InputError: If it is not installed.
-    """
+    """Return a module of the extra `logs`; refuse what needs it if it is not installed."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -28,52 +25,36 @@ def library(module: str, source: str) -> Any:
 
 
 @contextlib.contextmanager
-def readable(path: Path, kind: str) -> Iterator[None]:
+def readable(source: str, kind: str) -> Iterator[None]:
     """Report a file that a library cannot read as damaged."""
     try:
         yield
     except InputError:
         raise
-    except Exception as error:  # of many kinds: it depends on which bytes are damaged
-        raise InputError(
-            f"`{path.name}` is no {kind}, or is damaged: {first_line(error)}."
-        ) from error
-
-
-def first_line(error: BaseException) -> str:
-    """Return what an error of a library says, in one line."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    except (Exception, pl.exceptions.PanicException) as error:
+        # Of many kinds: it depends on which bytes are damaged.
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"`{source}` is no {kind}, or is damaged: {said}.") from error
 
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of a MAT file of any version."""
     from scipy.io import loadmat
 
-    try:
-        with readable(path, "MAT file"):
-            content = loadmat(path, simplify_cells=True)
-    except InputError as error:
-        if not isinstance(error.__cause__, NotImplementedError):
-            raise
-        # Version 7.3 is HDF5, in which MATLAB's arrays are transposed.
-        arrays = read_hdf5(path).items()
-        return _named_arrays({name.replace("/", "."): array.T for name, array in arrays})
+    with path.open("rb") as file:
+        if b"\x89HDF" in file.read(516):
+            # Version 7.3 is HDF5, in which the arrays are transposed.
+            return _named_arrays({name: array.T for name, array in read_hdf5(path).items()})
+    with readable(path.name, "MAT file"):
+        content = loadmat(path, simplify_cells=True)
     return _named_arrays({k: value for k, value in content.items() if not k.startswith("__")})
 
 
 def read_hdf5(path: Path) -> dict[str, np.ndarray]:
-    """Read the numbers in an HDF5 file but its images, named like `group/q`."""
+    """Read the arrays of an HDF5 file but its images; those in a group are named like `log.q`."""
     h5py = library("h5py", path.name)
-    arrays: dict[str, np.ndarray] = {}
-
-    def read(name: str, item: Any) -> None:
-        is_array = isinstance(item, h5py.Dataset) and item.ndim in (1, 2)
-        if is_array and item.dtype.kind in "iuf" and item.dtype.itemsize > 1:
-            arrays[name] = item[()]
-
-    with readable(path, "HDF5 file"), h5py.File(path, "r") as file:
-        file.visititems(read)
-    return arrays
+    with readable(path.name, "HDF5 file"), h5py.File(path, "r") as file:
+        return _named_arrays(file)
 
 
 def with_elements(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -87,45 +68,37 @@ def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.
     """Return arrays by name; those in a structure are named like `log.q`."""
     arrays: dict[str, np.ndarray] = {}
     for name, value in content.items():
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             arrays |= _named_arrays(value, f"{prefix}{name}.")
         elif isinstance(value, np.ndarray) and value.ndim > 0:
             # Single rows, as MATLAB writes them, are columns here.
             arrays[prefix + name] = value.ravel() if 1 in value.shape else value
+        elif getattr(value, "ndim", 0) in (1, 2) and value.dtype.itemsize > 1:  # of HDF5
+            arrays[prefix + name] = value[()]
     return arrays
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of an NPZ file; objects, which could run code, are rejected."""
-    try:
+    with readable(path.name, "NPZ file of plain arrays (`numpy.savez`, without objects)"):
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             # A member that NumPy did not write comes as bytes, which are left out.
             return _named_arrays({name: archive[name] for name in archive.files})
-    except Exception as error:  # some ten kinds: it depends on which bytes are damaged
-        raise InputError(
-            f"`{path.name}` is no NPZ file of plain arrays ({first_line(error)}): save it by "
-            "`numpy.savez`, without objects."
-        ) from error
 
 
 def map_arrays(path: Path) -> dict[str, np.ndarray] | None:
     """Map the arrays of an NPZ file into memory; None if one is compressed or none is there."""
     arrays = {}
-    try:
-        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
-            for entry in archive.infolist():
-                if entry.compress_type != zipfile.ZIP_STORED:
-                    return None
-                file.seek(entry.header_offset + 26)
-                lengths = np.frombuffer(file.read(4), "<u2")
-                file.seek(entry.header_offset + 30 + int(lengths.sum()))
-                np.lib.format.read_magic(file)
-                shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-                order = "F" if fortran else "C"
-                array = np.memmap(path, dtype, "r", file.tell(), shape, order)
-                arrays[entry.filename.removesuffix(".npy")] = array
-    except Exception as error:  # of many kinds: it depends on which bytes are damaged
-        raise InputError(
-            f"`{path.name}` is no NPZ file of numbers, or is damaged: {first_line(error)}."
-        ) from error
+    with readable(path.name, "NPZ file"), zipfile.ZipFile(path) as archive, path.open("rb") as file:
+        for entry in archive.infolist():
+            if entry.compress_type != zipfile.ZIP_STORED:
+                return None
+            file.seek(entry.header_offset + 26)
+            lengths = np.frombuffer(file.read(4), "<u2")
+            file.seek(entry.header_offset + 30 + int(lengths.sum()))
+            np.lib.format.read_magic(file)
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            order = "F" if fortran else "C"
+            array = np.memmap(path, dtype, "r", file.tell(), shape, order)
+            arrays[entry.filename.removesuffix(".npy")] = array
     return _named_arrays(arrays) or None

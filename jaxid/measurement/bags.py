@@ -1,7 +1,7 @@
 """Bags of ROS 1 and ROS 2 as columns, named like `/joint_states.position.shoulder`."""
 
+import contextlib
 import dataclasses
-import functools
 import itertools
 import re
 from array import array
@@ -44,26 +44,19 @@ class Topic(NamedTuple):
 
 
 def read_bag(path: Path, selected: Collection[str]) -> list[Topic]:
-    """Read the messages of selected topics, and one message of each other topic.
-
-    Raises:
-        InputError: If the bag is damaged, or does not define the messages of a selected topic.
-    """
-    types, topics = library("rosbags.typesys", path.name), []
-    latest = types.get_typestore(types.Stores.LATEST)
-    highlevel = library("rosbags.highlevel", path.name)
-    with readable(path, "bag"), highlevel.AnyReader([path], default_typestore=latest) as bag:
+    """Read the messages of selected topics, and one message of each other topic."""
+    types, highlevel = (library(f"rosbags.{x}", path.name) for x in ("typesys", "highlevel"))
+    latest, topics = types.get_typestore(types.Stores.LATEST), []
+    kind = "bag that defines its messages"
+    with readable(path.name, kind), highlevel.AnyReader([path], default_typestore=latest) as bag:
         for name in dict.fromkeys(connection.topic for connection in bag.connections):
             raw = bag.messages([one for one in bag.connections if one.topic == name])
             read = ((time, bag.deserialize(data, one.msgtype)) for one, time, data in raw)
-            try:
-                topics.append(_topic(name, read if name in selected else itertools.islice(read, 1)))
-            except Exception as error:  # of many kinds: no definition, or damaged bytes
-                if name in selected:
-                    raise InputError(
-                        f"`{name}` of `{path.name}` cannot be read ({error!r}): record it as MCAP, "
-                        "which holds the definitions of its messages."
-                    ) from error
+            if name in selected:
+                topics.append(_topic(name, read))
+            else:
+                with contextlib.suppress(Exception):  # the bag may not define these messages
+                    topics.append(_topic(name, itertools.islice(read, 1)))
     return topics
 
 
@@ -80,8 +73,7 @@ def _topic(name: str, messages: Iterable[tuple[int, Any]]) -> Topic:
                 column = topic.columns.setdefault(field + element, (array("q"), array("d")))
                 column[0].append(number)
                 column[1].append(value)
-    count = len(topic.recorded)
-    topic.columns[name + RECORDED] = array("q", range(count)), array("d", topic.recorded)
+    topic.columns[name + RECORDED] = topic.recorded, topic.recorded
     for field, kinds in orders.items():
         for k, element in enumerate(itertools.chain(*kinds.values())):
             if len(kinds) == 1 and element:
@@ -113,17 +105,12 @@ def _fields(
         elif dataclasses.is_dataclass(value):
             yield from _fields(value, f"{field}.", names)
         elif isinstance(value, np.ndarray | list) and 0 < len(value) <= WIDEST:
-            elements = names.get(len(value)) or _positions(len(value))
+            elements = names.get(len(value)) or tuple(f"[{k}]" for k in range(len(value)))
             if isinstance(value, np.ndarray):
                 yield field, elements, value.tolist()
             elif dataclasses.is_dataclass(value[0]):
                 for element, item in zip(elements, value, strict=True):
                     yield from _fields(item, f"{field}{element}.", names)
-
-
-@functools.cache
-def _positions(count: int) -> tuple[str, ...]:
-    return tuple(f"[{k}]" for k in range(count))
 
 
 def join_topics(
@@ -133,61 +120,40 @@ def join_topics(
 
     The times are the stamps in the headers if all of the topics have them and no time of recording
     is asked for. Columns with other times are interpolated linearly.
-
-    Raises:
-        InputError: If the columns do not overlap in time.
     """
-    clocks = [name for name in names if name.endswith((STAMP, RECORDED)) or name == CLOCK]
-    names = [name for name in names if name not in clocks]
+    clock = next((x for x in names if x.endswith((STAMP, RECORDED)) or x == CLOCK), CLOCK)
+    names = [name for name in names if name != clock]
     owners = {name: topic for topic in topics for name in topic.columns}
-    recorded = any(name.endswith(RECORDED) for name in clocks)
-    if clocks == [CLOCK]:
-        recorded = not all(all(owners[name].stamps) for name in names)
+    stamped = clock != CLOCK or all(all(owners[name].stamps) for name in names)
+    recorded = clock.endswith(RECORDED) or not stamped
     times, values = {}, {}
     for name in names:
         rows, values[name] = map(np.asarray, owners[name].columns[name])
         times[name] = np.asarray(owners[name].recorded if recorded else owners[name].stamps)[rows]
-    first = times[names[0]]
+    first, main = times[names[0]], names[0].partition(".")[0]
     others = [name for name in names if not np.array_equal(times[name], first)]
-    covered = [_covered(times[name], first) for name in others]
-    kept = np.all([np.full(len(first), True), *covered], axis=0)
+    for name in others:
+        values[name] = _interpolated(times[name], values[name], first)
+    kept = np.all([np.isfinite(values[name]) | (name not in others) for name in names], axis=0)
     if not kept.any():
-        raise InputError(
-            f"`{names[0]}` and `{others[0]}` of `{source}` do not overlap in time: compare their "
-            "clocks."
-        )
+        raise InputError(f"the topics of `{source}` overlap nowhere in time: compare their clocks.")
     notes = [
-        f"`{topic}` is interpolated linearly at the times of `{names[0].partition('.')[0]}`"
+        f"`{topic}` is interpolated linearly at the times of `{main}`"
         for topic in dict.fromkeys(name.partition(".")[0] for name in others)
     ]
     if left := int(np.sum(~kept)):
         notes.append(f"{left} of {len(kept)} messages were left out: other topics pause there")
-    wanted = first[kept]
-    columns: dict[str, Any] = dict.fromkeys(clocks, pl.Series(wanted.astype("M8[ns]")))
-    for name in names:
-        same = name not in others
-        columns[name] = (
-            values[name][kept] if same else _interpolated(times[name], values[name], wanted)
-        )
-    return columns, tuple(notes)
+    columns = {name: values[name][kept] for name in names}
+    return {**columns, clock: pl.Series(first[kept].astype("M8[ns]"))}, tuple(notes)
 
 
 def _interpolated(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return values between others; NaN outside and in their pauses."""
     order = np.argsort(times, kind="stable")
     # Float64 holds nanoseconds only if they do not count from 1970.
     own, new = ((x - wanted[0]).astype(np.float64) for x in (times[order], wanted))
-    return np.interp(new, own, values[order])
-
-
-def _rate(times: np.ndarray) -> float:
-    """Return the usual number of messages in a second."""
-    return 1e9 / max(float(np.median(np.diff(np.sort(times)))), 1.0) if len(times) > 1 else 0.0
-
-
-def _covered(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return which times lie between values, but not in a pause."""
-    times = np.sort(times)
-    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1)) % len(times)
-    pauses = (times[after] - times[after - 1]) * 1e-9 * _rate(times)
-    inside = (times[0] <= wanted) & (wanted <= times[-1])
-    return inside & ((pauses <= LONGEST_PAUSE) | (times[after] == wanted))
+    found = np.interp(new, own, values[order], left=np.nan, right=np.nan)
+    steps = np.diff(own, prepend=own[0])
+    after = np.minimum(np.searchsorted(own, new), len(own) - 1)
+    pausing = (steps[after] > LONGEST_PAUSE * np.median(steps)) & (own[after] != new)
+    return np.where(pausing, np.nan, found)

@@ -32,9 +32,8 @@ class Columns(eqx.Module):
 
     A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` stands for the joints'
     numbers, from 1 or from 0), a tuple of positions from 0 (files without a header), or one name:
-    that of the column of a single joint, or of a whole array (samples x joints), whose columns
-    are also named `"q[0]"`, `"q[1]"`, … Fields of bags are named `"/joint_states.position[{}]"`, or
-    by joints `"/joint_states.position.shoulder"`.
+    that of the column of a single joint, or of a whole array (samples x joints), whose columns are
+    `"q[{}]"`. Fields of bags are `"/topic.field[{}]"`, or `"/topic.field.joint"` by names.
 
     Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and forces
     `sign * gain * torque constant * unit * value`. A unit is one for all joints, or one for each.
@@ -44,8 +43,7 @@ class Columns(eqx.Module):
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`; None if
             there are none.
-        time: Time stamps; None if `sample_time` is given, or for the clock that bags and LeRobot
-            data sets have.
+        time: Time stamps; None for `sample_time`, or the clock of bags and LeRobot data sets.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
         angle_unit: Unit of the angles.
@@ -83,9 +81,7 @@ class Columns(eqx.Module):
     def __check_init__(self) -> None:
         """Refuse contradictions."""
         if self.time is not None and self.sample_time is not None:
-            raise InputError(
-                "`Columns` takes `time` (a column) or `sample_time` [s], but not both."
-            )
+            raise InputError("give `time` (a column) or `sample_time` [s], but not both.")
         if self.sample_time is not None:
             positive_time(self.sample_time)
         self._require_unit("time_unit", Quantity.TIME)
@@ -176,11 +172,6 @@ class Log:
             for table in self.tables
             for k, text in (table.bad or {}).items()
         }
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Remarks about how the columns were made."""
-        return tuple(note for table in self.tables for note in table.notes)
 
     def stamps(self, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Return time stamps [s]; integers and dates count from `start`."""

@@ -20,7 +20,7 @@ import polars as pl
 
 from jaxid.errors import InputError
 
-from .array_files import first_line, map_arrays, read_hdf5, read_mat, read_npz, with_elements
+from .array_files import map_arrays, read_hdf5, read_mat, read_npz, readable, with_elements
 from .bags import BAGS, CLOCK, is_bag, join_topics, read_bag
 from .recording import LARGEST
 
@@ -30,8 +30,6 @@ Selections = Mapping[str, Selection | None]
 """Selections by channel; None is the clock that some kinds of files have."""
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 """Suffixes of text files."""
-OTHERS = (".parquet", ".npz", ".mat", ".h5", ".hdf5", *BAGS)
-"""Suffixes of other files."""
 HEAD = 65536
 """Bytes from which a format is detected."""
 BLOCK = 2**26
@@ -67,7 +65,7 @@ class LogTable:
     def rows(self) -> int:
         """Number of rows."""
         if isinstance(self.columns, pl.LazyFrame):
-            with _readable_parquet(self.source):
+            with readable(self.source, "Parquet file"):
                 rows = int(self.columns.select(pl.len()).collect().item())
         else:
             first, *others = itertools.chain(*self.channels.values())
@@ -93,7 +91,7 @@ class LogTable:
         names = list(itertools.chain(*kept.values()))
         columns = self.columns
         if isinstance(columns, pl.LazyFrame):
-            with _readable_parquet(self.source):
+            with readable(self.source, "Parquet file"):
                 length = None if stop is None else stop - start
                 part = columns.select(names).slice(start, length).collect()
                 columns = part.to_dict(as_series=True)
@@ -192,53 +190,45 @@ def open_table(
 
 def summarise_columns(path: Path) -> str:
     """Return the names of the columns of a file, as messages show them."""
-    if path.suffix.lower() in SUFFIXES:
-        with path.open("rb") as file:
-            names = _detect_format(path.name, file.read(HEAD)).names
-    else:
-        names = _open_columns(path, on_disk=True)[1].names
-    return f"`{'`, `'.join(_shortened(names))}`"
+    _, layout = _open_columns(path, on_disk=True)
+    return f"`{'`, `'.join(_shortened(layout.names))}`"
 
 
 def _open_columns(path: Path, on_disk: bool, topics: Collection[str] = ()) -> tuple[Any, "_Layout"]:
-    """Return the columns of a file that is no text, or the topics of a bag, and their names."""
-    suffix = path.suffix.lower()
+    """Return the columns of a file (None of a text), or the topics of a bag; and names."""
+    suffix, clock = path.suffix.lower(), ""
     if is_bag(path):
-        columns = read_bag(path, topics)
+        columns, clock = read_bag(path, topics), CLOCK
         names = itertools.chain(*(topic.columns for topic in columns))
-        return columns, _Layout(path.name, (*dict.fromkeys(names),), clock=CLOCK)
-    if not path.is_file():
+    elif not path.is_file():
         raise InputError(f"`{path}` is no file and no bag of ROS 2: check the path of the log.")
-    if suffix == ".parquet":
-        with _readable_parquet(path.name):
+    elif suffix in SUFFIXES:
+        with path.open("rb") as file:
+            return None, _detect_format(path.name, file.read(HEAD))
+    elif suffix == ".parquet":
+        with readable(path.name, "Parquet file"):
             columns = _with_elements(pl.scan_parquet(path))
             names = columns.collect_schema().names()
         clock = "timestamp" if {"timestamp", "episode_index"} <= {*names} else ""
-        return columns, _Layout(path.name, tuple(names), clock=clock)
-    if suffix == ".npz":
-        arrays = (map_arrays(path) if on_disk else None) or read_npz(path)
-    elif suffix in (".h5", ".hdf5"):
-        arrays = read_hdf5(path)
-    elif suffix == ".mat":
-        arrays = read_mat(path)
+    elif suffix == ".npz":
+        columns = names = with_elements((map_arrays(path) if on_disk else None) or read_npz(path))
+    elif suffix in (".mat", ".h5", ".hdf5"):
+        columns = names = with_elements((read_mat if suffix == ".mat" else read_hdf5)(path))
     else:
-        raise InputError(
-            f"`{path.name}` must end in {', '.join((*SUFFIXES, *OTHERS))}: convert it."
-        )
-    columns = with_elements(arrays)
-    return columns, _Layout(path.name, tuple(columns))
+        known = ", ".join((*SUFFIXES, ".parquet", ".npz", ".mat", ".h5", ".hdf5", *BAGS))
+        raise InputError(f"`{path.name}` must end in {known}: convert it.")
+    return columns, _Layout(path.name, tuple(dict.fromkeys(names)), clock=clock)
 
 
 def _with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
     """Add the elements of lists, named like `action[0]`, and join the clocks of episodes."""
-    schema, columns = frame.collect_schema(), []
-    head = frame.head(1).collect()
+    schema, head, columns = frame.collect_schema(), frame.head(1).collect(), []
     for name, kind in schema.items():
         if isinstance(kind, pl.List | pl.Array) and kind.inner.is_numeric():
             values, row = pl.col(name).cast(pl.List(kind.inner)), head[name].to_list()
             for k in range(len(row[0] or ()) if row else 0):
                 columns.append(values.list.get(k, null_on_oob=True).alias(f"{name}[{k}]"))
-    if {"timestamp", "episode_index"} <= {*schema} and schema["timestamp"].is_numeric():
+    if {"timestamp", "episode_index"} <= {*schema}:
         stamps = pl.col("timestamp").cast(pl.Float64)
         begins = (pl.col("episode_index").diff() != 0).fill_null(False)
         pauses = pl.when(begins).then(EPISODE_PAUSE - stamps.diff()).otherwise(0.0)
@@ -466,14 +456,3 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     mark = len(codecs.BOM_UTF8) if first.startswith(codecs.BOM_UTF8) else 0
     start = min(len(first) + 1, len(head)) if named else mark
     return _Layout(source, tuple(names), named, separator, comma, start)
-
-
-@contextlib.contextmanager
-def _readable_parquet(source: str) -> Iterator[None]:
-    """Report a Parquet file that polars cannot read as damaged."""
-    try:
-        yield
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-        raise InputError(
-            f"`{source}` is no Parquet file, or is damaged: {first_line(error)}."
-        ) from error

@@ -74,7 +74,8 @@ def read_recording(
     bad = log.bad_rows
     if time is not None:
         _find_stray_stamps(time, bad, log.tables[0])
-    rows, sample_time, notes = len(angles), columns.sample_time, log.notes
+    rows, sample_time = len(angles), columns.sample_time
+    notes = tuple(note for table in log.tables for note in table.notes)
     named = "; ".join(text for _, text in sorted(bad.items())[:NAMED])
     named += f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
     if len(bad) > bad_rows * rows:
@@ -89,12 +90,8 @@ def read_recording(
         angles, forces, time = angles[kept], forces[kept], time[kept]
         velocities = None if velocities is None else velocities[kept]
         left = "is bad and was" if len(bad) == 1 else "are bad and were"
-        notes = (
-            *notes,
-            f"{len(bad)} of {rows} rows {left} left out: {named}",
-        )
-    if columns.unwrap:
-        angles = np.unwrap(angles, axis=0)
+        notes += (f"{len(bad)} of {rows} rows {left} left out: {named}",)
+    angles = np.unwrap(angles, axis=0) if columns.unwrap else angles
     recording = Recording.of(
         angles,
         forces,

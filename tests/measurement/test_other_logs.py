@@ -12,6 +12,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import jaxid as jid
 from jaxid import units
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.reading import read_recording
