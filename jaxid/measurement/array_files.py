@@ -80,10 +80,10 @@ def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of an NPZ file; objects, which could run code, are rejected."""
-    with readable(path.name, "NPZ file of plain arrays (`numpy.savez`, without objects)"):
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            # A member that NumPy did not write comes as bytes, which are left out.
-            return _named_arrays({name: archive[name] for name in archive.files})
+    kind = "NPZ file of plain arrays (`numpy.savez`, without objects)"
+    with readable(path.name, kind), path.open("rb") as file, np.load(file) as archive:
+        # A member that NumPy did not write comes as bytes, which are left out.
+        return _named_arrays({name: archive[name] for name in archive.files})
 
 
 def map_arrays(path: Path) -> dict[str, np.ndarray] | None:

@@ -222,18 +222,20 @@ def _open_columns(path: Path, on_disk: bool, topics: Collection[str] = ()) -> tu
 
 def _with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
     """Add the elements of lists, named like `action[0]`, and join the clocks of episodes."""
-    schema, head, columns = frame.collect_schema(), frame.head(1).collect(), []
-    for name, kind in schema.items():
-        if isinstance(kind, pl.List | pl.Array) and kind.inner.is_numeric():
-            values, row = pl.col(name).cast(pl.List(kind.inner)), head[name].to_list()
-            for k in range(len(row[0] or ()) if row else 0):
-                columns.append(values.list.get(k, null_on_oob=True).alias(f"{name}[{k}]"))
+    schema, columns = frame.collect_schema(), []
+    kinds = {x: kind for x, kind in schema.items() if isinstance(kind, pl.List | pl.Array)}
+    for name, values in (
+        frame.select(list(kinds)).head(1).collect().to_dict(as_series=False).items()
+    ):
+        elements = pl.col(name).cast(pl.List(kinds[name].inner)).list
+        for k in range(len(values[0] or ()) if values else 0):
+            columns.append(elements.get(k, null_on_oob=True).alias(f"{name}[{k}]"))
     if {"timestamp", "episode_index"} <= {*schema}:
         stamps = pl.col("timestamp").cast(pl.Float64)
         begins = (pl.col("episode_index").diff() != 0).fill_null(False)
         pauses = pl.when(begins).then(EPISODE_PAUSE - stamps.diff()).otherwise(0.0)
         columns.append((stamps + pauses.cum_sum()).alias("timestamp"))
-    return frame.with_columns(columns)
+    return frame.with_columns(columns).drop(list(kinds))
 
 
 def estimated_rows(path: Path) -> int:
