@@ -30,9 +30,7 @@ CLOCK = "time"
 
 def is_bag(path: Path) -> bool:
     """Return whether a file is a bag, or a folder a bag of ROS 2."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    return path.suffix.lower() in BAGS
+    return (path / "metadata.yaml").is_file() or path.suffix.lower() in BAGS
 
 
 class Topic(NamedTuple):
