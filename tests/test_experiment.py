@@ -334,6 +334,15 @@ def test_mistakes_are_one_sentence_with_file_and_key(load, text, expected):
     assert not message.endswith("..")
 
 
+def test_columns_by_the_names_of_the_joints(load):
+    table = '[recording]\nangles = "/js.position.{name}"\nforces = "tau{}"\nunwrap = true\n'
+    experiment = load(ARM + table)
+    names = experiment.robot.joint_names
+    assert experiment.columns.angles == tuple(f"/js.position.{name}" for name in names)
+    assert experiment.columns.forces == "tau{}"
+    assert experiment.columns.unwrap
+
+
 def test_logs_that_do_not_fit_the_file(load, tmp_path):
     log = tmp_path / "run.csv"
     rows = "\n".join(f"{0.01 * i},{i},{i},{i},1,1,1" for i in range(100))
