@@ -334,12 +334,24 @@ def test_mistakes_are_one_sentence_with_file_and_key(load, text, expected):
     assert not message.endswith("..")
 
 
+def test_columns_by_the_names_of_the_joints(load):
+    table = '[recording]\nangles = "/js.position.{name}"\nforces = "tau{}"\nunwrap = true\n'
+    experiment = load(ARM + table)
+    names = experiment.robot.joint_names
+    assert experiment.columns.angles == tuple(f"/js.position.{name}" for name in names)
+    assert experiment.columns.forces == "tau{}"
+    assert experiment.columns.unwrap
+
+
 def test_logs_that_do_not_fit_the_file(load, tmp_path):
-    with pytest.raises(ValueError, match=r"the table `\[recording\]` is missing: .* `run.csv`"):
-        load(ARM).read("run.csv")
     log = tmp_path / "run.csv"
     rows = "\n".join(f"{0.01 * i},{i},{i},{i},1,1,1" for i in range(100))
     log.write_text("t,q1,q2,q3,tau1,tau2,tau3\n" + rows)
+    missing = (
+        r"the table `\[recording\]` is missing: .* `run.csv`, which has `t`, `q1`, .* `tau3`\."
+    )
+    with pytest.raises(ValueError, match=missing):
+        load(ARM).read(log)
     with pytest.raises(
         ValueError, match=r"`recording.angles` names 3 of the columns of `run.csv`, but"
     ):

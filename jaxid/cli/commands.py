@@ -92,7 +92,7 @@ def _check_logs(logs: list[Path], verify: list[Path], split: float | None) -> No
             f"`{Path(sorted(both)[0]).name}` is given both to identify and to verify with: use "
             "`--split`."
         )
-    if all(p.is_dir() for p in logs):
+    if all(map(identify_logs.is_report, logs)):
         raise InputError("give at least one log as a file, for torque errors and figures.")
 
 

@@ -273,7 +273,7 @@ def _wrapped(x: np.ndarray, time: np.ndarray) -> str:
             times = "once" if at.size == 1 else f"{at.size} times"
             return (
                 f"jumps by a full turn ({turn:.4g}) {times}, first at {time[at[0] + 1]:.6g} s: "
-                "undo the wrapping (`numpy.unwrap`) before the log is read."
+                "undo the wrapping (`recording.unwrap = true`)."
             )
     return ""
 

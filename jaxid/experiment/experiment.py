@@ -28,7 +28,7 @@ from jaxid.identification.presliding import identify_presliding, presliding_note
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import AbstractDecimation, AbstractFilter
-from jaxid.measurement.log_files import estimated_rows
+from jaxid.measurement.log_files import estimated_rows, summarise_columns
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import read_recording, scan_log
 from jaxid.measurement.recording import NeedsMemory, Recording, remove_delay
@@ -241,8 +241,8 @@ class Experiment:
     def _columns_of(self, log: Path) -> Columns:
         if self.columns is None:
             raise InputError(
-                f"{self.path.name}: the table `[recording]` is missing: it names the columns of "
-                f"`{log.name}`."
+                f"{self.path.name}: the table `[recording]` is missing: it names columns of "
+                f"`{log.name}`, which has {summarise_columns(log)}."
             )
         return self.columns
 

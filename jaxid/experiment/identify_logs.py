@@ -29,6 +29,7 @@ from jaxid.identification.filter_and_parameter_selection import FilterChoice, ch
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.bags import is_bag
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import NeedsMemory, Recording
 from jaxid.model_validation import Validation, comparison_step, validate
@@ -157,6 +158,11 @@ def _without_bounds(experiment: Experiment) -> AbstractEstimator:
     return chosen.plain if bounded else chosen.estimator
 
 
+def is_report(path: Path) -> bool:
+    """Return whether a folder is an earlier report, and no bag."""
+    return path.is_dir() and not is_bag(path)
+
+
 def earlier_run(experiment: Experiment, folder: Path) -> Fit:
     """Return the fit of the report in a folder.
 
@@ -192,12 +198,12 @@ def read_runs(
         rest = "the rest of `[estimator]` does not count"
         doubts.append(f"all runs are weighted least squares here: {rest}")
     stage("finding base parameters")
-    files = [path for paths in groups for path in paths if not path.is_dir()]
+    files = [path for paths in groups for path in paths if not is_report(path)]
     experiment, _ = select_filter(experiment, files, stage)
     runs = []
     for paths, name in zip(groups, names, strict=True):
-        fits = [earlier_run(experiment, path) for path in paths if path.is_dir()]
-        logs = [load_log(experiment, path, stage) for path in paths if not path.is_dir()]
+        fits = [earlier_run(experiment, path) for path in paths if is_report(path)]
+        logs = [load_log(experiment, path, stage) for path in paths if not is_report(path)]
         _require_motion(logs)
         doubts += _findings(logs)
         if logs:
@@ -247,8 +253,8 @@ def identify_logs(
         InputError: If a log is not as the file says, or a log would verify a model that has seen
             it.
     """
-    logs = [p for p in paths if not p.is_dir()]
-    reports = [p for p in paths if p.is_dir()]
+    logs = [p for p in paths if not is_report(p)]
+    reports = [p for p in paths if is_report(p)]
     experiment, choice = select_filter(experiment, logs, stage, split)
     loaded, stems = [], [path.stem for path in (*logs, *verify)]
     for path in (*logs, *verify):

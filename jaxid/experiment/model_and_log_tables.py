@@ -237,6 +237,12 @@ SIDES = ("angles_on_motor_side", "forces_on_motor_side")
 
 def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, Logs]:
     """Return the columns of the logs, and how logs are read."""
+    table = {
+        key: [value.replace("{name}", name) for name in robot.joint_names]
+        if isinstance(value, str) and "{name}" in value
+        else value
+        for key, value in table.items()
+    }
     given, reading = decode([Columns, Logs], table, "recording", skip=SIDES)
     with within("recording"):
         logs = Logs(**reading)

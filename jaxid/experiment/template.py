@@ -45,8 +45,9 @@ HEAD = """\
 SUMMARIES = {
     "load": "Known load that is on the robot in some logs only: `jaxid gains` finds the true "
     "forces.",
-    "recording": "Columns of the logs: CSV (any separator), Parquet, NPZ or MAT files. A pattern "
-    '("{}" stands for the joint\'s number), a list of names, or positions from 0.',
+    "recording": "Columns of the logs: CSV (any separator), Parquet, NPZ, MAT, HDF5 or ROS bags. "
+    'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), a list of names, or '
+    "positions from 0.",
 }
 """Descriptions of tables where the docstring of their function says something else."""
 INNER = {"robot": ("robot.tool", known_load), "model": ("model.coulomb", DryFriction)}

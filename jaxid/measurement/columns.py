@@ -32,8 +32,8 @@ class Columns(eqx.Module):
 
     A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` stands for the joints'
     numbers, from 1 or from 0), a tuple of positions from 0 (files without a header), or one name:
-    that of the column of a single joint, or of a whole array (samples x joints) in NPZ and MAT
-    files.
+    that of the column of a single joint, or of a whole array (samples x joints), whose columns are
+    `"q[{}]"`. Fields of bags are `"/topic.field[{}]"`, or `"/topic.field.joint"` by names.
 
     Angles become `sign * unit * value + offset`, velocities `sign * unit * value`, and forces
     `sign * gain * torque constant * unit * value`. A unit is one for all joints, or one for each.
@@ -43,7 +43,7 @@ class Columns(eqx.Module):
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`; None if
             there are none.
-        time: Time stamps; None if `sample_time` is given.
+        time: Time stamps; None for `sample_time`, or the clock of bags and LeRobot data sets.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
         angle_unit: Unit of the angles.
@@ -57,6 +57,7 @@ class Columns(eqx.Module):
         force_gains: Ratio of the true forces to those of the log, as a known load tells.
         angles_on_motor_side: Whether angles and velocities are the motors', before the gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.
+        unwrap: Whether angles jump by full turns, which is undone.
     """
 
     angles: Selection = eqx.field(static=True, converter=_listed)
@@ -75,13 +76,12 @@ class Columns(eqx.Module):
     force_gains: PerJoint = eqx.field(static=True, converter=_listed, default=None)
     angles_on_motor_side: bool = eqx.field(static=True, default=False)
     forces_on_motor_side: bool = eqx.field(static=True, default=False)
+    unwrap: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
         """Refuse contradictions."""
-        if (self.time is None) == (self.sample_time is None):
-            raise InputError(
-                "`Columns` needs either `time` (a column) or `sample_time` [s], and not both."
-            )
+        if self.time is not None and self.sample_time is not None:
+            raise InputError("give `time` (a column) or `sample_time` [s], but not both.")
         if self.sample_time is not None:
             positive_time(self.sample_time)
         self._require_unit("time_unit", Quantity.TIME)
@@ -198,11 +198,11 @@ def open_log(
     if velocities_path is not None and columns.velocities is None:
         raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")
     path = Path(path)
-    files: dict[Path, dict[str, Selection]] = {}
+    files: dict[Path, dict[str, Selection | None]] = {}
     paths = {"angles": path, "forces": forces_path, "velocities": velocities_path, "time": path}
     for channel, own in paths.items():
         selection = getattr(columns, channel)
-        if selection is not None:
+        if selection is not None or (channel == "time" and columns.sample_time is None):
             files.setdefault(Path(own or path), {})[channel] = selection
     tables = tuple(open_table(file, chosen, on_disk, lenient) for file, chosen in files.items())
     first = tables[0]

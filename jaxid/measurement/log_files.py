@@ -1,4 +1,4 @@
-"""Log files as columns: CSV (any separator, with or without header), Parquet, NPZ and MAT."""
+"""Log files as columns: texts of any separator, Parquet, arrays, and bags."""
 
 import atexit
 import codecs
@@ -11,8 +11,7 @@ import itertools
 import re
 import shutil
 import tempfile
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -21,16 +20,22 @@ import polars as pl
 
 from jaxid.errors import InputError
 
+from .array_files import map_arrays, read_hdf5, read_mat, read_npz, readable, with_elements
+from .bags import BAGS, CLOCK, is_bag, join_topics, read_bag
 from .recording import LARGEST
 
 Selection = str | int | tuple[str | int, ...]
 """A name, a pattern with `{}` for the joint's number, a position from 0, or several."""
+Selections = Mapping[str, Selection | None]
+"""Selections by channel; None is the clock that some kinds of files have."""
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 """Suffixes of text files."""
 HEAD = 65536
 """Bytes from which a format is detected."""
 BLOCK = 2**26
 """Bytes of a text file that are read at once."""
+EPISODE_PAUSE = 10.0
+"""Pause between two episodes of a LeRobot file, whose clock begins anew [s]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,6 +50,7 @@ class LogTable:
         unit: Name of a row, for messages: `line` in text files.
         bad: Complaints about rows that cannot be read, by their numbers; None if the first one is
             an error.
+        notes: Remarks about how the columns were made.
     """
 
     source: str
@@ -53,12 +59,13 @@ class LogTable:
     first_row: int = 1
     unit: str = "row"
     bad: dict[int, str] | None = None
+    notes: tuple[str, ...] = ()
 
     @functools.cached_property
     def rows(self) -> int:
         """Number of rows."""
         if isinstance(self.columns, pl.LazyFrame):
-            with _readable_parquet(self.source):
+            with readable(self.source, "Parquet file"):
                 rows = int(self.columns.select(pl.len()).collect().item())
         else:
             first, *others = itertools.chain(*self.channels.values())
@@ -84,7 +91,7 @@ class LogTable:
         names = list(itertools.chain(*kept.values()))
         columns = self.columns
         if isinstance(columns, pl.LazyFrame):
-            with _readable_parquet(self.source):
+            with readable(self.source, "Parquet file"):
                 length = None if stop is None else stop - start
                 part = columns.select(names).slice(start, length).collect()
                 columns = part.to_dict(as_series=True)
@@ -168,28 +175,67 @@ class LogTable:
 
 
 def open_table(
-    path: Path, selections: Mapping[str, Selection], on_disk: bool, lenient: bool = False
+    path: Path, selections: Selections, on_disk: bool, lenient: bool = False
 ) -> LogTable:
     """Open a file; its suffix tells the format. With `lenient`, bad rows are collected."""
-    if not path.is_file():
-        raise InputError(f"`{path}` is no file: check the path of the log.")
-    suffix = path.suffix.lower()
-    if suffix in SUFFIXES:
+    if path.suffix.lower() in SUFFIXES and path.is_file():
         return _open_text(path, selections, on_disk, lenient)
-    if suffix == ".parquet":
-        with _readable_parquet(path.name):
-            columns = pl.scan_parquet(path)
+    chosen = itertools.chain(*(x if isinstance(x, tuple) else [x] for x in selections.values()))
+    columns, layout = _open_columns(path, on_disk, {str(x).partition(".")[0] for x in chosen})
+    channels, notes = layout.channels(selections), ()
+    if isinstance(columns, list):
+        columns, notes = join_topics(path.name, columns, [*itertools.chain(*channels.values())])
+    return LogTable(path.name, columns, channels, bad={} if lenient else None, notes=notes)
+
+
+def summarise_columns(path: Path) -> str:
+    """Return the names of the columns of a file, as messages show them."""
+    _, layout = _open_columns(path, on_disk=True)
+    return f"`{'`, `'.join(_shortened(layout.names))}`"
+
+
+def _open_columns(path: Path, on_disk: bool, topics: Collection[str] = ()) -> tuple[Any, "_Layout"]:
+    """Return the columns of a file (None of a text), or the topics of a bag; and names."""
+    suffix, clock = path.suffix.lower(), ""
+    if is_bag(path):
+        columns, clock = read_bag(path, topics), CLOCK
+        names = itertools.chain(*(topic.columns for topic in columns))
+    elif not path.is_file():
+        raise InputError(f"`{path}` is no file and no bag of ROS 2: check the path of the log.")
+    elif suffix in SUFFIXES:
+        with path.open("rb") as file:
+            return None, _detect_format(path.name, file.read(HEAD))
+    elif suffix == ".parquet":
+        with readable(path.name, "Parquet file"):
+            columns = _with_elements(pl.scan_parquet(path))
             names = columns.collect_schema().names()
+        clock = "timestamp" if {"timestamp", "episode_index"} <= {*names} else ""
     elif suffix == ".npz":
-        columns = names = (_map_arrays(path) if on_disk else None) or _read_npz(path)
-    elif suffix == ".mat":
-        columns = names = _read_mat(path)
+        columns = names = with_elements((map_arrays(path) if on_disk else None) or read_npz(path))
+    elif suffix in (".mat", ".h5", ".hdf5"):
+        columns = names = with_elements((read_mat if suffix == ".mat" else read_hdf5)(path))
     else:
-        raise InputError(
-            f"`{path.name}` must end in {', '.join(SUFFIXES)}, .parquet, .npz or .mat: convert it."
-        )
-    channels = _Layout(path.name, tuple(names)).channels(selections)
-    return LogTable(path.name, columns, channels, bad={} if lenient else None)
+        known = ", ".join((*SUFFIXES, ".parquet", ".npz", ".mat", ".h5", ".hdf5", *BAGS))
+        raise InputError(f"`{path.name}` must end in {known}: convert it.")
+    return columns, _Layout(path.name, tuple(dict.fromkeys(names)), clock=clock)
+
+
+def _with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
+    """Add the elements of lists, named like `action[0]`, and join the clocks of episodes."""
+    schema, columns = frame.collect_schema(), []
+    kinds = {x: kind for x, kind in schema.items() if isinstance(kind, pl.List | pl.Array)}
+    for name, values in (
+        frame.select(list(kinds)).head(1).collect().to_dict(as_series=False).items()
+    ):
+        elements = pl.col(name).cast(pl.List(kinds[name].inner)).list
+        for k in range(len(values[0] or ()) if values else 0):
+            columns.append(elements.get(k, null_on_oob=True).alias(f"{name}[{k}]"))
+    if {"timestamp", "episode_index"} <= {*schema}:
+        stamps = pl.col("timestamp").cast(pl.Float64)
+        begins = (pl.col("episode_index").diff() != 0).fill_null(False)
+        pauses = pl.when(begins).then(EPISODE_PAUSE - stamps.diff()).otherwise(0.0)
+        columns.append((stamps + pauses.cum_sum()).alias("timestamp"))
+    return frame.with_columns(columns).drop(list(kinds))
 
 
 def estimated_rows(path: Path) -> int:
@@ -203,7 +249,7 @@ def estimated_rows(path: Path) -> int:
         if suffix == ".parquet":
             return LogTable(path.name, pl.scan_parquet(path), {}).rows
         if suffix == ".npz":
-            return max(map(len, (_map_arrays(path) or {}).values()), default=0)
+            return max(map(len, (map_arrays(path) or {}).values()), default=0)
     return 0
 
 
@@ -216,8 +262,9 @@ class _Layout(NamedTuple):
     separator: str = ","
     decimal_comma: bool = False
     start: int = 0
+    clock: str = ""
 
-    def channels(self, selections: Mapping[str, Selection]) -> dict[str, tuple[str, ...]]:
+    def channels(self, selections: Selections) -> dict[str, tuple[str, ...]]:
         """Return the names of the columns of each channel, each of which has its own."""
         channels = {c: self._expand(c, selection) for c, selection in selections.items()}
         names = [*itertools.chain(*channels.values())]
@@ -229,10 +276,19 @@ class _Layout(NamedTuple):
             )
         return channels
 
-    def _expand(self, channel: str, selection: Selection) -> tuple[str, ...]:
+    def _expand(self, channel: str, selection: Selection | None) -> tuple[str, ...]:
         """Return the names of the columns of a selection, in the order of the joints."""
+        if selection is None:
+            if not self.clock:
+                raise InputError(
+                    f"`{self.source}` has no clock of its own: give `time` (its column of time "
+                    "stamps) or `sample_time` [s]."
+                )
+            return (self.clock,)
         if isinstance(selection, tuple):
             return tuple(self._name(channel, one) for one in selection)
+        if selection not in self.names and f"{selection}[0]" in self.names:
+            selection = f"{selection}[{{}}]"
         if isinstance(selection, int) or "{}" not in selection:
             return (self._name(channel, selection),)
         pattern = re.escape(selection).replace(re.escape("{}"), r"(\d{1,18})")
@@ -263,7 +319,7 @@ class _Layout(NamedTuple):
                 f"`{channel}` asks for column {column} of `{self.source}`, which has {has} from 0 "
                 f"to {len(names) - 1}: give another position."
             )
-        near = difflib.get_close_matches(column, names, n=40, cutoff=0)
+        near = difflib.get_close_matches(column, _shortened(names), n=40, cutoff=0)
         raise InputError(
             f"`{self.source}` has no column `{column}` for `{channel}`: it has, "
             f"the closest first, `{'`, `'.join(near)}`."
@@ -321,13 +377,16 @@ class _Layout(NamedTuple):
         return b"\n".join(lines)
 
 
+def _shortened(names: Iterable[str]) -> list[str]:
+    """Return names, with one for all columns of an array, like `q[{}]`."""
+    return [*dict.fromkeys(re.sub(r"\[\d+\]$", "[{}]", name) for name in names)]
+
+
 _conversions: dict[tuple, Path] = {}
 """Folders with the Parquet files of long text files."""
 
 
-def _open_text(
-    path: Path, selections: Mapping[str, Selection], on_disk: bool, lenient: bool
-) -> LogTable:
+def _open_text(path: Path, selections: Selections, on_disk: bool, lenient: bool) -> LogTable:
     """Read the needed columns of a text file, or convert them to Parquet unless this was done."""
     with path.open("rb") as file:
         text = _detect_format(path.name, file.read(HEAD))
@@ -379,7 +438,7 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
     if b"\0" in head:
-        raise InputError(f"`{source}` is no text: a log is CSV, Parquet, NPZ or MAT.")
+        raise InputError(f"`{source}` is no text: the suffix of a log must tell its format.")
     first, _, _ = head.partition(b"\n")
     line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
     if not line.strip():
@@ -399,80 +458,3 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     mark = len(codecs.BOM_UTF8) if first.startswith(codecs.BOM_UTF8) else 0
     start = min(len(first) + 1, len(head)) if named else mark
     return _Layout(source, tuple(names), named, separator, comma, start)
-
-
-@contextlib.contextmanager
-def _readable_parquet(source: str) -> Iterator[None]:
-    """Report a Parquet file that polars cannot read as damaged."""
-    try:
-        yield
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-        raise InputError(
-            f"`{source}` is no Parquet file, or is damaged: {_said(error)}."
-        ) from error
-
-
-def _said(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
-
-
-def _read_mat(path: Path) -> dict[str, np.ndarray]:
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(path, simplify_cells=True)
-    except NotImplementedError as error:
-        raise InputError(
-            f"`{path.name}` is a MAT file of version 7.3: save it with `save(name, ..., '-v7')`."
-        ) from error
-    except Exception as error:  # of many kinds: it depends on which bytes are damaged
-        raise InputError(f"`{path.name}` is no MAT file, or is damaged: {_said(error)}.") from error
-    return _named_arrays({k: value for k, value in content.items() if not k.startswith("__")})
-
-
-def _named_arrays(content: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
-    """Return arrays by name; those in a structure are named like `log.q`."""
-    arrays: dict[str, np.ndarray] = {}
-    for name, value in content.items():
-        if isinstance(value, dict):
-            arrays |= _named_arrays(value, f"{prefix}{name}.")
-        elif isinstance(value, np.ndarray) and value.ndim > 0:
-            # Single rows, as MATLAB writes them, are columns here.
-            arrays[prefix + name] = value.ravel() if 1 in value.shape else value
-    return arrays
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an NPZ file; objects, which could run code, are rejected."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            # A member that NumPy did not write comes as bytes, which are left out.
-            return _named_arrays({name: archive[name] for name in archive.files})
-    except Exception as error:  # some ten kinds: it depends on which bytes are damaged
-        raise InputError(
-            f"`{path.name}` is no NPZ file of plain arrays ({_said(error)}): save it by "
-            "`numpy.savez`, without objects."
-        ) from error
-
-
-def _map_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """Map the arrays of an NPZ file into memory; None if one is compressed or none is there."""
-    arrays = {}
-    try:
-        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
-            for entry in archive.infolist():
-                if entry.compress_type != zipfile.ZIP_STORED:
-                    return None
-                file.seek(entry.header_offset + 26)
-                lengths = np.frombuffer(file.read(4), "<u2")
-                file.seek(entry.header_offset + 30 + int(lengths.sum()))
-                np.lib.format.read_magic(file)
-                shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-                order = "F" if fortran else "C"
-                array = np.memmap(path, dtype, "r", file.tell(), shape, order)
-                arrays[entry.filename.removesuffix(".npy")] = array
-    except Exception as error:  # of many kinds: it depends on which bytes are damaged
-        raise InputError(
-            f"`{path.name}` is no NPZ file of numbers, or is damaged: {_said(error)}."
-        ) from error
-    return _named_arrays(arrays) or None

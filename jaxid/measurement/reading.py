@@ -51,7 +51,7 @@ def read_recording(
     bridged: float = 0.0,
     bad_rows: float = BAD_ROWS,
 ) -> Recording:
-    """Read a log from CSV (any separator, with or without header), Parquet, NPZ or MAT.
+    """Read a log from CSV (any separator), Parquet, NPZ, MAT, HDF5, or a bag of ROS 1 or 2.
 
     Args:
         path: File with the angles, and with all other channels that have no file of their own.
@@ -70,11 +70,12 @@ def read_recording(
     """
     log = open_log(path, columns, forces_path, velocities_path, lenient=True)
     angles, velocities, forces = log.read()
-    time = None if columns.time is None else log.stamps()
+    time = None if columns.sample_time is not None else log.stamps()
     bad = log.bad_rows
     if time is not None:
         _find_stray_stamps(time, bad, log.tables[0])
-    rows, sample_time, notes = len(angles), columns.sample_time, ()
+    rows, sample_time = len(angles), columns.sample_time
+    notes = tuple(note for table in log.tables for note in table.notes)
     named = "; ".join(text for _, text in sorted(bad.items())[:NAMED])
     named += f"; and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
     if len(bad) > bad_rows * rows:
@@ -89,7 +90,8 @@ def read_recording(
         angles, forces, time = angles[kept], forces[kept], time[kept]
         velocities = None if velocities is None else velocities[kept]
         left = "is bad and was" if len(bad) == 1 else "are bad and were"
-        notes = (f"{len(bad)} of {rows} rows {left} left out: {named}",)
+        notes += (f"{len(bad)} of {rows} rows {left} left out: {named}",)
+    angles = np.unwrap(angles, axis=0) if columns.unwrap else angles
     recording = Recording.of(
         angles,
         forces,
@@ -199,6 +201,8 @@ def scan_log(
         InputError: If the file is of another kind, its columns are not the robot's, forces and
             columns would be aliased, or no samples are left.
     """
+    if columns.unwrap:
+        raise NeedsMemory("`unwrap` counts the turns of whole logs")
     log = open_log(path, columns, forces_path, velocities_path, on_disk=True)
     rows = log.tables[0].rows
     first_row = log.tables[0].first_row

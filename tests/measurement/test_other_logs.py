@@ -1,0 +1,328 @@
+"""Bags, LeRobot data sets, HDF5 and MAT 7.3: the table that CSV gives, bit for bit."""
+
+import dataclasses
+import importlib
+import sys
+
+import h5py
+import numpy as np
+import polars as pl
+import pytest
+from mcap.writer import Writer as McapWriter
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from jaxid import units
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.reading import read_recording
+
+JOINTS = ("shoulder", "elbow", "wrist")
+SAMPLES = 40
+START = 1_700_000_000_123_456_789
+STEP = 2_000_000
+BY_PLACE = Columns("/js.position[{}]", "/js.effort[{}]", "/js.velocity[{}]")
+ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+STATE = "control_msgs/msg/JointTrajectoryControllerState"
+ROS2.register(
+    get_types_from_msg(
+        "std_msgs/Header header\nstring[] joint_names\n"
+        "trajectory_msgs/JointTrajectoryPoint actual\ntrajectory_msgs/JointTrajectoryPoint output",
+        STATE,
+    )
+)
+
+
+def by_name(group):
+    return tuple(f"/js.{group}.{joint}" for joint in JOINTS)
+
+
+def numbers(shift=0):
+    """Return angles, velocities and efforts; equal at equal times."""
+    rng = np.random.default_rng(7)
+    return [rng.normal(size=(SAMPLES, 3)) + shift for _ in range(3)]
+
+
+def header(store, time):
+    stamp = store.types["builtin_interfaces/msg/Time"](*divmod(int(time), 10**9))
+    kind = store.types["std_msgs/msg/Header"]
+    sequence = {"seq": 0} if store is ROS1 else {}
+    return kind(**sequence, stamp=stamp, frame_id="base")
+
+
+def joint_state(store, time, names, *values):
+    kind = store.types["sensor_msgs/msg/JointState"]
+    return kind(header(store, time), list(names), *(np.array(x, np.float64) for x in values))
+
+
+def states(store, shuffled=False, joints=JOINTS, lag=0, topic="/js", start=0, stop=SAMPLES):
+    """Return messages as (topic, time of recording, message)."""
+    rng, messages = np.random.default_rng(1), []
+    for k, row in enumerate(zip(*numbers(), strict=True)):
+        order = rng.permutation(3) if shuffled and k else np.arange(3)
+        stamp = START + k * STEP
+        names = [joints[j] for j in order]
+        message = joint_state(store, stamp + lag, names, *(x[order] for x in row))
+        messages.append((topic, stamp + 5_000_000 + (k % 3) * 100_000, message))
+    return messages[start:stop]
+
+
+def write_ros1(path, messages):
+    with rosbag1.Writer(path) as writer:
+        connections = {}
+        for topic, time, message in sorted(messages, key=lambda x: x[1]):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1)
+            writer.write(connections[topic], time, ROS1.serialize_ros1(message, kind))
+    return path
+
+
+def write_ros2(path, messages, plugin=rosbag2.StoragePlugin.SQLITE3):
+    with rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for topic, time, message in sorted(messages, key=lambda x: x[1]):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS2)
+            writer.write(connections[topic], time, ROS2.serialize_cdr(message, kind))
+    return path
+
+
+def write_mcap(path, messages, undefined=None):
+    with path.open("wb") as file:
+        writer, channels = McapWriter(file), {}
+        writer.start(profile="ros2")
+        for topic, time, message in sorted(messages, key=lambda x: x[1]):
+            kind = message.__msgtype__
+            if topic not in channels:
+                text, _ = ROS2.generate_msgdef(kind, ros_version=2)
+                written = ("", b"") if topic == undefined else ("ros2msg", text.encode())
+                schema = writer.register_schema(kind, *written)
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            data = bytes(ROS2.serialize_cdr(message, kind))
+            writer.add_message(channels[topic], time, data, time)
+        writer.finish()
+    return path
+
+
+WRITERS = {
+    "a.bag": (write_ros1, ROS1),
+    "sqlite": (write_ros2, ROS2),
+    "mcap": (lambda *x: write_ros2(*x, rosbag2.StoragePlugin.MCAP), ROS2),
+    "a.mcap": (write_mcap, ROS2),
+}
+
+
+def check(recording, values=None, step=STEP * 1e-9):
+    angles, velocities, forces = numbers() if values is None else values
+    np.testing.assert_array_equal(recording.angles, angles)
+    np.testing.assert_array_equal(recording.velocities, velocities)
+    np.testing.assert_array_equal(recording.forces, forces)
+    assert recording.sample_time == pytest.approx(step, rel=1e-12)
+    assert recording.notes == ()
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("kind", list(WRITERS))
+def test_bags_of_all_kinds(tmp_path, kind, shuffled):
+    write, store = WRITERS[kind]
+    path = write(tmp_path / kind, states(store, shuffled))
+    check(read_recording(path, BY_PLACE))
+    names = Columns(by_name("position"), by_name("effort"), by_name("velocity"))
+    check(read_recording(path, names))
+    whole = Columns("/js.position", "/js.effort", "/js.velocity", time="/js.header.stamp")
+    check(read_recording(path, whole))
+    late = read_recording(path, dataclasses.replace(BY_PLACE, time="/js.log_time"))
+    np.testing.assert_array_equal(late.segments, [(0, SAMPLES)])
+    assert late.notes  # the times of recording jitter
+
+
+def refused(path, columns, *parts):
+    with pytest.raises(ValueError) as caught:
+        read_recording(path, columns)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.endswith((".", "?"))
+    for part in parts:
+        assert part in message, message
+
+
+def test_unknown_topics_and_fields_list_what_there_is(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", states(ROS2) + states(ROS2, topic="/other"))
+    listed = "`/js.position[{}]`", "`/js.effort.wrist`", "`/other.position[{}]`", "`/js.log_time`"
+    refused(path, Columns("/joints.position[{}]", "/js.effort[{}]"), "`/joints.position", *listed)
+    refused(path, Columns("/js.positions[{}]", "/js.effort[{}]"), "`/js.positions", *listed)
+    refused(path, Columns("/js.position.hand", "/js.effort.wrist"), "`/js.position.hand`", *listed)
+
+
+def test_two_robots_on_one_topic_are_told_apart(tmp_path):
+    hand = states(ROS2, joints=("thumb", "index", "palm"), lag=900_000)
+    mixed = write_mcap(tmp_path / "a.mcap", states(ROS2, shuffled=True) + hand)
+    refused(mixed, BY_PLACE, "`/js.position[1]`", "`/js.position.thumb`", "`/js.position.elbow`")
+    check(
+        read_recording(mixed, Columns(by_name("position"), by_name("effort"), by_name("velocity")))
+    )
+
+
+def test_topics_with_other_times_are_interpolated(tmp_path):
+    """Forces 0.9 ms later, which begin later, end earlier and pause."""
+    others = states(ROS2, topic="/e", lag=900_000, start=2, stop=15)
+    others += states(ROS2, topic="/e", lag=900_000, start=25, stop=38)
+    path = write_mcap(tmp_path / "a.mcap", states(ROS2) + others)
+    r = read_recording(path, Columns("/js.position[{}]", "/e.effort[{}]"))
+    assert "`/e` is interpolated linearly at the times of `/js`" in r.notes
+    assert any(note.startswith("16 of 40 messages were left out") for note in r.notes)
+    assert r.segments == ((0, 12), (12, 24))
+    angles, _, efforts = numbers()
+    kept = [*range(3, 15), *range(26, 38)]
+    np.testing.assert_array_equal(r.angles, angles[kept])
+    expected = [0.45 * efforts[k - 1] + 0.55 * efforts[k] for k in kept]
+    np.testing.assert_allclose(r.forces, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(r.time[12] - r.time[0], 23 * 0.002, rtol=1e-12)
+
+
+def test_topics_that_share_their_times_are_not_interpolated(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", states(ROS2) + states(ROS2, True, topic="/e"))
+    check(read_recording(path, Columns("/js.position[{}]", "/e.effort", "/e.velocity[{}]")))
+
+
+def test_topics_without_common_times(tmp_path):
+    messages = states(ROS2, stop=20) + states(ROS2, topic="/e", start=21)
+    path = write_mcap(tmp_path / "a.mcap", messages)
+    refused(path, Columns("/js.position[{}]", "/e.effort[{}]"), "`a.mcap`", "in time")
+
+
+def trajectory_states():
+    kind, point = ROS2.types[STATE], ROS2.types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    passed = ROS2.types["builtin_interfaces/msg/Duration"](0, 0)
+    for k, (q, qd, tau) in enumerate(zip(*numbers(), strict=True)):
+        order, none = np.roll(np.arange(3), k), np.zeros(0)
+        points = (
+            point(q[order], qd[order], none, none, passed),
+            point(none, none, none, tau[order], passed),
+        )
+        time = START + k * STEP
+        names = [JOINTS[j] for j in order]
+        yield "/js", time, kind(header(ROS2, time), names, *points)
+
+
+def test_states_of_a_controller(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", trajectory_states())
+    fields = "actual.positions", "output.effort", "actual.velocities"
+    check(read_recording(path, Columns(*(f"/js.{field}[{{}}]" for field in fields))))
+    check(read_recording(path, Columns(*(by_name(field) for field in fields))))
+
+
+def test_arrays_without_names_and_stamps(tmp_path):
+    kind, layout = (
+        ROS2.types[f"std_msgs/msg/{x}"] for x in ("Float64MultiArray", "MultiArrayLayout")
+    )
+    rows = zip(*numbers(), strict=True)
+    messages = [
+        ("/raw", START + k * STEP, kind(layout([], 0), np.concatenate(row)))
+        for k, row in enumerate(rows)
+    ]
+    path = write_mcap(tmp_path / "a.mcap", messages)
+    groups = [tuple(f"/raw.data[{k}]" for k in range(3 * g, 3 * g + 3)) for g in (0, 2, 1)]
+    check(read_recording(path, Columns(*groups)))
+    check(read_recording(path, Columns(*groups, sample_time=0.002)))
+
+
+def test_bags_that_are_cut_or_do_not_define_their_messages(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", trajectory_states())
+    (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:2000])
+    refused(tmp_path / "cut.mcap", BY_PLACE, "`cut.mcap`", "damaged")
+    messages = [*trajectory_states(), *states(ROS2, topic="/known")]
+    path = write_mcap(tmp_path / "a.mcap", messages, undefined="/js")
+    refused(path, BY_PLACE, "`a.mcap`", "defines its messages", STATE)
+    refused(path, Columns("/known.p", "/known.q"), "`/known.position[{}]`")
+
+
+def write_lerobot(path, **kinds):
+    angles, velocities, forces = numbers()
+    pl.DataFrame(
+        {
+            "observation.state": np.hstack([angles, velocities]).astype(np.float32).tolist(),
+            "action": forces.astype(np.float32).tolist(),
+            "timestamp": np.float32(0.02 * (np.arange(SAMPLES) % 20)),
+            "episode_index": np.arange(SAMPLES) // 20,
+            "task": ["reach"] * SAMPLES,
+        },
+        schema_overrides={"timestamp": pl.Float32, **kinds},
+    ).write_parquet(path)
+    return path
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_lerobot_data_sets(tmp_path, fixed):
+    widths = {"observation.state": 6, "action": 3}
+    kinds = {
+        n: pl.Array(pl.Float32, w) if fixed else pl.List(pl.Float32) for n, w in widths.items()
+    }
+    path = write_lerobot(tmp_path / "episode_000000.parquet", **kinds)
+    state = [f"observation.state[{k}]" for k in range(6)]
+    for forces in ("action", "action[{}]"):
+        r = read_recording(path, Columns(state[:3], forces, state[3:]))
+        assert r.segments == ((0, 20), (20, 40))
+        for found, values in zip((r.angles, r.velocities, r.forces), numbers(), strict=True):
+            np.testing.assert_array_equal(found, values.astype(np.float32))
+        # Stamps are in single precision.
+        np.testing.assert_allclose(np.diff(r.time[:20]), 0.02, atol=1e-7)
+    refused(path, Columns("observation.stat", "action"), "`observation.state[{}]`", "`action[{}]`")
+
+
+def write_hdf5(path, **groups):
+    with h5py.File(path, "w") as file:
+        for name, array in zip(("q", "dq", "tau"), numbers(), strict=True):
+            file[f"arm/{name}"] = array
+        file["arm/t"] = START + STEP * np.arange(SAMPLES)
+        file.create_dataset("images", (SAMPLES, 480, 640, 3), np.uint8)
+        file["note"] = "held"
+    return path
+
+
+def test_hdf5(tmp_path):
+    path = write_hdf5(tmp_path / "a.h5")
+    clock = {"time": "arm.t", "time_unit": units.NS}
+    check(read_recording(path, Columns("arm.q", "arm.tau", "arm.dq", **clock)))
+    check(read_recording(path, Columns("arm.q[{}]", "arm.tau[{}]", "arm.dq[{}]", **clock)))
+    some = Columns(("arm.q[2]", "arm.q[0]"), ("arm.tau[2]", "arm.tau[0]"), **clock)
+    np.testing.assert_array_equal(read_recording(path, some).angles, numbers()[0][:, [2, 0]])
+    refused(path, Columns("arm.p", "arm.tau", **clock), "`arm.q`", "`arm.q[{}]`", "`arm.t`")
+    refused(path, Columns("arm.q", "arm.tau"), "`a.h5`", "`time`", "`sample_time`")
+
+
+def test_mat_of_version_7_3(tmp_path):
+    """Written as MATLAB does: transposed arrays, a head of 512 bytes, structures as groups."""
+    path = tmp_path / "a.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in zip(("q", "dq", "tau"), numbers(), strict=True):
+            file[f"log/{name}"] = array.T
+            file[f"log/{name}"].attrs["MATLAB_class"] = np.bytes_("double")
+        file["t"] = 0.002 * np.arange(SAMPLES)[None, :]
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    check(read_recording(path, Columns("log.q", "log.tau", "log.dq", time="t")))
+    check(read_recording(path, Columns("log.q[{}]", "log.tau[{}]", "log.dq[{}]", time="t")))
+
+
+@pytest.mark.parametrize(("name", "package"), [("a.mcap", "rosbags"), ("a.h5", "h5py")])
+def test_missing_packages_and_damaged_files(tmp_path, monkeypatch, name, package):
+    path = tmp_path / name
+    path.write_bytes(b"damaged" * 20)
+    refused(path, BY_PLACE, f"`{name}`", "damaged")
+    for module in [module for module in sys.modules if module.partition(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError):
+        importlib.import_module(package)
+    refused(path, BY_PLACE, f"`{package}`", 'pip install "jaxid-robotics[logs]"')
+
+
+def test_turns_are_unwrapped(tmp_path):
+    t = 0.01 * np.arange(200)
+    angles = np.stack([5 * np.sin(2 * t), 0.3 * t], axis=1)
+    wrapped = np.rad2deg((angles + np.pi) % (2 * np.pi) - np.pi)
+    np.savez(tmp_path / "a.npz", q=wrapped, tau=angles)
+    columns = Columns("q", "tau", sample_time=0.01, angle_unit=units.DEG, unwrap=True)
+    found = read_recording(tmp_path / "a.npz", columns).angles
+    np.testing.assert_allclose(found, angles, atol=1e-12)
