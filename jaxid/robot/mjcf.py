@@ -15,6 +15,8 @@ from .rotations import axis_rotation, rpy_angles
 
 Loop = tuple[str, str, str]
 """Name of a constraint that closes a loop, and the two bodies that it connects."""
+_KINDS = ("floating", "ball", "prismatic", "revolute")
+"""Types of joints in MuJoCo's order."""
 Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 
@@ -55,7 +57,7 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Lo
     for site in range(model.nsite):
         tree.add_site(site)
     tree.add_constraints()
-    weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    weightless = model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     return tree.root, np.zeros(3) if weightless else np.array(model.opt.gravity), tree.loops
 
 
@@ -69,7 +71,7 @@ class _Writer:
         self.root = etree.Element("robot", name=name)
         self.loops: list[Loop] = []
         self._links = ["world"]
-        self._joints: list[Any] = []
+        self._joints: dict[int, Any] = {}
         self._efforts = _largest_forces(mujoco, model)
         etree.SubElement(self.root, "link", name="world")
 
@@ -82,8 +84,12 @@ class _Writer:
         model, name = self._model, self._name("body", body)
         link = self._links[model.body_parentid[body]]
         R, r = _matrix(model.body_quat[body]), model.body_pos[body]
+        mount, kind = f"{name} mount", "fixed"
         first = int(model.body_jntadr[body])
         for joint in range(first, first + int(model.body_jntnum[body])):
+            if _KINDS[model.jnt_type[joint]] == "floating":
+                mount, kind = self._name("joint", joint), "floating"
+                continue
             anchor, axis = model.jnt_pos[joint], model.jnt_axis[joint]
             r = r + R @ anchor
             moved = f"{self._name('joint', joint)} frame"
@@ -98,7 +104,7 @@ class _Writer:
             products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
             etree.SubElement(inertial, "inertia", {**dict(moments), **products})
         self._links.append(name)
-        self._connect(f"{name} mount", "fixed", link, name, (R, r))
+        self._connect(mount, kind, link, name, (R, r))
 
     def add_site(self, site: int) -> None:
         """Write a site as a link; one without a name, or with that of a body, is left out."""
@@ -113,20 +119,20 @@ class _Writer:
     def _at_zero(self, joint: int, R: np.ndarray, r: np.ndarray, axis: np.ndarray) -> Pose:
         """Return the pose at coordinate zero; the file describes the one at `ref`."""
         ref = self._model.qpos0[self._model.jnt_qposadr[joint]]
-        kind = self._mujoco.mjtJoint
-        if self._model.jnt_type[joint] == kind.mjJNT_HINGE and ref:
+        kind = _KINDS[self._model.jnt_type[joint]]
+        if kind == "revolute" and ref:
             R = R @ axis_rotation(axis, -ref)
-        if self._model.jnt_type[joint] == kind.mjJNT_SLIDE:
+        if kind == "prismatic":
             r = r - R @ axis * ref
         return R, r
 
     def _add_joint(self, joint: int, link: str, moved: str, pose: Pose) -> None:
         """Write a joint with its range, largest force, friction and rotor inertia."""
         model = self._model
-        kind = ("floating", "ball", "prismatic", "revolute")[model.jnt_type[joint]]
+        kind = _KINDS[model.jnt_type[joint]]
         etree.SubElement(self.root, "link", name=moved)
         element = self._connect(self._name("joint", joint), kind, link, moved, pose)
-        self._joints.append(element)
+        self._joints[joint] = element
         etree.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
         limit = etree.SubElement(element, "limit")
         if model.jnt_limited[joint]:
@@ -153,15 +159,15 @@ class _Writer:
     def add_constraints(self) -> None:
         """Write active constraints between joints as mimics, and list those that close loops."""
         model, kind = self._model, self._mujoco.mjtEq
-        bodies = (kind.mjEQ_CONNECT, kind.mjEQ_WELD)
+        bodies = (int(kind.mjEQ_CONNECT), int(kind.mjEQ_WELD))
         for i in range(model.neq):
             pair = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
             if not model.eq_active0[i]:
                 continue
-            if model.eq_type[i] == kind.mjEQ_JOINT:
+            if int(model.eq_type[i]) == int(kind.mjEQ_JOINT):
                 self._add_mimic(*pair, model.eq_data[i, :5])
-            elif model.eq_type[i] in bodies:
-                if model.eq_objtype[i] == self._mujoco.mjtObj.mjOBJ_SITE:
+            elif int(model.eq_type[i]) in bodies:
+                if int(model.eq_objtype[i]) == int(self._mujoco.mjtObj.mjOBJ_SITE):
                     pair = [int(model.site_bodyid[site]) for site in pair]
                 # A mocap body is moved by a program: it is no part of the robot.
                 if (model.body_mocapid[pair] < 0).all():
@@ -187,12 +193,12 @@ class _Writer:
 def _largest_forces(mujoco: Any, model: Any) -> Float[np.ndarray, " joints"]:
     """Return the largest forces of the actuators on each joint; infinite where unknown."""
     total = np.zeros(model.njnt)
-    joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    joints = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     for i in range(model.nu):
-        if model.actuator_trntype[i] not in joints:
+        if int(model.actuator_trntype[i]) not in joints:
             continue
         most = np.inf
-        plain = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
+        plain = int(model.actuator_biastype[i]) == int(mujoco.mjtBias.mjBIAS_NONE)
         if model.actuator_forcelimited[i]:
             most = np.abs(model.actuator_forcerange[i]).max()
         elif model.actuator_ctrllimited[i] and plain:

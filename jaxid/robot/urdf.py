@@ -212,10 +212,10 @@ def _held_notes(tree: UrdfTree) -> Iterator[str]:
         master = joint.find("mimic").get("joint", "")
         groups.setdefault((master, f"{tree.held_at(joint):.4g}"), []).append(joint.get("name"))
     for (master, value), names in groups.items():
-        cause = f"as mimics of joint `{master}`" if master else "by a constraint"
+        cause = f"mimic of joint `{master}`" if master else "constraint"
         yield (
-            f"{owners('joint', names)}: held at {value} {cause}; what they carry belongs to the "
-            "bodies before them."
+            f"{owners('joint', names)}: held at {value} ({cause}); the links belong to the bodies "
+            "that carry them."
         )
     if tree.loose:
         yield f"{owners('link', tree.loose)}: left out, as objects that float freely."

@@ -142,6 +142,8 @@ class UrdfTree:
             if mimic is not None and not fixed:
                 fixed, (rotation, offset) = True, self.held_pose(joint)
                 self.held.append(joint)
+            r = r + R @ offset
+            R = without_rounding(R @ rotation)
             if fixed:
                 self.carriers[child] = (body, R, r)
             else:
@@ -242,11 +244,7 @@ class UrdfTree:
         if kind not in (*TURNING, "prismatic"):
             cure = "make it fixed"
             if kind == "floating":
-                # The first link that a reader of the file knows: MJCF has none between joints.
-                link = link_names(joint)[1]
-                below = self._below[link]
-                link = link_names(below[0])[1] if link.endswith(" frame") and below else link
-                cure = f"hold the robot at its base (`base`, `--base {link}`)"
+                cure = f"hold the robot at its base (`base`, `--base {link_names(joint)[1]}`)"
             raise self.error(
                 joint, f"is {kind}, but must turn or slide: avoid it (`tip`, `--tip`), or {cure}"
             )
