@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
+from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from scipy.spatial.transform import Rotation
 
-from jaxid.arrays import AnyArray, Float, Numbers
+from jaxid.arrays import Float, Numbers
 from jaxid.errors import InputError
 
 from .rotations import axis_rotation, rpy_angles
@@ -17,15 +17,10 @@ Loop = tuple[str, str, str]
 """Name of a constraint that closes a loop, and the two bodies that it connects."""
 _KINDS = ("floating", "ball", "prismatic", "revolute")
 """Types of joints in MuJoCo's order."""
-Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 
 def import_mujoco() -> Any:
-    """Return the module `mujoco`.
-
-    Raises:
-        ModuleNotFoundError: If it is not installed.
-    """
+    """Return the module `mujoco`; say how to install it if it is missing."""
     try:
         return importlib.import_module("mujoco")
     except ModuleNotFoundError as missing:
@@ -56,7 +51,8 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Lo
         tree.add_body(body)
     for site in range(model.nsite):
         tree.add_site(site)
-    tree.add_constraints()
+    for constraint in np.flatnonzero(model.eq_active0):
+        tree.add_constraint(int(constraint))
     weightless = model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     return tree.root, np.zeros(3) if weightless else np.array(model.opt.gravity), tree.loops
 
@@ -67,127 +63,107 @@ class _Writer:
     def __init__(self, mujoco: Any, model: Any):
         self._mujoco = mujoco
         self._model = model
-        name = bytes(model.names).split(b"\0")[0].decode()
-        self.root = etree.Element("robot", name=name)
-        self.loops: list[Loop] = []
         self._links = ["world"]
         self._joints: dict[int, Any] = {}
         self._efforts = _largest_forces(mujoco, model)
-        etree.SubElement(self.root, "link", name="world")
+        self.loops: list[Loop] = []
+        self.root = E.robot(E.link(name="world"), name=model.names.split(b"\0")[0].decode())
 
     def _name(self, kind: str, index: int) -> str:
         """Return the name of a body, a joint or a constraint, or its number if it has none."""
         return getattr(self._model, kind)(index).name or f"{kind}{index}"
+
+    def _connect(self, joint: str, kind: str, ends: tuple[str, str], origin: Any) -> Any:
+        parent, child = ends
+        element = E.joint(E.parent(link=parent), E.child(link=child), origin, name=joint, type=kind)
+        self.root.append(element)
+        return element
 
     def add_body(self, body: int) -> None:
         """Write the joints of a body, one after the other, and its link with the inertia."""
         model, name = self._model, self._name("body", body)
         link = self._links[model.body_parentid[body]]
         R, r = _matrix(model.body_quat[body]), model.body_pos[body]
-        mount, kind = f"{name} mount", "fixed"
+        mount, mount_kind = f"{name} mount", "fixed"
         first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
-            if _KINDS[model.jnt_type[joint]] == "floating":
-                mount, kind = self._name("joint", joint), "floating"
+        for i in range(first, first + int(model.body_jntnum[body])):
+            joint, kind = self._name("joint", i), _KINDS[model.jnt_type[i]]
+            if kind == "floating":
+                mount, mount_kind = joint, kind
                 continue
-            anchor, axis = model.jnt_pos[joint], model.jnt_axis[joint]
-            r = r + R @ anchor
-            moved = f"{self._name('joint', joint)} frame"
-            self._add_joint(joint, link, moved, self._at_zero(joint, R, r, axis))
-            link, R, r = moved, np.eye(3), -anchor
-        element = etree.SubElement(self.root, "link", name=name)
+            r = r + R @ model.jnt_pos[i]
+            # The file describes the pose at `ref`, a URDF the one at zero.
+            ref = model.qpos0[model.jnt_qposadr[i]]
+            if kind == "revolute" and ref:
+                R = R @ axis_rotation(model.jnt_axis[i], -ref)
+            if kind == "prismatic":
+                r = r - R @ model.jnt_axis[i] * ref
+            moved = f"{joint} frame"
+            self.root.append(E.link(name=moved))
+            self._joints[i] = self._connect(joint, kind, (link, moved), _origin(R, r))
+            self._joints[i].extend(self._properties(i))
+            link, R, r = moved, np.eye(3), -model.jnt_pos[i]
+        element = E.link(name=name)
         if model.body_mass[body] or model.body_inertia[body].any():
-            inertial = etree.SubElement(element, "inertial")
-            _add_origin(inertial, _matrix(model.body_iquat[body]), model.body_ipos[body])
-            etree.SubElement(inertial, "mass", value=_text(model.body_mass[body]))
-            moments = zip(("ixx", "iyy", "izz"), map(_text, model.body_inertia[body]), strict=True)
-            products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
-            etree.SubElement(inertial, "inertia", {**dict(moments), **products})
+            xx, yy, zz = map(_text, model.body_inertia[body])
+            place = _origin(_matrix(model.body_iquat[body]), model.body_ipos[body])
+            mass = E.mass(value=_text(model.body_mass[body]))
+            element.append(E.inertial(place, mass, E.inertia(ixx=xx, iyy=yy, izz=zz)))
+        self.root.append(element)
         self._links.append(name)
-        self._connect(mount, kind, link, name, (R, r))
+        self._connect(mount, mount_kind, (link, name), _origin(R, r))
+
+    def _properties(self, joint: int) -> list[Any]:
+        """Return a joint's axis, range, largest force, friction and rotor inertia."""
+        model, limit = self._model, {}
+        if model.jnt_limited[joint]:
+            limit = dict(zip(("lower", "upper"), map(_text, model.jnt_range[joint]), strict=True))
+        if np.isfinite(self._efforts[joint]):
+            limit["effort"] = _text(self._efforts[joint])
+        dof = model.jnt_dofadr[joint]
+        dynamics = E.dynamics(
+            damping=_text(model.dof_damping[dof]),
+            friction=_text(model.dof_frictionloss[dof]),
+            armature=_text(model.dof_armature[dof]),
+        )
+        return [E.axis(xyz=_text(model.jnt_axis[joint])), E.limit(**limit), dynamics]
 
     def add_site(self, site: int) -> None:
         """Write a site as a link; one without a name, or with that of a body, is left out."""
-        model, name = self._model, self._name("site", site)
-        if name == f"site{site}" or name in self._links:
-            return
-        etree.SubElement(self.root, "link", name=name)
-        body = self._links[model.site_bodyid[site]]
-        pose = _matrix(model.site_quat[site]), model.site_pos[site]
-        self._connect(f"{name} site", "fixed", body, name, pose)
+        model, name = self._model, self._model.site(site).name
+        if name and name not in self._links:
+            self.root.append(E.link(name=name))
+            origin = _origin(_matrix(model.site_quat[site]), model.site_pos[site])
+            ends = (self._links[model.site_bodyid[site]], name)
+            self._connect(f"{name} site", "fixed", ends, origin)
 
-    def _at_zero(self, joint: int, R: np.ndarray, r: np.ndarray, axis: np.ndarray) -> Pose:
-        """Return the pose at coordinate zero; the file describes the one at `ref`."""
-        ref = self._model.qpos0[self._model.jnt_qposadr[joint]]
-        kind = _KINDS[self._model.jnt_type[joint]]
-        if kind == "revolute" and ref:
-            R = R @ axis_rotation(axis, -ref)
-        if kind == "prismatic":
-            r = r - R @ axis * ref
-        return R, r
-
-    def _add_joint(self, joint: int, link: str, moved: str, pose: Pose) -> None:
-        """Write a joint with its range, largest force, friction and rotor inertia."""
-        model = self._model
-        kind = _KINDS[model.jnt_type[joint]]
-        etree.SubElement(self.root, "link", name=moved)
-        element = self._connect(self._name("joint", joint), kind, link, moved, pose)
-        self._joints[joint] = element
-        etree.SubElement(element, "axis", xyz=_text(model.jnt_axis[joint]))
-        limit = etree.SubElement(element, "limit")
-        if model.jnt_limited[joint]:
-            for key, end in zip(("lower", "upper"), model.jnt_range[joint], strict=True):
-                limit.set(key, _text(end))
-        if np.isfinite(self._efforts[joint]):
-            limit.set("effort", _text(self._efforts[joint]))
-        dof = model.jnt_dofadr[joint]
-        values = {
-            "damping": model.dof_damping[dof],
-            "friction": model.dof_frictionloss[dof],
-            "armature": model.dof_armature[dof],
-        }
-        numbers = {key: _text(value) for key, value in values.items()}
-        etree.SubElement(element, "dynamics", numbers)
-
-    def _connect(self, name: str, kind: str, parent: str, child: str, pose: Pose) -> Any:
-        joint = etree.SubElement(self.root, "joint", name=name, type=kind)
-        etree.SubElement(joint, "parent", link=parent)
-        etree.SubElement(joint, "child", link=child)
-        _add_origin(joint, *pose)
-        return joint
-
-    def add_constraints(self) -> None:
-        """Write active constraints between joints as mimics, and list those that close loops."""
-        model, kind = self._model, self._mujoco.mjtEq
-        bodies = (int(kind.mjEQ_CONNECT), int(kind.mjEQ_WELD))
-        for i in range(model.neq):
-            pair = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
-            if not model.eq_active0[i]:
-                continue
-            if int(model.eq_type[i]) == int(kind.mjEQ_JOINT):
-                self._add_mimic(*pair, model.eq_data[i, :5])
-            elif int(model.eq_type[i]) in bodies:
-                if int(model.eq_objtype[i]) == int(self._mujoco.mjtObj.mjOBJ_SITE):
-                    pair = [int(model.site_bodyid[site]) for site in pair]
-                # A mocap body is moved by a program: it is no part of the robot.
-                if (model.body_mocapid[pair] < 0).all():
-                    ends = [self._links[body] for body in pair]
-                    self.loops.append((self._name("equality", i), ends[0], ends[1]))
+    def add_constraint(self, i: int) -> None:
+        """Write a constraint between joints as a mimic; note one that closes a loop."""
+        model, kinds, kind = self._model, self._mujoco.mjtEq, int(self._model.eq_type[i])
+        pair = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
+        if kind == int(kinds.mjEQ_JOINT):
+            self._add_mimic(*pair, model.eq_data[i, :5])
+        elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+            if int(model.eq_objtype[i]) == int(self._mujoco.mjtObj.mjOBJ_SITE):
+                pair = [int(model.site_bodyid[site]) for site in pair]
+            # A mocap body is moved by a program: it is no part of the robot.
+            if (model.body_mocapid[pair] < 0).all():
+                first, second = (self._links[body] for body in pair)
+                self.loops.append((self._name("equality", i), first, second))
 
     def _add_mimic(self, joint: int, other: int, polynomial: np.ndarray) -> None:
         """Write a joint's constraint; the polynomial is exact where the other joint is held."""
         model, start = self._model, self._model.qpos0
-        mimic = etree.SubElement(self._joints[joint], "mimic")
-        zero = start[model.jnt_qposadr[joint]]
-        if other < 0:
-            mimic.set("offset", _text(zero + polynomial[0]))
-            return
-        low, high = model.jnt_range[other] if model.jnt_limited[other] else (-np.inf, np.inf)
-        held = min(max(0.0, low), high)
-        value = zero + np.polyval(polynomial[::-1], held - start[model.jnt_qposadr[other]])
-        mimic.set("joint", self._joints[other].get("name"))
-        mimic.set("multiplier", _text(polynomial[1]))
-        mimic.set("offset", _text(value - polynomial[1] * held))
+        value, slope, mimicked = start[model.jnt_qposadr[joint]] + polynomial[0], 0.0, {}
+        if other >= 0:
+            low, high = model.jnt_range[other] if model.jnt_limited[other] else (-np.inf, np.inf)
+            held = min(max(0.0, low), high)
+            shift = held - start[model.jnt_qposadr[other]]
+            slope = polynomial[1]
+            value += np.polyval(polynomial[::-1], shift) - polynomial[0] - slope * held
+            mimicked = {"joint": self._joints[other].get("name")}
+        mimic = E.mimic(**mimicked, multiplier=_text(slope), offset=_text(value))
+        self._joints[joint].append(mimic)
 
 
 def _largest_forces(mujoco: Any, model: Any) -> Float[np.ndarray, " joints"]:
@@ -214,8 +190,8 @@ def _matrix(quaternion: np.ndarray) -> Float[np.ndarray, "3 3"]:
     return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
 
 
-def _add_origin(element: Any, R: AnyArray, r: Numbers) -> None:
-    etree.SubElement(element, "origin", xyz=_text(r), rpy=_text(rpy_angles(R)))
+def _origin(R: Float[np.ndarray, "3 3"], r: Float[np.ndarray, "3"]) -> Any:
+    return E.origin(xyz=_text(r), rpy=_text(rpy_angles(R)))
 
 
 def _text(values: Numbers | float) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -86,28 +87,17 @@ def load_urdf(
     return robot.replace(notes=(*robot.notes, *_weight_notes(robot, tree.bodies())))
 
 
-def load_mjcf(
-    path: str | Path,
-    *,
-    tip: str | None = None,
-    base: str | None = None,
-    gravity: Numbers | None = None,
-    base_rotation: Numbers | None = None,
-    base_position: Numbers = _ZERO,
-) -> Robot:
+def load_mjcf(path: str | Path, **options: Any) -> Robot:
     """Load a robot from an MJCF file, compiled by MuJoCo; `urdf_parameters` reads its inertias.
 
     Bodies without joints become part of the body that carries them, and a joint that an equality
-    constraint couples to another is held, as mimic joints are in `load_urdf`. The frame of a body
-    is that of MuJoCo, moved to the joint's anchor. Largest forces are those of the actuators.
+    constraint couples to another is held, as mimic joints are in `load_urdf`. Largest forces are
+    those of the actuators. Gravity is that of the file.
 
     Args:
         path: MJCF file.
-        tip: Body or site of the end-effector, as in `load_urdf`.
-        base: Body that stands on the ground; the world if None. A robot with a free joint needs it.
-        gravity: Acceleration of gravity in the frame of the ground [m/s²]; the file's if None.
-        base_rotation: As in `load_urdf`.
-        base_position: As in `load_urdf` [m].
+        options: `tip` (a body or site), `base` (a body; needed if a free joint carries the robot),
+            `gravity`, `base_rotation` and `base_position`, as in `load_urdf`.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -115,14 +105,7 @@ def load_mjcf(
             loop on the way.
         ModuleNotFoundError: If MuJoCo is not installed.
     """
-    return load_urdf(
-        path,
-        tip=tip,
-        base=base,
-        gravity=gravity,
-        base_rotation=base_rotation,
-        base_position=base_position,
-    )
+    return load_urdf(path, **options)
 
 
 def urdf_parameters(
@@ -158,14 +141,7 @@ def joint_parameters(
 ) -> dict[str, Float[np.ndarray, " joints"]]:
     """Return `armature`, `damping` and dry `friction` that a file claims, zero where it does not.
 
-    Args:
-        path: URDF or MJCF file.
-        tip: As in `load_urdf`.
-        base: As in `load_urdf`.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        InputError: If the file cannot be loaded.
+    Arguments and errors are those of `load_urdf`.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     return {
