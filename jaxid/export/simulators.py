@@ -1,5 +1,6 @@
 """Files for simulators and tools: URDF, MJCF, and the parameters that Pinocchio takes."""
 
+import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +26,8 @@ from .torque_program import body_parameters
 
 _COMMENT = " Inertias and friction: model of "
 """Beginning of the comment in a URDF file that names the model."""
+_UNLIMITED = "1e9"
+"""Effort or velocity in a URDF file where none is known."""
 
 
 def joint_dynamics(
@@ -170,6 +173,9 @@ def export_urdf(
             element.set(quantity, _text(dynamics[quantity][i]))
         if np.isfinite(efforts[i]):
             _child(joints[name], "limit").set("effort", _text(efforts[i]))
+    for limit, key in itertools.product(root.iterfind("joint/limit"), ("effort", "velocity")):
+        # A URDF must have both; MJCF has no speeds.
+        limit.set(key, limit.get(key, _UNLIMITED))
     write_bytes(
         path, etree.tostring(root.getroottree(), xml_declaration=True, encoding="utf-8") + b"\n"
     )

@@ -67,7 +67,7 @@ class _Writer:
         self._joints: dict[int, Any] = {}
         self._efforts = _largest_forces(mujoco, model)
         self.loops: list[Loop] = []
-        self.root = E.robot(E.link(name="world"), name=model.names.split(b"\0")[0].decode())
+        self.root: Any = E.robot(E.link(name="world"), name=model.names.split(b"\0")[0].decode())
 
     def _name(self, kind: str, index: int) -> str:
         """Return the name of a body, a joint or a constraint, or its number if it has none."""
@@ -91,13 +91,15 @@ class _Writer:
             if kind == "floating":
                 mount, mount_kind = joint, kind
                 continue
+            if kind == "revolute" and not model.jnt_limited[i]:
+                kind = "continuous"
             r = r + R @ model.jnt_pos[i]
             # The file describes the pose at `ref`, a URDF the one at zero.
             ref = model.qpos0[model.jnt_qposadr[i]]
-            if kind == "revolute" and ref:
-                R = R @ axis_rotation(model.jnt_axis[i], -ref)
             if kind == "prismatic":
                 r = r - R @ model.jnt_axis[i] * ref
+            elif ref:
+                R = R @ axis_rotation(model.jnt_axis[i], -ref)
             moved = f"{joint} frame"
             self.root.append(E.link(name=moved))
             self._joints[i] = self._connect(joint, kind, (link, moved), _origin(R, r))
@@ -115,9 +117,10 @@ class _Writer:
 
     def _properties(self, joint: int) -> list[Any]:
         """Return a joint's axis, range, largest force, friction and rotor inertia."""
-        model, limit = self._model, {}
+        model = self._model
+        limit: dict[str, str] = {}
         if model.jnt_limited[joint]:
-            limit = dict(zip(("lower", "upper"), map(_text, model.jnt_range[joint]), strict=True))
+            limit["lower"], limit["upper"] = map(_text, model.jnt_range[joint])
         if np.isfinite(self._efforts[joint]):
             limit["effort"] = _text(self._efforts[joint])
         dof = model.jnt_dofadr[joint]
@@ -142,7 +145,7 @@ class _Writer:
         model, kinds, kind = self._model, self._mujoco.mjtEq, int(self._model.eq_type[i])
         pair = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
         if kind == int(kinds.mjEQ_JOINT):
-            self._add_mimic(*pair, model.eq_data[i, :5])
+            self._add_mimic(pair[0], pair[1], model.eq_data[i, :5])
         elif kind in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
             if int(model.eq_objtype[i]) == int(self._mujoco.mjtObj.mjOBJ_SITE):
                 pair = [int(model.site_bodyid[site]) for site in pair]
