@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers
+from jaxid.arrays import AnyArray, Float, Numbers, is_traced
 from jaxid.errors import InputError
 
 from .forward_and_inverse_kinematics import tip_jacobian
@@ -213,6 +213,8 @@ def _inertial_notes(tree: UrdfTree) -> Iterator[str]:
 
 def _weight_notes(robot: Robot, bodies: Float[np.ndarray, "joints 10"]) -> Iterator[str]:
     """Yield notes on joints that cannot hold a fraction of what gravity needs with these bodies."""
+    if is_traced(robot):
+        return
     low, high = (np.asarray(x) for x in (robot.limits.position_min, robot.limits.position_max))
     ends = np.where(robot.revolute, np.pi, 0.0)
     low, high = np.where(np.isfinite(low), low, -ends), np.where(np.isfinite(high), high, ends)
