@@ -234,13 +234,8 @@ class RobotSource:
         if self.mjcf is None:
             return {}
         claimed = joint_parameters(folder / self.mjcf, **self.chain)
-        symbols = {"armature": "Ia", "damping": "fv", "friction": "fc"}
-        return {
-            f"{symbols[key]}{j}": float(value)
-            for key, values in claimed.items()
-            for j, value in enumerate(values, 1)
-            if value > 0.0
-        }
+        rows = zip(("Ia", "fv", "fc"), claimed.values(), strict=True)
+        return {f"{k}{j}": float(x) for k, row in rows for j, x in enumerate(row, 1) if x > 0.0}
 
 
 def named(bodies: Float[np.ndarray, "bodies 10"]) -> dict[str, float]:

@@ -105,12 +105,14 @@ class _Writer:
             self._joints[i] = self._connect(joint, kind, (link, moved), _origin(R, r))
             self._joints[i].extend(self._properties(i))
             link, R, r = moved, np.eye(3), -model.jnt_pos[i]
-        element = E.link(name=name)
+        element: Any = E.link(name=name)
         if model.body_mass[body] or model.body_inertia[body].any():
             xx, yy, zz = map(_text, model.body_inertia[body])
             place = _origin(_matrix(model.body_iquat[body]), model.body_ipos[body])
             mass = E.mass(value=_text(model.body_mass[body]))
-            element.append(E.inertial(place, mass, E.inertia(ixx=xx, iyy=yy, izz=zz)))
+            products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+            moments = E.inertia(ixx=xx, iyy=yy, izz=zz, **products)
+            element.append(E.inertial(place, mass, moments))
         self.root.append(element)
         self._links.append(name)
         self._connect(mount, mount_kind, (link, name), _origin(R, r))
