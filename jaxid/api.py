@@ -72,6 +72,10 @@ from .robot.forward_and_inverse_kinematics import inverse_kinematics as inverse_
 from .robot.library import from_dh as from_dh
 from .robot.limits_and_drives import Drives as Drives, Limits as Limits
 from .robot.robot import Robot as Robot, Tool as Tool
-from .robot.urdf import load_urdf as load_urdf, urdf_parameters as urdf_parameters
+from .robot.urdf import (
+    load_mjcf as load_mjcf,
+    load_urdf as load_urdf,
+    urdf_parameters as urdf_parameters,
+)
 from .simulation.virtual import VirtualRobot as VirtualRobot
 from .trajectory import random_fourier_series as random_fourier_series

@@ -226,9 +226,13 @@ def separate(folder, *args, out=subprocess.PIPE):
 
 
 def test_init_writes_a_file_that_loads(tmp_path):
-    (tmp_path / "arm.urdf").write_text(STICK)
+    limit = '<limit lower="0" upper="0" velocity="0" effort="0"/></joint>'
+    (tmp_path / "arm.urdf").write_text(STICK.replace("</joint>", limit))
     with open(tmp_path / "experiment.toml", "w") as file:
-        assert separate(tmp_path, "init", "arm.urdf", out=file).returncode == 0
+        done = separate(tmp_path, "init", "arm.urdf", out=file)
+    assert done.returncode == 0
+    for words in ("velocity 0 is taken", "effort 0 is taken", "the body has no mass"):
+        assert words in " ".join(done.stderr.split())
     assert load_experiment(tmp_path / "experiment.toml").robot.joint_names == ("hinge",)
 
 

@@ -383,6 +383,21 @@ def test_the_template_loads_as_it_is_and_keeps_what_the_urdf_says(tmp_path):
     assert max(len(line) for line in text.splitlines()) <= 100
 
 
+def test_an_mjcf_file_gives_template_robot_and_nominal_values(tmp_path):
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><worldbody><body name="link"><joint name="hinge" armature="0.1" frictionloss="2"/>'
+        '<geom size="0.1" pos="0.2 0 0"/></body></worldbody></mujoco>'
+    )
+    text = write_template(tmp_path / "arm.xml", folder=tmp_path, base="world", tip="link")
+    (tmp_path / "experiment.toml").write_text(text, encoding="utf-8")
+    experiment = load_experiment(tmp_path / "experiment.toml")
+    assert 'mjcf = "arm.xml"' in text
+    assert experiment.robot.joint_names == ("hinge",)
+    assert experiment.source.parameters(tmp_path)[0, 0] == pytest.approx(4000 / 3 * np.pi * 1e-3)
+    assert experiment.source.joint_parameters(tmp_path) == {"Ia1": 0.1, "fc1": 2.0}
+
+
 def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     text = write_template(tmp_path / "arm.urdf", folder=tmp_path)

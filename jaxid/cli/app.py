@@ -106,7 +106,9 @@ def example(
 
 @app.command()
 def init(
-    urdf: Annotated[Path, typer.Argument(help="The robot's URDF file.", metavar="ARM.URDF")],
+    urdf: Annotated[
+        Path, typer.Argument(help="The robot's URDF, xacro or MJCF file.", metavar="ARM.URDF")
+    ],
     tip: options.Tip = None,
     base: options.Base = None,
 ) -> None:
@@ -116,8 +118,11 @@ def init(
     """
     options.start(urdf)
     from jaxid.experiment.template import write_template
+    from jaxid.report.page import show_remarks
+    from jaxid.robot.urdf import load_urdf
 
     text = write_template(urdf, tip=tip, base=base)
+    show_remarks(options.open_console(stderr=True), load_urdf(urdf, tip=tip, base=base).notes)
     typer.echo(text.encode(), nl=False)  # TOML is UTF-8, whatever the terminal is
 
 

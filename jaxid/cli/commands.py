@@ -52,6 +52,8 @@ UNUSABLE = 3
 """Exit code of `jaxid identify` if the verdict is that the model must not be used."""
 MARKED = (Status.DOUBTFUL, Status.BAD)
 """Statuses that the terminal shows of a verdict."""
+SOURCES = (".urdf", ".xacro", ".xml")
+"""Suffixes of files that `jaxid export --to urdf` changes without being told."""
 UNLIKELY = 0.01
 """Probability that the states agree on shared parameters, below which a remark is made."""
 
@@ -236,7 +238,7 @@ def export(
         export_c(fit, path.parent, name=path.stem, double=double)
     elif to == "urdf":
         own = Path(fit.base.model.robot.source) if urdf is None else urdf
-        if urdf is None and (own.suffix != ".urdf" or not own.is_file()):
+        if urdf is None and (own.suffix not in SOURCES or not own.is_file()):
             raise InputError("`--to urdf` changes the robot's own file: name it with `--urdf`.")
         export_urdf(fit, own, path, **chain)
     else:

@@ -106,7 +106,7 @@ def build_estimation(
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
     ridge: Fraction | Literal["cross_validated"] | None = None,
     truncate: Fraction | None = None,
-    prior: Literal["urdf"] | None = None,
+    prior: Literal["urdf", "mjcf"] | None = None,
     essential: Annotated[float, Bounds(least=0.0, below=1.0)] | None = None,
     nonlinear_friction: bool = False,
     uncertainty: Literal["spectral", "jackknife", "independent"] = "spectral",
@@ -135,9 +135,9 @@ def build_estimation(
             logs best; or a number like 0.01.
         truncate: Singular value below which directions are left out, relative to the largest, like
             `0.01`.
-        prior: Prior of what the logs do not determine: "urdf" takes the inertias of the URDF file;
-            with `ridge`, `truncate` or `kind = "consistent"`, which takes them by itself if such
-            bodies can exist.
+        prior: Prior of what the logs do not determine: "urdf" or "mjcf" takes the inertias of
+            the robot's file; with `ridge`, `truncate` or `kind = "consistent"`, which takes them by
+            itself if such bodies can exist.
         essential: Held-out error that leaving out parameters may cost in all (fraction), like
             `0.02`: keeps only parameters without which unseen data are predicted worse.
         nonlinear_friction: Whether to find `epsilon` and `stribeck` of each joint too, and to keep
@@ -179,7 +179,7 @@ def build_estimation(
     plain = estimators.WeightedLeastSquares(joint_weights, solution)
     bodies = None if prior is None else source.parameters(folder)
     if prior is not None and bodies is None:
-        raise InputError('`prior = "urdf"` needs a robot with `robot.urdf`.')
+        raise InputError("`prior` needs a robot with `robot.urdf` or `robot.mjcf`.")
     match kind:
         case "weighted":
             estimator = plain

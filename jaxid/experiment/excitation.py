@@ -220,7 +220,7 @@ def _earlier_information(
 
 
 def find_nominal(experiment: Experiment) -> Nominal | None:
-    """Return nominal parameters of an earlier result, or those that the URDF file claims.
+    """Return nominal parameters of an earlier result, or those that the robot's file claims.
 
     Raises:
         InputError: If the earlier result is of other parameters.
@@ -235,7 +235,8 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
             return None  # nothing depends on it, and the robot's notes name the body
         if bodies is None or not np.any(bodies):
             return None
-        standard, known = experiment.model.parameter_names, named(bodies)
+        standard = experiment.model.parameter_names
+        known = named(bodies) | experiment.source.joint_parameters(folder)
         values = np.asarray(base.from_standard([known.get(name, 0.0) for name in standard]))
         leads = [standard[k] in known for k in base.indices]
         return Nominal(np.where(leads, values, np.nan), None)

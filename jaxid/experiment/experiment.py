@@ -291,7 +291,9 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         if not isinstance(table, dict):
             raise InputError(f"`{name}` must be a table, but is {table!r}.")
     if "robot" not in content:
-        raise InputError("the table `[robot]` is missing: give it `urdf`, `builtin` or `dh`.")
+        raise InputError(
+            "the table `[robot]` is missing: give it `urdf`, `mjcf`, `builtin` or `dh`."
+        )
     source = call(RobotSource, content["robot"], "robot")
     with within("robot"):
         robot = source.build(folder)

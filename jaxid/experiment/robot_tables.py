@@ -15,7 +15,7 @@ from jaxid.robot.library import from_dh
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.rotations import rpy_rotation
-from jaxid.robot.urdf import load_urdf, urdf_parameters
+from jaxid.robot.urdf import joint_parameters, load_urdf, urdf_parameters
 
 from .decoder import Finite, Magnitude, PerJoint, Positive, Vector
 
@@ -118,13 +118,14 @@ def joint_number(robot: Robot, name: str, key: str = "body") -> int:
 
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
-    """Source of a robot, and its place on the ground; one of `urdf`, `builtin` and `dh` is needed.
+    """Place of a robot, and its source: one of `urdf`, `mjcf`, `builtin` and `dh` is needed.
 
     Attributes:
-        urdf: Path of a URDF file, as seen from the folder of this file.
-        tip: Link of the end-effector in the URDF file: only the chain from `base` to it is used,
-            like `"flange"`.
-        base: Link of the URDF file that stands on the ground, like `"base_link"`.
+        urdf: Path of a URDF or xacro file, as seen from the folder of this file.
+        mjcf: Path of an MJCF file, which MuJoCo compiles, like `"arm.xml"`.
+        tip: Link (body or site) of the end-effector in the URDF (MJCF) file: only the chain from
+            `base` to it is used, like `"flange"`.
+        base: Link (body) of that file that stands on the ground, like `"base_link"`.
         builtin: Name of a robot that jaxid knows, like `"tx40"`: tx90l_on_rail, tx40, ur10, ur10e,
             panda, iiwa14, kr300 or planar_arm.
         dh: Denavit-Hartenberg table with one row for each joint, alpha and theta in degrees, a and
@@ -143,6 +144,7 @@ class RobotSource:
     """
 
     urdf: str | None = None
+    mjcf: str | None = None
     tip: str | None = None
     base: str | None = None
     builtin: (
@@ -159,14 +161,18 @@ class RobotSource:
     tool: Annotated[Callable[[Robot], Tool | float], known_load] | None = None
 
     def __post_init__(self) -> None:
-        given = [k for k in ("urdf", "builtin", "dh") if getattr(self, k) is not None]
+        given = [k for k in ("urdf", "mjcf", "builtin", "dh") if getattr(self, k) is not None]
         if len(given) != 1:
             came = " and ".join(f"`{k}`" for k in given) or "none of them"
-            raise InputError(f"one of `urdf`, `builtin` and `dh` is needed, but there is {came}.")
-        owners = {"tip": "urdf", "base": "urdf", "convention": "dh"}
+            raise InputError(
+                f"one of `urdf`, `mjcf`, `builtin` and `dh` is needed, but there is {came}."
+            )
+        owners = {"tip": ("urdf", "mjcf"), "base": ("urdf", "mjcf"), "convention": ("dh",)}
         for key, owner in owners.items():
-            if getattr(self, key) is not None and given[0] != owner:
-                raise InputError(f"`{key}` belongs to `{owner}`, not to `{given[0]}`: remove it.")
+            if getattr(self, key) is not None and given[0] not in owner:
+                raise InputError(
+                    f"`{key}` belongs to `{owner[0]}`, not to `{given[0]}`: remove it."
+                )
 
     @property
     def placement(self) -> dict[str, Any]:
@@ -176,15 +182,20 @@ class RobotSource:
 
     @property
     def chain(self) -> dict[str, Any]:
-        """Chain in the URDF file."""
+        """Chain in the URDF or MJCF file."""
         return {"tip": self.tip, "base": self.base}
+
+    @property
+    def file(self) -> str | None:
+        """Path of the URDF or MJCF file."""
+        return self.mjcf if self.urdf is None else self.urdf
 
     def build(self, folder: Path) -> Robot:
         """Return the robot; paths are relative to the folder of the experiment file."""
-        if self.urdf is not None:
-            path = folder / self.urdf
+        if self.file is not None:
+            path, key = folder / self.file, "mjcf" if self.urdf is None else "urdf"
             if not path.is_file():
-                raise InputError(f"`urdf`: `{path}` is no file: paths are relative to this file.")
+                raise InputError(f"`{key}`: `{path}` is no file: paths are relative to this file.")
             robot = load_urdf(path, **self.chain, **self.placement)
         elif self.dh is not None:
             robot = from_dh(
@@ -209,14 +220,22 @@ class RobotSource:
         return robot if tool is None else robot.replace(tool=tool)
 
     def parameters(self, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
-        """Return the bodies' parameters that the URDF file claims; None if there is no such file.
+        """Return the bodies' parameters that the robot's file claims; None if there is none.
 
         Raises:
             InputError: If the file describes a body that cannot exist.
         """
-        if self.urdf is None:
+        if self.file is None:
             return None
-        return np.asarray(urdf_parameters(folder / self.urdf, **self.chain)).reshape(-1, 10)
+        return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(-1, 10)
+
+    def joint_parameters(self, folder: Path) -> dict[str, float]:
+        """Return rotor inertias and friction of an MJCF file, by their names in a model."""
+        if self.mjcf is None:
+            return {}
+        claimed = joint_parameters(folder / self.mjcf, **self.chain)
+        rows = zip(("Ia", "fv", "fc"), claimed.values(), strict=True)
+        return {f"{k}{j}": float(x) for k, row in rows for j, x in enumerate(row, 1) if x > 0.0}
 
 
 def named(bodies: Float[np.ndarray, "bodies 10"]) -> dict[str, float]:

@@ -21,6 +21,7 @@ import numpy as np
 from jaxid.io import union_members
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf
+from jaxid.robot.urdf_tree import is_mjcf
 from jaxid.units import Unit
 
 from .decoder import Key, keys_of
@@ -66,13 +67,13 @@ def write_template(
     """Return a complete commented experiment file for a robot; it loads as it is.
 
     Args:
-        urdf: Path of the robot's URDF file.
+        urdf: Path of the robot's URDF, xacro or MJCF file.
         tip: Link of the end-effector; the end of the longest chain if None.
         base: Link that stands on the ground; the root if None.
-        folder: Folder of the experiment file, to which the URDF's path is relative.
+        folder: Folder of the experiment file, to which that path is relative.
 
     Raises:
-        FileNotFoundError: If the URDF file does not exist.
+        FileNotFoundError: If the robot's file does not exist.
         InputError: If it cannot be loaded.
     """
     robot = load_urdf(urdf, tip=tip, base=base)
@@ -81,7 +82,7 @@ def write_template(
     joints = range(robot.joints)
     angles, forces = [*map(robot.joint_unit, joints)], [*map(robot.force_unit, joints)]
     values = {
-        "robot": {"urdf": path.as_posix(), "tip": tip, "base": base},
+        "robot": {"mjcf" if is_mjcf(urdf) else "urdf": path.as_posix(), "tip": tip, "base": base},
         "limits": {name: np.asarray(getattr(robot.limits, name)).tolist() for name in limits},
         "drives": {"gear_ratios": [1.0] * robot.joints},
         "model": {"offset": True},

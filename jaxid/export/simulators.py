@@ -1,5 +1,6 @@
 """Files for simulators and tools: URDF, MJCF, and the parameters that Pinocchio takes."""
 
+import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,12 +18,16 @@ from jaxid.io import json_text, write_bytes, write_text
 from jaxid.result_table import printable
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
-from jaxid.robot.urdf import UrdfTree, load_urdf
+from jaxid.robot.rotations import rpy_angles
+from jaxid.robot.urdf import load_urdf
+from jaxid.robot.urdf_tree import UrdfTree
 
 from .torque_program import body_parameters
 
 _COMMENT = " Inertias and friction: model of "
 """Beginning of the comment in a URDF file that names the model."""
+_UNLIMITED = "1e9"
+"""Effort or velocity in a URDF file where none is known."""
 
 
 def joint_dynamics(
@@ -127,12 +132,14 @@ def export_urdf(
 
     Replaced are the inertial of each link that a joint moves, with all that is fixed to it (fixed
     links then have none), the damping and the dry friction of each joint, and its effort where a
-    largest force is known. A URDF describes no rotor inertias, no offsets and no width of a tanh: a
-    comment names what is left out. Meshes, names and all else stay as they are.
+    largest force is known. Joints on identified bodies that the robot does not have, such as
+    fingers, become fixed where the robot holds them, because the bodies contain their links. A URDF
+    describes no rotor inertias, no offsets and no width of a tanh: a comment names what is left
+    out. Meshes, names and all else stay as they are.
 
     Args:
         fit: Physically consistent fit.
-        source: URDF file of the robot.
+        source: URDF file of the robot; from a xacro or MJCF file, its expanded form is written.
         path: Path of the new file.
         tip: Last link, as in `load_urdf`.
         base: First link, as in `load_urdf`.
@@ -143,22 +150,19 @@ def export_urdf(
     """
     robot, bodies = fit.base.model.robot, _feasible_bodies(fit, "a URDF file")
     _require_same(robot, load_urdf(source, tip=tip, base=base), source)
-    carriers = UrdfTree(source, tip=tip, base=base).carriers
+    tree = UrdfTree(source, tip=tip, base=base)
     dynamics, rotors, left_out = joint_dynamics(fit)
     efforts = np.asarray(robot.known_max_forces)
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
-    document = etree.parse(str(source), parser)
-    root = document.getroot()
+    root, links = tree.root, _hold_joints(tree)
     for comment in root.xpath("comment()"):
         if comment.text.startswith(_COMMENT):
             root.remove(comment)
     root.insert(0, etree.Comment(_COMMENT + _origin(fit, (*rotors, *left_out))))
     joints = {e.get("name"): e for e in root.iterfind("joint")}
     moved = {joints[name].find("child").get("link"): i for i, name in enumerate(robot.joint_names)}
-    for link in root.iterfind("link"):
-        name = link.get("name")
-        if name not in carriers or carriers[name][0] < 0:
-            continue
+    links += [name for name, (body, _, _) in tree.carriers.items() if body >= 0]
+    for name in links:
+        link = tree.links[name]
         for old in link.findall("inertial"):
             link.remove(old)
         if name in moved:
@@ -169,8 +173,29 @@ def export_urdf(
             element.set(quantity, _text(dynamics[quantity][i]))
         if np.isfinite(efforts[i]):
             _child(joints[name], "limit").set("effort", _text(efforts[i]))
-    write_bytes(path, etree.tostring(document, xml_declaration=True, encoding="utf-8") + b"\n")
+    for limit, key in itertools.product(root.iterfind("joint/limit"), ("effort", "velocity")):
+        # A URDF must have both; MJCF has no speeds.
+        limit.set(key, limit.get(key, _UNLIMITED))
+    write_bytes(
+        path, etree.tostring(root.getroottree(), xml_declaration=True, encoding="utf-8") + b"\n"
+    )
     return Path(path)
+
+
+def _hold_joints(tree: UrdfTree) -> list[str]:
+    """Fix the joints on identified bodies that the robot does not have; return links below them."""
+    branches = [joint for first in tree.left_out for joint in tree.branch(first)]
+    for joint in (*tree.held, *branches):
+        if joint.get("type") == "fixed":
+            continue
+        R, r = tree.held_pose(joint)
+        joint.set("type", "fixed")
+        for mimic in joint.findall("mimic"):
+            joint.remove(mimic)
+        origin = _child(joint, "origin")
+        origin.set("xyz", _text(r))
+        origin.set("rpy", _text(rpy_angles(R)))
+    return [joint.find("child").get("link") for joint in branches]
 
 
 def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:

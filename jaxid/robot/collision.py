@@ -25,7 +25,7 @@ from .shapes import (
     HalfSpace as HalfSpace,
     segment_distance,
 )
-from .urdf import UrdfTree
+from .urdf_tree import UrdfTree
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _ZERO = (0.0, 0.0, 0.0)
@@ -297,7 +297,8 @@ def _enclose_geometry(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the capsule around one geometry, in the frame of the geometry."""
     geometry = collision.find("geometry")
-    shape = geometry[0] if geometry is not None and len(geometry) else collision
+    inner = None if geometry is None else geometry.find("*")
+    shape = collision if inner is None else inner
     if shape.tag == "box":
         return enclose(_CORNERS * tree.numbers(shape, "size", _ZERO))
     if shape.tag == "mesh":

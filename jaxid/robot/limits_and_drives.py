@@ -235,11 +235,25 @@ def limit_notes(names: Sequence[str], revolute: Sequence[bool], limits: Limits) 
     speeds = limits.velocity
     if not all(isinstance(x, np.ndarray) and x.ndim == 1 for x in (low, high, speeds)):
         return
+    fast: dict[float, list[str]] = {}
     for name, turns, speed, *ends in zip(names, revolute, speeds, low, high, strict=True):
         if not turns:
             yield from far_notes(f"joint `{name}`: an end of its range", ends)
         elif 50.0 < speed < np.inf:
-            yield (
-                f"joint `{name}`: a velocity of up to {speed:g} rad/s is "
-                f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per second?"
-            )
+            fast.setdefault(float(speed), []).append(name)
+    for speed, group in fast.items():
+        yield (
+            f"{owners('joint', group)}: a velocity of up to {speed:g} rad/s is "
+            f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per second, or none?"
+        )
+
+
+def owners(kind: str, names: Sequence[str]) -> str:
+    """Return how a note names one or several joints or links."""
+    return f"{kind}s {listed(names)}" if len(names) > 1 else f"{kind} `{names[0]}`"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in backticks, the first eight of them."""
+    shown = ", ".join(f"`{name}`" for name in names[:8])
+    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"

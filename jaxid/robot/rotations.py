@@ -49,6 +49,13 @@ def rpy_rotation(rpy: Numbers) -> Float[np.ndarray, "3 3"]:
     return axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
 
 
+def rpy_angles(rotation: Float[AnyArray, "3 3"]) -> Float[np.ndarray, "3"]:
+    """Return roll, pitch and yaw [rad] of a rotation, as precise at a pitch of a quarter turn."""
+    roll = float(np.arctan2(rotation[2, 1], rotation[2, 2]))
+    R = np.asarray(rotation) @ axis_rotation((1.0, 0.0, 0.0), -roll)
+    return np.array([roll, np.arctan2(-R[2, 0], R[2, 2]), np.arctan2(-R[0, 1], R[1, 1])])
+
+
 def snapped(
     vectors: Float[AnyArray, "*shape 3"], tolerance: float
 ) -> Float[np.ndarray, "*shape 3"]:

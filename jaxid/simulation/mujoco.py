@@ -1,7 +1,6 @@
 """The same experiment on MuJoCo, which is independent of this package (extra `mujoco`)."""
 
 import dataclasses
-import importlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.export.simulators import mjcf_text
 from jaxid.export.torque_program import body_parameters
+from jaxid.robot.mjcf import import_mujoco
 
 from .virtual import VirtualRobot
 
@@ -37,7 +37,7 @@ class MujocoRobot(VirtualRobot):
             InputError: If the equations of motion contain more than bodies and rotors.
             ModuleNotFoundError: If MuJoCo is not installed.
         """
-        library, friction = _mujoco(), self.present_friction
+        library, friction = import_mujoco(), self.present_friction
         text = mjcf_text(
             self.robot,
             self._bodies_with_tool(),
@@ -81,7 +81,7 @@ class MujocoPlant:
     """One simulation of MuJoCo, with joints in the order of the robot."""
 
     def __init__(self, model: Any, joint_names: Sequence[str]):
-        self._library, self._model = _mujoco(), model
+        self._library, self._model = import_mujoco(), model
         self._data = self._library.MjData(model)
         # MuJoCo numbers the joints of a tree branch by branch.
         self._at = np.array([model.joint(name).qposadr[0] for name in joint_names])
@@ -117,12 +117,3 @@ class MujocoPlant:
             self._library.mj_inverse(self._model, self._data)
             forces[k] = self._data.qfrc_inverse[self._at]
         return forces
-
-
-def _mujoco() -> Any:
-    try:
-        return importlib.import_module("mujoco")
-    except ModuleNotFoundError as missing:
-        raise ModuleNotFoundError(
-            "MuJoCo is not installed: `pip install 'jaxid-robotics[mujoco]'`."
-        ) from missing

@@ -115,6 +115,65 @@ def test_everything_else_in_the_urdf_is_untouched(fit, source, tmp_path):
     assert path.read_bytes() == jid.export_urdf(fit, path, tmp_path / "b.urdf").read_bytes()
 
 
+FINGERS = """
+  <link name="left"><inertial><mass value="0.3"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <link name="right"><inertial><mass value="0.4"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <link name="tip"><inertial><mass value="0.1"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+  <joint name="right" type="revolute"><parent link="lower"/><child link="right"/>
+    <axis xyz="0 1 1"/><mimic joint="left" multiplier="2" offset="0.5"/>
+    <limit lower="-1" upper="1" effort="5" velocity="1"/></joint>
+  <joint name="left" type="prismatic"><parent link="lower"/><child link="left"/>
+    <limit lower="0.1" upper="0.2" effort="5" velocity="1"/></joint>
+  <joint name="pad" type="fixed"><parent link="left"/><child link="tip"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize("tip", [None, "lower"], ids=["the tree", "a chain"])
+def test_fingers_are_exported_once_to_pinocchio_and_mujoco(source, tmp_path, tip):
+    pin, mujoco = pytest.importorskip("pinocchio"), pytest.importorskip("mujoco")
+    source.write_text(URDF.replace("</robot>", FINGERS), "utf-8")
+    robot = jid.load_urdf(source, tip=tip)
+    assert robot.joint_names == ("rail", "shoulder", "elbow", "left")[: 3 if tip else 4]
+    model = jid.Model(robot)
+    fit = fit_of(model, possible(model), full=True)
+    path = jid.export_urdf(fit, source, tmp_path / "arm.urdf", tip=tip)
+    again = jid.load_urdf(path, tip=tip)
+    assert not any("held" in note for note in again.notes)
+    np.testing.assert_allclose(again.offset, robot.offset, atol=1e-15)
+    bodies = fit.full_parameters[: 10 * robot.joints].reshape(-1, 10)
+    m, total = motion(robot.joints, 20), bodies[:, 0].sum()
+    there = pin.buildModelFromUrdf(str(path))
+    assert list(there.names)[1:] == list(robot.joint_names)
+    assert abs(pin.computeTotalMass(there) - total) < 1e-12 * total
+    close(pinocchio_torques(pin, there, m), held(fit, m, drives=False), 1e-12)
+    there = mujoco.MjModel.from_xml_path(str(path))
+    assert [there.joint(i).name for i in range(there.njnt)] == list(robot.joint_names)
+    assert abs(there.body_mass.sum() - total) < 1e-12 * total
+    there.dof_damping[:] = 0.0
+    close(mujoco_torques(mujoco, there, m), held(fit, m, drives=False), 1e-11)
+
+
+def test_an_mjcf_file_is_exported_to_both_formats(source, tmp_path):
+    pin, mujoco = pytest.importorskip("pinocchio"), pytest.importorskip("mujoco")
+    model = jid.Model(jid.load_urdf(source))
+    first = jid.export_mjcf(fit_of(model, possible(model), full=True), tmp_path / "first.xml")
+    robot = jid.load_mjcf(first)
+    assert robot.joint_names == model.robot.joint_names
+    np.testing.assert_allclose(robot.offset, model.robot.offset, atol=1e-14)
+    np.testing.assert_allclose(robot.rotation, model.robot.rotation, atol=1e-14)
+    expected = possible(model)[:30]
+    np.testing.assert_allclose(jid.urdf_parameters(first), expected, rtol=0, atol=1e-13)
+    fit, m = fit_of(jid.Model(robot), possible(model, 1), full=True), motion(3, 20)
+    there = pin.buildModelFromUrdf(str(jid.export_urdf(fit, first, tmp_path / "arm.urdf")))
+    close(pinocchio_torques(pin, there, m), held(fit, m, drives=False), 1e-12)
+    there = mujoco.MjModel.from_xml_path(str(jid.export_mjcf(fit, tmp_path / "arm.xml")))
+    assert [there.joint(i).name for i in range(3)] == ["rail", "shoulder", "elbow"]
+    close(mujoco_torques(mujoco, there, m), held(fit, m, drives=True), 1e-11)
+
+
 def test_a_urdf_of_another_robot_is_refused(fit, source, tmp_path):
     source.write_text(URDF.replace('"elbow"', '"knee"'), "utf-8")
     with pytest.raises(ValueError, match="has the joints rail, shoulder, knee"):

@@ -14,7 +14,6 @@ from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 
-MIMIC = '<mimic joint="j1"/>'
 ARM = {"revolute": (True,), "axis": [(0, 0, 1)], "rotation": [np.eye(3)], "offset": [(0, 0, 0)]}
 LOAD = {"mass": 1.0, "centre_of_mass": (0.0, 0.0, 0.1)}
 ROD = {"start": (0, 0, 0), "end": (1, 0, 0), "radius": 0.1}
@@ -78,8 +77,15 @@ def test_invalid_arguments_are_named(case):
 
 
 FILES = {
-    "a floating joint": (arm(kind="floating"), "joint `j1` is floating.*`--tip`"),
-    "a mimic joint": (two(link("b"), joint("j2", "a", "b", inner=MIMIC)), "`j2` mimics .*`j1`"),
+    "a floating base": (
+        robot(
+            *map(link, ("world", "base", "a")),
+            joint("root", "world", "base", "floating"),
+            joint("j1", "base", "a"),
+        ),
+        "joint `root` is floating.*`--tip`.*`--base base`",
+    ),
+    "a planar joint": (arm(kind="planar"), "joint `j1` is planar.*`--tip`"),
     "two parents": (two(link("b"), joint("j2", "base", "b"), joint("j3", "a", "b")), "`j3` moves"),
     "a loop without root": (
         robot(link("a"), link("b"), joint("j1", "a", "b"), joint("j2", "b", "a")),
@@ -130,7 +136,7 @@ def test_an_error_of_a_file_is_one_sentence_about_it(tmp_path, text, sentence):
 
 def test_joints_that_the_chain_avoids_do_no_harm(tmp_path):
     path = tmp_path / "arm.urdf"
-    hand = joint("j2", "a", "b", inner=MIMIC)
+    hand = joint("j2", "a", "b", kind="planar")
     path.write_text(two(link("b"), link("c"), hand, joint("j3", "b", "c")))
     assert load_urdf(path, tip="a").joint_names == ("j1",)
     assert load_urdf(path, base="b").joint_names == ("j3",)

@@ -1,3 +1,5 @@
+import re
+import sys
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -14,6 +16,9 @@ from urdf_text import arm, inertial, joint, link, robot
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
+from jaxid.errors import InputError
+from jaxid.robot.inertia import Inertia
+from jaxid.robot.rotations import rpy_angles, rpy_rotation
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 
 SHARE = "cmeel.prefix/share/example-robot-data/robots"
@@ -211,3 +216,130 @@ def test_defaults_of_name_and_axis(write):
     loaded = load_urdf(write(text, "left.urdf"))
     assert loaded.name == "left"
     assert loaded.axis.tolist() == [[1.0, 0.0, 0.0]]
+
+
+# Mimic joints, xacro, and files with nonsense.
+
+HAND = robot(
+    *map(link, ("base", "palm")),
+    link("left", inertial(0.2, (0.0, 0.01, 0.02), (0, 0, 0), (1e-4, 0, 0, 1e-4, 0, 1e-4))),
+    link("right", inertial(0.3, (0.1, 0.0, 0.02), (0, 0, 0), (2e-4, 0, 0, 2e-4, 0, 2e-4))),
+    joint("wrist", "base", "palm", "continuous"),
+    joint(
+        "left",
+        "palm",
+        "left",
+        "prismatic",
+        inner='<limit lower="0.01" upper="0.04" velocity="1" effort="9"/>',
+    ),
+    joint(
+        "right",
+        "palm",
+        "right",
+        xyz="0.1 0 0",
+        rpy="0.1 0.2 0.3",
+        axis="1 2 0",
+        inner='<mimic joint="left" multiplier="-20" offset="0.5"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="9"/>',
+    ),
+)
+
+
+def test_a_mimic_joint_is_held_where_its_joint_puts_it(write):
+    path = write(HAND)
+    ours = load_urdf(path)
+    assert ours.joint_names == ("wrist", "left")
+    assert "`right`: held at 0.3 (mimic of joint `left`)" in ours.notes[0]
+    full = pin.buildModelFromUrdf(str(path))
+    reference = pin.neutral(full)
+    reference[full.joints[full.getJointId("right")].idx_q] = 0.3
+    reduced = pin.buildReducedModel(full, [full.getJointId("right")], reference)
+    parameters = urdf_parameters(path).reshape(-1, 10)
+    for name, p in zip(ours.joint_names, parameters, strict=True):
+        expected = reduced.inertias[reduced.getJointId(name)].toDynamicParameters()
+        np.testing.assert_allclose(Inertia.from_parameters(p).pinocchio, expected, atol=1e-14)
+
+
+def test_a_mimic_of_nothing_is_held_at_its_offset(write):
+    path = write(HAND.replace('<mimic joint="left"', '<mimic joint="lost"'))
+    assert "held at 0.5 (mimic of joint `lost`)" in load_urdf(path).notes[0]
+    path = write(HAND.replace('<mimic joint="left"', '<mimic joint="right"'))
+    assert "held at 0.5" in load_urdf(path).notes[0]
+
+
+def test_a_tip_leaves_mimics_out(write):
+    path = write(HAND)
+    assert load_urdf(path, tip="palm").joint_names == ("wrist",)
+    assert not urdf_parameters(path, tip="palm").any()
+
+
+@pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9])
+def test_rpy_angles_are_precise_at_any_pitch(pitch):
+    R = rpy_rotation((0.4, pitch, -2.0))
+    np.testing.assert_allclose(rpy_rotation(rpy_angles(R)), R, atol=1e-15)
+
+
+def test_nonsense_is_named_at_once(write):
+    zero = '<limit lower="0" upper="0" velocity="0" effort="0"/>'
+    weak = '<limit lower="-2" upper="2" velocity="3" effort="0.5"/>'
+    bodies = {
+        "a": inertial(2.0, (0.5, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1)),
+        "b": inertial(-1.0, (0, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1)),
+        "c": inertial(1.0, (0, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.3)),
+    }
+    path = write(
+        robot(
+            *map(link, ("base", "d")),
+            *(link(name, text) for name, text in bodies.items()),
+            joint("j1", "base", "a", axis="0 1 0", inner=weak),
+            joint("j2", "a", "b", inner=zero),
+            joint("j3", "b", "c", inner=zero),
+            joint("j4", "c", "d"),
+        )
+    )
+    text = "\n".join(load_urdf(path).notes)
+    for words in (
+        "joints `j2`, `j3`: a range from 0 to 0",
+        "joints `j2`, `j3`: velocity 0",
+        "joints `j2`, `j3`: effort 0",
+        "joint `j4`: the body has no mass",
+        "link `b`: .*`mass` is -1 kg",
+        "link `c`: .*larger than the sum",
+        "joint `j1`: an effort of 0.5 N m is far below",
+    ):
+        assert re.search(words, text), words
+    assert len(load_urdf(path).notes) == 7
+
+
+def test_an_effort_that_holds_the_arm_is_no_nonsense(write):
+    body = inertial(2.0, (0.5, 0, 0), (0, 0, 0), (0.1, 0, 0, 0.1, 0, 0.1))
+    limit = '<limit lower="-2" upper="2" velocity="3" effort="9"/>'
+    path = write(
+        robot(link("base"), link("a", body), joint("j1", "base", "a", axis="0 1 0", inner=limit))
+    )
+    assert load_urdf(path).notes == ()
+    hung = load_urdf(path, gravity=(0.0, 0.0, -9.81 * 5))
+    assert "`j1`: an effort of 9 N m is far below the 49 N m" in hung.notes[0]
+
+
+XACRO = HAND.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"').replace(
+    "</robot>", '<xacro:property name="x" value="1"/></robot>'
+)
+
+
+def test_a_xacro_file_is_expanded_by_the_program(write, tmp_path, monkeypatch):
+    path = write(XACRO, "arm.urdf.xacro")
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    with pytest.raises(InputError, match=r"`xacro .*arm.urdf.xacro -o arm.urdf`.*pip install"):
+        load_urdf(path)
+    (tmp_path / "bin").mkdir()
+    program = tmp_path / "bin" / "xacro"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\n" + "print(open(sys.argv[1]).read()"
+        """.replace('<xacro:property name="x" value="1"/>', ""))"""
+    )
+    program.chmod(0o755)
+    assert load_urdf(path).joint_names == load_urdf(write(HAND)).joint_names
+    program.write_text(f"#!{sys.executable}\nraise SystemExit('no such macro')")
+    with pytest.raises(InputError, match="fails: no such macro"):
+        load_urdf(path)

@@ -1,0 +1,167 @@
+"""Robots of MJCF files have the dynamics that MuJoCo computes from the same file."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import jaxid as jid
+from jaxid.errors import InputError
+from jaxid.robot.urdf import joint_parameters
+
+ARM = """
+<mujoco model="cell">
+  <compiler angle="degree" autolimits="true"/>
+  <option gravity="0.5 0 -9.7"/>
+  <default>
+    <joint damping="0.2" armature="0.01"/>
+    <default class="heavy"><geom density="3000"/></default>
+  </default>
+  <worldbody>
+    <body name="object" pos="2 0 0"><freejoint name="free"/><geom size="0.1"/></body>
+    <body name="table" pos="0 0 0.4" euler="10 20 30">
+      <geom type="box" size="0.5 0.5 0.02"/>
+      <body name="shoulder" pos="0 0 0.1" quat="1 1 0 0">
+        <joint name="pan" pos="0.1 0 0" axis="0 1 1" ref="20" range="-100 160" frictionloss="0.3"/>
+        <joint name="lift" pos="0 0.2 0.1" axis="1 0 0"/>
+        <geom type="box" size="0.1 0.2 0.3" pos="0.1 0 0.2" euler="0 30 0"/>
+        <body name="plate" pos="0 0.2 0" euler="0 90 0">
+          <geom type="capsule" size="0.05" fromto="0 0 0 0.3 0.1 0" class="heavy"/>
+          <body name="ram" pos="0 0 0.3" euler="0 0 45">
+            <joint name="slide" type="slide" axis="1 0 1" ref="0.1" range="-0.3 0.4"/>
+            <inertial pos="0.1 0.2 0.3" mass="2" fullinertia="0.2 0.3 0.4 0.01 0.02 0.03"/>
+            <site name="flange" pos="0 0 0.2" euler="0 45 0"/>
+            <body name="left"><joint name="left" type="slide" axis="0 1 0" range="0.01 0.05"/>
+              <geom size="0.02"/></body>
+            <body name="right" pos="0 0 0.1"><joint name="right" axis="0 0 1"/>
+              <geom size="0.03" pos="0.1 0 0"/></body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="right" joint2="left" polycoef="0.1 2 30 0 0"/></equality>
+  <actuator>
+    <motor joint="pan" ctrlrange="-3 2" gear="50"/>
+    <position joint="slide" kp="10" forcerange="-70 70"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_file(text):
+        (tmp_path / "arm.xml").write_text(text)
+        return tmp_path / "arm.xml"
+
+    return write_file
+
+
+def mujoco_forces(path, names, motion, held=None):
+    """Forces of MuJoCo at named joints without friction, rotors and constraints."""
+    model = mujoco.MjModel.from_xml_path(str(path))
+    off = mujoco.mjtDisableBit
+    model.opt.disableflags |= off.mjDSBL_CONSTRAINT | off.mjDSBL_DAMPER | off.mjDSBL_SPRING
+    model.dof_armature[:] = 0.0
+    data, forces = mujoco.MjData(model), []
+    for name, value in (held or {}).items():
+        data.joint(name).qpos = value
+    for q, qd, qdd in zip(motion.q, motion.qd, motion.qdd, strict=True):
+        for name, *values in zip(names, q, qd, qdd, strict=True):
+            data.joint(name).qpos, data.joint(name).qvel, data.joint(name).qacc = values
+        mujoco.mj_inverse(model, data)
+        forces.append([data.joint(name).qfrc_inverse[0] for name in names])
+    return np.array(forces)
+
+
+def random_motion(joints):
+    rng = np.random.default_rng(0)
+    return jid.Motion(*(rng.uniform(-s, s, (20, joints)) for s in (1.0, 2.0, 5.0)))
+
+
+def assert_same_forces(path, robot, motion, held=None, **chain):
+    model = jid.Model(robot, (jid.RigidBodies(),))
+    ours = model.inverse_dynamics(jid.urdf_parameters(path, **chain), motion)
+    wanted = mujoco_forces(path, robot.joint_names, motion, held)
+    np.testing.assert_allclose(ours, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+
+
+def test_forces_limits_and_gravity_are_those_of_mujoco(write):
+    path = write(ARM)
+    robot = jid.load_mjcf(path)
+    assert robot.joint_names == ("pan", "lift", "slide", "left")
+    assert robot.gravity.tolist() == [0.5, 0.0, -9.7]
+    # The left finger is held at 0.01 m: 0.1 + 2 x 0.01 + 30 x 0.01^2.
+    assert_same_forces(path, robot, random_motion(4), {"right": 0.123})
+    limits = robot.limits
+    np.testing.assert_allclose(limits.position_min, [*np.deg2rad([-100]), -np.inf, -0.3, 0.01])
+    np.testing.assert_allclose(limits.position_max, [*np.deg2rad([160]), np.inf, 0.4, 0.05])
+    assert limits.force.tolist() == [150.0, np.inf, 70.0, np.inf]
+    held, loose = robot.notes[:2]
+    assert "`right`: held at 0.123 (mimic of joint `left`)" in held
+    assert "`object`" in loose
+    values = joint_parameters(path)
+    assert values["armature"].tolist() == [0.01] * 4
+    assert values["damping"].tolist() == [0.2] * 4
+    assert values["friction"].tolist() == [0.3, 0.0, 0.0, 0.0]
+
+
+def test_a_site_is_a_tip_and_leaves_the_fingers_out(write):
+    path = write(ARM)
+    robot = jid.load_mjcf(path, tip="flange")
+    assert robot.joint_names == ("pan", "lift", "slide")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    q = np.array([0.3, -0.4, 0.2])
+    for name, value in zip(robot.joint_names, q, strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_forward(model, data)
+    from jaxid.robot.forward_and_inverse_kinematics import tip_placement
+
+    R, r = tip_placement(robot, q)
+    np.testing.assert_allclose(r, data.site("flange").xpos, atol=1e-14)
+    np.testing.assert_allclose(R.ravel(), data.site("flange").xmat, atol=1e-14)
+
+
+def test_switched_off_gravity_is_none(write):
+    text = ARM.replace('gravity="0.5 0 -9.7"/>', '><flag gravity="disable"/></option>')
+    assert not jid.load_mjcf(write(text)).gravity.any()
+
+
+def test_a_free_robot_is_held_at_its_base(write):
+    free = ARM.replace('<body name="table" pos="0 0 0.4" euler="10 20 30">', "<body name='table'>")
+    free = free.replace("<body name='table'>", "<body name='table'><freejoint name='root'/>")
+    path = write(free)
+    with pytest.raises(InputError, match=r"joint `root` is floating.*`--base table`"):
+        jid.load_mjcf(path)
+    robot = jid.load_mjcf(path, base="table")
+    held = {"right": 0.123}
+    assert_same_forces(path, robot, random_motion(4), held, base="table")
+
+
+REFUSED = {
+    "a ball joint": (ARM.replace('name="lift"', 'name="lift" type="ball"'), "joint `lift` is ball"),
+    "a loop": (
+        ARM.replace("<equality>", '<equality><connect body1="ram" body2="table" anchor="0 0 0"/>'),
+        "`equality0` between `ram` and `table` closes a loop",
+    ),
+    "a mesh that is missing": (
+        ARM.replace("<default>", '<asset><mesh file="no.stl"/></asset><default>', 1),
+        "MuJoCo cannot compile this file: .*no.stl",
+    ),
+    "no model": ("<mujoco><bodies/></mujoco>", "MuJoCo cannot compile"),
+}
+
+
+@pytest.mark.parametrize(("text", "sentence"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_is_no_open_tree_is_one_sentence(write, text, sentence):
+    path = write(text)
+    with pytest.raises(InputError, match=sentence) as caught:
+        jid.load_mjcf(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_loop_outside_the_chain_does_no_harm(write):
+    path = write(REFUSED["a loop"][0].replace('body1="ram"', 'body1="left"'))
+    assert jid.load_mjcf(path, tip="flange").joints == 3
