@@ -149,7 +149,7 @@ def test_true_forces_are_found_and_can_be_used(shop, run):  # noqa: F811
 
 def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
     _, out, _ = run("inspect", "experiment.toml", "late.csv")
-    found = re.search(r"`force_delay = ([0-9.]+)`", " ".join(out.split()))
+    found = re.search(r"force_delay = ([0-9.]+)`", " ".join(out.split()))
     assert found, out
     assert abs(float(found[1]) - 0.012) < 3e-4
     cured = SPATIAL.replace('time = "t"', f'time = "t"\nforce_delay = {found[1]}')

@@ -196,7 +196,7 @@ class _Samples:
     def amounts(self) -> Iterator[_Amount]:
         """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""
         robot, q, forces = self._model.robot, self.motion.q, self.forces
-        text = "the forces of the log seem to be late (`recording.force_delay = {:.2g}`)"
+        text = "the forces of the log seem to be late (`recording.force_delay = {:.3g}`)"
 
         def correction(text: str, part: slice, q=q, forces=forces) -> Correction:
             moved = Motion(q[part], self.motion.qd[part], self.motion.qdd[part])
