@@ -438,7 +438,10 @@ def _detect_format(source: str, head: bytes) -> _Layout:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"`{source}` is text in UTF-16: save it again in UTF-8.")
     if b"\0" in head:
-        raise InputError(f"`{source}` is no text: the suffix of a log must tell its format.")
+        raise InputError(
+            f"`{source}` is no text: a log is CSV, Parquet, NPZ, MAT, HDF5 or a bag of ROS, as its "
+            "suffix says."
+        )
     first, _, _ = head.partition(b"\n")
     line = first.decode("utf-8-sig", errors="replace").strip("\r").lstrip("#% ")
     if not line.strip():
