@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax
 import numpy as np
 
 import jaxid as jid
-from jaxid.arrays import Float
+from jaxid.arrays import Float, on_cores
 from jaxid.excitation.design import DesignProgress
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.model_validation import Validation
@@ -226,9 +225,7 @@ def _design(
         )
 
     # Most of the time is that of the compiler, which works on one core at a time.
-    with ThreadPoolExecutor() as pool:
-        both = pool.map(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal()))
-        return tuple(both)
+    return tuple(on_cores(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal())))
 
 
 def _follow(

@@ -149,8 +149,8 @@ def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> list[Remark]:
     names = [f"`{n}`" for n, x in zip(fit.base.model.robot.joint_names, found, strict=False) if x]
     remarks = [
         Remark(
-            f"Errors depend on speed (joints {', '.join(names)}): friction has another shape, and "
-            "the intervals of its parameters are too narrow.",
+            f"Errors depend on speed (joints {', '.join(names)}): friction seems to have another "
+            "shape, and the intervals of its parameters may be too narrow.",
             Status.DOUBTFUL,
             "Means over classes of speed agree between blocks of time: try `jaxid choose`.",
         )
