@@ -33,7 +33,7 @@ def readable(source: str, kind: str) -> Iterator[None]:
         raise
     except (Exception, pl.exceptions.PanicException) as error:
         # Of many kinds: it depends on which bytes are damaged.
-        said = " ".join(str(error).split())[:200] or type(error).__name__
+        said = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
         raise InputError(f"`{source}` is no {kind}, or is damaged: {said}.") from error
 
 
