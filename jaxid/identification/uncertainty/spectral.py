@@ -10,13 +10,14 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy import fft
 
 from jaxid.arrays import AnyArray, Float, on_cores
+from jaxid.measurement.observations import Observations
 
 from ..estimators.estimate import Channel, Estimate
 from ..factors import RowChunk
@@ -51,8 +52,8 @@ class SpectralSandwich(AbstractUncertainty):
             found, _ = BlockJackknife()(problem, estimate, naive)
             note = "standard deviations come from the block jackknife: only factors were given."
             return dataclasses.replace(found, notes=found.notes or (note,)), None
-        lines, correlated, complete = row_spectra(problem, estimate)
-        covariance, dof, white = sandwich(lines, correlated)
+        lines, pairs, complete = row_spectra(problem, estimate)
+        covariance, dof, white = sandwich(lines, pairs)
         exact = np.diag(naive)
         if not complete:
             known = (white > 0) & np.isfinite(exact)
@@ -76,6 +77,7 @@ class Lines(NamedTuple):
         power: Periodogram of the disturbances [channels, lines].
         residual: Periodogram of the residuals [joints, lines], in [N² m²] or [N²].
         exposure: Number of stretches, weighted by the fraction of rows of each channel that count.
+        stretches: Number of stretches, as an array without axes.
     """
 
     length: int
@@ -89,20 +91,40 @@ class Lines(NamedTuple):
     power: np.ndarray
     residual: np.ndarray
     exposure: np.ndarray
-    stretches: int
+    stretches: np.ndarray
 
-    def add(self, other: "Lines") -> "Lines":
-        """Return the sums with the spectra of stretches with the same lines."""
-        names = ("energy", "leverage", "power", "residual", "exposure", "stretches")
-        return self._replace(**{x: getattr(self, x) + getattr(other, x) for x in names})
+    @classmethod
+    def empty(cls, length: int, observations: Observations, sizes: tuple[int, int]) -> "Lines":
+        """Return the lines of no stretch yet, for some sizes (base parameters, channels)."""
+        row_time, (base, channels) = observations.row_time, sizes
+        frequency = fft.rfftfreq(length, row_time)
+        dt, decimation = observations.sample_time, observations.decimation
+        gain = observations.filter.low_pass(dt).gain(frequency, dt)
+        for k, factor in enumerate(decimation.stages):
+            gain = gain * decimation.low_pass(k).gain(frequency, dt)
+            dt *= factor
+        # Lines with less gain carry no information.
+        count = int(np.flatnonzero(gain > 1e-3)[-1]) + 1
+        frequency = frequency[:count]
+        bins = np.searchsorted(BIN_EDGES, frequency, side="right")
+        known = frequency, multiplicity(length)[:count], gain[:count], bins
+        joints = observations.mask.shape[1]
+        shapes = (base, channels, count), (channels, count), (channels, count), (joints, count)
+        sums = map(np.zeros, (*shapes, channels, ()))
+        return cls(length, row_time, *known, *sums)
+
+    def transform(self, rows: np.ndarray) -> np.ndarray:
+        """Return the Fourier transform of the rows of a stretch, on the last axis."""
+        return np.asarray(fft.rfft(rows, self.length))[..., : len(self.frequency)]
 
 
 def row_spectra(problem: RegressionProblem, estimate: Estimate):
     """Transform every stretch of the rows in one pass.
 
     Returns:
-        Spectra of every length of stretches; energies of pairs of parameters, summed over the lines
-        of each bin [bins, channels, base, base]; whether all rows were transformed.
+        Spectra of every length of stretches; for each channel its columns of $B$ and the products
+        of its instruments, summed over the lines of each bin [bins, columns, columns]; whether all
+        rows were transformed.
     """
     stretches, complete = _divide(problem)
     kinds = {(b - a, problem.recordings[number].row_time) for number, a, b in stretches}
@@ -112,8 +134,8 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
             longest[row_time] = n
         lengths[n, row_time] = longest[row_time]
     found: dict[tuple, Lines] = {}
+    pairs: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     B, p = np.asarray(estimate.inverse), np.asarray(estimate.parameters)
-    correlated: Any = 0.0
 
     def pieces_of_stretches() -> Iterator[tuple[Span, RowChunk, np.ndarray]]:
         for chunk, residuals in problem.residuals(p, stretches):
@@ -123,16 +145,26 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
                 if number == chunk.recording and own.start < own.stop:
                     yield (number, a, b), chunk.part(own), residuals[own]
 
-    for (number, a, b), group in itertools.groupby(pieces_of_stretches(), lambda x: x[0]):
-        o, parts = problem.recordings[number], [(chunk, r) for _, chunk, r in group]
-        pieces = [estimate.influence(chunk, residuals) for chunk, residuals in parts]
-        r = np.concatenate([np.where(chunk.mask, r, 0.0) for chunk, r in parts])
-        n = lengths[b - a, o.row_time]
-        lines, pairs = _transform(n, pieces, r, B, o)
-        correlated = correlated + pairs
-        key = (n, o.row_time, len(lines.frequency))
-        found[key] = found[key].add(lines) if key in found else lines
-    return list(found.values()), correlated, complete
+    def channels() -> Iterator[tuple[Lines, int, Sequence[Channel]]]:
+        for (number, a, b), group in itertools.groupby(pieces_of_stretches(), lambda x: x[0]):
+            o, parts = problem.recordings[number], [(chunk, r) for _, chunk, r in group]
+            pieces = [estimate.influence(chunk, residuals) for chunk, residuals in parts]
+            new = Lines.empty(lengths[b - a, o.row_time], o, (len(B), len(pieces[0])))
+            lines = found.setdefault((new.length, o.row_time, len(new.frequency)), new)
+            r = np.concatenate([np.where(chunk.mask, r, 0.0) for chunk, r in parts])
+            lines.residual[...] += np.abs(lines.transform(r.T)) ** 2 / lines.length
+            lines.stretches[...] += 1
+            for c, own in enumerate(zip(*pieces, strict=True)):
+                yield lines, c, own
+
+    sums = on_cores(lambda x: (*x[:2], _channel(x[0], B, x[2])), channels())
+    for lines, c, (own, energy, leverage, power, exposure, products) in sums:
+        lines.energy[:, c] += energy
+        lines.leverage[c] += leverage
+        lines.power[c] += power
+        lines.exposure[c] += exposure
+        pairs[c] = B[:, own], products + (pairs[c][1] if c in pairs else 0.0)
+    return list(found.values()), list(pairs.values()), complete
 
 
 def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
@@ -141,50 +173,29 @@ def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
     return np.bincount(np.minimum(k, length - k)).astype(float)
 
 
-def _transform(n: int, pieces, residuals, inverse, observations) -> tuple[Lines, np.ndarray]:
-    """Return the lines of one stretch, and its energies of pairs of parameters by bins."""
-    row_time = observations.row_time
-    frequency = fft.rfftfreq(n, row_time)
-    dt, decimation = observations.sample_time, observations.decimation
-    gain = observations.filter.low_pass(dt).gain(frequency, dt)
-    for k, factor in enumerate(decimation.stages):
-        gain = gain * decimation.low_pass(k).gain(frequency, dt)
-        dt *= factor
-    # Lines with less gain carry no information.
-    last = int(np.flatnonzero(gain > 1e-3)[-1]) + 1
-    frequency, gain, m = frequency[:last], gain[:last], multiplicity(n)[:last]
-    bins = np.searchsorted(BIN_EDGES, frequency, side="right")
-    present, starts = np.unique(bins, return_index=True)
-    scale = np.sqrt(m / n)[:, None]
+def _channel(lines: Lines, inverse: np.ndarray, parts: Sequence[Channel]) -> tuple:
+    """Return columns, the sums of `Lines`, and products by bins, of one channel of a stretch."""
+    n, m = lines.length, lines.multiplicity
+    own, scale = list(parts[0].columns), np.sqrt(m / n)
 
-    def transform(rows: np.ndarray) -> np.ndarray:
+    def transform(rows: list[np.ndarray]) -> np.ndarray:
         """Return real and imaginary parts of each line, weighted by how often it counts."""
-        found = np.asarray(fft.rfft(rows, n, axis=0))[:last]
-        return scale * np.stack([np.real(found), np.imag(found)])
+        found = scale * lines.transform(np.concatenate(rows).T)
+        return np.stack([np.real(found), np.imag(found)], axis=1)
 
-    def channel(parts: Sequence[Channel]) -> tuple:
-        """Return the sums of `Lines` and the energies of pairs of one channel."""
-        own = list(parts[0].columns)
-        B = inverse[:, own]
-        Z = theta = transform(np.concatenate([x.instruments for x in parts]))
-        if any(x.equations is not x.instruments for x in parts):
-            theta = transform(np.concatenate([x.equations for x in parts]))
-        P = Z @ B.T
-        leverage = np.sum(P[..., own] * theta, axis=(0, 2)) / m
-        energy = np.sum(np.square(P, out=P), axis=0).T
-        pairs = np.zeros((len(BIN_EDGES) + 1, *inverse.shape))
-        for k, (a, b) in zip(present, itertools.pairwise([*starts, last]), strict=True):
-            both = Z[:, a:b].reshape(-1, len(own))
-            pairs[k] = B @ (both.T @ both) @ B.T
-        u = np.concatenate([x.disturbance for x in parts])
-        power = np.abs(np.asarray(fft.rfft(u, n))[:last]) ** 2 / n
-        return energy, leverage, power, sum(x.counted for x in parts) / n, pairs
-
-    channels = zip(*on_cores(channel, zip(*pieces, strict=True)), strict=True)
-    energy, leverage, power, exposure, pairs = map(np.array, channels)
-    residual = np.abs(np.asarray(fft.rfft(residuals, n, axis=0))[:last].T) ** 2 / n
-    sums = energy.swapaxes(0, 1), leverage, power, residual, exposure
-    return Lines(n, row_time, frequency, m, gain, bins, *sums, 1), pairs.swapaxes(0, 1)
+    Z = theta = transform([x.instruments for x in parts])
+    if any(x.equations is not x.instruments for x in parts):
+        theta = transform([x.equations for x in parts])
+    P = (inverse[:, own] @ Z.reshape(len(own), -1)).reshape(-1, 2, len(m))
+    leverage = np.einsum("ikf,ikf->f", P[own], theta) / m
+    energy = np.sum(np.square(P, out=P), axis=1)
+    products = np.zeros((len(BIN_EDGES) + 1, len(own), len(own)))
+    present, starts = np.unique(lines.bins, return_index=True)
+    for k, (a, b) in zip(present, itertools.pairwise([*starts, len(m)]), strict=True):
+        both = Z[..., a:b].reshape(len(own), -1)
+        products[k] = both @ both.T
+    power = np.abs(lines.transform(np.concatenate([x.disturbance for x in parts]))) ** 2 / n
+    return own, energy, leverage, power, sum(x.counted for x in parts) / n, products
 
 
 def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
@@ -287,18 +298,18 @@ class SpectralTable:
         return variance, dof
 
 
-def sandwich(lines: Sequence[Lines], correlated: np.ndarray):
+def sandwich(lines: Sequence[Lines], pairs: Sequence[tuple[np.ndarray, np.ndarray]]):
     """Return the covariance of an estimate, degrees of freedom, and variances for white errors."""
-    count, table = len(correlated), SpectralTable.of(lines)
+    count, table = len(BIN_EDGES) + 1, SpectralTable.of(lines)
     power = np.concatenate([x.power for x in lines], axis=1)
     (variance,), (dof,) = table(power[None])
     bins = np.concatenate([x.bins for x in lines])
     weights = np.concatenate([x.multiplicity for x in lines])
     size = np.maximum(np.bincount(bins, weights, count), 1e-300)
     rough = np.zeros((len(variance), len(variance)))
-    for c, density in enumerate(table.density(power)):
+    for density, (B, products) in zip(table.density(power), pairs, strict=True):
         mean = np.bincount(bins, weights * density, count) / size
-        rough += np.einsum("k,kab->ab", mean, correlated[:, c])
+        rough += B @ np.einsum("k,kab->ab", mean, products) @ B.T
     scale = np.sqrt(np.maximum(np.diag(rough), 1e-300))
     deviation = np.sqrt(np.maximum(variance, 0.0))
     covariance = rough / scale / scale[:, None] * deviation * deviation[:, None]
