@@ -8,7 +8,9 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.dispatch import in_numpy
+from jaxid.identification.estimators import ResidualVariances, WeightedLeastSquares
 from jaxid.identification.fit_result import Fit
+from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.result_table import Column, Remark, Status, Table, percent, significant
@@ -38,6 +40,8 @@ class TorqueErrors(eqx.Module):
         counted: Rows that count, for each joint.
         max_forces: Largest force of each joint [N m or N]; NaN where not known.
         speeds: Velocities, filtered and decimated alike [rad/s or m/s].
+        unexplained: Errors of the same model fitted to this recording alone: what no parameters of
+            it explain; NaN where a row does not count [N m or N].
     """
 
     name: str = eqx.field(static=True)
@@ -47,6 +51,7 @@ class TorqueErrors(eqx.Module):
     counted: Bool[AnyArray, "rows joints"]
     max_forces: Float[AnyArray, " joints"]
     speeds: Float[AnyArray, "rows joints"]
+    unexplained: Float[AnyArray, "rows joints"]
 
     @property
     def moving(self) -> Bool[np.ndarray, "rows joints"]:
@@ -96,13 +101,14 @@ class TorqueErrors(eqx.Module):
 
     @property
     def depend_on_speed(self) -> tuple[bool, ...]:
-        """Whether the errors of each joint depend on its speed: friction of another shape.
+        """Whether errors of each joint depend on its speed: friction of another shape.
 
-        Then means over classes of speed agree between blocks of time: more than after nearly any
-        change of the blocks' signs, which leaves noise as it is (randomization test, Fisher).
+        Then means of unexplained errors over classes of speed agree between blocks of time: more
+        than after nearly any change of the blocks' signs, which leaves noise as it is
+        (randomization test, Fisher).
         """
         limit = FALSE_ALARM / self.errors.shape[1]
-        pairs = zip(self.errors.T, np.asarray(self.speeds).T, strict=True)
+        pairs = zip(*(np.asarray(x).T for x in (self.unexplained, self.speeds)), strict=True)
         return tuple(_chance(e, v) <= limit for e, v in pairs)
 
     def _rms_where(self, chosen: np.ndarray) -> np.ndarray:
@@ -258,17 +264,22 @@ def torque_errors(
     observations = with_memory(observations, fit.base.model.memory)
     step = comparison_step(observations)
     mask = np.asarray(observations.mask)
-    measured, predicted, speeds = np.zeros((3, len(mask[::step]), observations.joints))
+    estimator = WeightedLeastSquares(ResidualVariances())
+    own = estimator(RegressionProblem(fit.base, [observations])).parameters
+    measured, predicted, speeds, refitted = np.zeros((4, len(mask[::step]), observations.joints))
     for chunk in observations.chunks(65536):
         first, stop = chunk.rows
         # Masked parts are not evaluated.
         if mask[first:stop].any():
             motion, forces = observations.read(slice(*chunk.samples))
-            model_forces = fit.predict(motion) + fit.base.tool_forces(motion)
+            tool = fit.base.tool_forces(motion)
+            model_forces = fit.predict(motion) + tool
+            own_forces = fit.base.forces_in_numpy(own, motion) + tool
             rows = slice(-(-first // step), -(-stop // step))
             taken = slice(rows.start * step - first, None, step)
             measured[rows] = chunk.reduce(forces)[taken]
             predicted[rows] = chunk.reduce(model_forces)[taken]
+            refitted[rows] = chunk.reduce(own_forces)[taken]
             speeds[rows] = chunk.reduce(motion.qd)[taken]
         if progress is not None:
             progress(stop / observations.rows)
@@ -280,6 +291,7 @@ def torque_errors(
         counted=mask[::step],
         max_forces=np.where(np.isfinite(known), known, np.nan),
         speeds=speeds,
+        unexplained=np.where(mask[::step], refitted - measured, np.nan),
     )
 
 

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from virtual import fit_of
+from virtual import fit_of, observations, planar_base, standard_parameters
 
 import jaxid as jid
-from jaxid.model_validation import TorqueErrors, definiteness
+from jaxid.model_validation import TorqueErrors, definiteness, torque_errors
 
 
 def errors(counted=None):
@@ -15,7 +15,8 @@ def errors(counted=None):
     counted = np.ones((50, 2), bool) if counted is None else counted
     limits = np.array([100.0, 5.0])
     speeds = np.where(np.arange(50)[:, None] >= [20, 0], 1.0, 0.0)
-    return TorqueErrors("log", np.arange(50) * 0.01, measured, predicted, counted, limits, speeds)
+    data = measured, predicted, counted, limits, speeds, predicted - measured
+    return TorqueErrors("log", np.arange(50) * 0.01, *data)
 
 
 def test_errors_are_those_of_the_paper():
@@ -43,12 +44,25 @@ def test_errors_that_depend_on_speed_are_told_from_noise():
     shape = 2.0 * np.sign(speeds) * np.exp(-((speeds / 0.1) ** 2)) * [0.0, 0.0, 1.0]
     false = 0
     for _ in range(50):
-        noise = rng.normal(size=shape.shape)
-        e = TorqueErrors("", t, noise + shape, 0 * t[:, None], shape < 9.0, np.ones(3), speeds)
+        x = rng.normal(size=shape.shape) + shape
+        e = TorqueErrors("", t, x, 0 * x, shape < 9.0, np.ones(3), speeds, -x)
         *steady, found = e.depend_on_speed
         assert found
         false += any(steady)
     assert false <= 3
+
+
+def test_wrong_parameters_are_no_other_shape_of_friction():
+    base = planar_base()
+    p = standard_parameters(base.model)
+    o = observations(base.model, p, samples=2000, noise=0.4)
+    wrong = np.asarray(base.from_standard(p)) * np.where(np.char.find(base.names, "fv") < 0, 1, 3)
+    e = torque_errors(fit_of(base, wrong), o)
+    as_unexplained = dataclasses.replace(e, unexplained=e.errors)
+    assert all(as_unexplained.depend_on_speed)
+    assert not any(e.depend_on_speed)
+    right = torque_errors(fit_of(base, base.from_standard(p)), o)
+    np.testing.assert_allclose(e.unexplained, right.unexplained, atol=1e-9)
 
 
 def test_rows_that_do_not_count_change_nothing():

@@ -20,14 +20,16 @@ def errors_of():
     def errors_of(joints, rows=200, *, name="log", seed=0):
         random = np.random.default_rng(seed)
         measured = 10.0 * random.standard_normal((rows, joints))
+        errors = random.standard_normal((rows, joints))
         return TorqueErrors(
             name=name,
             time=np.arange(rows) * 0.01,
             measured=measured,
-            predicted=measured + random.standard_normal((rows, joints)),
+            predicted=measured + errors,
             counted=np.ones((rows, joints), bool),
             max_forces=np.full(joints, 50.0),
             speeds=np.where(random.random((rows, joints)) < 0.8, 1.0, 0.0),
+            unexplained=errors,
         )
 
     return errors_of
