@@ -219,11 +219,7 @@ def follow(
     resolution: Joints,
     substeps: int,
 ) -> tuple[Motion, np.ndarray, np.ndarray]:
-    """Return true motion, motor angles, and forces after each tick of a servo from no error.
-
-    Raises:
-        InputError: If the motion diverges.
-    """
+    """Return true motion, motor angles, and forces after each tick of a servo from no error."""
     ticks, n = forward.shape
     goals, known = np.asarray(desired.q).tolist(), forward.tolist()
     kp, kd, limit, step = (
