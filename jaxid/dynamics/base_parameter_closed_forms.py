@@ -69,14 +69,7 @@ def closed_forms(
     dependent: tuple[int, ...],
     kappa: Float[np.ndarray, "base dependent"],
 ) -> ClosedForms:
-    r"""Express base parameters as combinations of standard parameters with readable coefficients.
-
-    Args:
-        model: The model.
-        independent: Columns that lead the base parameters.
-        dependent: Other columns.
-        kappa: Matrix $\kappa$ of the robot, from which coefficients without a short form are taken.
-    """
+    r"""Express base parameters as combinations of standard parameters with short coefficients."""
     kappa = np.asarray(kappa, np.float64)
     names, units = model.parameter_names, [dimension(u) for u in model.parameter_units]
     finder = _Finder(model, independent, dependent)
@@ -131,14 +124,7 @@ class _Finder:
     def coefficient(
         self, row: int, column: int, difference: np.ndarray | None, value: float
     ) -> Coefficient | None:
-        """Return the coefficient of a dependent column in a base parameter, or None if it is zero.
-
-        Args:
-            row: Index of the base parameter.
-            column: Index of the dependent column.
-            difference: Dimension of the coefficient, if it is known.
-            value: Coefficient of the robot.
-        """
+        """Return the coefficient of a dependent column in a base parameter; None if it is zero."""
         x, kappa = self._fitted
         y = kappa[:, row, column]
         # A coefficient without a short form is a number.

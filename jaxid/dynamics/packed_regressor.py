@@ -23,11 +23,6 @@ from .dispatch import FEW, KEPT, program_of
 class JointRegressor(eqx.Module):
     """Compiled regressor, evaluated joint by joint in the columns that can act on the joint.
 
-    Args:
-        owner: Model whose geometry is known.
-        definition: Method of the model that returns the regressor of one sample.
-        shapes: Shapes of the method's arguments.
-
     Attributes:
         program: Program of the regressor.
         columns: For each joint the columns that can act on it.
@@ -57,12 +52,7 @@ class JointRegressor(eqx.Module):
         return lower(self.program, fence).stacked(groups, *arrays)
 
     def gram(self, weights: AnyArray, *arrays: AnyArray) -> Float[Array, "columns columns"]:
-        r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns.
-
-        Args:
-            weights: Weight of each joint's rows.
-            arrays: Arguments of the definition [samples, entries].
-        """
+        r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns."""
         groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
         whole = jnp.zeros((self.size, self.size), arrays[0].dtype)
         sums = row_products(self.program, groups, *map(jnp.asarray, arrays))
@@ -92,12 +82,7 @@ def _compiled_gram(regressor: JointRegressor) -> Callable:
 def gram(
     owner: eqx.Module, definition: Callable, weights: AnyArray | None, *arrays: AnyArray
 ) -> Float[Array, "columns columns"]:
-    """Return the Gram matrix of a model's columns over a motion; see `Model.gram`.
-
-    Raises:
-        InputError: If the motion does not have one axis of samples, or JAX is tracing the model's
-            own numbers.
-    """
+    """Return the Gram matrix of a model's columns over a motion; see `Model.gram`."""
     n = _require_rows(owner, arrays[0])
     weights = np.ones(n) if weights is None else as_array("weights", weights)
     regressor = JointRegressor(owner, definition, *((n,) for _ in arrays))
@@ -121,21 +106,12 @@ class PackedRegressor(eqx.Module):
     It has one array over the samples for each entry that varies, and writes zeros only into the
     `matrix`.
 
-    Args:
-        owner: Model.
-        definition: Method of the model that returns the regressor of one sample.
-        samples: Arguments of the definition [samples, joints].
-
     Attributes:
         values: Distinct entries that vary with the motion, over the samples.
         places: For each joint the pairs of a column and either the number of its array in `values`
             or its constant, a float.
         samples: Number of samples.
         columns: Number of parameters.
-
-    Raises:
-        InputError: If the motion does not have one axis of samples, or JAX is tracing the model's
-            own numbers, as a gradient with respect to the geometry does.
     """
 
     values: tuple[Float[AnyArray, " samples"], ...]

@@ -98,11 +98,7 @@ def keys_of(function: Callable) -> dict[str, Key]:
 
 
 def call(function: Callable, table: Any, place: str, *context: Any) -> Any:
-    """Call a function with the keys of a table as arguments.
-
-    Raises:
-        InputError: If a key or a value does not fit, or the function rejects it.
-    """
+    """Call a function with the keys of a table as arguments."""
     (arguments,) = decode([function], table, place)
     with within(place):
         return function(*context, **arguments)
@@ -128,9 +124,6 @@ def decode(
     """Return the arguments that a table holds for each of several functions that share it.
 
     Arguments in `skip` are no keys; keys without default are needed where the table is `complete`.
-
-    Raises:
-        InputError: If a key is unknown or missing, or a value is not what it should be.
     """
     groups = [{k: v for k, v in keys_of(f).items() if k not in skip} for f in functions]
     known = {name: key for keys in groups for name, key in keys.items()}
@@ -164,11 +157,7 @@ _OTHER = object()
 
 
 def decode_value(value: Any, hint: Any, place: str) -> Any:
-    """Return a value of the file as an argument with such an annotation.
-
-    Raises:
-        InputError: If it does not fit.
-    """
+    """Return a value of the file as an argument with such an annotation."""
     options = [o for o in union_members(hint) if o is not type(None)]
     for option in options:
         made = _convert(value, option, place)

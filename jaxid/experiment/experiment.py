@@ -159,11 +159,7 @@ class Experiment:
         return dataclasses.replace(fit, notes=(*fit.notes, note))
 
     def read(self, log: str | Path) -> Recording:
-        """Read a log as the table `[recording]` says.
-
-        Raises:
-            InputError: If the file has no table `[recording]`, or the log is not as it says.
-        """
+        """Read a log as the table `[recording]` says."""
         return self._read(Path(log), self._columns_of(Path(log)))
 
     def commanded(self, log: Path) -> Observations | None:
@@ -215,12 +211,7 @@ class Experiment:
         return estimated_rows(Path(log)) >= LONG
 
     def open(self, log: Path) -> Observations:
-        """Open a log that need not fit into memory: like `read` and `observe`, part by part.
-
-        Raises:
-            NeedsMemory: If it can be read only as a whole.
-            InputError: If the log is not as the file says.
-        """
+        """Open a log that need not fit into memory: like `read` and `observe`, part by part."""
         logs = self.logs
         if logs.force_delay:
             raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
@@ -248,13 +239,7 @@ class Experiment:
 
 
 def load_experiment(path: str | Path) -> Experiment:
-    """Load an experiment file; paths in it are relative to its folder.
-
-    Raises:
-        OSError: If the file cannot be read.
-        InputError: If the file or something in it is not what it should be: one sentence with the
-            names of file and key.
-    """
+    """Load an experiment file; paths in it are relative to its folder."""
     path = Path(path)
     if not path.is_file():
         raise InputError(
@@ -268,11 +253,7 @@ def load_experiment(path: str | Path) -> Experiment:
 
 
 def parse_experiment(text: str, path: Path) -> Experiment:
-    """Return the experiment of a file with this text; other paths are relative to its folder.
-
-    Raises:
-        InputError: If the text or something in it is not what it should be.
-    """
+    """Return the experiment of a file with this text; other paths are relative to its folder."""
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:

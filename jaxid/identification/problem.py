@@ -220,11 +220,7 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
 
 
 def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blocks, Blocks]]:
-    """Yield the blocks without one contiguous part of time, and that part, for each part in turn.
-
-    Raises:
-        InputError: If there are fewer than two blocks.
-    """
+    """Yield the blocks without one contiguous part of time, and that part; each in turn."""
     size = len(blocks.parts)
     if size < 2:
         raise InputError("held-out errors need at least two blocks of rows: record longer.")

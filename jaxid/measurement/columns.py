@@ -191,9 +191,6 @@ def open_log(
     """Open the files of a log; with `on_disk`, texts and arrays stay on the disk.
 
     With `lenient`, rows that cannot be read are no error: `Log.bad_rows` names them.
-
-    Raises:
-        InputError: If a file or column is missing, or files differ in their numbers of rows.
     """
     if velocities_path is not None and columns.velocities is None:
         raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")

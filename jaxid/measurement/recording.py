@@ -321,10 +321,6 @@ def find_grid(
         limits: Pauses that are bridged by interpolation: in sample times, and in seconds.
         first_row: Number of the first row in its file, for messages.
         in_parts: Whether the log is too large to move or remove rows.
-
-    Raises:
-        NeedsMemory: If rows of a log in parts must be moved or removed.
-        InputError: If time runs backwards, or does not advance.
     """
     first = next(iter(read()), np.zeros(0))
     steps = np.diff(first)
@@ -427,9 +423,6 @@ def _resampling(
     Returns:
         Time between two samples [s]; times of each segment's samples [s]; remarks; and a function
         of a channel's rows: its samples as they are, or interpolated by cubic splines.
-
-    Raises:
-        InputError: If time runs backwards, or does not advance.
     """
     _require_forward(stamps, np.diff(stamps), first_row, source)
     kept = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)

@@ -35,9 +35,7 @@ def distinct_results(program: Program) -> tuple[tuple[int, ...], np.ndarray]:
 def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
     """Return the distinct results of a block of samples, each computed once.
 
-    Args:
-        program: Program made by `trace`, of inputs with one axis.
-        arrays: Inputs: [entries] if all samples have it in common, else [samples, entries].
+    Inputs are [entries] if all samples have them in common, else [samples, entries].
     """
     nodes, _ = distinct_results(program)
     lowered = lower(program, fence=True)
@@ -111,10 +109,7 @@ def _at_once(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
 def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
     """Return the packed result of each sample; not for differentiation.
 
-    Args:
-        program: Program made by `trace`, of inputs with one axis.
-        arrays: Inputs: [entries] if all samples have it in common, else [samples, entries]; at
-            least the last one has samples.
+    Inputs as in `block_results`; at least the last one has samples.
     """
     if not len(arrays[-1]):
         return jnp.zeros((0, len(program.outputs)), arrays[-1].dtype)
@@ -158,10 +153,7 @@ def row_products(
 ) -> list[Float[Array, "results results"]]:
     """Return the sums over samples of products of results; the results are never stored.
 
-    Args:
-        program: Program made by `trace`, of inputs with one axis.
-        groups: Positions in the packed result, whose values are multiplied with each other.
-        arrays: Inputs [samples, entries].
+    A group holds positions in the packed result whose values are multiplied with each other.
     """
     _, entries = distinct_results(program)
     count, dtype = len(arrays[0]), arrays[0].dtype

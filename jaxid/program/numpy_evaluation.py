@@ -41,51 +41,24 @@ class _Plan(NamedTuple):
 def evaluate(program: Program, *arrays: AnyArray) -> Any:
     """Compute the outputs of a program in NumPy.
 
-    Args:
-        program: Program made by `trace`.
-        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-
     Returns:
         Outputs in the structure of the traced function, each with the batch axes last.
-
-    Raises:
-        InputError: If the arrays do not fit the program's inputs.
     """
     return program.unpack(*_packed(program, arrays), np)
 
 
 def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | float]:
-    """Compute the packed result of a program in NumPy; constants stay numbers.
-
-    Args:
-        program: Program made by `trace`.
-        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-
-    Returns:
-        For each entry of each output, in order, an array of the batch's shape, or a constant.
-        Equal entries share one array.
-    """
+    """Compute the packed result of a program in NumPy; constants stay numbers."""
     return _packed(program, arrays)[0]
 
 
 def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
-    """Compute the distinct results of a program that vary, in NumPy: [results, samples].
-
-    Args:
-        program: Program made by `trace`.
-        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-    """
+    """Compute the distinct results of a program that vary, in NumPy: [results, samples]."""
     return _evaluate(program, arrays)[0]
 
 
 def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
-    """Return the packed result of each sample [samples, results] from its distinct values.
-
-    Args:
-        program: Program made by `trace`.
-        rows: Distinct results that vary [results, samples], in the order of the packed result.
-        dtype: Precision of the result.
-    """
+    """Return the packed result of each sample [samples, results] from its distinct values."""
     results, samples = _plan(program).results, rows.shape[1]
     out = np.zeros((samples, len(program.outputs)), dtype)
     nodes = {k: results[x] for k, x in enumerate(program.outputs) if isinstance(x, int)}
@@ -176,9 +149,6 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
     It takes the entries of each input in C order, and returns the entries of all outputs, one after
     the other. Division by zero, and functions outside their domain, raise Python's own errors,
     where NumPy gives infinities and NaN.
-
-    Args:
-        program: Program made by `trace`.
     """
     formats = {
         Operation.NEGATE: "-{0}",

@@ -127,16 +127,7 @@ class Program:
         return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
 
     def align(self, arrays: Sequence[Any], xp: ModuleType) -> tuple[list[Any], tuple[int, ...]]:
-        """Return the inputs with their own axes merged and the whole batch behind; and its shape.
-
-        Args:
-            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-            xp: NumPy or `jax.numpy`.
-
-        Raises:
-            InputError: If the arrays are not as many as the inputs, or a shape does
-                not begin with its input's.
-        """
+        """Return the inputs with their own axes merged and the batch behind; the batch's shape."""
         if len(arrays) != len(self.input_shapes):
             wanted = len(self.input_shapes)
             raise InputError(f"The program takes {wanted} arrays, but got {len(arrays)}.")
@@ -188,12 +179,7 @@ def assemble(
 
 
 def select_outputs(program: Program, entries: np.ndarray) -> Program:
-    """Return a program that computes only some results of a program.
-
-    Args:
-        program: Program with further results.
-        entries: Positions in the packed result, in the shape of the new result.
-    """
+    """Return a program that computes only some results of a program."""
     graph = Graph()
     scalars: list[Scalar] = []
 

@@ -84,13 +84,7 @@ class Operation(enum.StrEnum):
     def spell(
         self, operands: Sequence[str], formats: Mapping["Operation", str], suffix: str = ""
     ) -> str:
-        """Write the operation as an expression of a programming language.
-
-        Args:
-            operands: Expressions of the operands.
-            formats: Format strings of the operations that the language writes in its own way.
-            suffix: Suffix of the names of functions, such as `f` for single precision in C.
-        """
+        """Write the operation as an expression of a programming language."""
         if self.infix:
             return f" {self.infix} ".join(operands)
         if self in formats:

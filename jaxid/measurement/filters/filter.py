@@ -123,11 +123,7 @@ def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
 
 
 def butterworth(cutoff: float, order: int, sample_time: float, name: str = "cutoff") -> LowPass:
-    """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's.
-
-    Raises:
-        InputError: If the cut-off does not suit the sampling rate.
-    """
+    """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's."""
     if math.isinf(cutoff):
         return LowPass((), math.inf)
     require_cutoff(name, cutoff, sample_time)
