@@ -5,7 +5,6 @@ A joint feels only the bodies beyond it, so most entries of a regressor are zero
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Lowered, Program, evaluate_packed, lower, on_any_platform
+from jaxid.program import Lowered, Program, evaluate_rows, lower, on_any_platform
 from jaxid.program.blocks import row_products
 
 from .dispatch import FEW, KEPT, program_of
@@ -63,14 +62,13 @@ class JointRegressor(eqx.Module):
 
     def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
         """Return the columns of each joint, evaluated in NumPy."""
-        batch = np.shape(arrays[0])[1:]
-        packed = evaluate_packed(self.program, *arrays)
-        found = []
+        rows, program = evaluate_rows(self.program, *arrays), self.program
+        found = [np.empty((len(own), rows.shape[1])) for own in self.columns]
         for joint, own in enumerate(self.columns):
-            rows = np.empty((len(own), *batch))
-            for row, k in zip(rows, own, strict=True):
-                row[:] = packed[joint * self.size + k]
-            found.append(rows)
+            for row, k in zip(found[joint], own, strict=True):
+                entry = joint * self.size + k
+                number = program.distinct[1][entry]
+                row[:] = rows[number] if number >= 0 else program.outputs[entry]
         return found
 
 
@@ -123,13 +121,12 @@ class PackedRegressor(eqx.Module):
         _require_rows(owner, samples[0])
         arrays = [x.T for x in samples]
         program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
-        varying, self.places = _layout(program)
+        self.places = _places(program)
         self.samples, self.columns = len(samples[0]), program.output_shapes[0][1]
-        if self.samples > FEW or is_traced(arrays):
-            self.values = _compiled(program)(*arrays)
-        else:
-            outputs: Any = evaluate_packed(program, *arrays)
-            self.values = tuple(outputs[k] for k in varying)
+        many = self.samples > FEW or is_traced(arrays)
+        self.values = tuple(
+            _compiled(program)(*arrays) if many else evaluate_rows(program, *arrays)
+        )
 
     def matrix(self) -> Float[np.ndarray, "rows columns"]:
         """Return the whole matrix in Fortran's order: all samples of joint 1, of joint 2, etc.
@@ -146,25 +143,20 @@ class PackedRegressor(eqx.Module):
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _layout(program: Program) -> tuple[list[int], tuple]:
-    """Return one place in the packed result for each value that varies, and all `places`."""
-    first: dict[int, int] = {}
-    for k, x in enumerate(program.outputs):
-        if isinstance(x, int):
-            first.setdefault(x, k)
-    numbers = {x: number for number, x in enumerate(first)}
-    entries = [numbers[x] if isinstance(x, int) else x for x in program.outputs]
-    ((joints, columns),) = program.output_shapes
-    rows = (entries[j * columns : (j + 1) * columns] for j in range(joints))
-    places = (
+def _places(program: Program) -> tuple[tuple[tuple[int, int | float], ...], ...]:
+    """Return the `places` of a packed regressor; what is always zero has none."""
+    pairs = zip(program.distinct[1].tolist(), program.outputs, strict=True)
+    entries = [number if number >= 0 else constant for number, constant in pairs]
+    rows = np.array(entries, object).reshape(program.output_shapes[0])
+    return tuple(
         tuple((k, x) for k, x in enumerate(row) if isinstance(x, int) or x != 0) for row in rows
     )
-    return list(first.values()), tuple(places)
 
 
 @functools.lru_cache(maxsize=KEPT)
 def _compiled(program: Program) -> Callable:
-    varying, _ = _layout(program)
+    _, first = np.unique(program.distinct[1], return_index=True)
+    varying = [k for k in first.tolist() if isinstance(program.outputs[k], int)]
 
     def run(lowered: Lowered, *arrays: AnyArray) -> tuple:
         outputs = lowered(*arrays)

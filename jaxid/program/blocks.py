@@ -9,7 +9,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_batching import custom_vmap
 
 from jaxid.arrays import Array, Float
@@ -22,22 +21,12 @@ BLOCK = 256
 """Samples of one evaluation."""
 
 
-@functools.lru_cache(maxsize=64)
-def distinct_results(program: Program) -> tuple[tuple[int, ...], np.ndarray]:
-    """Return the nodes of the packed result, and for each entry the number of its node, or -1."""
-    numbers: dict[int, int] = {}
-    entries = [
-        numbers.setdefault(x, len(numbers)) if isinstance(x, int) else -1 for x in program.outputs
-    ]
-    return tuple(numbers), np.array(entries, int)
-
-
 def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
     """Return the distinct results of a block of samples, each computed once.
 
     Inputs are [entries] if all samples have them in common, else [samples, entries].
     """
-    nodes, _ = distinct_results(program)
+    nodes, _ = program.distinct
     lowered = lower(program, fence=True)
     block = next(len(x) for x in arrays if x.ndim == 2)
 
@@ -64,12 +53,12 @@ def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
     inputs = [[jnp.broadcast_to(row, (count,)) for row in x.T] for x in arrays]
     like = jnp.zeros(count, arrays[-1].dtype)
     values = lower(program, fence=False).run(inputs, primitives(like))[0]
-    return tuple(values[k] for k in distinct_results(program)[0])
+    return tuple(values[k] for k in program.distinct[0])
 
 
 def _dense(program: Program, rows: tuple[Array, ...], like: Array) -> Float[Array, "samples out"]:
     """Return distinct results in the order of the packed result, with its constants."""
-    _, entries = distinct_results(program)
+    _, entries = program.distinct
     pairs = zip(entries, program.outputs, strict=True)
     full = [rows[k] if k >= 0 else jax.lax.full_like(like, x) for k, x in pairs]
     return jnp.stack(full, axis=1)
@@ -155,7 +144,7 @@ def row_products(
 
     A group holds positions in the packed result whose values are multiplied with each other.
     """
-    _, entries = distinct_results(program)
+    _, entries = program.distinct
     count, dtype = len(arrays[0]), arrays[0].dtype
     if count == 0:
         return [jnp.zeros((len(group), len(group)), dtype) for group in groups]

@@ -28,13 +28,11 @@ class _Plan(NamedTuple):
     Attributes:
         loads: Cell, input's number and entry's position for each entry that is read.
         run: Function that does all operations on the cells.
-        results: Cells of the nodes that are results.
         cells: Number of cells.
     """
 
     loads: tuple[tuple[int, int, int], ...]
     run: Callable[[list[np.ndarray]], None]
-    results: dict[int, int]
     cells: int
 
 
@@ -44,12 +42,10 @@ def evaluate(program: Program, *arrays: AnyArray) -> Any:
     Returns:
         Outputs in the structure of the traced function, each with the batch axes last.
     """
-    return program.unpack(*_packed(program, arrays), np)
-
-
-def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | float]:
-    """Compute the packed result of a program in NumPy; constants stay numbers."""
-    return _packed(program, arrays)[0]
+    table, batch = _evaluate(program, arrays)
+    rows = [row.reshape(batch) for row in table]
+    pairs = zip(program.distinct[1], program.outputs, strict=True)
+    return program.unpack([rows[k] if k >= 0 else x for k, x in pairs], batch, np)
 
 
 def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
@@ -59,12 +55,11 @@ def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
 
 def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
     """Return the packed result of each sample [samples, results] from its distinct values."""
-    results, samples = _plan(program).results, rows.shape[1]
-    out = np.zeros((samples, len(program.outputs)), dtype)
-    nodes = {k: results[x] for k, x in enumerate(program.outputs) if isinstance(x, int)}
-    varying, source = list(nodes), list(nodes.values())
-    constants = [k for k, x in enumerate(program.outputs) if not isinstance(x, int) and x != 0]
+    (_, entries), samples = program.distinct, rows.shape[1]
+    out = np.zeros((samples, len(entries)), dtype)
+    varying, constants = np.flatnonzero(entries >= 0), np.flatnonzero(entries < 0)
     out[:, constants] = [program.outputs[k] for k in constants]
+    source = entries[varying]
     for start in range(0, samples, _BLOCK // 4):
         part = slice(start, start + _BLOCK // 4)
         out[part, varying] = rows[source, part].T
@@ -73,10 +68,7 @@ def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def _plan(program: Program) -> _Plan:
-    results: dict[int, int] = {}
-    for x in program.outputs:
-        if isinstance(x, int):
-            results.setdefault(x, len(results))
+    results = {node: k for k, node in enumerate(program.distinct[0])}
     last_use = {k: position for position, node in enumerate(program.nodes) for k in node.uses}
     cell, idle, cells, loads = dict(results), [], len(results), []
     # Written as one function, since a loop over the operations takes as long as a short operation.
@@ -107,7 +99,7 @@ def _plan(program: Program) -> _Plan:
     unpack = "".join(f"c{k}, " for k in range(cells))
     body = "".join(f"    {line}\n" for line in lines)
     exec(f"def run(cells):\n    [{unpack}] = cells\n{body}", scope)
-    return _Plan(tuple(loads), scope["run"], results, cells)
+    return _Plan(tuple(loads), scope["run"], cells)
 
 
 def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
@@ -116,23 +108,14 @@ def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
     return out
 
 
-def _packed(
-    program: Program, arrays: tuple[AnyArray, ...]
-) -> tuple[list[np.ndarray | float], tuple[int, ...]]:
-    """Return the packed result, and the batch's shape."""
-    table, batch = _evaluate(program, arrays)
-    rows, results = [row.reshape(batch) for row in table], _plan(program).results
-    return [rows[results[x]] if isinstance(x, int) else x for x in program.outputs], batch
-
-
 def _evaluate(program: Program, arrays: tuple[AnyArray, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return the distinct results that vary [results, samples], and the batch's shape."""
     plan = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
     inputs = [x.reshape(len(x), samples) for x in aligned]
-    table = np.empty((len(plan.results), samples))
-    scratch = np.empty((plan.cells - len(plan.results), min(samples, _BLOCK)))
+    table = np.empty((len(program.distinct[0]), samples))
+    scratch = np.empty((plan.cells - len(table), min(samples, _BLOCK)))
     with np.errstate(all="ignore"):
         for start in range(0, samples, _BLOCK):
             block = slice(start, min(start + _BLOCK, samples))

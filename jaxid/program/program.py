@@ -115,6 +115,14 @@ class Program:
                 uses[x] += 1
         return tuple(uses)
 
+    @functools.cached_property
+    def distinct(self) -> tuple[tuple[int, ...], np.ndarray]:
+        """Nodes of the packed result, and for each entry the number of its node, or -1."""
+        numbers: dict[int, int] = {}
+        nodes = (x if isinstance(x, int) else None for x in self.outputs)
+        entries = [-1 if x is None else numbers.setdefault(x, len(numbers)) for x in nodes]
+        return tuple(numbers), np.array(entries, int)
+
     @property
     def nonzeros(self) -> Any:
         """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
