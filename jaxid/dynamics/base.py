@@ -161,12 +161,7 @@ class BaseParameters(Hashable):
         return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
-        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26).
-
-        Raises:
-            InputError: If the motion does not have one axis of samples, or JAX is tracing the
-                robot's geometry.
-        """
+        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26)."""
         self.model.check(motion.q)
         return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 

@@ -86,7 +86,6 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
         Paths of the files.
 
     Raises:
-        InputError: If `folder` is a file, or contains one of the files with other content.
         RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)

@@ -48,11 +48,7 @@ class BodyBounds(eqx.Module):
         ellipsoid_axes: Numbers = np.inf,
         total_mass: float | int | None = None,
     ):
-        """Build bounds; `mass_max` or `radius` has one number per body, others may be scalars.
-
-        Raises:
-            InputError: If shapes do not fit, or no body satisfies all bounds.
-        """
+        """Build bounds; `mass_max` or `radius` has one number per body, others may be scalars."""
         bodies = max(np.size(mass_max), np.size(radius))
 
         def each(name: str, value: Numbers, *shape: int) -> np.ndarray:
@@ -111,11 +107,7 @@ class BodyBounds(eqx.Module):
         return cls(100.0 * reach**2, farthest + 0.25 * reach)
 
     def replace(self, **fields: Numbers | float | None) -> "BodyBounds":
-        """Return a copy with some bounds replaced; scalars count for all bodies.
-
-        Raises:
-            InputError: If shapes do not fit, or no body satisfies all bounds.
-        """
+        """Return a copy with some bounds replaced; scalars count for all bodies."""
         return type(self)(**{**vars(self), **fields})  # pyright: ignore[reportArgumentType]
 
     def __str__(self):
@@ -141,11 +133,7 @@ class BodyBounds(eqx.Module):
 
     @property
     def inner_centres(self) -> Float[np.ndarray, "bodies 3"]:
-        """Centres of mass well inside all bounds [m].
-
-        Raises:
-            InputError: If there are none for some body.
-        """
+        """Centres of mass well inside all bounds [m]."""
         radius, known = self.radius[:, None], self.has_ellipsoid[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
