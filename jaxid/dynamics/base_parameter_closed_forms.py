@@ -52,15 +52,10 @@ _NOTHING = 1e-12
 
 @dataclass(frozen=True)
 class ClosedForms:
-    """Base parameters in letters.
+    """Base parameters in letters."""
 
-    Attributes:
-        expressions: Expression of each base parameter.
-        lengths: Values of the lengths that occur in them [m]; of `g` [m/s²].
-    """
-
-    expressions: tuple[Expression, ...]
-    lengths: dict[str, float]
+    expressions: tuple[Expression, ...]  # expression of each base parameter
+    lengths: dict[str, float]  # values of the lengths that occur in them [m]; of `g` [m/s²]
 
 
 def closed_forms(
@@ -188,19 +183,13 @@ def _simple(number: float) -> Fraction | float:
 
 @dataclass(frozen=True)
 class Length:
-    """A number of the geometry that can vary on its own.
+    """A number of the geometry that can vary on its own."""
 
-    Attributes:
-        name: Name, such as `l3z`.
-        value: Signed value for the robot [m]; for `g` [m/s²].
-        entries: Numbers of the geometry that it sets, each with its multiple of the value.
-        dimension: Dimension of a length, or of an acceleration.
-    """
-
-    name: str
-    value: float
+    name: str  # name, such as `l3z`
+    value: float  # signed value for the robot [m]; for `g` [m/s²]
+    # numbers of the geometry that it sets, each with its multiple of the value
     entries: tuple[tuple[int, float], ...]
-    dimension: Dimension
+    dimension: Dimension  # dimension of a length, or of an acceleration
 
 
 class Regrouping:

@@ -20,17 +20,12 @@ from .dispatch import FEW, KEPT, program_of
 
 
 class JointRegressor(eqx.Module):
-    """Compiled regressor, evaluated joint by joint in the columns that can act on the joint.
+    """Compiled regressor, evaluated joint by joint in the columns that can act on the joint."""
 
-    Attributes:
-        program: Program of the regressor.
-        columns: For each joint the columns that can act on it.
-        size: Number of columns.
-    """
-
-    program: Program = eqx.field(static=True)
+    program: Program = eqx.field(static=True)  # program of the regressor
+    # for each joint the columns that can act on it
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    size: int = eqx.field(static=True)
+    size: int = eqx.field(static=True)  # number of columns
 
     def __init__(self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]):
         self.program = program_of(owner, definition, *shapes)

@@ -24,19 +24,12 @@ ROUNDING = 1e-12
 
 
 class Dependence(NamedTuple):
-    """Independent and dependent columns of a matrix, and how clear the distinction is.
+    """Independent and dependent columns of a matrix, and how clear the distinction is."""
 
-    Attributes:
-        independent: Columns that no earlier ones can replace, in order.
-        dependent: Other columns, in order.
-        smallest_independent: Smallest measure of independence among the first.
-        largest_dependent: Largest measure among the second.
-    """
-
-    independent: tuple[int, ...]
-    dependent: tuple[int, ...]
-    smallest_independent: float
-    largest_dependent: float
+    independent: tuple[int, ...]  # columns that no earlier ones can replace, in order
+    dependent: tuple[int, ...]  # other columns, in order
+    smallest_independent: float  # smallest measure of independence among the first
+    largest_dependent: float  # largest measure among the second
 
     @property
     def gap(self) -> float:

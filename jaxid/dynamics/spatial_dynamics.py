@@ -87,20 +87,14 @@ def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
 
 
 class GroundMotion(NamedTuple):
-    """Motion of all bodies about the origin of the ground.
+    """Motion of all bodies about the origin of the ground."""
 
-    Attributes:
-        carry: Matrices that carry wrenches from the bodies' frames to the ground; their transposes
-            carry motions back.
-        joints: Motion of what a joint moves at unit speed.
-        velocities: Velocity of each body.
-        accelerations: Acceleration of each body less gravity.
-    """
-
+    # matrices that carry wrenches from the bodies' frames to the ground; their transposes carry
+    # motions back
     carry: Float[Array, "joints 6 6"]
-    joints: Spatial
-    velocities: Spatial
-    accelerations: Spatial
+    joints: Spatial  # motion of what a joint moves at unit speed
+    velocities: Spatial  # velocity of each body
+    accelerations: Spatial  # acceleration of each body less gravity
 
 
 def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMotion:

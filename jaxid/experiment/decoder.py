@@ -31,19 +31,12 @@ RENAMED = {"rows.slow": "min_speed", "rows.every": "step"}
 
 
 class Bounds(NamedTuple):
-    """Range of a number, given as `Annotated[float, Bounds(above=0.0)]`; None for no bound.
+    """Range of a number, given as `Annotated[float, Bounds(above=0.0)]`; None for no bound."""
 
-    Attributes:
-        above: Exclusive lower bound.
-        least: Inclusive lower bound.
-        most: Inclusive upper bound.
-        below: Exclusive upper bound.
-    """
-
-    above: float | None = None
-    least: float | None = None
-    most: float | None = None
-    below: float | None = None
+    above: float | None = None  # exclusive lower bound
+    least: float | None = None  # inclusive lower bound
+    most: float | None = None  # inclusive upper bound
+    below: float | None = None  # exclusive upper bound
 
     def check(self, value: float | int, place: str) -> None:
         """Reject a number out of the range, NaN and infinity."""
@@ -65,19 +58,12 @@ PerJoint = list[float]
 
 
 class Key(NamedTuple):
-    """A key of a table.
+    """A key of a table."""
 
-    Attributes:
-        name: Name in the file.
-        hint: Annotation of the argument.
-        default: Default value; `inspect.Parameter.empty` if the key is needed.
-        text: Description, from the docstring.
-    """
-
-    name: str
-    hint: Any
-    default: Any
-    text: str
+    name: str  # name in the file
+    hint: Any  # annotation of the argument
+    default: Any  # default value; `inspect.Parameter.empty` if the key is needed
+    text: str  # description, from the docstring
 
 
 def keys_of(function: Callable) -> dict[str, Key]:

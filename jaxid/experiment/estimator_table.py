@@ -51,23 +51,16 @@ ALTERNATIVES = (
 
 
 class Estimation(NamedTuple):
-    """Choice of how rows become parameters.
+    """Choice of how rows become parameters."""
 
-    Attributes:
-        estimator: Estimator of the file.
-        plain: Least squares with the same weights and solution.
-        uncertainty: Method of the standard deviations.
-        essential: Held-out error that leaving out parameters may cost (fraction); None to keep all.
-        nonlinear: Whether the shape of friction is sought too.
-        notes: Assumptions, in sentences.
-    """
-
-    estimator: estimators.AbstractEstimator
+    estimator: estimators.AbstractEstimator  # estimator of the file
+    # least squares with the same weights and solution
     plain: estimators.LeastSquares | estimators.WeightedLeastSquares
-    uncertainty: AbstractUncertainty
+    uncertainty: AbstractUncertainty  # method of the standard deviations
+    # held-out error that leaving out parameters may cost (fraction); None to keep all
     essential: float | None
-    nonlinear: bool
-    notes: list[str]
+    nonlinear: bool  # whether the shape of friction is sought too
+    notes: list[str]  # assumptions, in sentences
 
 
 def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

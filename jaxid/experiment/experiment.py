@@ -69,47 +69,30 @@ LONG = 500_000
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """Content of an experiment file.
+    """Content of an experiment file."""
 
-    Attributes:
-        path: Path of the file.
-        text: Text of the file.
-        source: Source of the robot.
-        robot: Robot with its limits, drives and known tool.
-        model: Effects whose parameters are wanted.
-        clearance: Shapes that must keep a distance; None if the file has none.
-        columns: Columns of the logs; None if the file does not say.
-        logs: Sides, files and parts of the logs.
-        load: Known load that is on the robot in some logs only; None if the file does not say.
-        filter: Filter of motion, forces and columns.
-        candidates: Filters to choose from; none if the file names one.
-        decimation: Decimation of forces and columns.
-        min_speed: Speeds below which rows do not count [rad/s or m/s]; None if all count.
-        estimation: Estimator and uncertainty.
-        linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
-        load_transition: Transition of friction by load, which the model leaves out; None without.
-        excitation: Settings of the motion to design.
-        notes: Assumptions where the file says nothing, in sentences.
-    """
-
-    path: Path
-    text: str
-    source: RobotSource
-    robot: Robot
-    model: Model
-    clearance: Clearance | None
-    columns: Columns | None
-    logs: Logs
+    path: Path  # path of the file
+    text: str  # text of the file
+    source: RobotSource  # source of the robot
+    robot: Robot  # robot with its limits, drives and known tool
+    model: Model  # effects whose parameters are wanted
+    clearance: Clearance | None  # shapes that must keep a distance; None if the file has none
+    columns: Columns | None  # columns of the logs; None if the file does not say
+    logs: Logs  # sides, files and parts of the logs
+    # known load that is on the robot in some logs only; None if the file does not say
     load: Tool | float | None
-    filter: AbstractFilter
-    candidates: tuple[FilterCandidate, ...]
-    decimation: AbstractDecimation
+    filter: AbstractFilter  # filter of motion, forces and columns
+    candidates: tuple[FilterCandidate, ...]  # filters to choose from; none if the file names one
+    decimation: AbstractDecimation  # decimation of forces and columns
+    # speeds below which rows do not count [rad/s or m/s]; None if all count
     min_speed: Float[np.ndarray, " joints"] | None
-    estimation: Estimation
+    estimation: Estimation  # estimator and uncertainty
+    # terms of the model that nonlinear friction must beat; None if it is not wanted
     linear: tuple[AbstractTerm, ...] | None
+    # transition of friction by load, which the model leaves out; None without
     load_transition: AbstractTransition | None
-    excitation: Excitation
-    notes: tuple[str, ...]
+    excitation: Excitation  # settings of the motion to design
+    notes: tuple[str, ...]  # assumptions where the file says nothing, in sentences
 
     @functools.cached_property
     def base(self) -> BaseParameters:

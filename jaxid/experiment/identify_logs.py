@@ -205,27 +205,16 @@ def read_runs(
 
 
 class Identification(NamedTuple):
-    """Result of the command `jaxid identify`.
+    """Result of the command `jaxid identify`."""
 
-    Attributes:
-        experiment: Experiment with the filter that was chosen.
-        choice: Choice of the filter, where it was left to the logs.
-        fit: Identified parameters.
-        validation: Torque errors of all logs, those of the fit first.
-        fitted: Number of logs, or of parts of logs, of the fit.
-        notes: Notes on the logs, as sentences.
-        findings: Findings on the logs.
-        mistakes: Likely mistakes in the columns of the logs, by the fit.
-    """
-
-    experiment: Experiment
-    choice: FilterChoice | None
-    fit: Fit
-    validation: Validation
-    fitted: int
-    notes: list[str]
-    findings: list[str]
-    mistakes: tuple[str, ...]
+    experiment: Experiment  # experiment with the filter that was chosen
+    choice: FilterChoice | None  # choice of the filter, where it was left to the logs
+    fit: Fit  # identified parameters
+    validation: Validation  # torque errors of all logs, those of the fit first
+    fitted: int  # number of logs, or of parts of logs, of the fit
+    notes: list[str]  # notes on the logs, as sentences
+    findings: list[str]  # findings on the logs
+    mistakes: tuple[str, ...]  # likely mistakes in the columns of the logs, by the fit
 
 
 def identify_logs(

@@ -71,16 +71,12 @@ class SamplesInMemory(AbstractSamples):
 
 
 class Chunk(NamedTuple):
-    """Part of the observations whose columns fit into memory.
+    """Part of the observations whose columns fit into memory."""
 
-    Attributes:
-        samples: Half-open range of samples whose columns are needed (rows and overlap).
-        rows: Half-open range of the resulting rows.
-        reduce: Function that turns columns at these samples into these rows.
-    """
-
+    # half-open range of samples whose columns are needed (rows and overlap)
     samples: tuple[int, int]
-    rows: tuple[int, int]
+    rows: tuple[int, int]  # half-open range of the resulting rows
+    # function that turns columns at these samples into these rows
     reduce: Callable[[AnyArray], np.ndarray]
 
 

@@ -23,17 +23,12 @@ _BLOCK = 1024
 
 
 class _Plan(NamedTuple):
-    """Assignment of values to memory cells: cells of the results first, then reused cells.
+    """Assignment of values to memory cells: cells of the results first, then reused cells."""
 
-    Attributes:
-        loads: Cell, input's number and entry's position for each entry that is read.
-        run: Function that does all operations on the cells.
-        cells: Number of cells.
-    """
-
+    # cell, input's number and entry's position for each entry that is read
     loads: tuple[tuple[int, int, int], ...]
-    run: Callable[[list[np.ndarray]], None]
-    cells: int
+    run: Callable[[list[np.ndarray]], None]  # function that does all operations on the cells
+    cells: int  # number of cells
 
 
 def evaluate(program: Program, *arrays: AnyArray) -> Any:

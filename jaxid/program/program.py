@@ -40,23 +40,14 @@ class Node(NamedTuple):
 
 
 class OperationCounts(NamedTuple):
-    """Numbers of operations of a program.
+    """Numbers of operations of a program."""
 
-    Attributes:
-        multiplications: Multiplications.
-        additions: Additions and subtractions.
-        divisions: Divisions.
-        functions: Calls of sin, cos, sqrt, tanh and similar functions.
-        selections: Comparisons, choices, absolute values and signs.
-        negations: Changes of sign.
-    """
-
-    multiplications: int
-    additions: int
-    divisions: int
-    functions: int
-    selections: int
-    negations: int
+    multiplications: int  # multiplications
+    additions: int  # additions and subtractions
+    divisions: int  # divisions
+    functions: int  # calls of sin, cos, sqrt, tanh and similar functions
+    selections: int  # comparisons, choices, absolute values and signs
+    negations: int  # changes of sign
 
     @property
     def total(self) -> int:
@@ -72,20 +63,14 @@ class Program:
     """A function as a sequence of scalar operations; made by `trace`.
 
     Equality and hash are by identity, so that a program can be static metadata under `jit`.
-
-    Attributes:
-        input_shapes: Shapes of the inputs, without batch axes.
-        nodes: Operations; each one reads only nodes before it.
-        outputs: Packed result: for each entry of each output, in order, a node or a constant.
-        output_shapes: Shapes of the outputs, without batch axes.
-        structure: PyTree structure of the function's result.
     """
 
-    input_shapes: tuple[tuple[int, ...], ...]
-    nodes: tuple[Node, ...] = field(repr=False)
+    input_shapes: tuple[tuple[int, ...], ...]  # shapes of the inputs, without batch axes
+    nodes: tuple[Node, ...] = field(repr=False)  # operations; each one reads only nodes before it
+    # packed result: for each entry of each output, in order, a node or a constant
     outputs: tuple[Reference, ...] = field(repr=False)
-    output_shapes: tuple[tuple[int, ...], ...]
-    structure: Any = field(repr=False)
+    output_shapes: tuple[tuple[int, ...], ...]  # shapes of the outputs, without batch axes
+    structure: Any = field(repr=False)  # pyTree structure of the function's result
 
     @functools.cached_property
     def counts(self) -> OperationCounts:
