@@ -52,11 +52,7 @@ def atomic_folder(
 
     After an error in the block nothing has changed. A new folder appears in one step. In an
     existing folder, each file replaces the one of its name in one step, files in JSON last: a
-    result whose JSON file is there is complete. Other files stay.
-
-    Args:
-        folder: Folder of the files.
-        outdated: Function of the folder that names files of an earlier result, to be removed.
+    result whose JSON file is there is complete. Other files stay, but those that `outdated` names.
     """
     folder = Path(folder).absolute()
     with _temporary_folder(folder) as staging:

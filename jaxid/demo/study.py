@@ -105,14 +105,7 @@ def run_study(
     periods: int = 2,
     motion: jid.trajectories.AbstractTrajectory | None = None,
 ) -> Study:
-    """Repeat the experiments of the paper.
-
-    Args:
-        seed: Seed of all random numbers.
-        progress: Callback, called with the name of a stage and its completed fraction (0 to 1).
-        periods: Number of periods of the excitation that are measured.
-        motion: Motion to identify with; designed if None.
-    """
+    """Repeat the experiments of the paper."""
     progress("finding base parameters", 0.0)
     cold = jid.simulation.virtual_tx90l_on_rail()
     hot = jid.simulation.virtual_tx90l_on_rail(warm=True)

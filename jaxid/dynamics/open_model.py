@@ -35,15 +35,7 @@ def opened(
 ) -> tuple[OpenModel, Float[AnyArray, "models numbers"]]:
     """Return a method whose inputs are the numbers that JAX is tracing, or in which models differ.
 
-    All other numbers stay constants of a program.
-
-    Args:
-        method: Name of the method.
-        model: Model.
-        others: Models with the same structure.
-
-    Returns:
-        The method, and the numbers of each model, the first one included.
+    All other numbers stay constants of a program. The numbers are those of each model.
     """
     leaves, structure = jax.tree.flatten(model)
     each = [leaves, *map(jax.tree.leaves, others)]

@@ -299,13 +299,9 @@ def find_grid(
 ) -> TimeGrid:
     """Find the uniform grid behind time stamps; the typical step is that of the first part.
 
-    Args:
-        read: Function that yields the finite stamps of the rows in consecutive parts [s]; it is
-            called three times.
-        source: Name of the log, for messages.
-        limits: Pauses that are bridged by interpolation: in sample times, and in seconds.
-        first_row: Number of the first row in its file, for messages.
-        in_parts: Whether the log is too large to move or remove rows.
+    `read` yields the finite stamps [s] in consecutive parts, and is called three times; `limits`
+    are the pauses that are bridged, in sample times and in seconds. Where `in_parts`, the log is
+    too large to move or remove rows.
     """
     first = next(iter(read()), np.zeros(0))
     steps = np.diff(first)

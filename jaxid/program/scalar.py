@@ -22,16 +22,12 @@ import numpy as np
 class Operation(enum.StrEnum):
     """A scalar operation; where JAX has the same elementwise primitive, its name is the value.
 
-    Attributes:
-        numpy: Function on NumPy arrays; `jax.numpy` has one of the same name.
-        infix: Operator between two operands in Python and C; empty if there is none.
-        traits: Properties for simplification and counting: `odd`, `even`, `commutative`, `truth`
-            (the result is a truth value), `choice` (a selection), `function` (as expensive as a
-            call of the mathematical library).
+    Traits serve simplification and counting: `odd`, `even`, `commutative`, `truth` (the result is a
+    truth value), `choice` (a selection), `function` (as expensive as a library's function).
     """
 
-    numpy: Any
-    infix: str
+    numpy: Any  # function on NumPy arrays; `jax.numpy` has one of the same name
+    infix: str  # operator between two operands in Python and C; empty if there is none
     traits: frozenset[str]
 
     def __new__(cls, name: str, numpy: Any = None, infix: str = "", traits: str = ""):  # noqa: D102

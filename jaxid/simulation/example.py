@@ -84,9 +84,6 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
 
     Returns:
         Paths of the files.
-
-    Raises:
-        RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
     with atomic_folder(folder) as staging:

@@ -241,9 +241,6 @@ class VirtualRobot(Hashable):
 
         Returns:
             Times from now on [s], and temperatures [°C].
-
-        Raises:
-            RuntimeError: If JAX runs in single precision.
         """
         require_float64("warming a virtual robot")
         heating = self.heating
@@ -304,9 +301,6 @@ class VirtualRobot(Hashable):
             sample_time: Time between two samples [s].
             seed: Seed of the noise.
             name: Name of the recording.
-
-        Raises:
-            RuntimeError: If JAX runs in single precision.
         """
         require_float64("a virtual measurement")
         motion = trajectory.motion(sample_time * np.arange(round(duration / sample_time)))
@@ -369,9 +363,6 @@ class VirtualRobot(Hashable):
                 servo if None.
             substeps: Steps of the simulation in one tick of the servo.
             name: Name of the recording.
-
-        Raises:
-            RuntimeError: If JAX runs in single precision.
         """
         require_float64("a virtual experiment")
         servo = self.servo() if servo is None else servo

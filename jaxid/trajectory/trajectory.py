@@ -58,9 +58,6 @@ class AbstractTrajectory(Hashable):
 
         Args:
             sample_time: Largest time between two samples [s].
-
-        Raises:
-            RuntimeError: If JAX runs in single precision.
         """
         require_float64("sampling a trajectory")
         if not 0 < sample_time < np.inf:

@@ -187,7 +187,7 @@ def _outside_dead_zone(dead_zone: Any, qd: Any, value: Any) -> Any:
 
 
 class AbstractDryFriction(AbstractTerm):
-    """Friction with a transition from one direction of motion to the other."""
+    """Friction with a `transition` from one direction of motion to the other."""
 
     transition: eqx.AbstractVar[AbstractTransition]
 
@@ -225,11 +225,7 @@ class AsymmetricViscousFriction(AbstractTerm):
 
 
 class CoulombFriction(AbstractDryFriction):
-    r"""Dry friction `fc1`, …, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14).
-
-    Attributes:
-        transition: Transition from one direction of motion to the other.
-    """
+    r"""Dry friction `fc1`, …, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14)."""
 
     transition: AbstractTransition = Tanh()
     symbols = (("fc", "N m", "N"),)
@@ -246,9 +242,6 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
     It takes the place of `CoulombFriction` together with `ConstantOffset`, whose columns its own
     columns span. Its parameters are `fcp1`, … for positive, then `fcn1`, … for negative speeds
     [N m or N].
-
-    Attributes:
-        transition: Transition from one direction of motion to the other.
     """
 
     transition: AbstractTransition = Tanh()
@@ -272,9 +265,6 @@ class SquareRootFriction(AbstractDryFriction):
     $\sqrt{|\dot q_i| / v_1} \tanh(\dot q_i / \epsilon)$: with $v_1$ = 1 rad/s or 1 m/s, its
     parameters `fr1`, … are the forces at that speed [N m or N]. It is used beside dry and viscous
     friction: greased gears often lie between the two.
-
-    Attributes:
-        transition: Transition from one direction of motion to the other.
     """
 
     transition: AbstractTransition = Tanh()

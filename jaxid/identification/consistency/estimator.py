@@ -367,9 +367,6 @@ def consistent_batch(
         z: Weighted forces, of the same decompositions.
         rows: Numbers of rows behind the factors.
         estimator: Bounds, margin and priors; wide bounds if None.
-
-    Raises:
-        RuntimeError: If JAX's 64-bit mode is off.
     """
     count = len(R)
     if not count or R.shape[-1] != base.size or z.shape != R.shape[:-1] or rows.shape != (count,):

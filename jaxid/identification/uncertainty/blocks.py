@@ -103,9 +103,6 @@ def bootstrap(
 
     Returns:
         Parameters of each draw; their covariance is that of the estimates.
-
-    Raises:
-        RuntimeError: If JAX's 64-bit mode is off.
     """
     from ..batch_solver import RIDGE, inverse_information
 
