@@ -50,21 +50,13 @@ _NOTHING = 1e-12
 """Relative size below which a length, gravity or a column counts as zero."""
 
 
-@dataclass(frozen=True)
-class ClosedForms:
-    """Base parameters in letters."""
-
-    expressions: tuple[Expression, ...]  # expression of each base parameter
-    lengths: dict[str, float]  # values of the lengths that occur in them [m]; of `g` [m/s²]
-
-
 def closed_forms(
     model: Model,
     independent: tuple[int, ...],
     dependent: tuple[int, ...],
     kappa: Float[np.ndarray, "base dependent"],
-) -> ClosedForms:
-    r"""Express base parameters as combinations of standard parameters with short coefficients."""
+) -> tuple[tuple[Expression, ...], dict[str, float]]:
+    r"""Return base parameters as combinations of standard ones, and the values of the letters."""
     kappa = np.asarray(kappa, np.float64)
     names, units = model.parameter_names, [dimension(u) for u in model.parameter_units]
     finder = _Finder(model, independent, dependent)
@@ -83,7 +75,7 @@ def closed_forms(
         expressions.append(Expression(tuple((names[k], c) for k, c in terms)))
     used = {name for e in expressions for name in e.symbols}
     lengths = {x.name: x.value for x in finder.lengths if x.name in used}
-    return ClosedForms(tuple(expressions), lengths)
+    return tuple(expressions), lengths
 
 
 class _Finder:

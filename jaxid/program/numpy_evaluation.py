@@ -9,7 +9,7 @@ whereas Python runs a program of a thousand operations in some thirty microsecon
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,21 +22,13 @@ _BLOCK = 1024
 """Samples at a time, so that intermediate values stay in the processor's cache."""
 
 
-class _Plan(NamedTuple):
-    """Assignment of values to memory cells: cells of the results first, then reused cells."""
-
-    # cell, input's number and entry's position for each entry that is read
-    loads: tuple[tuple[int, int, int], ...]
-    run: Callable[[list[np.ndarray]], None]  # function that does all operations on the cells
-    cells: int  # number of cells
+_Plan = tuple[tuple[tuple[int, int, int], ...], Callable[[list[np.ndarray]], None], int]
+"""Cell, input's number and entry's position for each entry that is read; function that does all
+operations on the cells; number of cells. Those of the results come first, others are reused."""
 
 
 def evaluate(program: Program, *arrays: AnyArray) -> Any:
-    """Compute the outputs of a program in NumPy.
-
-    Returns:
-        Outputs in the structure of the traced function, each with the batch axes last.
-    """
+    """Compute the outputs of a program, in the structure of the traced function, in NumPy."""
     table, batch = _evaluate(program, arrays)
     rows = [row.reshape(batch) for row in table]
     pairs = zip(program.distinct[1], program.outputs, strict=True)
@@ -94,7 +86,7 @@ def _plan(program: Program) -> _Plan:
     unpack = "".join(f"c{k}, " for k in range(cells))
     body = "".join(f"    {line}\n" for line in lines)
     exec(f"def run(cells):\n    [{unpack}] = cells\n{body}", scope)
-    return _Plan(tuple(loads), scope["run"], cells)
+    return tuple(loads), scope["run"], cells
 
 
 def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
@@ -105,19 +97,19 @@ def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
 
 def _evaluate(program: Program, arrays: tuple[AnyArray, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return the distinct results that vary [results, samples], and the batch's shape."""
-    plan = _plan(program)
+    loads, run, count = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
     inputs = [x.reshape(len(x), samples) for x in aligned]
     table = np.empty((len(program.distinct[0]), samples))
-    scratch = np.empty((plan.cells - len(table), min(samples, _BLOCK)))
+    scratch = np.empty((count - len(table), min(samples, _BLOCK)))
     with np.errstate(all="ignore"):
         for start in range(0, samples, _BLOCK):
             block = slice(start, min(start + _BLOCK, samples))
             cells = [*table[:, block], *scratch[:, : block.stop - block.start]]
-            for target, number, entry in plan.loads:
+            for target, number, entry in loads:
                 cells[target][:] = inputs[number][entry, block]
-            plan.run(cells)
+            run(cells)
     return table, batch
 
 

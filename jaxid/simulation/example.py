@@ -81,9 +81,6 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
     Args:
         folder: Folder of the files; made with its parents.
         seed: Seed of the parameters, the motions and the noise.
-
-    Returns:
-        Paths of the files.
     """
     robot = virtual_panda(seed)
     with atomic_folder(folder) as staging:
