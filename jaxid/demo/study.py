@@ -54,7 +54,7 @@ class PathRun(NamedTuple):
 
 
 class Study(NamedTuple):
-    """Results of the demo."""
+    """Results of the demo, with and without the weights of the joints (Eq. 30)."""
 
     seed: int  # seed of all random numbers
     base: jid.BaseParameters  # base parameters of the robot
@@ -170,7 +170,7 @@ def run_study(
 def _design(
     base: jid.BaseParameters, seed: int, progress: Callable[[str, float], None]
 ) -> tuple[jid.ExcitationPlan, ...]:
-    """Return a motion with the least condition number, and a D-optimal one."""
+    """Return a motion with the least condition number, and a D-optimal one (Eq. 36)."""
     limits = base.model.robot.limits
     low, high, most = (
         np.array(x) for x in (limits.position_min, limits.position_max, limits.acceleration)
