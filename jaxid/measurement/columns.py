@@ -9,11 +9,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxid import units
+from jaxid.arrays import optional
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.units import Quantity, Unit
 
-from .filters import optional
 from .log_files import LogTable, Selection, open_table
 from .recording import positive_time
 

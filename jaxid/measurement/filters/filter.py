@@ -24,11 +24,6 @@ SETTLED = 1e-4
 """Fraction of the impulse response's peak below which the start of a log no longer matters."""
 
 
-def optional(value: float | int | None) -> float | None:
-    """Convert a number, unless it is None."""
-    return None if value is None else float(value)
-
-
 def integer(name: str) -> Callable[[float | int], int]:
     """Return a converter that accepts integers only, as `int` or `float`."""
 
