@@ -50,9 +50,9 @@ def load_urdf(
     Args:
         path: URDF or MJCF file; a xacro file is expanded by the program `xacro`.
         tip: Link (in MJCF a body or site) of the end-effector: only the chain from `base` to it is
-            loaded, with the links fixed to it. If None, the whole tree below `base` is, and the end-effector is the last
-            link of the longest chain: of the most moving joints, then of the most links, then
-            first in the file.
+            loaded, with the links fixed to it. If None, the whole tree below `base` is, and the
+            end-effector is the last link of the longest chain: of the most moving joints, then of
+            the most links, then first in the file.
         base: Link or body that stands on the ground; the root if None.
         gravity: Acceleration of gravity in the frame of the ground [m/s²]; 9.81 downwards if None,
             or that of an MJCF file.
