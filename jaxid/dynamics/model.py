@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -111,7 +111,7 @@ class Model(Hashable):
         rest, law = np.zeros(self.robot.joints), self.memory
         return [rest.shape] * 3 + ([] if law is None else [law.settled(rest).shape])
 
-    def with_memory(self, **changes: Any) -> Self:
+    def with_memory(self, **changes: Any) -> "Model":
         """Return the model with other fields of `memory`, such as `length` or `state`."""
         leaves, tree = jax.tree.flatten(self.terms, is_leaf=_has_memory)
         leaves = [dataclasses.replace(x, **changes) if _has_memory(x) else x for x in leaves]
