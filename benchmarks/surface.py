@@ -55,10 +55,9 @@ def packed_form(model, definition, *shapes):
 
     from jaxid.dynamics.dispatch import program_of  # private: the form that is compared
     from jaxid.program import lower  # private: the form that is compared
-    from jaxid.program.blocks import distinct_results  # private: the form that is compared
 
     program = program_of(model, definition, *shapes)
-    lowered, (nodes, _) = lower(program), distinct_results(program)
+    lowered, (nodes, _) = lower(program), program.distinct
     first = [program.outputs.index(k) for k in nodes]
 
     def run(*arrays):

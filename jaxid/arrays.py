@@ -67,6 +67,16 @@ def as_array(name: str, value: Numbers) -> AnyArray:
         raise InputError(f"`{name}` must be an array of numbers, but is {value!r:.60}.") from error
 
 
+def given(value: Any) -> Any:
+    """Return an argument as it is: converter of a field that is checked together with others."""
+    return value
+
+
+def optional(value: float | int | None) -> float | None:
+    """Convert a number, unless it is None."""
+    return None if value is None else float(value)
+
+
 def one_or_each(value: Any) -> Any:
     """Convert a field that holds one number for all joints, or a list with one for each."""
     return as_array("value", value) if isinstance(value, list | tuple) else value

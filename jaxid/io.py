@@ -38,12 +38,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file, whole or not at all; missing folders above it are made.
-
-    Raises:
-        OSError: If nothing can be written there.
-        InputError: If a folder is in its place.
-    """
+    """Write a file, whole or not at all; missing folders above it are made."""
     path = Path(path)
     with atomic_folder(path.parent) as folder:
         (folder / path.name).write_bytes(data)
@@ -57,15 +52,7 @@ def atomic_folder(
 
     After an error in the block nothing has changed. A new folder appears in one step. In an
     existing folder, each file replaces the one of its name in one step, files in JSON last: a
-    result whose JSON file is there is complete. Other files stay.
-
-    Args:
-        folder: Folder of the files.
-        outdated: Function of the folder that names files of an earlier result, to be removed.
-
-    Raises:
-        OSError: If nothing can be written there.
-        InputError: If a file is in the place of a folder, or a folder in that of a file.
+    result whose JSON file is there is complete. Other files stay, but those that `outdated` names.
     """
     folder = Path(folder).absolute()
     with _temporary_folder(folder) as staging:
@@ -78,12 +65,7 @@ def atomic_folder(
 
 
 def require_writable(folder: str | Path) -> None:
-    """Check that files can be written to a folder, which need not exist, before long work begins.
-
-    Raises:
-        OSError: If nothing can be written there.
-        InputError: If a file is in the place of the folder, or of one above it.
-    """
+    """Check that files can be written to a folder, which need not exist, before long work."""
     with _temporary_folder(Path(folder).absolute()):
         pass
 
@@ -125,12 +107,7 @@ def _move_files(staging: Path, folder: Path, outdated: Iterable[str]) -> None:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        OSError: If the file cannot be read.
-        InputError: If it is no JSON in UTF-8.
-    """
+    """Read a JSON file."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -144,16 +121,21 @@ def json_text(content: dict[str, Any]) -> str:
     return re.sub(r"\[\n[^\[\]{}]*\n *\]", lambda m: re.sub(r"\n *", " ", m[0]), text) + "\n"
 
 
+def fill_template(path: Path, **values: Any) -> str:
+    """Return the text of a Jinja template with these values; a missing one is an error."""
+    import jinja2  # loaded by those who write such files
+
+    environment = jinja2.Environment(
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.from_string(path.read_text(encoding="utf-8")).render(values)
+
+
 def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
-    """Return a module, or the value of a field, as plain JSON values.
-
-    Args:
-        value: Module, enumeration, tuple, array, number or text.
-        refused: Classes that must not occur, such as recordings.
-
-    Raises:
-        InputError: If anything else occurs.
-    """
+    """Return a module, or the value of a field, as plain JSON values."""
     if isinstance(value, refused):
         raise InputError(f"a document cannot hold `{type(value).__name__}`.")
     if value is None or isinstance(value, str | bool | int):
@@ -183,16 +165,7 @@ def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:
 
 
 def from_json(value: Any, hint: Any, place: str = "") -> Any:
-    """Return the module or value that `to_json` has made these values of.
-
-    Args:
-        value: Plain JSON values.
-        hint: Class, or annotation of a field, that the result must fit.
-        place: Path within the document, for messages.
-
-    Raises:
-        InputError: If the values do not fit; the message names the place.
-    """
+    """Return the module or value that `to_json` has made these values of."""
     options = union_members(hint)
     if isinstance(value, dict):
         result = _object_from_json(value, options, place)

@@ -60,18 +60,7 @@ def require_one_log_per_option() -> None:
 
 
 def start(*reads: Path, output: Path | None = None, force: bool = False) -> Console:
-    """Turn on double precision and the cache of compiled code; return the terminal.
-
-    Args:
-        reads: Files and folders that the command reads: what is missing is named at once.
-        output: Folder of the result.
-        force: Whether the folder may hold other files.
-
-    Raises:
-        OSError: If nothing can be written into the folder `output`.
-        InputError: If something is missing, or there is something else than an earlier report in
-            the folder's place.
-    """
+    """Turn on double precision and the cache of compiled code; return the terminal."""
     missing = [f"`{path}`" for path in reads if not path.exists()]
     if missing:
         words = "is no file or folder" if len(missing) == 1 else "are no files or folders"
@@ -133,16 +122,7 @@ def command_line() -> str:
 
 
 def refuse_foreign_table(target: Path) -> None:
-    """Reject a table of a motion in whose place are other files than an earlier motion.
-
-    Args:
-        target: Table, beside which the trajectory lies with the suffix `.json`, the message for
-            ROS, and a folder of pictures.
-
-    Raises:
-        OSError: If nothing can be written there.
-        InputError: If the name is not that of a table, or something else is in its place.
-    """
+    """Reject a table of a motion in whose place are other files than an earlier motion."""
     from jaxid.io import require_writable
     from jaxid.trajectory.files import load_trajectory
 

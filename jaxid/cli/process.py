@@ -31,11 +31,7 @@ class _SignalReceived(BaseException):
 
 @contextlib.contextmanager
 def handing_over(farewell: str) -> Iterator[None]:
-    """Grant a block some time after a signal to react to `STOP`.
-
-    Args:
-        farewell: What is said if the time does not suffice.
-    """
+    """Grant a block some time after a signal to react to `STOP`."""
     _farewells.append(farewell)
     yield
     _farewells.remove(farewell)

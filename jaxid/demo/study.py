@@ -54,39 +54,25 @@ class PathRun(NamedTuple):
 
 
 class Study(NamedTuple):
-    """Results of the demo.
+    """Results of the demo, with and without the weights of the joints (Eq. 30)."""
 
-    Attributes:
-        seed: Seed of all random numbers.
-        base: Base parameters of the robot.
-        truth: Base parameters of the cold robot.
-        plans: Motions with the least condition number (Eq. 36), and D-optimal; none if a motion
-            was given.
-        played: Motion of the identification, from standstill to standstill.
-        joint_path: Path of the verification in joint coordinates.
-        observations: Filtered recordings: identification cold, identification warm, verification.
-        unweighted: Least squares without weights.
-        weighted: Least squares with the weights of Eq. 30.
-        consistent: Estimate of physically consistent bodies.
-        true: Parameters of the robot itself: their errors are all due to disturbances.
-        warm: Fit of the warm robot.
-        temperature: Comparison of the cold with the warm robot.
-        followed: Runs along the path with no model, CAD values, and the identified model.
-    """
-
-    seed: int
-    base: jid.BaseParameters
-    truth: Float[np.ndarray, " base"]
+    seed: int  # seed of all random numbers
+    base: jid.BaseParameters  # base parameters of the robot
+    truth: Float[np.ndarray, " base"]  # base parameters of the cold robot
+    # motions with the least condition number (Eq. 36), and D-optimal; none if a motion was given
     plans: tuple[jid.ExcitationPlan, ...]
+    # motion of the identification, from standstill to standstill
     played: jid.trajectories.WithLeads
-    joint_path: jid.trajectories.AbstractTrajectory
+    joint_path: jid.trajectories.AbstractTrajectory  # path of the verification in joint coordinates
+    # filtered recordings: identification cold, identification warm, verification
     observations: tuple[jid.Observations, ...]
-    unweighted: Model
-    weighted: Model
-    consistent: Model
-    true: Model
-    warm: jid.Fit
-    temperature: Comparison
+    unweighted: Model  # least squares without weights
+    weighted: Model  # least squares with the weights of Eq. 30
+    consistent: Model  # estimate of physically consistent bodies
+    true: Model  # parameters of the robot itself: their errors are all due to disturbances
+    warm: jid.Fit  # fit of the warm robot
+    temperature: Comparison  # comparison of the cold with the warm robot
+    # runs along the path with no model, CAD values, and the identified model
     followed: tuple[PathRun, ...]
 
     @property
@@ -119,14 +105,7 @@ def run_study(
     periods: int = 2,
     motion: jid.trajectories.AbstractTrajectory | None = None,
 ) -> Study:
-    """Repeat the experiments of the paper.
-
-    Args:
-        seed: Seed of all random numbers.
-        progress: Callback, called with the name of a stage and its completed fraction (0 to 1).
-        periods: Number of periods of the excitation that are measured.
-        motion: Motion to identify with; designed if None.
-    """
+    """Repeat the experiments of the paper."""
     progress("finding base parameters", 0.0)
     cold = jid.simulation.virtual_tx90l_on_rail()
     hot = jid.simulation.virtual_tx90l_on_rail(warm=True)
@@ -191,7 +170,7 @@ def run_study(
 def _design(
     base: jid.BaseParameters, seed: int, progress: Callable[[str, float], None]
 ) -> tuple[jid.ExcitationPlan, ...]:
-    """Return a motion with the least condition number, and a D-optimal one."""
+    """Return a motion with the least condition number, and a D-optimal one (Eq. 36)."""
     limits = base.model.robot.limits
     low, high, most = (
         np.array(x) for x in (limits.position_min, limits.position_max, limits.acceleration)

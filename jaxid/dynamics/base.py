@@ -4,7 +4,7 @@ import enum
 import functools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
 from jaxid.result_table import MISSING, Column, Remark, Status, Table
 
+from .base_parameter_expressions import Expression
 from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion
@@ -26,12 +27,6 @@ from .rank import (
     regrouping,
     singular_values,
 )
-
-if TYPE_CHECKING:
-    from .base_parameter_closed_forms import ClosedForms
-else:
-    # Closed forms are loaded where they are used.
-    ClosedForms = Any
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
@@ -84,8 +79,8 @@ class BaseParameters(Hashable):
         return tuple(units[k] for k in self.indices)
 
     @functools.cached_property
-    def closed_forms(self) -> ClosedForms:
-        """Base parameters in letters, computed when they are first needed (Eq. 24)."""
+    def closed_forms(self) -> tuple[tuple[Expression, ...], dict[str, float]]:
+        """Expressions in letters, and the values of these, computed when first needed (Eq. 24)."""
         from .base_parameter_closed_forms import closed_forms
 
         model, kappa = _snapped(self.model), np.asarray(self.kappa)
@@ -94,12 +89,12 @@ class BaseParameters(Hashable):
     @property
     def expressions(self) -> tuple[str, ...]:
         """Base parameters as readable combinations, like `mx2 + l2x*m3` (Eq. 24)."""
-        return tuple(str(e) for e in self.closed_forms.expressions)
+        return tuple(str(e) for e in self.closed_forms[0])
 
     @property
     def lengths(self) -> dict[str, float]:
         """Values of the letters in the expressions: lengths [m], and `g` [m/s²]."""
-        return dict(self.closed_forms.lengths)
+        return dict(self.closed_forms[1])
 
     def columns(self, q, qd, qdd, s=None) -> Float[AnyArray, "joints base"]:
         """Return the base regressor of one sample by definition (Eq. 23)."""
@@ -161,12 +156,7 @@ class BaseParameters(Hashable):
         return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
-        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26).
-
-        Raises:
-            InputError: If the motion does not have one axis of samples, or JAX is tracing the
-                robot's geometry.
-        """
+        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26)."""
         self.model.check(motion.q)
         return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 

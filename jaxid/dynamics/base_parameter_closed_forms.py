@@ -50,33 +50,13 @@ _NOTHING = 1e-12
 """Relative size below which a length, gravity or a column counts as zero."""
 
 
-@dataclass(frozen=True)
-class ClosedForms:
-    """Base parameters in letters.
-
-    Attributes:
-        expressions: Expression of each base parameter.
-        lengths: Values of the lengths that occur in them [m]; of `g` [m/s²].
-    """
-
-    expressions: tuple[Expression, ...]
-    lengths: dict[str, float]
-
-
 def closed_forms(
     model: Model,
     independent: tuple[int, ...],
     dependent: tuple[int, ...],
     kappa: Float[np.ndarray, "base dependent"],
-) -> ClosedForms:
-    r"""Express base parameters as combinations of standard parameters with readable coefficients.
-
-    Args:
-        model: The model.
-        independent: Columns that lead the base parameters.
-        dependent: Other columns.
-        kappa: Matrix $\kappa$ of the robot, from which coefficients without a short form are taken.
-    """
+) -> tuple[tuple[Expression, ...], dict[str, float]]:
+    r"""Return base parameters as combinations of standard ones, and the values of the letters."""
     kappa = np.asarray(kappa, np.float64)
     names, units = model.parameter_names, [dimension(u) for u in model.parameter_units]
     finder = _Finder(model, independent, dependent)
@@ -95,7 +75,7 @@ def closed_forms(
         expressions.append(Expression(tuple((names[k], c) for k, c in terms)))
     used = {name for e in expressions for name in e.symbols}
     lengths = {x.name: x.value for x in finder.lengths if x.name in used}
-    return ClosedForms(tuple(expressions), lengths)
+    return tuple(expressions), lengths
 
 
 class _Finder:
@@ -131,14 +111,7 @@ class _Finder:
     def coefficient(
         self, row: int, column: int, difference: np.ndarray | None, value: float
     ) -> Coefficient | None:
-        """Return the coefficient of a dependent column in a base parameter, or None if it is zero.
-
-        Args:
-            row: Index of the base parameter.
-            column: Index of the dependent column.
-            difference: Dimension of the coefficient, if it is known.
-            value: Coefficient of the robot.
-        """
+        """Return the coefficient of a dependent column in a base parameter; None if it is zero."""
         x, kappa = self._fitted
         y = kappa[:, row, column]
         # A coefficient without a short form is a number.
@@ -202,19 +175,13 @@ def _simple(number: float) -> Fraction | float:
 
 @dataclass(frozen=True)
 class Length:
-    """A number of the geometry that can vary on its own.
+    """A number of the geometry that can vary on its own."""
 
-    Attributes:
-        name: Name, such as `l3z`.
-        value: Signed value for the robot [m]; for `g` [m/s²].
-        entries: Numbers of the geometry that it sets, each with its multiple of the value.
-        dimension: Dimension of a length, or of an acceleration.
-    """
-
-    name: str
-    value: float
+    name: str  # name, such as `l3z`
+    value: float  # signed value for the robot [m]; for `g` [m/s²]
+    # numbers of the geometry that it sets, each with its multiple of the value
     entries: tuple[tuple[int, float], ...]
-    dimension: Dimension
+    dimension: Dimension  # dimension of a length, or of an acceleration
 
 
 class Regrouping:

@@ -14,15 +14,10 @@ Powers = tuple[tuple[str, int], ...]
 
 @dataclass(frozen=True)
 class Monomial:
-    """A number times powers of lengths, such as `2*l2x/l3z`.
-
-    Attributes:
-        number: Number.
-        powers: Names of the lengths and their exponents, which are not zero.
-    """
+    """A number times powers of lengths, such as `2*l2x/l3z`."""
 
     number: Number
-    powers: Powers = ()
+    powers: Powers = ()  # names of the lengths and their exponents, which are not zero
 
 
 @dataclass(frozen=True)
@@ -63,13 +58,10 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class Expression:
-    """A base parameter as a combination of standard parameters; `str` makes it readable.
+    """A base parameter as a combination of standard parameters; `str` makes it readable."""
 
-    Attributes:
-        terms: Standard parameters in the order of their columns, with their coefficients. The first
-            one leads the base parameter and has the coefficient 1.
-    """
-
+    # Standard parameters in the order of their columns, with their coefficients. The first one
+    # leads the base parameter and has the coefficient 1
     terms: tuple[tuple[str, Coefficient], ...]
 
     @property

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -88,11 +88,7 @@ class Model(Hashable):
     def split(
         self, p: Float[AnyArray, " standard"]
     ) -> list[tuple[AbstractTerm, Float[AnyArray, " columns"]]]:
-        """Return each term with its parameters.
-
-        Raises:
-            InputError: If there is not one number for each standard parameter.
-        """
+        """Return each term with its parameters."""
         sizes = [len(term.parameters(self.robot)) for term in self.terms]
         if p.shape != (sum(sizes),):
             raise InputError(
@@ -103,11 +99,7 @@ class Model(Hashable):
 
     @property
     def memory(self) -> Presliding | None:
-        """Law of the friction that depends on the path of the joints; None without such friction.
-
-        Raises:
-            InputError: If terms have different lengths.
-        """
+        """Law of the friction that depends on the path of the joints; None without."""
         laws = {x for x in jax.tree.leaves(self.terms, is_leaf=_has_memory) if _has_memory(x)}
         if len(laws) > 1:
             raise InputError("all terms with `Presliding` must have the same one.")
@@ -119,7 +111,7 @@ class Model(Hashable):
         rest, law = np.zeros(self.robot.joints), self.memory
         return [rest.shape] * 3 + ([] if law is None else [law.settled(rest).shape])
 
-    def with_memory(self, **changes: Any) -> Self:
+    def with_memory(self, **changes: Any) -> "Model":
         """Return the model with other fields of `memory`, such as `length` or `state`."""
         leaves, tree = jax.tree.flatten(self.terms, is_leaf=_has_memory)
         leaves = [dataclasses.replace(x, **changes) if _has_memory(x) else x for x in leaves]
@@ -195,10 +187,6 @@ class Model(Hashable):
 
         Args:
             motion: Joint motion [samples, joints].
-
-        Raises:
-            InputError: If the motion does not have one axis of samples, or JAX is tracing the
-                robot's geometry.
         """
         self.check(motion.q)
         return PackedRegressor(self, self.columns, *self.arguments(motion))
@@ -292,11 +280,7 @@ class Model(Hashable):
         return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
 
     def check(self, q: Coordinates) -> Float[AnyArray, "*batch joints"]:
-        """Return coordinates as an array with one number for each joint along the last axis.
-
-        Raises:
-            InputError: If the last axis has another length.
-        """
+        """Return coordinates as an array with one number for each joint along the last axis."""
         q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
             raise InputError(

@@ -9,16 +9,11 @@ from jaxid.arrays import AnyArray, Array, Float, is_traced
 
 
 class OpenModel(eqx.Module):
-    """A method of a model for one sample, whose first argument are numbers of the model.
+    """A method of a model for one sample, whose first argument are numbers of the model."""
 
-    Attributes:
-        model: Model; in the place of these numbers it has any others.
-        method: Name of the method.
-        places: Leaves of the model that have such numbers, and their positions in each.
-    """
-
-    model: eqx.Module
-    method: str = eqx.field(static=True)
+    model: eqx.Module  # model; in the place of these numbers it has any others
+    method: str = eqx.field(static=True)  # name of the method
+    # leaves of the model that have such numbers, and their positions in each
     places: tuple[tuple[int, tuple[int, ...]], ...] = eqx.field(static=True)
 
     def call(self, numbers: Float[AnyArray, " numbers"], *arguments: AnyArray) -> Array:
@@ -40,15 +35,7 @@ def opened(
 ) -> tuple[OpenModel, Float[AnyArray, "models numbers"]]:
     """Return a method whose inputs are the numbers that JAX is tracing, or in which models differ.
 
-    All other numbers stay constants of a program.
-
-    Args:
-        method: Name of the method.
-        model: Model.
-        others: Models with the same structure.
-
-    Returns:
-        The method, and the numbers of each model, the first one included.
+    All other numbers stay constants of a program. The numbers are those of each model.
     """
     leaves, structure = jax.tree.flatten(model)
     each = [leaves, *map(jax.tree.leaves, others)]

@@ -5,7 +5,6 @@ A joint feels only the bodies beyond it, so most entries of a regressor are zero
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,29 +13,19 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Lowered, Program, evaluate_packed, lower, on_any_platform
+from jaxid.program import Lowered, Program, evaluate_rows, lower, on_any_platform
 from jaxid.program.blocks import row_products
 
 from .dispatch import FEW, KEPT, program_of
 
 
 class JointRegressor(eqx.Module):
-    """Compiled regressor, evaluated joint by joint in the columns that can act on the joint.
+    """Compiled regressor, evaluated joint by joint in the columns that can act on the joint."""
 
-    Args:
-        owner: Model whose geometry is known.
-        definition: Method of the model that returns the regressor of one sample.
-        shapes: Shapes of the method's arguments.
-
-    Attributes:
-        program: Program of the regressor.
-        columns: For each joint the columns that can act on it.
-        size: Number of columns.
-    """
-
-    program: Program = eqx.field(static=True)
+    program: Program = eqx.field(static=True)  # program of the regressor
+    # for each joint the columns that can act on it
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    size: int = eqx.field(static=True)
+    size: int = eqx.field(static=True)  # number of columns
 
     def __init__(self, owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]):
         self.program = program_of(owner, definition, *shapes)
@@ -57,12 +46,7 @@ class JointRegressor(eqx.Module):
         return lower(self.program, fence).stacked(groups, *arrays)
 
     def gram(self, weights: AnyArray, *arrays: AnyArray) -> Float[Array, "columns columns"]:
-        r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns.
-
-        Args:
-            weights: Weight of each joint's rows.
-            arrays: Arguments of the definition [samples, entries].
-        """
+        r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns."""
         groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
         whole = jnp.zeros((self.size, self.size), arrays[0].dtype)
         sums = row_products(self.program, groups, *map(jnp.asarray, arrays))
@@ -73,14 +57,13 @@ class JointRegressor(eqx.Module):
 
     def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
         """Return the columns of each joint, evaluated in NumPy."""
-        batch = np.shape(arrays[0])[1:]
-        packed = evaluate_packed(self.program, *arrays)
-        found = []
+        rows, program = evaluate_rows(self.program, *arrays), self.program
+        found = [np.empty((len(own), rows.shape[1])) for own in self.columns]
         for joint, own in enumerate(self.columns):
-            rows = np.empty((len(own), *batch))
-            for row, k in zip(rows, own, strict=True):
-                row[:] = packed[joint * self.size + k]
-            found.append(rows)
+            for row, k in zip(found[joint], own, strict=True):
+                entry = joint * self.size + k
+                number = program.distinct[1][entry]
+                row[:] = rows[number] if number >= 0 else program.outputs[entry]
         return found
 
 
@@ -92,12 +75,7 @@ def _compiled_gram(regressor: JointRegressor) -> Callable:
 def gram(
     owner: eqx.Module, definition: Callable, weights: AnyArray | None, *arrays: AnyArray
 ) -> Float[Array, "columns columns"]:
-    """Return the Gram matrix of a model's columns over a motion; see `Model.gram`.
-
-    Raises:
-        InputError: If the motion does not have one axis of samples, or JAX is tracing the model's
-            own numbers.
-    """
+    """Return the Gram matrix of a model's columns over a motion; see `Model.gram`."""
     n = _require_rows(owner, arrays[0])
     weights = np.ones(n) if weights is None else as_array("weights", weights)
     regressor = JointRegressor(owner, definition, *((n,) for _ in arrays))
@@ -121,21 +99,12 @@ class PackedRegressor(eqx.Module):
     It has one array over the samples for each entry that varies, and writes zeros only into the
     `matrix`.
 
-    Args:
-        owner: Model.
-        definition: Method of the model that returns the regressor of one sample.
-        samples: Arguments of the definition [samples, joints].
-
     Attributes:
         values: Distinct entries that vary with the motion, over the samples.
         places: For each joint the pairs of a column and either the number of its array in `values`
             or its constant, a float.
         samples: Number of samples.
         columns: Number of parameters.
-
-    Raises:
-        InputError: If the motion does not have one axis of samples, or JAX is tracing the model's
-            own numbers, as a gradient with respect to the geometry does.
     """
 
     values: tuple[Float[AnyArray, " samples"], ...]
@@ -147,13 +116,12 @@ class PackedRegressor(eqx.Module):
         _require_rows(owner, samples[0])
         arrays = [x.T for x in samples]
         program = program_of(owner, definition, *(x.shape[:1] for x in arrays))
-        varying, self.places = _layout(program)
+        self.places = _places(program)
         self.samples, self.columns = len(samples[0]), program.output_shapes[0][1]
-        if self.samples > FEW or is_traced(arrays):
-            self.values = _compiled(program)(*arrays)
-        else:
-            outputs: Any = evaluate_packed(program, *arrays)
-            self.values = tuple(outputs[k] for k in varying)
+        many = self.samples > FEW or is_traced(arrays)
+        self.values = tuple(
+            _compiled(program)(*arrays) if many else evaluate_rows(program, *arrays)
+        )
 
     def matrix(self) -> Float[np.ndarray, "rows columns"]:
         """Return the whole matrix in Fortran's order: all samples of joint 1, of joint 2, etc.
@@ -170,25 +138,20 @@ class PackedRegressor(eqx.Module):
 
 
 @functools.lru_cache(maxsize=KEPT)
-def _layout(program: Program) -> tuple[list[int], tuple]:
-    """Return one place in the packed result for each value that varies, and all `places`."""
-    first: dict[int, int] = {}
-    for k, x in enumerate(program.outputs):
-        if isinstance(x, int):
-            first.setdefault(x, k)
-    numbers = {x: number for number, x in enumerate(first)}
-    entries = [numbers[x] if isinstance(x, int) else x for x in program.outputs]
-    ((joints, columns),) = program.output_shapes
-    rows = (entries[j * columns : (j + 1) * columns] for j in range(joints))
-    places = (
+def _places(program: Program) -> tuple[tuple[tuple[int, int | float], ...], ...]:
+    """Return the `places` of a packed regressor; what is always zero has none."""
+    pairs = zip(program.distinct[1].tolist(), program.outputs, strict=True)
+    entries = [number if number >= 0 else constant for number, constant in pairs]
+    rows = np.array(entries, object).reshape(program.output_shapes[0])
+    return tuple(
         tuple((k, x) for k, x in enumerate(row) if isinstance(x, int) or x != 0) for row in rows
     )
-    return list(first.values()), tuple(places)
 
 
 @functools.lru_cache(maxsize=KEPT)
 def _compiled(program: Program) -> Callable:
-    varying, _ = _layout(program)
+    _, first = np.unique(program.distinct[1], return_index=True)
+    varying = [k for k in first.tolist() if isinstance(program.outputs[k], int)]
 
     def run(lowered: Lowered, *arrays: AnyArray) -> tuple:
         outputs = lowered(*arrays)

@@ -26,12 +26,6 @@ def body_motions(
 ) -> list[tuple[Vector, Vector, Vector]]:
     r"""Return the motion of every body in its own frame: $(a, \omega, \dot\omega)$ (Eqs. 6, 8).
 
-    Args:
-        robot: The kinematic tree.
-        q: Joint coordinates [rad or m].
-        qd: Joint velocities [rad/s or m/s].
-        qdd: Joint accelerations [rad/s² or m/s²].
-
     Returns:
         For each body the acceleration of its origin less gravity [m/s²], its angular velocity
         [rad/s] and its angular acceleration [rad/s²].

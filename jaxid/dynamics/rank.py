@@ -24,19 +24,12 @@ ROUNDING = 1e-12
 
 
 class Dependence(NamedTuple):
-    """Independent and dependent columns of a matrix, and how clear the distinction is.
+    """Independent and dependent columns of a matrix, and how clear the distinction is."""
 
-    Attributes:
-        independent: Columns that no earlier ones can replace, in order.
-        dependent: Other columns, in order.
-        smallest_independent: Smallest measure of independence among the first.
-        largest_dependent: Largest measure among the second.
-    """
-
-    independent: tuple[int, ...]
-    dependent: tuple[int, ...]
-    smallest_independent: float
-    largest_dependent: float
+    independent: tuple[int, ...]  # columns that no earlier ones can replace, in order
+    dependent: tuple[int, ...]  # other columns, in order
+    smallest_independent: float  # smallest measure of independence among the first
+    largest_dependent: float  # largest measure among the second
 
     @property
     def gap(self) -> float:
@@ -50,10 +43,6 @@ def gram_schmidt(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-9) ->
     A dependent column uses up no direction, unlike in a plain QR decomposition without pivoting,
     and every column is measured against its own norm. So near-degenerate geometry is still told
     apart: an elbow offset of a micrometre.
-
-    Args:
-        W: Matrix whose columns are of comparable size or zero.
-        tolerance: Fraction of a column, from 0 to 1, below which its new part counts as none.
     """
     rows, columns = W.shape
     W = np.asarray(W, np.float64)
@@ -88,10 +77,6 @@ def singular_values(W: Float[AnyArray, "rows columns"], tolerance: float = 1e-6)
     The rank is where the singular values fall by the largest factor. A column depends on earlier
     ones if some vector of the null space ends there: the null space is brought into that form by a
     QR decomposition with its columns reversed.
-
-    Args:
-        W: Matrix whose columns are of comparable size or zero.
-        tolerance: Fraction of the largest singular value above which none counts as zero.
     """
     W = np.asarray(W, np.float64)
     columns = W.shape[1]

@@ -8,8 +8,6 @@ Dynamics Algorithms, Secs. 2, 5, 6). This form compiles soon, is differentiated 
 geometry as an input.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -86,21 +84,9 @@ def all_placements(robot: Robot, q: Joints) -> Float[Array, "joints 4 4"]:
     return placed
 
 
-class GroundMotion(NamedTuple):
-    """Motion of all bodies about the origin of the ground.
-
-    Attributes:
-        carry: Matrices that carry wrenches from the bodies' frames to the ground; their transposes
-            carry motions back.
-        joints: Motion of what a joint moves at unit speed.
-        velocities: Velocity of each body.
-        accelerations: Acceleration of each body less gravity.
-    """
-
-    carry: Float[Array, "joints 6 6"]
-    joints: Spatial
-    velocities: Spatial
-    accelerations: Spatial
+GroundMotion = tuple[Float[Array, "joints 6 6"], Spatial, Spatial, Spatial]
+"""Matrices that carry wrenches from the bodies' frames to the ground (transposed, motions back);
+motion of what a joint moves at unit speed; velocities, and accelerations less gravity."""
 
 
 def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMotion:
@@ -120,7 +106,7 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     v = moved @ speeds
     a = moved @ (joints * qdd[:, None] + _times(_combine(CROSS, v), speeds))
     gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
-    return GroundMotion(carry, joints, v, a - gravity[None])
+    return carry, joints, v, a - gravity[None]
 
 
 def ground_inertias(p: Bodies, carry: Array) -> Float[Array, "joints 6 6"]:
@@ -131,7 +117,7 @@ def ground_inertias(p: Bodies, carry: Array) -> Float[Array, "joints 6 6"]:
 def spatial_forces(robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints) -> Joints:
     """Return the generalised forces of all bodies [N m or N] (Eq. 11)."""
     x = ground_motion(robot, q, qd, qdd)
-    return _projected_wrenches(robot, ground_inertias(p, x.carry), x)
+    return _projected_wrenches(robot, ground_inertias(p, x[0]), x)
 
 
 def spatial_mass_and_bias(
@@ -139,19 +125,19 @@ def spatial_mass_and_bias(
 ) -> tuple[Float[Array, "joints joints"], Joints]:
     """Return the mass matrix of the bodies by composite bodies, and the bias forces (Eq. 38)."""
     x = ground_motion(robot, q, qd, jnp.zeros_like(q))
-    inertias, moved = ground_inertias(p, x.carry), jnp.asarray(moved_by(robot), q.dtype)
+    inertias, moved = ground_inertias(p, x[0]), jnp.asarray(moved_by(robot), q.dtype)
     composite = jnp.tensordot(moved.T, inertias, 1)
-    M = moved * (_times(composite, x.joints) @ x.joints.T)
+    M = moved * (_times(composite, x[1]) @ x[1].T)
     M = M + (M * jnp.asarray(1.0 - np.eye(len(q)), q.dtype)).T
     return M, _projected_wrenches(robot, inertias, x)
 
 
 def _projected_wrenches(robot: Robot, inertias: Array, x: GroundMotion) -> Joints:
-    momenta = _times(inertias, x.velocities)
-    rates = jnp.einsum("nji,nj->ni", _combine(CROSS, x.velocities), momenta)
-    wrenches = _times(inertias, x.accelerations) - rates
-    beyond = jnp.asarray(moved_by(robot).T, x.joints.dtype) @ wrenches
-    return jnp.sum(x.joints * beyond, axis=1)
+    _, joints, v, a = x
+    rates = jnp.einsum("nji,nj->ni", _combine(CROSS, v), _times(inertias, v))
+    wrenches = _times(inertias, a) - rates
+    beyond = jnp.asarray(moved_by(robot).T, joints.dtype) @ wrenches
+    return jnp.sum(joints * beyond, axis=1)
 
 
 def spatial_regressor(

@@ -36,11 +36,7 @@ ESTIMATORS: dict[str, Changes] = {
 
 
 def choose(experiment: Experiment, logs: Sequence[Path], stage: Stages) -> tuple[ModelChoice, str]:
-    """Choose friction and estimator with some logs; return the choice and the text of a file.
-
-    Raises:
-        InputError: If a log is not as the file says, or the file seeks nonlinear friction.
-    """
+    """Choose friction and estimator with some logs; return the choice and the text of a file."""
     if experiment.linear is not None:
         raise InputError(
             f"{experiment.path.name}: leave `estimator.nonlinear_friction` out: the choice is "

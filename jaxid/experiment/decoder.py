@@ -31,19 +31,12 @@ RENAMED = {"rows.slow": "min_speed", "rows.every": "step"}
 
 
 class Bounds(NamedTuple):
-    """Range of a number, given as `Annotated[float, Bounds(above=0.0)]`; None for no bound.
+    """Range of a number, given as `Annotated[float, Bounds(above=0.0)]`; None for no bound."""
 
-    Attributes:
-        above: Exclusive lower bound.
-        least: Inclusive lower bound.
-        most: Inclusive upper bound.
-        below: Exclusive upper bound.
-    """
-
-    above: float | None = None
-    least: float | None = None
-    most: float | None = None
-    below: float | None = None
+    above: float | None = None  # exclusive lower bound
+    least: float | None = None  # inclusive lower bound
+    most: float | None = None  # inclusive upper bound
+    below: float | None = None  # exclusive upper bound
 
     def check(self, value: float | int, place: str) -> None:
         """Reject a number out of the range, NaN and infinity."""
@@ -65,19 +58,12 @@ PerJoint = list[float]
 
 
 class Key(NamedTuple):
-    """A key of a table.
+    """A key of a table."""
 
-    Attributes:
-        name: Name in the file.
-        hint: Annotation of the argument.
-        default: Default value; `inspect.Parameter.empty` if the key is needed.
-        text: Description, from the docstring.
-    """
-
-    name: str
-    hint: Any
-    default: Any
-    text: str
+    name: str  # name in the file
+    hint: Any  # annotation of the argument
+    default: Any  # default value; `inspect.Parameter.empty` if the key is needed
+    text: str  # description, from the docstring
 
 
 def keys_of(function: Callable) -> dict[str, Key]:
@@ -98,11 +84,7 @@ def keys_of(function: Callable) -> dict[str, Key]:
 
 
 def call(function: Callable, table: Any, place: str, *context: Any) -> Any:
-    """Call a function with the keys of a table as arguments.
-
-    Raises:
-        InputError: If a key or a value does not fit, or the function rejects it.
-    """
+    """Call a function with the keys of a table as arguments."""
     (arguments,) = decode([function], table, place)
     with within(place):
         return function(*context, **arguments)
@@ -128,9 +110,6 @@ def decode(
     """Return the arguments that a table holds for each of several functions that share it.
 
     Arguments in `skip` are no keys; keys without default are needed where the table is `complete`.
-
-    Raises:
-        InputError: If a key is unknown or missing, or a value is not what it should be.
     """
     groups = [{k: v for k, v in keys_of(f).items() if k not in skip} for f in functions]
     known = {name: key for keys in groups for name, key in keys.items()}
@@ -164,11 +143,7 @@ _OTHER = object()
 
 
 def decode_value(value: Any, hint: Any, place: str) -> Any:
-    """Return a value of the file as an argument with such an annotation.
-
-    Raises:
-        InputError: If it does not fit.
-    """
+    """Return a value of the file as an argument with such an annotation."""
     options = [o for o in union_members(hint) if o is not type(None)]
     for option in options:
         made = _convert(value, option, place)

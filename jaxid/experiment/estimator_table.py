@@ -51,31 +51,20 @@ ALTERNATIVES = (
 
 
 class Estimation(NamedTuple):
-    """Choice of how rows become parameters.
+    """Choice of how rows become parameters."""
 
-    Attributes:
-        estimator: Estimator of the file.
-        plain: Least squares with the same weights and solution.
-        uncertainty: Method of the standard deviations.
-        essential: Held-out error that leaving out parameters may cost (fraction); None to keep all.
-        nonlinear: Whether the shape of friction is sought too.
-        notes: Assumptions, in sentences.
-    """
-
-    estimator: estimators.AbstractEstimator
+    estimator: estimators.AbstractEstimator  # estimator of the file
+    # least squares with the same weights and solution
     plain: estimators.LeastSquares | estimators.WeightedLeastSquares
-    uncertainty: AbstractUncertainty
+    uncertainty: AbstractUncertainty  # method of the standard deviations
+    # held-out error that leaving out parameters may cost (fraction); None to keep all
     essential: float | None
-    nonlinear: bool
-    notes: list[str]
+    nonlinear: bool  # whether the shape of friction is sought too
+    notes: list[str]  # assumptions, in sentences
 
 
 def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arguments of `build_estimation`, and the bounds of bodies.
-
-    Raises:
-        InputError: If a key is wrong, belongs to another kind, or does not go with another one.
-    """
+    """Return the arguments of `build_estimation`, and the bounds of bodies."""
     given, bounds = decode([build_estimation, BodyBounds], table, "estimator", complete=False)
     owners = [KINDS["weighted"], KINDS["consistent"]]
     if not any(name in owners[0] and name not in owners[1] for name in given):
@@ -151,9 +140,6 @@ def build_estimation(
         reference_start: Time stamp at which it began [s], like `0.0`; or a list.
         margin: Fraction of a ball that each body contains ("consistent"), like `0.01`.
         pull: Strength of a pull towards the prior, or towards balls ("consistent"); 0 for none.
-
-    Raises:
-        InputError: If keys do not go together, or a file cannot be read.
     """
     robot = model.robot
     joint_weights: estimators.AbstractWeights = estimators.ResidualVariances()

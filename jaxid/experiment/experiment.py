@@ -69,47 +69,30 @@ LONG = 500_000
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """Content of an experiment file.
+    """Content of an experiment file."""
 
-    Attributes:
-        path: Path of the file.
-        text: Text of the file.
-        source: Source of the robot.
-        robot: Robot with its limits, drives and known tool.
-        model: Effects whose parameters are wanted.
-        clearance: Shapes that must keep a distance; None if the file has none.
-        columns: Columns of the logs; None if the file does not say.
-        logs: Sides, files and parts of the logs.
-        load: Known load that is on the robot in some logs only; None if the file does not say.
-        filter: Filter of motion, forces and columns.
-        candidates: Filters to choose from; none if the file names one.
-        decimation: Decimation of forces and columns.
-        min_speed: Speeds below which rows do not count [rad/s or m/s]; None if all count.
-        estimation: Estimator and uncertainty.
-        linear: Terms of the model that nonlinear friction must beat; None if it is not wanted.
-        load_transition: Transition of friction by load, which the model leaves out; None without.
-        excitation: Settings of the motion to design.
-        notes: Assumptions where the file says nothing, in sentences.
-    """
-
-    path: Path
-    text: str
-    source: RobotSource
-    robot: Robot
-    model: Model
-    clearance: Clearance | None
-    columns: Columns | None
-    logs: Logs
+    path: Path  # path of the file
+    text: str  # text of the file
+    source: RobotSource  # source of the robot
+    robot: Robot  # robot with its limits, drives and known tool
+    model: Model  # effects whose parameters are wanted
+    clearance: Clearance | None  # shapes that must keep a distance; None if the file has none
+    columns: Columns | None  # columns of the logs; None if the file does not say
+    logs: Logs  # sides, files and parts of the logs
+    # known load that is on the robot in some logs only; None if the file does not say
     load: Tool | float | None
-    filter: AbstractFilter
-    candidates: tuple[FilterCandidate, ...]
-    decimation: AbstractDecimation
+    filter: AbstractFilter  # filter of motion, forces and columns
+    candidates: tuple[FilterCandidate, ...]  # filters to choose from; none if the file names one
+    decimation: AbstractDecimation  # decimation of forces and columns
+    # speeds below which rows do not count [rad/s or m/s]; None if all count
     min_speed: Float[np.ndarray, " joints"] | None
-    estimation: Estimation
+    estimation: Estimation  # estimator and uncertainty
+    # terms of the model that nonlinear friction must beat; None if it is not wanted
     linear: tuple[AbstractTerm, ...] | None
+    # transition of friction by load, which the model leaves out; None without
     load_transition: AbstractTransition | None
-    excitation: Excitation
-    notes: tuple[str, ...]
+    excitation: Excitation  # settings of the motion to design
+    notes: tuple[str, ...]  # assumptions where the file says nothing, in sentences
 
     @functools.cached_property
     def base(self) -> BaseParameters:
@@ -159,11 +142,7 @@ class Experiment:
         return dataclasses.replace(fit, notes=(*fit.notes, note))
 
     def read(self, log: str | Path) -> Recording:
-        """Read a log as the table `[recording]` says.
-
-        Raises:
-            InputError: If the file has no table `[recording]`, or the log is not as it says.
-        """
+        """Read a log as the table `[recording]` says."""
         return self._read(Path(log), self._columns_of(Path(log)))
 
     def commanded(self, log: Path) -> Observations | None:
@@ -215,12 +194,7 @@ class Experiment:
         return estimated_rows(Path(log)) >= LONG
 
     def open(self, log: Path) -> Observations:
-        """Open a log that need not fit into memory: like `read` and `observe`, part by part.
-
-        Raises:
-            NeedsMemory: If it can be read only as a whole.
-            InputError: If the log is not as the file says.
-        """
+        """Open a log that need not fit into memory: like `read` and `observe`, part by part."""
         logs = self.logs
         if logs.force_delay:
             raise NeedsMemory("`recording.force_delay` shifts the angles of whole logs")
@@ -248,13 +222,7 @@ class Experiment:
 
 
 def load_experiment(path: str | Path) -> Experiment:
-    """Load an experiment file; paths in it are relative to its folder.
-
-    Raises:
-        OSError: If the file cannot be read.
-        InputError: If the file or something in it is not what it should be: one sentence with the
-            names of file and key.
-    """
+    """Load an experiment file; paths in it are relative to its folder."""
     path = Path(path)
     if not path.is_file():
         raise InputError(
@@ -268,11 +236,7 @@ def load_experiment(path: str | Path) -> Experiment:
 
 
 def parse_experiment(text: str, path: Path) -> Experiment:
-    """Return the experiment of a file with this text; other paths are relative to its folder.
-
-    Raises:
-        InputError: If the text or something in it is not what it should be.
-    """
+    """Return the experiment of a file with this text; other paths are relative to its folder."""
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:

@@ -120,9 +120,6 @@ def select_filter(
     """Return the experiment with the filter that suits some logs best, and the choice.
 
     The rest of each log beyond the fraction `split` stays unseen.
-
-    Raises:
-        InputError: If a log and a filter do not go together, or a log is long.
     """
     if not experiment.candidates or not logs:
         return experiment, None
@@ -164,11 +161,7 @@ def is_report(path: Path) -> bool:
 
 
 def earlier_run(experiment: Experiment, folder: Path) -> Fit:
-    """Return the fit of the report in a folder.
-
-    Raises:
-        InputError: If it keeps nothing, or of another robot or model.
-    """
+    """Return the fit of the report in a folder."""
     fit = read_fit(folder)
     try:
         require_same_base((fit, dataclasses.replace(fit, base=experiment.base, name="these logs")))
@@ -180,12 +173,7 @@ def earlier_run(experiment: Experiment, folder: Path) -> Fit:
 def read_runs(
     experiment: Experiment, groups: Sequence[Sequence[Path]], names: Sequence[str], stage: Stages
 ) -> tuple[list[Fit], list[str]]:
-    """Return a run of the logs and reports of each group, and doubts about the logs.
-
-    Raises:
-        InputError: If the shape of friction is sought, a log is not as the file says, or a folder
-            holds no report.
-    """
+    """Return a run of the logs and reports of each group, and doubts about the logs."""
     if experiment.linear is not None:
         raise InputError(
             f"{experiment.path.name}: `estimator.nonlinear_friction` would find other shapes of "
@@ -217,27 +205,16 @@ def read_runs(
 
 
 class Identification(NamedTuple):
-    """Result of the command `jaxid identify`.
+    """Result of the command `jaxid identify`."""
 
-    Attributes:
-        experiment: Experiment with the filter that was chosen.
-        choice: Choice of the filter, where it was left to the logs.
-        fit: Identified parameters.
-        validation: Torque errors of all logs, those of the fit first.
-        fitted: Number of logs, or of parts of logs, of the fit.
-        notes: Notes on the logs, as sentences.
-        findings: Findings on the logs.
-        mistakes: Likely mistakes in the columns of the logs, by the fit.
-    """
-
-    experiment: Experiment
-    choice: FilterChoice | None
-    fit: Fit
-    validation: Validation
-    fitted: int
-    notes: list[str]
-    findings: list[str]
-    mistakes: tuple[str, ...]
+    experiment: Experiment  # experiment with the filter that was chosen
+    choice: FilterChoice | None  # choice of the filter, where it was left to the logs
+    fit: Fit  # identified parameters
+    validation: Validation  # torque errors of all logs, those of the fit first
+    fitted: int  # number of logs, or of parts of logs, of the fit
+    notes: list[str]  # notes on the logs, as sentences
+    findings: list[str]  # findings on the logs
+    mistakes: tuple[str, ...]  # likely mistakes in the columns of the logs, by the fit
 
 
 def identify_logs(
@@ -247,12 +224,7 @@ def identify_logs(
     split: float | None,
     stage: Stages,
 ) -> Identification:
-    """Identify with logs and with what earlier reports keep, and validate.
-
-    Raises:
-        InputError: If a log is not as the file says, or a log would verify a model that has seen
-            it.
-    """
+    """Identify with logs and with what earlier reports keep, and validate."""
     logs = [p for p in paths if not is_report(p)]
     reports = [p for p in paths if is_report(p)]
     experiment, choice = select_filter(experiment, logs, stage, split)

@@ -64,18 +64,7 @@ def write_template(
     base: str | None = None,
     folder: str | Path = ".",
 ) -> str:
-    """Return a complete commented experiment file for a robot; it loads as it is.
-
-    Args:
-        urdf: Path of the robot's URDF, xacro or MJCF file.
-        tip: Link of the end-effector; the end of the longest chain if None.
-        base: Link that stands on the ground; the root if None.
-        folder: Folder of the experiment file, to which that path is relative.
-
-    Raises:
-        FileNotFoundError: If the robot's file does not exist.
-        InputError: If it cannot be loaded.
-    """
+    """Return a complete commented experiment file for a robot; it loads as it is."""
     robot = load_urdf(urdf, tip=tip, base=base)
     path = Path(os.path.relpath(Path(urdf).resolve(), Path(folder).resolve()))
     limits = ("position_min", "position_max", "velocity", "acceleration", "jerk", "force")

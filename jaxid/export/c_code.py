@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float
 from jaxid.identification.fit_result import Fit
-from jaxid.io import atomic_folder
+from jaxid.io import atomic_folder, fill_template
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c_writer import CWriter
 
@@ -31,6 +30,11 @@ class CFunction(NamedTuple):
     def size(self) -> int:
         """Number of entries of the output."""
         return math.prod(self.program.output_shapes[0])
+
+    @property
+    def sizes(self) -> list[int]:
+        """Number of entries of each input."""
+        return [math.prod(shape) for shape in self.program.input_shapes]
 
 
 def export_c(fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = True) -> Path:
@@ -55,8 +59,7 @@ def export_c(fit: Fit, folder: str | Path, *, name: str = "arm", double: bool = 
     functions = c_functions(fit)
     writer = CWriter(double, name, [x.program for x in functions])
     with atomic_folder(folder) as staging:
-        for suffix, write in ((".c", _source), (".h", _header)):
-            text = write(fit, writer, functions)
+        for suffix, text in c_texts(fit, writer, functions).items():
             (staging / f"{name}{suffix}").write_text(text, encoding="ascii")
     return Path(folder) / f"{name}.c"
 
@@ -111,162 +114,42 @@ def c_functions(fit: Fit) -> tuple[CFunction, ...]:
     return tuple(written)
 
 
-def _header(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
-    robot, name = fit.base.model.robot, writer.prefix
-    joints = "\n".join(
-        f"     {j}  {_ascii(robot.joint_names[j])}: {'turns' if turns else 'slides'}, "
-        f"q in {robot.joint_unit(j)}, tau in {robot.force_unit(j)}"
-        for j, turns in enumerate(robot.revolute)
-    )
-    gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
-    memory = ""
-    if fit.base.model.memory is not None:
-        memory = f"""
-   s: state of dry friction, one number between -1 and 1 for each joint, then for each motor if some
-   turn several axes, which the caller keeps.
-   Begin with zeros, and call {name}_advance(q_before, q, s, s) at every sample, before the others.
-"""
-    terms = _ascii(", ".join(type(t).__name__ for t in fit.base.model.terms))
-    prototypes = []
-    for x in functions:
-        shapes = zip(x.inputs, x.program.input_shapes, strict=True)
-        inputs = ", ".join(f"{key}[{math.prod(shape)}]" for key, shape in shapes)
-        prototypes.append(
-            f"/* {x.summary}.\n   {x.program.counts.total} operations: {x.program.counts}.\n"
-            f"   From {inputs} to {x.output}[{x.size}]. */\n"
-            f"{writer.declaration(f'{name}_{x.name}', x.inputs, (x.output,))};"
-        )
-    listed = "\n\n".join(prototypes)
-    return f"""/* Identified model of the robot "{_ascii(robot.name)}", for a controller.
-
-   Model of {_ascii(fit.date) or "an unknown day"}, {fit.checksum}
-   Recordings: {_ascii(", ".join(fit.recordings) or "unknown")}
-   Terms: {terms}
-   Gravity in the frame of the ground: {gravity} m/s^2
-
-   Joints, in the order of all arrays:
-{joints}
-
-   q, qd, qdd: positions, velocities and accelerations [rad or m, per s, per s^2].
-   tau: generalised forces on the side of the joints [N m or N], without a known tool.
-{memory}
-   Nothing is allocated, nothing remembered, and no branch on data: every call takes the same time,
-   and functions can be called from any thread. All inputs are read before an output is written.
-   Numbers that are not finite, and angles beyond {writer.turns:.0f} turns, give NaN.
-
-   Check the file on its machine: cc -D{name.upper()}_SELF_TEST {name}.c -lm && ./a.out
-   Generated code: do not edit. */
-#ifndef {name.upper()}_H
-#define {name.upper()}_H
-
-#define {name.upper()}_JOINTS {robot.joints}
-#define {name.upper()}_PARAMETERS {fit.base.size}
-#define {name.upper()}_CHECKSUM "{fit.checksum}"
-#define {name.upper()}_DATE {json.dumps(_ascii(fit.date))}
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
-/* The estimates: see the list in {name}.c. */
-extern const {writer.type} {name}_parameters[{fit.base.size}];
-
-{listed}
-
-#ifdef __cplusplus
-}}
-#endif
-
-#endif
-"""
-
-
-def _source(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
-    base, name = fit.base, writer.prefix
-    labels = [f"{x} [{unit}]" for x, unit in zip(base.names, base.units, strict=True)]
-    estimates = zip(np.asarray(fit.parameters).tolist(), labels, strict=True)
-    parameters = "\n".join(
-        f"    {writer.number(x)}{',' if k + 1 < base.size else ' '} /* {_ascii(label)} */"
-        for k, (x, label) in enumerate(estimates)
-    )
-    definitions = "\n".join(
-        writer.definition(x.program, f"{name}_{x.name}", x.inputs, (x.output,)) for x in functions
-    )
-    return f"""/* Identified model of the robot "{_ascii(base.model.robot.name)}": see {name}.h.
-   Generated code: do not edit. */
-#include "{name}.h"
-
-#include <float.h>
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
-
-const {writer.type} {name}_parameters[{base.size}] = {{
-{parameters}
-}};
-
-{writer.library()}
-{definitions}
-{_self_test(fit, writer, functions)}"""
-
-
-def _self_test(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> str:
-    """Return a C program that compares all functions with their results in Python."""
-    name, kind, n, samples = writer.prefix, writer.type, fit.base.model.robot.joints, 4
-    random = np.random.default_rng(0)
+def c_texts(fit: Fit, writer: CWriter, functions: tuple[CFunction, ...]) -> dict[str, str]:
+    """Return the texts of the header and of the C file, by their suffixes."""
+    model = fit.base.model
+    random, samples = np.random.default_rng(0), 4
+    # The self-test compares all functions with their results in Python.
     used = dict.fromkeys(x for f in functions for x in f.inputs if x != "p")
-    states = {x: np.round(random.uniform(-2.0, 2.0, (samples, n)), 3) for x in used}
+    states = {
+        x: np.round(random.uniform(-2.0, 2.0, (samples, model.robot.joints)), 3) for x in used
+    }
     given = {**states, "p": np.tile(np.asarray(fit.parameters, np.float64), (samples, 1))}
-    tables, calls = [_table(f"{name}_{x}", writer, rows) for x, rows in states.items()], []
+    tables = {x: rows.tolist() for x, rows in states.items()}
     for function in functions:
         arrays = [given[x] for x in function.inputs]
         if not writer.double:
             arrays = [x.astype(np.float32).astype(np.float64) for x in arrays]
         result = np.asarray(evaluate(function.program, *(x.T for x in arrays)))
         rows = np.broadcast_to(result.reshape(function.size, -1), (function.size, samples)).T
-        tables.append(_table(f"{name}_{function.name}_expected", writer, rows))
-        inputs = [f"{name}_parameters" if x == "p" else f"{name}_{x}[k]" for x in function.inputs]
-        calls.append(
-            f"        {name}_{function.name}({', '.join(inputs)}, result);\n"
-            f'        wrong |= {name}_differs("{function.name}", result, '
-            f"{name}_{function.name}_expected[k], {function.size});"
-        )
-    body, tolerance = "\n".join(calls), 1e-10 if writer.double else 2e-3
-    return f"""#ifdef {name.upper()}_SELF_TEST
-#include <stdio.h>
-
-{"".join(tables)}
-static int {name}_differs(const char *what, const {kind} *got, const {kind} *wanted, int size)
-{{
-    double largest = 0.0, error = 0.0;
-    int i;
-    for (i = 0; i < size; ++i) {{
-        largest = fabs((double)wanted[i]) > largest ? fabs((double)wanted[i]) : largest;
-        error = fabs((double)got[i] - (double)wanted[i]) <= error
-            ? error : fabs((double)got[i] - (double)wanted[i]);
-    }}
-    printf("%-24s largest error %.1e of %.1e\\n", what, error, largest);
-    return !(error <= {tolerance:g} * largest + {tolerance:g});
-}}
-
-int main(void)
-{{
-    {kind} result[{max(x.size for x in functions)}];
-    int wrong = 0, k;
-    for (k = 0; k < {samples}; ++k) {{
-{body}
-    }}
-    puts(wrong ? "this build is WRONG" : "this build is right");
-    return wrong;
-}}
-#endif
-"""
-
-
-def _table(name: str, writer: CWriter, rows: Float[np.ndarray, "states entries"]) -> str:
-    listed = ",\n".join("    {" + ", ".join(map(writer.number, row)) + "}" for row in rows.tolist())
-    shape = f"[{rows.shape[0]}][{rows.shape[1]}]"
-    return f"static const {writer.type} {name}{shape} = {{\n{listed}\n}};\n"
+        tables[f"{function.name}_expected"] = rows.tolist()
+    values = {
+        "fit": fit,
+        "robot": model.robot,
+        "name": writer.prefix,
+        "writer": writer,
+        "functions": functions,
+        "parameters": np.asarray(fit.parameters).tolist(),
+        "terms": ", ".join(type(term).__name__ for term in model.terms),
+        "gravity": ", ".join(f"{x:g}" for x in np.asarray(model.robot.gravity)),
+        "has_memory": model.memory is not None,
+        "tables": tables,
+        "samples": samples,
+        "tolerance": "1e-10" if writer.double else "0.002",
+        "ascii": _ascii,
+        "quoted": json.dumps,
+    }
+    templates = Path(__file__).parent / "templates"
+    return {x: fill_template(templates / f"arm{x}.jinja", **values) for x in (".h", ".c")}
 
 
 def _ascii(text: str) -> str:

@@ -35,19 +35,12 @@ from jaxid.robot.robot import Robot
 
 @dataclasses.dataclass(frozen=True)
 class Description:
-    """One of many descriptions of the same robot, with the same forces.
+    """One of many descriptions of the same robot, with the same forces."""
 
-    Attributes:
-        robot: Joints and frames, in the unit of length.
-        bodies: Pseudo-inertias.
-        turned: Angles that are added to those of the joints [rad].
-        unit: Unit of length [m].
-    """
-
-    robot: Robot
-    bodies: Float[np.ndarray, "joints 4 4"]
-    turned: Float[np.ndarray, " joints"]
-    unit: float = 1.0
+    robot: Robot  # joints and frames, in the unit of length
+    bodies: Float[np.ndarray, "joints 4 4"]  # pseudo-inertias
+    turned: Float[np.ndarray, " joints"]  # angles that are added to those of the joints [rad]
+    unit: float = 1.0  # unit of length [m]
 
     @property
     def cost(self) -> int:

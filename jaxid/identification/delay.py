@@ -131,17 +131,11 @@ def estimate_delay(
 
 
 class _Equations(NamedTuple):
-    """Normal equations: sums of products over the rows, with the forces as last column.
+    """Normal equations: sums of products over the rows, with the forces as last column."""
 
-    Attributes:
-        products: Instruments times regressor, in each block of time.
-        squares: Regressor times regressor.
-        rates: Rates of the regressor times rates of the regressor.
-    """
-
-    products: np.ndarray
-    squares: np.ndarray
-    rates: np.ndarray
+    products: np.ndarray  # instruments times regressor, in each block of time
+    squares: np.ndarray  # regressor times regressor
+    rates: np.ndarray  # rates of the regressor times rates of the regressor
 
     def combined(self, columns: np.ndarray) -> "_Equations":
         """Return the equations for parameters of which the present ones are combinations."""

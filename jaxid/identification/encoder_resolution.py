@@ -51,11 +51,6 @@ def resolution_bias(
     The filtered motion is taken for the true one, and the fitted model's forces for the true ones.
     The angles are rounded as the encoders do, filtered, and the parameters estimated again: by how
     much they change is the bias. Angles on no grid are not rounded.
-
-    Args:
-        fit: Fit to these observations, or to several.
-        recording: Log with its angles as they were measured.
-        observations: The same log, filtered.
     """
     robot, motion = fit.base.model.robot, observations.motion
     steps = encoder_steps(recording)

@@ -25,25 +25,15 @@ Columns = Sequence[tuple[int, ...]]
 
 
 class RowChunk(NamedTuple):
-    """Consecutive rows of one block of time, filtered and decimated.
+    """Consecutive rows of one block of time, filtered and decimated."""
 
-    Attributes:
-        recording: Index of the recording.
-        block: Index of the block of time, counted over all recordings.
-        rows: Range of the recording's rows.
-        indices: Base parameters that can act on each joint.
-        columns: Columns of each joint [rows, indices of the joint].
-        forces: Measured forces less those of a known tool [rows, joints], in [N m] or [N].
-        mask: Rows that count for each joint [rows, joints].
-    """
-
-    recording: int
-    block: int
-    rows: slice
-    indices: Columns
-    columns: list[np.ndarray]
-    forces: np.ndarray
-    mask: np.ndarray
+    recording: int  # index of the recording
+    block: int  # index of the block of time, counted over all recordings
+    rows: slice  # range of the recording's rows
+    indices: Columns  # base parameters that can act on each joint
+    columns: list[np.ndarray]  # columns of each joint [rows, indices of the joint]
+    forces: np.ndarray  # measured forces less those of a known tool [rows, joints], in [N m] or [N]
+    mask: np.ndarray  # rows that count for each joint [rows, joints]
 
     def part(self, selection: slice) -> "RowChunk":
         """Return some of the rows, counted from the first of the chunk."""
@@ -107,17 +97,12 @@ def divide_rows(edges: Sequence[int], rows: slice) -> Iterator[tuple[int, slice]
 
 
 class JointFactor(eqx.Module):
-    r"""The R factor of $[\Theta_j \; Q_j]$, the rows of one joint and their forces.
+    r"""The R factor of $[\Theta_j \; Q_j]$, the rows of one joint and their forces."""
 
-    Attributes:
-        columns: Base parameters that can act on the joint.
-        R: Upper triangle, or fewer rows; its last column belongs to the forces.
-        rows: Number of rows that it stands for.
-    """
-
-    columns: tuple[int, ...] = eqx.field(static=True)
+    columns: tuple[int, ...] = eqx.field(static=True)  # base parameters that can act on the joint
+    # upper triangle, or fewer rows; its last column belongs to the forces
     R: Float[AnyArray, "height width"]
-    rows: int = eqx.field(static=True)
+    rows: int = eqx.field(static=True)  # number of rows that it stands for
 
     def append(self, rows: Float[AnyArray, "height width"]) -> "JointFactor":
         """Return the factor after more rows `[columns, force]`."""
@@ -126,15 +111,10 @@ class JointFactor(eqx.Module):
 
 
 class Factors(eqx.Module):
-    """The factors of all joints.
+    """The factors of all joints."""
 
-    Attributes:
-        joints: Factor of each joint.
-        size: Number of base parameters.
-    """
-
-    joints: tuple[JointFactor, ...]
-    size: int = eqx.field(static=True)
+    joints: tuple[JointFactor, ...]  # factor of each joint
+    size: int = eqx.field(static=True)  # number of base parameters
 
     def append(self, rows: Sequence[np.ndarray]) -> "Factors":
         """Return the factors after more rows `[columns, force]` of each joint."""
@@ -181,13 +161,9 @@ def empty_factors(columns: Columns, size: int) -> Factors:
 
 
 class Blocks(eqx.Module):
-    """Factors of contiguous blocks of time, which together hold all rows.
+    """Factors of contiguous blocks of time, which together hold all rows."""
 
-    Attributes:
-        parts: Factors of each block.
-    """
-
-    parts: tuple[Factors, ...]
+    parts: tuple[Factors, ...]  # factors of each block
 
     @property
     def total(self) -> Factors:

@@ -169,17 +169,11 @@ def _correlation(problem: RegressionProblem, estimator: AbstractEstimator) -> fl
 
 
 class Elimination(NamedTuple):
-    """One step of backward elimination.
+    """One step of backward elimination."""
 
-    Attributes:
-        name: Base parameter that is eliminated; empty before the first step.
-        remaining: Number of remaining parameters.
-        held_out: Weighted error on held-out blocks of time, relative to the forces.
-    """
-
-    name: str
-    remaining: int
-    held_out: float
+    name: str  # base parameter that is eliminated; empty before the first step
+    remaining: int  # number of remaining parameters
+    held_out: float  # weighted error on held-out blocks of time, relative to the forces
 
 
 class EssentialParameters(eqx.Module):

@@ -66,9 +66,6 @@ def identify_batch(
         estimator: Another than weighted least squares: it estimates one data set after the other,
             on all cores. It has weights of its own; not with `robots`, and not while JAX traces.
 
-    Returns:
-        The estimates of all data sets.
-
     Raises:
         InputError: If shapes do not fit, there are too few rows, or weights are not known.
         RuntimeError: If JAX's 64-bit mode is off.

@@ -177,17 +177,11 @@ def _held_out_errors(
 
 
 class ShapeSlopes(AbstractTerm):
-    """Forces of small changes of shapes: with this term the linearised problem is an ordinary one.
+    """Forces of small changes of shapes: it makes the linearised problem an ordinary one."""
 
-    Attributes:
-        shapes: Shapes that change, at which forces are linearised.
-        x: Their values.
-        p: Standard parameters of the terms that have shapes.
-    """
-
-    shapes: Shapes
-    x: Float[AnyArray, " shapes"]
-    p: Float[AnyArray, " standard"]
+    shapes: Shapes  # shapes that change, at which forces are linearised
+    x: Float[AnyArray, " shapes"]  # their values
+    p: Float[AnyArray, " standard"]  # standard parameters of the terms that have shapes
 
     def parameters(self, robot):
         """Return names and units of the shapes."""

@@ -104,11 +104,7 @@ class RegressionProblem:
         return self.blocks.total
 
     def require_samples(self) -> None:
-        """Check that the rows themselves are known.
-
-        Raises:
-            InputError: If only factors are known.
-        """
+        """Check that the rows themselves are known."""
         if not self.recordings:
             raise InputError("this estimate needs the rows themselves: `identify` the recordings.")
 
@@ -116,9 +112,6 @@ class RegressionProblem:
         """Return the problem of the same recordings with other base parameters.
 
         For estimators that search for constants of the model's terms.
-
-        Raises:
-            InputError: If only factors are known.
         """
         self.require_samples()
         return RegressionProblem(base, self.recordings, self.progress)
@@ -137,9 +130,6 @@ class RegressionProblem:
             columns: Parameters to which these columns belong; by default those of the rows.
             size: Number of all parameters; by default that of the base parameters.
             chunks: Rows; by default all.
-
-        Raises:
-            InputError: If only factors are known.
         """
         columns = self.base.acting_columns if columns is None else columns
         size = self.base.size if size is None else size
@@ -153,9 +143,6 @@ class RegressionProblem:
 
         Args:
             spans: Rows that are needed, in their order; others may come too. By default all.
-
-        Raises:
-            InputError: If only factors are known.
         """
         self.require_samples()
         for number in range(len(self.recordings)):
@@ -220,11 +207,7 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
 
 
 def cross_validation_folds(blocks: Blocks, count: int = 5) -> Iterator[tuple[Blocks, Blocks]]:
-    """Yield the blocks without one contiguous part of time, and that part, for each part in turn.
-
-    Raises:
-        InputError: If there are fewer than two blocks.
-    """
+    """Yield the blocks without one contiguous part of time, and that part; each in turn."""
     size = len(blocks.parts)
     if size < 2:
         raise InputError("held-out errors need at least two blocks of rows: record longer.")

@@ -9,11 +9,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxid import units
+from jaxid.arrays import optional
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.units import Quantity, Unit
 
-from .filters import optional
 from .log_files import LogTable, Selection, open_table
 from .recording import positive_time
 
@@ -191,9 +191,6 @@ def open_log(
     """Open the files of a log; with `on_disk`, texts and arrays stay on the disk.
 
     With `lenient`, rows that cannot be read are no error: `Log.bad_rows` names them.
-
-    Raises:
-        InputError: If a file or column is missing, or files differ in their numbers of rows.
     """
     if velocities_path is not None and columns.velocities is None:
         raise InputError("`velocities_path` is given, but `Columns.velocities` names no columns.")

@@ -12,18 +12,13 @@ PART = 16384
 
 
 class SamplesWithMemory(AbstractSamples):
-    """Samples whose motion has the states of friction with memory.
+    """Samples whose motion has the states of friction with memory."""
 
-    Attributes:
-        source: The samples.
-        law: Law of the state.
-        segments: Half-open ranges of samples without gaps; each starts as in steady motion.
-        starts: States at some samples, the first ones of all segments among them.
-    """
-
-    source: AbstractSamples
-    law: Presliding
+    source: AbstractSamples  # the samples
+    law: Presliding  # law of the state
+    # half-open ranges of samples without gaps; each starts as in steady motion
     segments: tuple[tuple[int, int], ...]
+    # states at some samples, the first ones of all segments among them
     starts: dict[int, np.ndarray]
 
     def __init__(self, source, law, segments):

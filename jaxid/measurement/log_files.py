@@ -40,26 +40,17 @@ EPISODE_PAUSE = 10.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LogTable:
-    """Channels of one file, in memory or on disk.
+    """Channels of one file, in memory or on disk."""
 
-    Attributes:
-        source: Name of the file, for messages.
-        columns: Columns, or whole arrays (samples x joints), by name; or a lazy frame.
-        channels: Names of the columns of each channel, in the order of the joints.
-        first_row: Number of the first row in the file, for messages.
-        unit: Name of a row, for messages: `line` in text files.
-        bad: Complaints about rows that cannot be read, by their numbers; None if the first one is
-            an error.
-        notes: Remarks about how the columns were made.
-    """
-
-    source: str
-    columns: Any
+    source: str  # name of the file, for messages
+    columns: Any  # columns, or whole arrays (samples x joints), by name; or a lazy frame
+    # names of the columns of each channel, in the order of the joints
     channels: Mapping[str, tuple[str, ...]]
-    first_row: int = 1
-    unit: str = "row"
+    first_row: int = 1  # number of the first row in the file, for messages
+    unit: str = "row"  # name of a row, for messages: `line` in text files
+    # complaints about rows that cannot be read, by their numbers; None if the first one is an error
     bad: dict[int, str] | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # remarks about how the columns were made
 
     @functools.cached_property
     def rows(self) -> int:

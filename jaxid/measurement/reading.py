@@ -243,11 +243,7 @@ def _stamps(log: Log) -> Iterator[np.ndarray]:
 
 
 def filter_memory(filter: AbstractFilter, sample_time: float, measured: bool) -> int:
-    """Return after how many samples a filter's motion no longer depends on an angle or velocity.
-
-    Raises:
-        NeedsMemory: If the memory is not finite.
-    """
+    """Return after how many samples a filter's motion no longer depends on an angle or velocity."""
     refusal = (
         f"`{type(filter).__name__}` needs the whole log: take another filter, or `read_recording`."
     )

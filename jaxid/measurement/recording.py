@@ -89,10 +89,6 @@ class Recording(eqx.Module):
             bridged: Pause that is bridged in any case [s].
             name: Name of the log.
             first_row: Number of the first row in its file, for messages.
-
-        Raises:
-            InputError: If shapes differ, a value is not finite, time runs backwards or does not
-                advance, or there are fewer than ten samples.
         """
         if not largest_gap > 1.0:
             raise InputError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
@@ -155,20 +151,12 @@ class Recording(eqx.Module):
         return TimeGrid(self.sample_time, self.segments, starts, self.notes)
 
     def crop(self, start: float | int = -np.inf, stop: float | int = np.inf) -> "Recording":
-        """Return the part from `start` [s] on and before `stop` [s], on the clock of `time`.
-
-        Raises:
-            InputError: If fewer than ten samples are left.
-        """
+        """Return the part from `start` [s] on and before `stop` [s], on the clock of `time`."""
         grid = self.grid.cropped(start, stop, self.name)
         return self._range(grid.ranges[0][0], grid.ranges[-1][1])
 
     def split(self, fraction: float) -> "tuple[Recording, Recording]":
-        """Return the first fraction (0 to 1) of the recorded time, and the rest.
-
-        Raises:
-            InputError: If a part has fewer than ten samples.
-        """
+        """Return the first fraction (0 to 1) of the recorded time, and the rest."""
         cut = round(fraction * self.samples)
         if not FEWEST <= cut <= self.samples - FEWEST:
             raise InputError(
@@ -226,9 +214,6 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
     Args:
         recording: Recording whose forces are delayed.
         seconds: Delay of the forces [s]; negative if they are early.
-
-    Raises:
-        InputError: If the delay is longer than the segments.
     """
     require_finite_delay(seconds)
     lost = math.ceil(abs(seconds) / recording.sample_time - 1e-9)
@@ -314,17 +299,9 @@ def find_grid(
 ) -> TimeGrid:
     """Find the uniform grid behind time stamps; the typical step is that of the first part.
 
-    Args:
-        read: Function that yields the finite stamps of the rows in consecutive parts [s]; it is
-            called three times.
-        source: Name of the log, for messages.
-        limits: Pauses that are bridged by interpolation: in sample times, and in seconds.
-        first_row: Number of the first row in its file, for messages.
-        in_parts: Whether the log is too large to move or remove rows.
-
-    Raises:
-        NeedsMemory: If rows of a log in parts must be moved or removed.
-        InputError: If time runs backwards, or does not advance.
+    `read` yields the finite stamps [s] in consecutive parts, and is called three times; `limits`
+    are the pauses that are bridged, in sample times and in seconds. Where `in_parts`, the log is
+    too large to move or remove rows.
     """
     first = next(iter(read()), np.zeros(0))
     steps = np.diff(first)
@@ -427,9 +404,6 @@ def _resampling(
     Returns:
         Time between two samples [s]; times of each segment's samples [s]; remarks; and a function
         of a channel's rows: its samples as they are, or interpolated by cubic splines.
-
-    Raises:
-        InputError: If time runs backwards, or does not advance.
     """
     _require_forward(stamps, np.diff(stamps), first_row, source)
     kept = np.flatnonzero(np.diff(stamps, prepend=-np.inf) > 0)

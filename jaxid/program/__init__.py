@@ -9,7 +9,6 @@ from .jax_sincos import sine_cosine as sine_cosine
 from .numpy_evaluation import (
     dense_rows as dense_rows,
     evaluate as evaluate,
-    evaluate_packed as evaluate_packed,
     evaluate_rows as evaluate_rows,
     to_python as to_python,
 )

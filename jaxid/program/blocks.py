@@ -9,7 +9,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_batching import custom_vmap
 
 from jaxid.arrays import Array, Float
@@ -22,24 +21,12 @@ BLOCK = 256
 """Samples of one evaluation."""
 
 
-@functools.lru_cache(maxsize=64)
-def distinct_results(program: Program) -> tuple[tuple[int, ...], np.ndarray]:
-    """Return the nodes of the packed result, and for each entry the number of its node, or -1."""
-    numbers: dict[int, int] = {}
-    entries = [
-        numbers.setdefault(x, len(numbers)) if isinstance(x, int) else -1 for x in program.outputs
-    ]
-    return tuple(numbers), np.array(entries, int)
-
-
 def block_results(program: Program, *arrays: Array) -> tuple[Array, ...]:
     """Return the distinct results of a block of samples, each computed once.
 
-    Args:
-        program: Program made by `trace`, of inputs with one axis.
-        arrays: Inputs: [entries] if all samples have it in common, else [samples, entries].
+    Inputs are [entries] if all samples have them in common, else [samples, entries].
     """
-    nodes, _ = distinct_results(program)
+    nodes, _ = program.distinct
     lowered = lower(program, fence=True)
     block = next(len(x) for x in arrays if x.ndim == 2)
 
@@ -66,12 +53,12 @@ def results_at_once(program: Program, *arrays: Array) -> tuple[Array, ...]:
     inputs = [[jnp.broadcast_to(row, (count,)) for row in x.T] for x in arrays]
     like = jnp.zeros(count, arrays[-1].dtype)
     values = lower(program, fence=False).run(inputs, primitives(like))[0]
-    return tuple(values[k] for k in distinct_results(program)[0])
+    return tuple(values[k] for k in program.distinct[0])
 
 
 def _dense(program: Program, rows: tuple[Array, ...], like: Array) -> Float[Array, "samples out"]:
     """Return distinct results in the order of the packed result, with its constants."""
-    _, entries = distinct_results(program)
+    _, entries = program.distinct
     pairs = zip(entries, program.outputs, strict=True)
     full = [rows[k] if k >= 0 else jax.lax.full_like(like, x) for k, x in pairs]
     return jnp.stack(full, axis=1)
@@ -111,10 +98,7 @@ def _at_once(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
 def on_rows(program: Program, *arrays: Array) -> Float[Array, "samples out"]:
     """Return the packed result of each sample; not for differentiation.
 
-    Args:
-        program: Program made by `trace`, of inputs with one axis.
-        arrays: Inputs: [entries] if all samples have it in common, else [samples, entries]; at
-            least the last one has samples.
+    Inputs as in `block_results`; at least the last one has samples.
     """
     if not len(arrays[-1]):
         return jnp.zeros((0, len(program.outputs)), arrays[-1].dtype)
@@ -158,12 +142,9 @@ def row_products(
 ) -> list[Float[Array, "results results"]]:
     """Return the sums over samples of products of results; the results are never stored.
 
-    Args:
-        program: Program made by `trace`, of inputs with one axis.
-        groups: Positions in the packed result, whose values are multiplied with each other.
-        arrays: Inputs [samples, entries].
+    A group holds positions in the packed result whose values are multiplied with each other.
     """
-    _, entries = distinct_results(program)
+    _, entries = program.distinct
     count, dtype = len(arrays[0]), arrays[0].dtype
     if count == 0:
         return [jnp.zeros((len(group), len(group)), dtype) for group in groups]

@@ -10,10 +10,12 @@ import math
 import re
 from collections.abc import Sequence
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.io import fill_template
 
 from .jax_sincos import DOUBLE, SINGLE, half_pi
 from .program import Program, Reference
@@ -32,6 +34,7 @@ _RESERVED = re.compile(
     "unsigned|using|virtual|void|volatile|while|xor|t[a-z]?[0-9]+[ab]?"
 )
 """Keywords of C and C++, and the names of the generated variables."""
+_LN2 = Fraction("0.693147180559945309417232121458176568075500134360255254120680009")
 
 
 class CWriter:
@@ -76,16 +79,7 @@ class CWriter:
         return f"({text})" if text.startswith("-") else text
 
     def declaration(self, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> str:
-        """Write the prototype of a program's function, without a semicolon.
-
-        Args:
-            name: Name of the C function.
-            inputs: Names of the inputs.
-            outputs: Names of the outputs.
-
-        Raises:
-            InputError: If a name is not an identifier of C, or is used twice.
-        """
+        """Write the prototype of a program's function, without a semicolon."""
         _check_names([name, *inputs, *outputs])
         arguments = [f"const {self.type} *{x}" for x in inputs]
         arguments += [f"{self.type} *{x}" for x in outputs]
@@ -101,15 +95,6 @@ class CWriter:
         a pointer for each input, then one for each output, all to numbers in C order. Every entry
         of an output is written, constants too. All inputs are read before an output is written, so
         that they may share memory.
-
-        Args:
-            program: Program made by `trace`.
-            name: Name of the C function.
-            inputs: Names of the inputs.
-            outputs: Names of the outputs.
-
-        Raises:
-            InputError: If a name is not an identifier of C, or is used twice.
         """
         lines = self._statements(program, inputs)
         read = {node.place[0] for node in program.nodes if node.operation is Operation.INPUT}
@@ -185,138 +170,42 @@ class CWriter:
         """Write the functions `{prefix}_sine_cosine` and `{prefix}_tanh` that are needed."""
         if not self.widths:
             return ""
-        restrict = f"{self.prefix.upper()}_RESTRICT"
-        head = f"""/* Operations must not be reordered, and there must be no excess precision. */
-#if defined __FAST_MATH__ || (defined FLT_EVAL_METHOD && FLT_EVAL_METHOD == 2) \\
-    || (defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__)
-#error "compile without -ffast-math, and for x86 with -msse2 -mfpmath=sse"
-#endif
-#if defined __GNUC__ || defined _MSC_VER
-#define {restrict} __restrict
-#else
-#define {restrict}
-#endif
-"""
-        write = {"sine_cosine": self._sine_cosine, "tanh": self._tanh}
-        bodies = [write[name](width, f"{restrict} ") for name, width in self.widths.items()]
-        return "\n".join([head, *bodies])
+        bits, mantissa, bias = (64, 52, 1023) if self.double else (32, 23, 127)
+        one = 2 ** (32 if self.double else 15)
+        high = Fraction(int(_LN2 * one), one)
+        terms = 14 if self.double else 7
+        return fill_template(
+            Path(__file__).with_name("vector_functions.c.jinja"),
+            prefix=self.prefix,
+            widths=self.widths,
+            type=self.type,
+            double=self.double,
+            number=self.number,
+            polynomial=self._polynomial,
+            precision=self._precision,
+            bits=bits,
+            mantissa=mantissa,
+            bias=bias,
+            # Adding it rounds to a whole number, in the last bits of the sum.
+            rounder=self.number(1.5 * 2.0**mantissa),
+            largest=float(np.finfo(self._dtype).max),
+            pattern_of_22=hex(int(np.array(22.0, self._dtype).view(f"uint{bits}"))),
+            pi=math.pi,
+            ln2=math.log(2),
+            ln2_pieces=(float(high), float(_LN2 - high)),
+            exponential=[1 / math.factorial(n) for n in range(2, terms + 1)],
+        )
 
     def _polynomial(self, coefficients: Sequence[float], powers: Sequence[str]) -> str:
         """Write a polynomial in Estrin's scheme; its chain grows with the logarithm of the degree.
 
-        Args:
-            coefficients: Coefficients, lowest power first.
-            powers: Names of x, x^2, x^4, ...
+        Coefficients begin with the lowest power; the `powers` are the names of x, x^2, x^4, ...
         """
         terms = [self.number(c) for c in coefficients]
         for power in powers:
             pairs = [terms[k : k + 2] for k in range(0, len(terms), 2)]
             terms = [f"({p[0]} + {power} * {p[1]})" if len(p) == 2 else p[0] for p in pairs]
-        (whole,) = terms
-        return whole
-
-    def _bits(self) -> tuple[int, int, int, str]:
-        """Return the bits of a number, of its mantissa, the exponent's bias, and a rounder.
-
-        Adding the rounder rounds to a whole number, in the last bits of the sum.
-        """
-        bits, mantissa, bias = (64, 52, 1023) if self.double else (32, 23, 127)
-        return bits, mantissa, bias, self.number(1.5 * 2.0**mantissa)
-
-    def _sine_cosine(self, width: int, alone: str) -> str:
-        precision, number, kind = self._precision, self.number, self.type
-        bits, _, _, rounder = self._bits()
-        *leading, middle, last = precision.pieces
-        reduce = "\n".join(f"        r = r - k * {number(p)};" for p in leading)
-        huge = float(np.finfo(self._dtype).max) / precision.limit
-        powers = ("z", "z2", "z4")[: 3 if self.double else 2]
-        fourth = f"\n        const {kind} z4 = z2 * z2;" if self.double else ""
-        return f"""/* Cosine and sine of each number, by Cody-Waite reduction and polynomials. The
-   additions of {rounder} round to whole numbers. Beyond {precision.limit:.0f} quarter
-   turns the product with the huge number overflows, and infinity times zero is NaN. */
-static void {self.prefix}_sine_cosine(const {kind} *{alone}x, {kind} *{alone}s,
-    {kind} *{alone}c)
-{{
-    int i;
-    for (i = 0; i < {width}; ++i) {{
-        const uint{bits}_t top = (uint{bits}_t)1 << {bits - 1};
-        const {kind} t = x[i] * {number(2 / math.pi)} + {rounder};
-        const {kind} k = t - {rounder};
-        const {kind} far = (k * {number(huge)}) * {number(0.0)};
-        {kind} r = x[i];
-        uint{bits}_t bits, a, b, swap;
-{reduce}
-        r = r - (k * {number(middle)} + (k * {number(last)} + far));
-        {{
-        const {kind} z = r * r;
-        const {kind} z2 = z * z;{fourth}
-        const {kind} sine = r + (r * z)
-            * {self._polynomial(precision.sine, powers)};
-        const {kind} cosine = ({number(1.0)} - {number(0.5)} * z) + z2
-            * {self._polynomial(precision.cosine, powers)};
-        memcpy(&bits, &t, sizeof bits);
-        memcpy(&a, &sine, sizeof a);
-        memcpy(&b, &cosine, sizeof b);
-        }}
-        swap = (a ^ b) & (0u - (bits & 1u));
-        a = a ^ swap ^ ((bits << {bits - 2}) & top);
-        b = b ^ swap ^ (((bits + 1u) << {bits - 2}) & top);
-        memcpy(&s[i], &a, sizeof a);
-        memcpy(&c[i], &b, sizeof b);
-    }}
-}}
-"""
-
-    def _tanh(self, width: int, alone: str) -> str:
-        number, kind, largest = self.number, self.type, 22.0  # there tanh is 1 to the last bit
-        bits, mantissa, bias, rounder = self._bits()
-        ln2 = Fraction("0.693147180559945309417232121458176568075500134360255254120680009")
-        one = 2 ** (32 if self.double else 15)
-        high = Fraction(int(ln2 * one), one)
-        terms = 14 if self.double else 7
-        exponential = [1 / math.factorial(n) for n in range(2, terms + 1)]
-        powers = ("r", "r2", "r4", "r8")[: 4 if self.double else 3]
-        pattern = int(np.array(largest, self._dtype).view(f"uint{bits}"))
-        eighth = f"\n        const {kind} r8 = r4 * r4;" if self.double else ""
-        return f"""/* Hyperbolic tangent of each number: e / (e + 2) with e = exp(2 |x|) - 1.
-   The smaller of |x| and {largest:g} is chosen by the sign of their difference, since compilers
-   make a branch of a comparison. */
-static void {self.prefix}_tanh(const {kind} *{alone}x, {kind} *{alone}y)
-{{
-    int i;
-    for (i = 0; i < {width}; ++i) {{
-        const uint{bits}_t top = (uint{bits}_t)1 << {bits - 1};
-        {kind} size, rest, v, t, k, p, scale, e;
-        uint{bits}_t bits, sign, far;
-        memcpy(&bits, &x[i], sizeof bits);
-        sign = bits & top;
-        bits = bits & ~top;
-        memcpy(&size, &bits, sizeof size);
-        rest = {number(largest)} - size;
-        memcpy(&far, &rest, sizeof far);
-        far = 0u - (far >> {bits - 1});
-        bits = (bits & ~far) | ((uint{bits}_t){pattern:#x}u & far);
-        memcpy(&size, &bits, sizeof size);
-        v = size + size;
-        t = v * {number(1 / math.log(2))} + {rounder};
-        k = t - {rounder};
-        {{
-        const {kind} r = (v - k * {number(float(high))}) - k * {number(float(ln2 - high))};
-        const {kind} r2 = r * r;
-        const {kind} r4 = r2 * r2;{eighth}
-        p = r + r2 * {self._polynomial(exponential, powers)};
-        }}
-        memcpy(&bits, &t, sizeof bits);
-        bits = (bits + {bias}u) << {mantissa};
-        memcpy(&scale, &bits, sizeof scale);
-        e = scale * p + (scale - 1);
-        e = e / (e + 2);
-        memcpy(&bits, &e, sizeof bits);
-        bits = bits | sign;
-        memcpy(&y[i], &bits, sizeof bits);
-    }}
-}}
-"""
+        return terms[0]
 
 
 def _check_names(names: list[str]) -> None:

@@ -31,19 +31,12 @@ def half_pi(bits: int, count: int) -> tuple[float, ...]:
 
 
 class Precision(NamedTuple):
-    """Constants of one floating-point precision.
+    """Constants of one floating-point precision."""
 
-    Attributes:
-        pieces: Parts of pi/2, the largest first.
-        limit: Largest number of quarter turns.
-        sine: Coefficients of the sine's polynomial, lowest power first.
-        cosine: Coefficients of the cosine's polynomial, lowest power first.
-    """
-
-    pieces: tuple[float, ...]
-    limit: float
-    sine: tuple[float, ...]
-    cosine: tuple[float, ...]
+    pieces: tuple[float, ...]  # parts of pi/2, the largest first
+    limit: float  # largest number of quarter turns
+    sine: tuple[float, ...]  # coefficients of the sine's polynomial, lowest power first
+    cosine: tuple[float, ...]  # coefficients of the cosine's polynomial, lowest power first
 
 
 # Minimax coefficients on |r| <= pi/4 (Remez exchange in 60 digits, then rounded), lowest power

@@ -9,7 +9,7 @@ whereas Python runs a program of a thousand operations in some thirty microsecon
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,76 +22,31 @@ _BLOCK = 1024
 """Samples at a time, so that intermediate values stay in the processor's cache."""
 
 
-class _Plan(NamedTuple):
-    """Assignment of values to memory cells: cells of the results first, then reused cells.
-
-    Attributes:
-        loads: Cell, input's number and entry's position for each entry that is read.
-        run: Function that does all operations on the cells.
-        results: Cells of the nodes that are results.
-        cells: Number of cells.
-    """
-
-    loads: tuple[tuple[int, int, int], ...]
-    run: Callable[[list[np.ndarray]], None]
-    results: dict[int, int]
-    cells: int
+_Plan = tuple[tuple[tuple[int, int, int], ...], Callable[[list[np.ndarray]], None], int]
+"""Cell, input's number and entry's position for each entry that is read; function that does all
+operations on the cells; number of cells. Those of the results come first, others are reused."""
 
 
 def evaluate(program: Program, *arrays: AnyArray) -> Any:
-    """Compute the outputs of a program in NumPy.
-
-    Args:
-        program: Program made by `trace`.
-        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-
-    Returns:
-        Outputs in the structure of the traced function, each with the batch axes last.
-
-    Raises:
-        InputError: If the arrays do not fit the program's inputs.
-    """
-    return program.unpack(*_packed(program, arrays), np)
-
-
-def evaluate_packed(program: Program, *arrays: AnyArray) -> list[np.ndarray | float]:
-    """Compute the packed result of a program in NumPy; constants stay numbers.
-
-    Args:
-        program: Program made by `trace`.
-        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-
-    Returns:
-        For each entry of each output, in order, an array of the batch's shape, or a constant.
-        Equal entries share one array.
-    """
-    return _packed(program, arrays)[0]
+    """Compute the outputs of a program, in the structure of the traced function, in NumPy."""
+    table, batch = _evaluate(program, arrays)
+    rows = [row.reshape(batch) for row in table]
+    pairs = zip(program.distinct[1], program.outputs, strict=True)
+    return program.unpack([rows[k] if k >= 0 else x for k, x in pairs], batch, np)
 
 
 def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
-    """Compute the distinct results of a program that vary, in NumPy: [results, samples].
-
-    Args:
-        program: Program made by `trace`.
-        arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-    """
+    """Compute the distinct results of a program that vary, in NumPy: [results, samples]."""
     return _evaluate(program, arrays)[0]
 
 
 def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
-    """Return the packed result of each sample [samples, results] from its distinct values.
-
-    Args:
-        program: Program made by `trace`.
-        rows: Distinct results that vary [results, samples], in the order of the packed result.
-        dtype: Precision of the result.
-    """
-    results, samples = _plan(program).results, rows.shape[1]
-    out = np.zeros((samples, len(program.outputs)), dtype)
-    nodes = {k: results[x] for k, x in enumerate(program.outputs) if isinstance(x, int)}
-    varying, source = list(nodes), list(nodes.values())
-    constants = [k for k, x in enumerate(program.outputs) if not isinstance(x, int) and x != 0]
+    """Return the packed result of each sample [samples, results] from its distinct values."""
+    (_, entries), samples = program.distinct, rows.shape[1]
+    out = np.zeros((samples, len(entries)), dtype)
+    varying, constants = np.flatnonzero(entries >= 0), np.flatnonzero(entries < 0)
     out[:, constants] = [program.outputs[k] for k in constants]
+    source = entries[varying]
     for start in range(0, samples, _BLOCK // 4):
         part = slice(start, start + _BLOCK // 4)
         out[part, varying] = rows[source, part].T
@@ -100,10 +55,7 @@ def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def _plan(program: Program) -> _Plan:
-    results: dict[int, int] = {}
-    for x in program.outputs:
-        if isinstance(x, int):
-            results.setdefault(x, len(results))
+    results = {node: k for k, node in enumerate(program.distinct[0])}
     last_use = {k: position for position, node in enumerate(program.nodes) for k in node.uses}
     cell, idle, cells, loads = dict(results), [], len(results), []
     # Written as one function, since a loop over the operations takes as long as a short operation.
@@ -134,7 +86,7 @@ def _plan(program: Program) -> _Plan:
     unpack = "".join(f"c{k}, " for k in range(cells))
     body = "".join(f"    {line}\n" for line in lines)
     exec(f"def run(cells):\n    [{unpack}] = cells\n{body}", scope)
-    return _Plan(tuple(loads), scope["run"], results, cells)
+    return tuple(loads), scope["run"], cells
 
 
 def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
@@ -143,30 +95,21 @@ def _select(condition, if_true, if_false, out: np.ndarray) -> np.ndarray:
     return out
 
 
-def _packed(
-    program: Program, arrays: tuple[AnyArray, ...]
-) -> tuple[list[np.ndarray | float], tuple[int, ...]]:
-    """Return the packed result, and the batch's shape."""
-    table, batch = _evaluate(program, arrays)
-    rows, results = [row.reshape(batch) for row in table], _plan(program).results
-    return [rows[results[x]] if isinstance(x, int) else x for x in program.outputs], batch
-
-
 def _evaluate(program: Program, arrays: tuple[AnyArray, ...]) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return the distinct results that vary [results, samples], and the batch's shape."""
-    plan = _plan(program)
+    loads, run, count = _plan(program)
     aligned, batch = program.align([np.asarray(x, np.float64) for x in arrays], np)
     samples = math.prod(batch)
     inputs = [x.reshape(len(x), samples) for x in aligned]
-    table = np.empty((len(plan.results), samples))
-    scratch = np.empty((plan.cells - len(plan.results), min(samples, _BLOCK)))
+    table = np.empty((len(program.distinct[0]), samples))
+    scratch = np.empty((count - len(table), min(samples, _BLOCK)))
     with np.errstate(all="ignore"):
         for start in range(0, samples, _BLOCK):
             block = slice(start, min(start + _BLOCK, samples))
             cells = [*table[:, block], *scratch[:, : block.stop - block.start]]
-            for target, number, entry in plan.loads:
+            for target, number, entry in loads:
                 cells[target][:] = inputs[number][entry, block]
-            plan.run(cells)
+            run(cells)
     return table, batch
 
 
@@ -176,9 +119,6 @@ def to_python(program: Program) -> Callable[..., tuple[float, ...]]:
     It takes the entries of each input in C order, and returns the entries of all outputs, one after
     the other. Division by zero, and functions outside their domain, raise Python's own errors,
     where NumPy gives infinities and NaN.
-
-    Args:
-        program: Program made by `trace`.
     """
     formats = {
         Operation.NEGATE: "-{0}",

@@ -40,23 +40,14 @@ class Node(NamedTuple):
 
 
 class OperationCounts(NamedTuple):
-    """Numbers of operations of a program.
+    """Numbers of operations of a program."""
 
-    Attributes:
-        multiplications: Multiplications.
-        additions: Additions and subtractions.
-        divisions: Divisions.
-        functions: Calls of sin, cos, sqrt, tanh and similar functions.
-        selections: Comparisons, choices, absolute values and signs.
-        negations: Changes of sign.
-    """
-
-    multiplications: int
-    additions: int
-    divisions: int
-    functions: int
-    selections: int
-    negations: int
+    multiplications: int  # multiplications
+    additions: int  # additions and subtractions
+    divisions: int  # divisions
+    functions: int  # calls of sin, cos, sqrt, tanh and similar functions
+    selections: int  # comparisons, choices, absolute values and signs
+    negations: int  # changes of sign
 
     @property
     def total(self) -> int:
@@ -72,20 +63,14 @@ class Program:
     """A function as a sequence of scalar operations; made by `trace`.
 
     Equality and hash are by identity, so that a program can be static metadata under `jit`.
-
-    Attributes:
-        input_shapes: Shapes of the inputs, without batch axes.
-        nodes: Operations; each one reads only nodes before it.
-        outputs: Packed result: for each entry of each output, in order, a node or a constant.
-        output_shapes: Shapes of the outputs, without batch axes.
-        structure: PyTree structure of the function's result.
     """
 
-    input_shapes: tuple[tuple[int, ...], ...]
-    nodes: tuple[Node, ...] = field(repr=False)
+    input_shapes: tuple[tuple[int, ...], ...]  # shapes of the inputs, without batch axes
+    nodes: tuple[Node, ...] = field(repr=False)  # operations; each one reads only nodes before it
+    # packed result: for each entry of each output, in order, a node or a constant
     outputs: tuple[Reference, ...] = field(repr=False)
-    output_shapes: tuple[tuple[int, ...], ...]
-    structure: Any = field(repr=False)
+    output_shapes: tuple[tuple[int, ...], ...]  # shapes of the outputs, without batch axes
+    structure: Any = field(repr=False)  # pyTree structure of the function's result
 
     @functools.cached_property
     def counts(self) -> OperationCounts:
@@ -115,6 +100,14 @@ class Program:
                 uses[x] += 1
         return tuple(uses)
 
+    @functools.cached_property
+    def distinct(self) -> tuple[tuple[int, ...], np.ndarray]:
+        """Nodes of the packed result, and for each entry the number of its node, or -1."""
+        numbers: dict[int, int] = {}
+        nodes = (x if isinstance(x, int) else None for x in self.outputs)
+        entries = [-1 if x is None else numbers.setdefault(x, len(numbers)) for x in nodes]
+        return tuple(numbers), np.array(entries, int)
+
     @property
     def nonzeros(self) -> Any:
         """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
@@ -127,16 +120,7 @@ class Program:
         return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]
 
     def align(self, arrays: Sequence[Any], xp: ModuleType) -> tuple[list[Any], tuple[int, ...]]:
-        """Return the inputs with their own axes merged and the whole batch behind; and its shape.
-
-        Args:
-            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-            xp: NumPy or `jax.numpy`.
-
-        Raises:
-            InputError: If the arrays are not as many as the inputs, or a shape does
-                not begin with its input's.
-        """
+        """Return the inputs with their own axes merged and the batch behind; the batch's shape."""
         if len(arrays) != len(self.input_shapes):
             wanted = len(self.input_shapes)
             raise InputError(f"The program takes {wanted} arrays, but got {len(arrays)}.")
@@ -188,12 +172,7 @@ def assemble(
 
 
 def select_outputs(program: Program, entries: np.ndarray) -> Program:
-    """Return a program that computes only some results of a program.
-
-    Args:
-        program: Program with further results.
-        entries: Positions in the packed result, in the shape of the new result.
-    """
+    """Return a program that computes only some results of a program."""
     graph = Graph()
     scalars: list[Scalar] = []
 

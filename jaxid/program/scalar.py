@@ -22,16 +22,12 @@ import numpy as np
 class Operation(enum.StrEnum):
     """A scalar operation; where JAX has the same elementwise primitive, its name is the value.
 
-    Attributes:
-        numpy: Function on NumPy arrays; `jax.numpy` has one of the same name.
-        infix: Operator between two operands in Python and C; empty if there is none.
-        traits: Properties for simplification and counting: `odd`, `even`, `commutative`, `truth`
-            (the result is a truth value), `choice` (a selection), `function` (as expensive as a
-            call of the mathematical library).
+    Traits serve simplification and counting: `odd`, `even`, `commutative`, `truth` (the result is a
+    truth value), `choice` (a selection), `function` (as expensive as a library's function).
     """
 
-    numpy: Any
-    infix: str
+    numpy: Any  # function on NumPy arrays; `jax.numpy` has one of the same name
+    infix: str  # operator between two operands in Python and C; empty if there is none
     traits: frozenset[str]
 
     def __new__(cls, name: str, numpy: Any = None, infix: str = "", traits: str = ""):  # noqa: D102
@@ -84,13 +80,7 @@ class Operation(enum.StrEnum):
     def spell(
         self, operands: Sequence[str], formats: Mapping["Operation", str], suffix: str = ""
     ) -> str:
-        """Write the operation as an expression of a programming language.
-
-        Args:
-            operands: Expressions of the operands.
-            formats: Format strings of the operations that the language writes in its own way.
-            suffix: Suffix of the names of functions, such as `f` for single precision in C.
-        """
+        """Write the operation as an expression of a programming language."""
         if self.infix:
             return f" {self.infix} ".join(operands)
         if self in formats:

@@ -354,10 +354,6 @@ def trace(function: Callable, *inputs: tuple[int, ...] | np.ndarray) -> Program:
         function: Function of one array for each input; returns any PyTree of arrays.
         inputs: Shape of each argument, or an object array that mixes `FREE` entries with
             numbers; the numbers become constants of the program.
-
-    Raises:
-        InputError: If the function does something that a scalar program cannot, such as a JAX
-            loop or a sort, or closes over a value that JAX is tracing.
     """
     graph = Graph()
     arguments = []

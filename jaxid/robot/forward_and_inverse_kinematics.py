@@ -146,9 +146,6 @@ def inverse_kinematics_along(
     """Return coordinates along a path of close positions, without a jump [rad or m].
 
     Arguments as of `inverse_kinematics`, with one rotation for all poses.
-
-    Raises:
-        InputError: If a pose cannot be reached, or only with a jump or beyond the limits.
     """
     task = _task(robot, posture)
     goals = _goals(positions, rotation)
@@ -299,11 +296,7 @@ def _try_starts(task: _Task, goal: np.ndarray, low: np.ndarray, high: np.ndarray
 
 
 def _candidates(task: _Task, goal: np.ndarray, name: str) -> list[np.ndarray]:
-    """Return coordinates that reach a pose within the limits, the nearest to the posture first.
-
-    Raises:
-        InputError: If there are none; the message names the reason.
-    """
+    """Return coordinates that reach a pose within the limits, the nearest to the posture first."""
     q = _try_starts(task, goal, task.low, task.high)
     reached = _distances(task, goal, q).max(axis=1)
     good = q[(reached <= _REACHED) & (_beyond(task, q).max(axis=1) <= _REACHED)]

@@ -105,13 +105,14 @@ def from_dh(
 
 
 @functools.cache
-def _entries() -> dict[str, dict[str, Any]]:
+def entries() -> dict[str, dict[str, Any]]:
+    """Return the content of `library.toml`."""
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text("utf-8"))
 
 
 def _robot(key: str) -> Robot:
     """Return a robot of `library.toml`."""
-    entry = dict(_entries()[key])
+    entry = dict(entries()[key])
     limits, drives = (dict(entry.pop(name, {})) for name in ("limits", "drives"))
     n = len(entry.get("dh") or entry["offset"])
     revolute = tuple(entry.pop("revolute", (True,) * n))
@@ -147,7 +148,7 @@ def tx90l_on_rail_collision() -> CollisionModel:
     flange's joint.
     """
     robot = tx90l_on_rail()
-    entry = _entries()["tx90l_on_rail_collision"]
+    entry = entries()["tx90l_on_rail_collision"]
     capsules = [Capsule(**capsule) for capsule in entry["capsules"]]
     return CollisionModel(robot, capsules, (HalfSpace("ground"),), entry["pairs"])
 
@@ -200,9 +201,6 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
     Args:
         joints: Number of joints.
         length: Lengths of the links [m], one for all or one for each.
-
-    Raises:
-        InputError: If there is no joint, or the lengths do not fit.
     """
     if joints < 1 or np.shape(length) not in ((), (joints,)):
         raise InputError("`joints` must be at least 1, and `length` one number or one for each.")

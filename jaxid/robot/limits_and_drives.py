@@ -1,5 +1,6 @@
 """Limits and drives of a robot's joints, and numbers that may be in other units."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -7,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Hashable, Numbers, namespace
+from jaxid.arrays import AnyArray, Float, Hashable, Numbers, given, namespace
 from jaxid.errors import InputError
 
 FAR, FARTHEST = 10.0, 1000.0
@@ -39,34 +40,24 @@ class Limits(eqx.Module):
             leaves a joint no range.
     """
 
-    position_min: PerJoint
-    position_max: PerJoint
-    velocity: PerJoint
-    acceleration: PerJoint
-    jerk: PerJoint
-    force: PerJoint
-    assumed: tuple[str, ...] = eqx.field(static=True)
+    joints: dataclasses.InitVar[int | None] = None
+    _: dataclasses.KW_ONLY
+    position_min: PerJoint = eqx.field(converter=given, default=None)
+    position_max: PerJoint = eqx.field(converter=given, default=None)
+    velocity: PerJoint = eqx.field(converter=given, default=None)
+    acceleration: PerJoint = eqx.field(converter=given, default=None)
+    jerk: PerJoint = eqx.field(converter=given, default=None)
+    force: PerJoint = eqx.field(converter=given, default=None)
+    assumed: tuple[str, ...] = eqx.field(static=True, default=())
 
-    def __init__(
-        self,
-        joints: int | None = None,
-        *,
-        position_min: Numbers | None = None,
-        position_max: Numbers | None = None,
-        velocity: Numbers | None = None,
-        acceleration: Numbers | None = None,
-        jerk: Numbers | None = None,
-        force: Numbers | None = None,
-        assumed: tuple[str, ...] = (),
-    ):
-        n = _count(joints, position_min, position_max, velocity, acceleration, jerk, force)
-        self.position_min = per_joint("position_min", position_min, n, -np.inf)
-        self.position_max = per_joint("position_max", position_max, n, np.inf)
-        self.velocity = _magnitudes("velocity", velocity, n)
-        self.acceleration = _magnitudes("acceleration", acceleration, n)
-        self.jerk = _magnitudes("jerk", jerk, n)
-        self.force = _magnitudes("force", force, n)
-        self.assumed = assumed
+    def __post_init__(self, joints: int | None):
+        magnitudes = ("velocity", "acceleration", "jerk", "force")
+        sizes = {name: getattr(self, name) for name in magnitudes}
+        n = _count(joints, self.position_min, self.position_max, *sizes.values())
+        self.position_min = per_joint("position_min", self.position_min, n, -np.inf)
+        self.position_max = per_joint("position_max", self.position_max, n, np.inf)
+        for name, value in sizes.items():
+            setattr(self, name, _magnitudes(name, value, n))
         low, high = self.position_min, self.position_max
         if isinstance(low, np.ndarray) and isinstance(high, np.ndarray) and (low >= high).any():
             j = int(np.flatnonzero(low >= high)[0])
@@ -94,22 +85,16 @@ class Drives(Hashable):
         InputError: If a length is wrong, the matrix is not invertible, or a number is out of range.
     """
 
-    reduction: Float[AnyArray, "joints joints"]
-    zero: PerJoint
-    max_torques: PerJoint
-    rotor_inertia: PerJoint
+    joints: dataclasses.InitVar[int | None] = None
+    _: dataclasses.KW_ONLY
+    reduction: Float[AnyArray, "joints joints"] = eqx.field(converter=given, default=None)
+    zero: PerJoint = eqx.field(converter=given, default=None)
+    max_torques: PerJoint = eqx.field(converter=given, default=None)
+    rotor_inertia: PerJoint = eqx.field(converter=given, default=None)
 
-    def __init__(
-        self,
-        joints: int | None = None,
-        *,
-        reduction: Numbers | None = None,
-        zero: Numbers | None = None,
-        max_torques: Numbers | None = None,
-        rotor_inertia: Numbers | None = None,
-    ):
-        n = _count(joints, reduction, zero, max_torques, rotor_inertia)
-        matrix = np.eye(n) if reduction is None else reduction
+    def __post_init__(self, joints: int | None):
+        n = _count(joints, self.reduction, self.zero, self.max_torques, self.rotor_inertia)
+        matrix = np.eye(n) if self.reduction is None else self.reduction
         if not isinstance(matrix, jax.Array) or matrix.ndim != 2:
             matrix = np.array(matrix, dtype=np.float64)
             matrix = np.diag(matrix) if matrix.shape == (n,) else matrix
@@ -121,10 +106,10 @@ class Drives(Hashable):
             if not largest.all() or np.linalg.cond(matrix / largest[:, None]) > 1e8:
                 raise InputError("`reduction` must be invertible: is a gear ratio zero?")
         self.reduction = matrix
-        self.zero = per_joint("zero", zero, n, 0.0)
+        self.zero = per_joint("zero", self.zero, n, 0.0)
         _require("zero", self.zero, np.isfinite, "finite")
-        self.max_torques = _magnitudes("max_torques", max_torques, n)
-        self.rotor_inertia = per_joint("rotor_inertia", rotor_inertia, n, np.nan)
+        self.max_torques = _magnitudes("max_torques", self.max_torques, n)
+        self.rotor_inertia = per_joint("rotor_inertia", self.rotor_inertia, n, np.nan)
         _require("rotor_inertia", self.rotor_inertia, lambda x: ~(x < 0), "zero or more")
 
     @property

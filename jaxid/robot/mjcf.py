@@ -35,10 +35,6 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Lo
     Each body is a link of its name, fixed to the frame of its last joint; each named site is a link
     that is fixed to its body. A joint that an equality constraint couples to another mimics it.
     Shapes are left out.
-
-    Raises:
-        InputError: If MuJoCo cannot compile the file.
-        ModuleNotFoundError: If MuJoCo is not installed.
     """
     mujoco = import_mujoco()
     try:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
+from jaxid.arrays import AnyArray, Float, Numbers, as_array, given, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.result_table import Column, Table
 
@@ -33,22 +33,15 @@ class Tool(eqx.Module):
     """
 
     body: int = eqx.field(static=True)
-    mass: Float[AnyArray, ""]
-    centre_of_mass: Float[AnyArray, "3"]
-    inertia: Float[AnyArray, "3 3"]
+    _: dataclasses.KW_ONLY
+    mass: Float[AnyArray, ""] = eqx.field(converter=given)
+    centre_of_mass: Float[AnyArray, "3"] = eqx.field(converter=given)
+    inertia: Float[AnyArray, "3 3"] = eqx.field(converter=given, default=None)
 
-    def __init__(
-        self,
-        body: int,
-        *,
-        mass: Float[AnyArray, ""] | float | int,
-        centre_of_mass: Numbers,
-        inertia: Numbers | None = None,
-    ):
-        self.body = body
-        self.mass = _checked("`mass` of the tool", mass, ())
-        self.centre_of_mass = _checked("`centre_of_mass` of the tool", centre_of_mass, (3,))
-        tensor = np.zeros((3, 3)) if inertia is None else inertia
+    def __post_init__(self):
+        self.mass = _checked("`mass` of the tool", self.mass, ())
+        self.centre_of_mass = _checked("`centre_of_mass` of the tool", self.centre_of_mass, (3,))
+        tensor = np.zeros((3, 3)) if self.inertia is None else self.inertia
         self.inertia = _checked("`inertia` of the tool", tensor, (3, 3))
         if not is_traced(self.mass) and self.mass <= 0:
             raise InputError(f"`mass` of the tool must be positive, but is {self.mass:g} kg.")
@@ -99,70 +92,49 @@ class Robot(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    joint_names: tuple[str, ...] = eqx.field(static=True)
-    parent: tuple[int, ...] = eqx.field(static=True)
+    _: dataclasses.KW_ONLY
+    joint_names: tuple[str, ...] = eqx.field(static=True, converter=given, default=None)
+    parent: tuple[int, ...] = eqx.field(static=True, converter=given, default=None)
     revolute: tuple[bool, ...] = eqx.field(static=True)
-    axis: Float[AnyArray, "*geometry joints 3"]
-    rotation: Float[AnyArray, "*geometry joints 3 3"]
-    offset: Float[AnyArray, "*geometry joints 3"]
-    gravity: Float[AnyArray, "*geometry 3"]
-    limits: Limits
-    drives: Drives
-    tool: Tool | None
-    tip_body: int = eqx.field(static=True)
-    tip_rotation: Float[AnyArray, "3 3"]
-    tip_offset: Float[AnyArray, "3"]
-    source: str = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    axis: Float[AnyArray, "*geometry joints 3"] = eqx.field(converter=given)
+    rotation: Float[AnyArray, "*geometry joints 3 3"] = eqx.field(converter=given)
+    offset: Float[AnyArray, "*geometry joints 3"] = eqx.field(converter=given)
+    gravity: Float[AnyArray, "*geometry 3"] = eqx.field(converter=given, default=GRAVITY)
+    limits: Limits = eqx.field(converter=given, default=None)
+    drives: Drives = eqx.field(converter=given, default=None)
+    tool: Tool | None = None
+    tip_body: int = eqx.field(static=True, converter=given, default=None)
+    tip_rotation: Float[AnyArray, "3 3"] = eqx.field(converter=given, default=None)
+    tip_offset: Float[AnyArray, "3"] = eqx.field(converter=given, default=(0.0, 0.0, 0.0))
+    source: str = eqx.field(static=True, default="")
+    notes: tuple[str, ...] = eqx.field(static=True, default=())
 
-    def __init__(
-        self,
-        name: str,
-        *,
-        revolute: tuple[bool, ...],
-        axis: Numbers,
-        rotation: Numbers,
-        offset: Numbers,
-        parent: tuple[int, ...] | None = None,
-        joint_names: tuple[str, ...] | None = None,
-        gravity: Numbers = GRAVITY,
-        limits: Limits | None = None,
-        drives: Drives | None = None,
-        tool: Tool | None = None,
-        tip_body: int | None = None,
-        tip_rotation: Numbers | None = None,
-        tip_offset: Numbers = (0.0, 0.0, 0.0),
-        source: str = "",
-        notes: tuple[str, ...] = (),
-    ):
-        n = len(revolute)
+    def __post_init__(self):
+        n, names, parent = len(self.revolute), self.joint_names, self.parent
         if n == 0:
             raise InputError("`revolute` must have one entry for each joint, but is empty.")
-        names = tuple(f"joint{i + 1}" for i in range(n)) if joint_names is None else joint_names
-        self.name, self.joint_names = name, tuple(names)
+        self.joint_names = tuple(names or (f"joint{i + 1}" for i in range(n)))
         self.parent = tuple(range(-1, n - 1)) if parent is None else tuple(int(i) for i in parent)
-        self.revolute = tuple(bool(r) for r in revolute)
-        self.axis = _checked("`axis`", axis, (n, 3))
+        self.revolute = tuple(bool(r) for r in self.revolute)
+        self.axis = _checked("`axis`", self.axis, (n, 3))
         if isinstance(self.axis, np.ndarray):
             length = np.linalg.norm(self.axis, axis=-1, keepdims=True)
             if (length < 1e-9).any():
                 j = int(length.argmin()) + 1
                 raise InputError(f"`axis` of joint {j} is the zero vector: give it a direction.")
             self.axis = np.where(np.abs(length - 1.0) > 1e-15, self.axis / length, self.axis)
-        self.rotation = _rotations("`rotation`", rotation, (n, 3, 3))
-        self.offset = _checked("`offset`", offset, (n, 3))
-        self.gravity = _checked("`gravity`", gravity, (3,))
-        self.limits = Limits(n) if limits is None else limits
-        self.drives = Drives(n) if drives is None else drives
-        self.tool = tool
-        self.tip_body = n - 1 if tip_body is None else tip_body
-        tip_rotation = np.eye(3) if tip_rotation is None else tip_rotation
+        self.rotation = _rotations("`rotation`", self.rotation, (n, 3, 3))
+        self.offset = _checked("`offset`", self.offset, (n, 3))
+        self.gravity = _checked("`gravity`", self.gravity, (3,))
+        self.limits = Limits(n) if self.limits is None else self.limits
+        self.drives = Drives(n) if self.drives is None else self.drives
+        self.tip_body = n - 1 if self.tip_body is None else self.tip_body
+        tip_rotation = np.eye(3) if self.tip_rotation is None else self.tip_rotation
         self.tip_rotation = _rotations("`tip_rotation`", tip_rotation, (3, 3))
-        self.tip_offset = _checked("`tip_offset`", tip_offset, (3,))
-        self.source = source
+        self.tip_offset = _checked("`tip_offset`", self.tip_offset, (3,))
         self._check_joints()
         doubts = limit_notes(self.joint_names, self.revolute, self.limits)
-        self.notes = tuple(dict.fromkeys((*notes, *self._far_notes(), *doubts)))
+        self.notes = tuple(dict.fromkeys((*self.notes, *self._far_notes(), *doubts)))
 
     def _check_joints(self) -> None:
         """Reject names, parents and bodies that do not fit the number of joints."""
@@ -221,11 +193,7 @@ class Robot(eqx.Module):
 
     @property
     def max_forces(self) -> Float[AnyArray, " joints"]:
-        """Largest force of every joint: its limit, or else that of its motors [N m or N] (Eq. 30).
-
-        Raises:
-            InputError: If neither is known for some joint.
-        """
+        """Largest force of every joint: its limit, or that of its motors [N m or N] (Eq. 30)."""
         forces = self.known_max_forces
         if not np.isfinite(forces).all():
             j = int(np.flatnonzero(~np.isfinite(forces))[0])
@@ -244,9 +212,6 @@ class Robot(eqx.Module):
 
         Args:
             tolerance: Entries of axes and attitudes this close to zero become zero [rad].
-
-        Raises:
-            InputError: If the tolerance is no small angle.
         """
         return self.replace(
             axis=snapped(self.axis, tolerance),
@@ -261,9 +226,6 @@ class Robot(eqx.Module):
         Args:
             rotation: Attitude of the former ground frame on the new ground; upright if None.
             position: Origin of the former ground frame on the new ground [m].
-
-        Raises:
-            InputError: If the attitude is no rotation, or the position no point.
         """
         R = _rotations("`rotation`", np.eye(3) if rotation is None else rotation, (3, 3))
         r = _checked("`position`", position, (3,))
@@ -293,9 +255,6 @@ class Robot(eqx.Module):
             centre_of_mass: Centre of mass in the end-effector's frame [m].
             inertia: Inertia tensor about the centre of mass, along the end-effector's axes [kg m²];
                 a point mass if None.
-
-        Raises:
-            InputError: If the mass is not positive, or no body has such an inertia.
         """
         own = Tool(self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia)
         there = own.body_inertia.moved(self.tip_rotation, self.tip_offset)

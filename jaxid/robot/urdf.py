@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -33,7 +32,7 @@ def load_urdf(
     base_rotation: Numbers | None = None,
     base_position: Numbers = _ZERO,
 ) -> Robot:
-    """Load a robot from a URDF or xacro file; its inertias are read by `urdf_parameters`.
+    """Load a robot from a URDF, xacro or MJCF file; `urdf_parameters` reads its inertias.
 
     Joints turn (revolute, continuous) or slide (prismatic) about any axis. The frame of a body is
     the frame of the link that its joint moves. Links on fixed joints become part of the body that
@@ -41,25 +40,30 @@ def load_urdf(
     several; so a parent comes before its children. A joint that mimics another is held at zero, or
     where the other joint's range puts it, and counts as fixed.
 
+    MuJoCo compiles an MJCF file: a joint that an equality constraint couples to another is held
+    like a mimic joint, largest forces are those of the actuators, and gravity is that of the file.
+
     Limits that the file does not state, or states as zero, are infinite. Angles that can only be
     degrees are rejected, and so are lengths that no robot has; held joints, and suspicious lengths,
     speeds, forces and inertias are reported in the robot's notes.
 
     Args:
-        path: URDF file; a xacro file is expanded by the program `xacro`.
-        tip: Link of the end-effector: only the chain from `base` to it is loaded, with the links
-            fixed to it. If None, the whole tree below `base` is, and the end-effector is the last
-            link of the longest chain: of the most moving joints, then of the most links, then
-            first in the file.
-        base: Link that stands on the ground; the root if None.
-        gravity: Acceleration of gravity in the frame of the ground [m/s²]; 9.81 downwards if None.
+        path: URDF or MJCF file; a xacro file is expanded by the program `xacro`.
+        tip: Link (in MJCF a body or site) of the end-effector: only the chain from `base` to it is
+            loaded, with the links fixed to it. If None, the whole tree below `base` is, and the
+            end-effector is the last link of the longest chain: of the most moving joints, then of
+            the most links, then first in the file.
+        base: Link or body that stands on the ground; the root if None.
+        gravity: Acceleration of gravity in the frame of the ground [m/s²]; 9.81 downwards if None,
+            or that of an MJCF file.
         base_rotation: Attitude of the base link on the ground; upright if None.
         base_position: Origin of the base link on the ground [m].
 
     Raises:
         FileNotFoundError: If the file does not exist.
         InputError: If it is no URDF, is no open tree, has a floating or planar joint on the way, or
-            angles or lengths in other units; if it is a xacro file that cannot be expanded.
+            angles or lengths in other units; if `xacro` or MuJoCo cannot read it.
+        ModuleNotFoundError: If it is MJCF, and MuJoCo is not installed.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     limits, limit_notes = _limits(tree)
@@ -87,25 +91,8 @@ def load_urdf(
     return robot.replace(notes=(*robot.notes, *_weight_notes(robot, tree.bodies())))
 
 
-def load_mjcf(path: str | Path, **options: Any) -> Robot:
-    """Load a robot from an MJCF file, compiled by MuJoCo; `urdf_parameters` reads its inertias.
-
-    Bodies without joints become part of the body that carries them, and a joint that an equality
-    constraint couples to another is held, as mimic joints are in `load_urdf`. Largest forces are
-    those of the actuators. Gravity is that of the file.
-
-    Args:
-        path: MJCF file.
-        options: `tip` (a body or site), `base` (a body; needed if a free joint carries the robot),
-            `gravity`, `base_rotation` and `base_position`, as in `load_urdf`.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        InputError: If MuJoCo cannot compile it, or the robot has a free or ball joint or a closed
-            loop on the way.
-        ModuleNotFoundError: If MuJoCo is not installed.
-    """
-    return load_urdf(path, **options)
+load_mjcf = load_urdf
+"""The same for an MJCF file."""
 
 
 def urdf_parameters(

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,46 +20,6 @@ from .friction_and_disturbances import SmoothFriction
 from .virtual import Sensors, VirtualRobot, random_bodies
 
 FILES = ("experiment.toml", "identification.csv", "verification.csv", "truth.json")
-
-_EXPERIMENT = """\
-# A virtual robot with the geometry of a Panda (7 joints), and two logs of it:
-#   identification.csv   16 s at 500 Hz, to identify with
-#   verification.csv      8 s of another motion, to verify with
-# The logs were computed, with noise, encoder steps and a little friction that no model below
-# describes. truth.json holds the parameters that were used: compare them with what you find.
-#
-#   jaxid inspect  experiment.toml identification.csv
-#   jaxid identify experiment.toml identification.csv --verify verification.csv -o report/
-#
-# Lines that begin with `#` are comments. Units: rad, s, N m.
-
-[robot]
-builtin = "panda"                     # what is known: geometry, limits, largest torques
-
-[model]                               # which effects have unknown parameters, beside the bodies
-viscous = true                        # friction that grows with speed
-rotor_inertia = true                  # motors' rotors, felt through the gears
-offset = true                         # constant torque at each joint
-[model.coulomb]                       # dry friction
-epsilon = 0.01                        # speed of its smooth transition [rad/s]
-
-[recording]                           # which columns of the logs hold what
-angles = "q{}"                        # q1 … q7
-forces = "tau{}"                      # tau1 … tau7
-time = "time"
-angle_unit = "rad"
-force_unit = "N m"
-
-[filter]                              # from angles to velocities and accelerations
-kind = "butterworth"                  # a low-pass, forward and backward, then differences
-cutoff = 10.0                         # the motion has nothing above 0.625 Hz [Hz]
-
-[rows]                                # which samples become rows of the least-squares problem
-step = 20                             # 25 rows in a second
-
-[estimator]
-kind = "weighted"                     # joints count by their largest torques (Eq. 30)
-"""
 
 
 def virtual_panda(seed: int = 0) -> VirtualRobot:
@@ -120,17 +81,10 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
     Args:
         folder: Folder of the files; made with its parents.
         seed: Seed of the parameters, the motions and the noise.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        InputError: If `folder` is a file, or contains one of the files with other content.
-        RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
     with atomic_folder(folder) as staging:
-        (staging / FILES[0]).write_text(_EXPERIMENT, encoding="utf-8")
+        shutil.copyfile(Path(__file__).with_suffix(".toml"), staging / FILES[0])
         for k, (file, periods) in enumerate(zip(FILES[1:3], (2, 1), strict=True)):
             path = staging / file
             _write_csv(path, virtual_log(robot, path.stem, periods, (seed, k + 1)))

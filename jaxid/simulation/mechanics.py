@@ -92,22 +92,14 @@ class DriveTrain(Hashable):
     The step is implicit where forces are stiff (friction, gears) and of second order elsewhere:
     positions move by half a step, velocities by a whole one with the forces there, positions by the
     other half.
-
-    Attributes:
-        model: Equations of motion without friction.
-        rotors: Inertia of the rotors on the joint side [kg m² or kg].
-        friction: Friction of the gears, on the motors' side of them.
-        gear: Gears between motors and joints.
-        disturbances: Further forces on the motors.
-        step: Length of a step [s].
     """
 
-    model: Model
-    rotors: Joints
-    friction: AbstractGearFriction
-    gear: RigidGear
-    disturbances: tuple[AbstractDisturbance, ...]
-    step: float
+    model: Model  # equations of motion without friction
+    rotors: Joints  # inertia of the rotors on the joint side [kg m² or kg]
+    friction: AbstractGearFriction  # friction of the gears, on the motors' side of them
+    gear: RigidGear  # gears between motors and joints
+    disturbances: tuple[AbstractDisturbance, ...]  # further forces on the motors
+    step: float  # length of a step [s]
 
     def inertia_and_bias(self, p, q, qd) -> Float[AnyArray, " entries"]:
         """Return mass matrix, row by row, and bias forces of one sample (Eq. 38)."""
@@ -219,11 +211,7 @@ def follow(
     resolution: Joints,
     substeps: int,
 ) -> tuple[Motion, np.ndarray, np.ndarray]:
-    """Return true motion, motor angles, and forces after each tick of a servo from no error.
-
-    Raises:
-        InputError: If the motion diverges.
-    """
+    """Return true motion, motor angles, and forces after each tick of a servo from no error."""
     ticks, n = forward.shape
     goals, known = np.asarray(desired.q).tolist(), forward.tolist()
     kp, kd, limit, step = (

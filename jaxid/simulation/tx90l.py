@@ -88,33 +88,8 @@ def cad_tx90l_on_rail() -> Float[np.ndarray, " standard"]:
 
 def _bodies(published: dict[int, float]) -> Float[np.ndarray, "7 7"]:
     """Return seven parameters of each body: principal axes, published base parameters (Eq. 24)."""
-    # Masses of the arm by CAD [kg]; that of the rail's carriage follows from p_B(1).
-    m = np.array([0.0, 16.93, 14.35, 7.50, 6.42, 0.569, 0.031])
-    # Centres of mass in the bodies' frames [m], assumed: near enough to the joints that these can
-    # hold the arm. The x of the second follows from p_B(2).
-    r = np.array(
-        [
-            (0.05, 0.02, 0.22),
-            (0.0, -0.01, -0.12),
-            (0.01, -0.10, 0.06),
-            (0.0, -0.02, 0.01),
-            (0.0, 0.01, 0.10),
-            (0.0, -0.02, 0.0),
-            (0.0, 0.0, -0.01),
-        ]
-    )
-    # Standard deviations of the masses along the bodies' axes [m], assumed.
-    gyration = np.array(
-        [
-            (0.25, 0.25, 0.25),
-            (0.12, 0.12, 0.14),
-            (0.08, 0.20, 0.07),
-            (0.07, 0.07, 0.07),
-            (0.06, 0.06, 0.18),
-            (0.03, 0.04, 0.03),
-            (0.015, 0.015, 0.008),
-        ]
-    )
+    known = library.entries()["virtual_tx90l_on_rail"]
+    m, r, gyration = (np.array(known[name]) for name in ("masses", "centres", "gyration"))
     # m4 r_c4z counts 20 times in p_B(1) and once in p_B(2): with l_2x = l_3z = 0.05 m.
     offset = m[3] * r[3, 2]
     m[0] = published[1] - m[1] - m[2] + 20.0 * offset - ROTORS[0]

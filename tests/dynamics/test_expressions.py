@@ -59,7 +59,7 @@ def values(expression: Expression, lengths: dict[str, float]) -> dict[str, float
 def evaluated(base: BaseParameters, lengths: dict[str, float]) -> np.ndarray:
     place = {name: k for k, name in enumerate(base.model.parameter_names)}
     full = np.zeros((base.size, base.model.size))
-    for row, expression in enumerate(base.closed_forms.expressions):
+    for row, expression in enumerate(base.closed_forms[0]):
         for name, value in values(expression, lengths).items():
             full[row, place[name]] = value
     return full
@@ -138,7 +138,7 @@ def test_what_has_no_short_form_is_a_number():
     base = base_parameters(Model(mixed_tree().robot(), (SEVEN, *DRIVES)))
     numbers = [
         coefficient.monomials[0].number
-        for e in base.closed_forms.expressions
+        for e in base.closed_forms[0]
         for _, coefficient in e.terms
         if len(coefficient.monomials) == 1 and not coefficient.symbols
     ]
@@ -192,11 +192,11 @@ def test_letters_hold_for_robots_of_other_lengths(name):
     expected, found = combinations(fresh), evaluated(base, lengths)
     if name in SQUARE:
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-10)
-        coefficients = [c for e in base.closed_forms.expressions for _, c in e.terms]
+        coefficients = [c for e in base.closed_forms[0] for _, c in e.terms]
         assert all(isinstance(m.number, Fraction) for c in coefficients for m in c.monomials)
     # A plain number is what has no short form: it need not hold for other lengths.
     place = {label: k for k, label in enumerate(model.parameter_names)}
-    for row, expression in enumerate(base.closed_forms.expressions):
+    for row, expression in enumerate(base.closed_forms[0]):
         for label, coefficient in expression.terms:
             if coefficient.symbols:
                 exact = pytest.approx(expected[row, place[label]], rel=1e-8, abs=1e-10)

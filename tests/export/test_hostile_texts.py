@@ -71,7 +71,7 @@ def test_c(fit):
     writer = CWriter(True, "arm", [x.program for x in functions])
 
     def written(fit):
-        texts = c_code._header(fit, writer, functions), c_code._source(fit, writer, functions)
+        texts = c_code.c_texts(fit, writer, functions).values()
         assert all(text.isascii() for text in texts)
         return [code_of(text.replace(fit.checksum, "")) for text in texts]
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from sample_functions import SIZE, chain, random_functions, reference, samples
 
 from jaxid.errors import InputError
-from jaxid.program import evaluate, evaluate_packed, to_python, trace
+from jaxid.program import dense_rows, evaluate, evaluate_rows, to_python, trace
 
 
 def flat(program, *x):
@@ -33,12 +33,12 @@ def test_batches_are_broadcast_and_results_are_float64():
     assert got.dtype == np.float64
 
 
-def test_packed_results_keep_constants_and_share_arrays():
+def test_distinct_results_are_computed_once_and_constants_not_at_all():
     program = trace(lambda x: jnp.array([x, 0.0, x, 2.5]), ())
-    first, zero, second, constant = evaluate_packed(program, np.arange(3.0))
-    np.testing.assert_array_equal(first, np.arange(3.0))
-    assert first is second
-    assert (zero, constant) == (0.0, 2.5)
+    rows = evaluate_rows(program, np.arange(3.0))
+    np.testing.assert_array_equal(rows, [np.arange(3.0)])
+    expected = [[x, 0.0, x, 2.5] for x in range(3)]
+    np.testing.assert_array_equal(dense_rows(program, rows, np.float64), expected)
 
 
 def test_inputs_are_not_changed():

@@ -187,7 +187,7 @@ def _outside_dead_zone(dead_zone: Any, qd: Any, value: Any) -> Any:
 
 
 class AbstractDryFriction(AbstractTerm):
-    """Friction with a transition from one direction of motion to the other."""
+    """Friction with a `transition` from one direction of motion to the other."""
 
     transition: eqx.AbstractVar[AbstractTransition]
 
@@ -225,11 +225,7 @@ class AsymmetricViscousFriction(AbstractTerm):
 
 
 class CoulombFriction(AbstractDryFriction):
-    r"""Dry friction `fc1`, …, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14).
-
-    Attributes:
-        transition: Transition from one direction of motion to the other.
-    """
+    r"""Dry friction `fc1`, …, $\mathrm{diag}\{\tanh(\dot q_i / \epsilon_c)\}$ (Eq. 14)."""
 
     transition: AbstractTransition = Tanh()
     symbols = (("fc", "N m", "N"),)
@@ -246,9 +242,6 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
     It takes the place of `CoulombFriction` together with `ConstantOffset`, whose columns its own
     columns span. Its parameters are `fcp1`, … for positive, then `fcn1`, … for negative speeds
     [N m or N].
-
-    Attributes:
-        transition: Transition from one direction of motion to the other.
     """
 
     transition: AbstractTransition = Tanh()
@@ -272,9 +265,6 @@ class SquareRootFriction(AbstractDryFriction):
     $\sqrt{|\dot q_i| / v_1} \tanh(\dot q_i / \epsilon)$: with $v_1$ = 1 rad/s or 1 m/s, its
     parameters `fr1`, … are the forces at that speed [N m or N]. It is used beside dry and viscous
     friction: greased gears often lie between the two.
-
-    Attributes:
-        transition: Transition from one direction of motion to the other.
     """
 
     transition: AbstractTransition = Tanh()
@@ -349,11 +339,7 @@ class LoadFriction(AbstractDryFriction):
     roles = ("load",)
 
     def parameters(self, robot):
-        """Return `fl1`, …: friction for each unit of load [1].
-
-        Raises:
-            InputError: If `bodies` holds fewer than ten numbers for each body.
-        """
+        """Return `fl1`, …: friction for each unit of load [1]."""
         self._bodies(robot)
         return super().parameters(robot)
 
@@ -437,11 +423,7 @@ class CoupledDrives(AbstractTerm):
     transition: AbstractTransition = Tanh()
 
     def couplings(self, robot: Robot) -> tuple[tuple[int, np.ndarray], ...]:
-        """Return the motors that turn several axes, with ratios relative to their own joint.
-
-        Raises:
-            InputError: If the motors are not in the order of their joints.
-        """
+        """Return the motors that turn several axes, with ratios relative to their own joint."""
         A = np.asarray(robot.drives.reduction)
         scale = np.abs(A).max()
         if not np.diag(A).all():

@@ -1,9 +1,12 @@
 """Prior knowledge about bodies: bounds of masses and sizes, a CAD model, a data sheet."""
 
+import dataclasses
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, Numbers
+from jaxid.arrays import AnyArray, Bool, Float, Numbers, given, optional
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
@@ -28,47 +31,21 @@ class BodyBounds(eqx.Module):
         total_mass: Mass of all bodies together [kg], like `120.0`; None if unknown.
     """
 
-    mass_max: Float[np.ndarray, " bodies"]
-    radius: Float[np.ndarray, " bodies"]
-    mass_min: Float[np.ndarray, " bodies"]
-    centre_min: Float[np.ndarray, "bodies 3"]
-    centre_max: Float[np.ndarray, "bodies 3"]
-    ellipsoid_centre: Float[np.ndarray, "bodies 3"]
-    ellipsoid_axes: Float[np.ndarray, "bodies 3"]
-    total_mass: float | None
+    mass_max: Float[np.ndarray, " bodies"] = eqx.field(converter=given)
+    radius: Float[np.ndarray, " bodies"] = eqx.field(converter=given)
+    mass_min: Float[np.ndarray, " bodies"] = eqx.field(converter=given, default=0.0)
+    centre_min: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=-np.inf)
+    centre_max: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=np.inf)
+    ellipsoid_centre: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=0.0)
+    ellipsoid_axes: Float[np.ndarray, "bodies 3"] = eqx.field(converter=given, default=np.inf)
+    total_mass: float | None = eqx.field(converter=optional, default=None)
 
-    def __init__(
-        self,
-        mass_max: Numbers,
-        radius: Numbers,
-        mass_min: Numbers = 0.0,
-        centre_min: Numbers = -np.inf,
-        centre_max: Numbers = np.inf,
-        ellipsoid_centre: Numbers = 0.0,
-        ellipsoid_axes: Numbers = np.inf,
-        total_mass: float | int | None = None,
-    ):
-        """Build bounds; `mass_max` or `radius` has one number per body, others may be scalars.
-
-        Raises:
-            InputError: If shapes do not fit, or no body satisfies all bounds.
-        """
-        bodies = max(np.size(mass_max), np.size(radius))
-
-        def each(name: str, value: Numbers, *shape: int) -> np.ndarray:
-            array = np.array(value, np.float64)
-            if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
-                raise InputError(f"`{name}` must be for all or each of {bodies} bodies: {value}.")
-            return np.broadcast_to(array, (bodies, *shape)).copy()
-
-        self.mass_max = each("mass_max", mass_max)
-        self.radius = each("radius", radius)
-        self.mass_min = each("mass_min", mass_min)
-        self.centre_min = each("centre_min", centre_min, 3)
-        self.centre_max = each("centre_max", centre_max, 3)
-        self.ellipsoid_centre = each("ellipsoid_centre", ellipsoid_centre, 3)
-        self.ellipsoid_axes = each("ellipsoid_axes", ellipsoid_axes, 3)
-        self.total_mass = None if total_mass is None else float(total_mass)
+    def __post_init__(self):
+        bodies = max(np.size(self.mass_max), np.size(self.radius))
+        for name in ("mass_max", "radius", "mass_min"):
+            setattr(self, name, _of_each(name, getattr(self, name), bodies))
+        for name in ("centre_min", "centre_max", "ellipsoid_centre", "ellipsoid_axes"):
+            setattr(self, name, _of_each(name, getattr(self, name), bodies, 3))
         low, high, radius = self.mass_min, self.mass_max, self.radius
         rules = (
             ("mass_max", "positive and finite", (high > 0) & np.isfinite(high)),
@@ -110,13 +87,9 @@ class BodyBounds(eqx.Module):
                 farthest[parent] = max(farthest[parent], offset[body])
         return cls(100.0 * reach**2, farthest + 0.25 * reach)
 
-    def replace(self, **fields: Numbers | float | None) -> "BodyBounds":
-        """Return a copy with some bounds replaced; scalars count for all bodies.
-
-        Raises:
-            InputError: If shapes do not fit, or no body satisfies all bounds.
-        """
-        return type(self)(**{**vars(self), **fields})  # pyright: ignore[reportArgumentType]
+    def replace(self, **fields: Any) -> "BodyBounds":
+        """Return a copy with some bounds replaced; scalars count for all bodies."""
+        return dataclasses.replace(self, **fields)
 
     def __str__(self):
         def span(values: AnyArray) -> str:
@@ -141,11 +114,7 @@ class BodyBounds(eqx.Module):
 
     @property
     def inner_centres(self) -> Float[np.ndarray, "bodies 3"]:
-        """Centres of mass well inside all bounds [m].
-
-        Raises:
-            InputError: If there are none for some body.
-        """
+        """Centres of mass well inside all bounds [m]."""
         radius, known = self.radius[:, None], self.has_ellipsoid[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)
@@ -167,6 +136,14 @@ class BodyBounds(eqx.Module):
             k = int(np.argmin(inside))
             raise InputError(f"no centre of mass of body {k + 1} fits its bounds: widen them.")
         return point
+
+
+def _of_each(name: str, value: Numbers, bodies: int, *shape: int) -> np.ndarray:
+    """Return numbers of each body, given for each or for all."""
+    array = np.array(value, np.float64)
+    if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
+        raise InputError(f"`{name}` must be for all or each of {bodies} bodies: {value}.")
+    return np.broadcast_to(array, (bodies, *shape)).copy()
 
 
 class EntropicPull(eqx.Module):

@@ -139,12 +139,7 @@ class FeasibleSet(NamedTuple):
 
 
 def feasible_set(model: Model, bounds: BodyBounds, margin: float = 0.0) -> FeasibleSet:
-    """Return the feasible parameters of a model; bodies contain a fraction of nominal balls.
-
-    Raises:
-        InputError: If the model has no bodies, the bounds are those of another robot, or coupled
-            drives lack the diagonal terms.
-    """
+    """Return the feasible parameters of a model; bodies contain a fraction of nominal balls."""
     robot = model.robot
     sizes = [len(term.parameters(robot)) for term in model.terms]
     starts = np.cumsum([0, *sizes[:-1]])
@@ -252,11 +247,7 @@ class ConeProgram(eqx.Module):
         return matrices + self.bodies * self.rows.shape[-2] + 2 * self.drives
 
     def require_interior(self) -> None:
-        """Check that the start lies strictly inside all bounds.
-
-        Raises:
-            InputError: If it does not.
-        """
+        """Check that the start lies strictly inside all bounds."""
         S, s = self.slacks(np, np.asarray(self.start))
         smallest = np.linalg.eigvalsh(S).min()
         if not (smallest > 0 and s.min() > 0):

@@ -25,20 +25,13 @@ class Channel(NamedTuple):
     r"""One series of equations $u_t = \theta_t (p - \hat p)$ + disturbance, usually of one joint.
 
     The estimate moves by $B \sum_t z_t u_t$. Rows that do not count are zero.
-
-    Attributes:
-        columns: Base parameters of the equations.
-        instruments: $z_t$ [rows, columns]: for least squares the equations themselves.
-        equations: $\theta_t$ [rows, columns], weighted.
-        disturbance: $u_t$ [rows]: residuals, weighted.
-        counted: Number of rows that count.
     """
 
-    columns: tuple[int, ...]
-    instruments: np.ndarray
-    equations: np.ndarray
-    disturbance: np.ndarray
-    counted: int
+    columns: tuple[int, ...]  # base parameters of the equations
+    instruments: np.ndarray  # $z_t$ [rows, columns]: for least squares the equations themselves
+    equations: np.ndarray  # $\theta_t$ [rows, columns], weighted
+    disturbance: np.ndarray  # $u_t$ [rows]: residuals, weighted
+    counted: int  # number of rows that count
 
 
 Influence = Callable[[RowChunk, np.ndarray], list[Channel]]
@@ -150,12 +143,7 @@ class AbstractEstimator(eqx.Module):
 
     @abstractmethod
     def __call__(self, problem: RegressionProblem) -> Estimate:
-        """Return the estimate of a regression problem.
-
-        Raises:
-            InputError: If weights are not known, the estimator needs rows and only factors are
-                known, or its settings do not fit the model or the recordings.
-        """
+        """Return the estimate of a regression problem."""
 
 
 class EstimatorInWords(AbstractEstimator):

@@ -23,20 +23,14 @@ class Decomposition(eqx.Module):
     """Singular value decomposition of the weighted observation matrix with columns of length one.
 
     Scaled columns make the result independent of units. Columns of zeros or of rounding stay zero.
-
-    Attributes:
-        scale: Lengths of the columns.
-        values: Singular values, in falling order.
-        directions: Right singular vectors of the scaled parameters, as rows.
-        forces: Weighted forces along the left singular vectors.
-        rest: Norm of the forces that the columns cannot explain.
     """
 
-    scale: Float[np.ndarray, " base"]
-    values: Float[np.ndarray, " base"]
+    scale: Float[np.ndarray, " base"]  # lengths of the columns
+    values: Float[np.ndarray, " base"]  # singular values, in falling order
+    # right singular vectors of the scaled parameters, as rows
     directions: Float[np.ndarray, "base base"]
-    forces: Float[np.ndarray, " base"]
-    rest: float
+    forces: Float[np.ndarray, " base"]  # weighted forces along the left singular vectors
+    rest: float  # norm of the forces that the columns cannot explain
 
     @classmethod
     def of(cls, R: AnyArray, z: AnyArray) -> "Decomposition":

@@ -76,14 +76,10 @@ class NonlinearFriction(AbstractEstimator):
 
 
 class Shapes(eqx.Module):
-    """Shape parameters of a model's friction laws, in the order of the terms.
+    """Shape parameters of a model's friction laws, in the order of the terms."""
 
-    Attributes:
-        model: Model; every shape has one value for each of its joints.
-        members: Index of the term, and shape, of each.
-    """
-
-    model: Model
+    model: Model  # model; every shape has one value for each of its joints
+    # index of the term, and shape, of each
     members: tuple[tuple[int, NonlinearParameter], ...] = eqx.field(static=True)
 
     @property
@@ -141,11 +137,7 @@ class Shapes(eqx.Module):
 
 
 def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
-    """Return the shapes of these names; without names, those that the terms propose.
-
-    Raises:
-        InputError: If there are none.
-    """
+    """Return the shapes of these names; without names, those that the terms propose."""
     if base.model.memory is not None:
         raise InputError("shapes are not searched for beside `Presliding`: take `Tanh`.")
     members = []
@@ -163,25 +155,17 @@ class ShapeSearch(eqx.Module):
 
     It is a function of JAX: `eqx.filter_jit(search)(weights)`. Replace `forces` to map over draws
     or to differentiate by the measurements. Only friction is evaluated and filtered again.
-
-    Attributes:
-        shapes: Shapes to be found.
-        start: Their values in the model.
-        recordings: Observations whose rows they are.
-        fixed: Columns that do not depend on shapes; zero in rows that do not count.
-        forces: Measured forces of the rows [N m or N], likewise.
-        counted: One for rows that count, otherwise zero.
-        blocks: Block of time of each row.
-        entries: Joint, base parameter, and column of the shaped terms, of what depends on shapes.
     """
 
-    shapes: Shapes
-    start: Float[AnyArray, " shapes"]
-    recordings: tuple[Observations, ...]
+    shapes: Shapes  # shapes to be found
+    start: Float[AnyArray, " shapes"]  # their values in the model
+    recordings: tuple[Observations, ...]  # observations whose rows they are
+    # columns that do not depend on shapes; zero in rows that do not count
     fixed: Float[AnyArray, "rows joints base"]
-    forces: Float[AnyArray, "rows joints"]
-    counted: Float[AnyArray, "rows joints"]
-    blocks: AnyArray
+    forces: Float[AnyArray, "rows joints"]  # measured forces of the rows [N m or N], likewise
+    counted: Float[AnyArray, "rows joints"]  # one for rows that count, otherwise zero
+    blocks: AnyArray  # block of time of each row
+    # joint, base parameter, and column of the shaped terms, of what depends on shapes
     entries: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
 
     @classmethod

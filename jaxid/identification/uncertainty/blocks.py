@@ -62,10 +62,6 @@ def block_covariance(blocks: Sequence[Block], inverse: AnyArray) -> tuple[np.nda
     Without block $k$ the estimate moves by $(1 - B G_k)^{-1} B g_k$, where $G_k$ is the block's
     information and $g_k$ the product of its derivatives and residuals. The covariance has at most
     the rank of the number of blocks less one: it serves single unknowns, and tests of a few.
-
-    Args:
-        blocks: Contiguous blocks of time, longer than the correlation of the errors.
-        inverse: $B$, the inverse of the information of all blocks.
     """
     B, count = np.asarray(inverse), len(blocks)
     size = np.sqrt(np.maximum(np.diag(B), 0.0))
@@ -107,10 +103,6 @@ def bootstrap(
 
     Returns:
         Parameters of each draw; their covariance is that of the estimates.
-
-    Raises:
-        InputError: If there are fewer than two blocks, or draws do not determine all parameters.
-        RuntimeError: If JAX's 64-bit mode is off.
     """
     from ..batch_solver import RIDGE, inverse_information
 

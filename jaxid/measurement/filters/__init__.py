@@ -5,7 +5,7 @@ from .decimation import (
     Decimation as Decimation,
     Subsample as Subsample,
 )
-from .filter import AbstractFilter as AbstractFilter, LowPass as LowPass, optional as optional
+from .filter import AbstractFilter as AbstractFilter, LowPass as LowPass
 from .motion_filters import (
     PaperFilter as PaperFilter,
     PeriodicFourier as PeriodicFourier,

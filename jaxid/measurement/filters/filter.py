@@ -24,11 +24,6 @@ SETTLED = 1e-4
 """Fraction of the impulse response's peak below which the start of a log no longer matters."""
 
 
-def optional(value: float | int | None) -> float | None:
-    """Convert a number, unless it is None."""
-    return None if value is None else float(value)
-
-
 def integer(name: str) -> Callable[[float | int], int]:
     """Return a converter that accepts integers only, as `int` or `float`."""
 
@@ -123,11 +118,7 @@ def _filter_both_ways(sos: np.ndarray, x: Array, padding: int) -> Array:
 
 
 def butterworth(cutoff: float, order: int, sample_time: float, name: str = "cutoff") -> LowPass:
-    """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's.
-
-    Raises:
-        InputError: If the cut-off does not suit the sampling rate.
-    """
+    """Return a Butterworth filter, to be run forward and backward; `cutoff` [Hz] is scipy's."""
     if math.isinf(cutoff):
         return LowPass((), math.inf)
     require_cutoff(name, cutoff, sample_time)

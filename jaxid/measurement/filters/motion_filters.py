@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from scipy import signal
 
-from jaxid.arrays import Float
+from jaxid.arrays import Float, optional
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
@@ -18,7 +18,6 @@ from .filter import (
     butterworth,
     check_settings,
     integer,
-    optional,
     require_cutoff,
     settled_edge,
     unit_gain_sections,
