@@ -68,7 +68,11 @@ ALL = tuple(known for known in vars().values() if isinstance(known, Unit))
 
 
 def unit(symbol: str) -> Unit:
-    """Return the unit with this symbol: `unit("deg")` is `DEG`."""
+    """Return the unit with this symbol: `unit("deg")` is `DEG`.
+
+    Raises:
+        InputError: If no unit has this symbol.
+    """
     units = {known.symbol: known for known in ALL}
     if symbol not in units:
         raise InputError(f"`{symbol}` is no known unit: write one of {', '.join(units)}.")

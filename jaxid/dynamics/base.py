@@ -156,7 +156,12 @@ class BaseParameters(Hashable):
         return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
-        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26)."""
+        r"""Return the stacked base regressor of many samples without its zeros (Eqs. 23, 26).
+
+        Raises:
+            InputError: If the motion does not have one axis of samples, or JAX is tracing the
+                robot's geometry.
+        """
         self.model.check(motion.q)
         return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 

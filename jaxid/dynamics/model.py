@@ -88,7 +88,11 @@ class Model(Hashable):
     def split(
         self, p: Float[AnyArray, " standard"]
     ) -> list[tuple[AbstractTerm, Float[AnyArray, " columns"]]]:
-        """Return each term with its parameters."""
+        """Return each term with its parameters.
+
+        Raises:
+            InputError: If there is not one number for each standard parameter.
+        """
         sizes = [len(term.parameters(self.robot)) for term in self.terms]
         if p.shape != (sum(sizes),):
             raise InputError(
@@ -99,7 +103,11 @@ class Model(Hashable):
 
     @property
     def memory(self) -> Presliding | None:
-        """Law of the friction that depends on the path of the joints; None without."""
+        """Law of the friction that depends on the path of the joints; None without such friction.
+
+        Raises:
+            InputError: If terms have different lengths.
+        """
         laws = {x for x in jax.tree.leaves(self.terms, is_leaf=_has_memory) if _has_memory(x)}
         if len(laws) > 1:
             raise InputError("all terms with `Presliding` must have the same one.")
@@ -187,6 +195,10 @@ class Model(Hashable):
 
         Args:
             motion: Joint motion [samples, joints].
+
+        Raises:
+            InputError: If the motion does not have one axis of samples, or JAX is tracing the
+                robot's geometry.
         """
         self.check(motion.q)
         return PackedRegressor(self, self.columns, *self.arguments(motion))
@@ -280,7 +292,11 @@ class Model(Hashable):
         return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
 
     def check(self, q: Coordinates) -> Float[AnyArray, "*batch joints"]:
-        """Return coordinates as an array with one number for each joint along the last axis."""
+        """Return coordinates as an array with one number for each joint along the last axis.
+
+        Raises:
+            InputError: If the last axis has another length.
+        """
         q = as_array("q", q)
         if q.shape[-1:] != (self.robot.joints,):
             raise InputError(

@@ -64,7 +64,11 @@ class Estimation(NamedTuple):
 
 
 def decode_estimator(table: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arguments of `build_estimation`, and the bounds of bodies."""
+    """Return the arguments of `build_estimation`, and the bounds of bodies.
+
+    Raises:
+        InputError: If a key is wrong, belongs to another kind, or does not go with another one.
+    """
     given, bounds = decode([build_estimation, BodyBounds], table, "estimator", complete=False)
     owners = [KINDS["weighted"], KINDS["consistent"]]
     if not any(name in owners[0] and name not in owners[1] for name in given):
@@ -140,6 +144,9 @@ def build_estimation(
         reference_start: Time stamp at which it began [s], like `0.0`; or a list.
         margin: Fraction of a ball that each body contains ("consistent"), like `0.01`.
         pull: Strength of a pull towards the prior, or towards balls ("consistent"); 0 for none.
+
+    Raises:
+        InputError: If keys do not go together, or a file cannot be read.
     """
     robot = model.robot
     joint_weights: estimators.AbstractWeights = estimators.ResidualVariances()

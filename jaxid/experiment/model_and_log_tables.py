@@ -160,7 +160,11 @@ class Effects:
         return tuple(term for term in chosen if not isinstance(term, bool))
 
     def load_transition(self, robot: Robot) -> terms.AbstractTransition | None:
-        """Return the transition of friction by load; None without it."""
+        """Return the transition of friction by load; None without it.
+
+        Raises:
+            InputError: If the bodies that it needs are not complete.
+        """
         if self.load and self.principal_axes:
             raise InputError("`load` needs complete bodies: leave `principal_axes` out.")
         dry = self.coulomb if isinstance(self.coulomb, DryFriction) else DryFriction()
@@ -293,6 +297,9 @@ def build_rows(
         factors: Factors of stages that low-pass and decimate, instead of `step`, like `[10, 10]`:
             13 at most.
         min_speed: Speed below which rows do not count [rad/s or m/s], like `0.05`; or a list.
+
+    Raises:
+        InputError: If two ways are asked for, or a factor is too large.
     """
     if step is not None and factors is not None:
         raise InputError("give `step` or `factors`, which also low-pass filter, but not both.")

@@ -88,6 +88,9 @@ def known_load(
 
     Returns:
         Function from a robot to the load as a tool of it; to the mass if nothing else is known.
+
+    Raises:
+        InputError: If the centre of mass is missing beside `inertia` or `body`.
     """
     if centre_of_mass is None and (inertia is not None or body is not None):
         raise InputError("`centre_of_mass` is missing.")
@@ -217,7 +220,11 @@ class RobotSource:
         return robot if tool is None else robot.replace(tool=tool)
 
     def parameters(self, folder: Path) -> Float[np.ndarray, "bodies 10"] | None:
-        """Return the bodies' parameters that the robot's file claims; None if there is none."""
+        """Return the bodies' parameters that the robot's file claims; None if there is none.
+
+        Raises:
+            InputError: If the file describes a body that cannot exist.
+        """
         if self.file is None:
             return None
         return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(-1, 10)
@@ -259,6 +266,9 @@ def replace_limits(
         acceleration: Largest accelerations [rad/s² or m/s²].
         jerk: Largest jerks [rad/s³ or m/s³].
         force: Largest forces [N m or N].
+
+    Raises:
+        InputError: If a list has another length, or a limit is not plausible.
     """
     given = {"position_min": position_min, "position_max": position_max, "velocity": velocity}
     given |= {"acceleration": acceleration, "jerk": jerk, "force": force}
@@ -312,6 +322,9 @@ def replace_drives(
         max_torques: Largest torques of the motors, before the gears [N m].
         rotor_inertia: Inertias of the rotors, before the gears [kg m²], like `1e-4`; shown, not
             used.
+
+    Raises:
+        InputError: If a list has another length, or the ratios cannot be inverted.
     """
     if gear_ratios is not None and matrix is not None:
         raise InputError("give `gear_ratios` or `matrix`, but not both.")

@@ -133,6 +133,9 @@ class Fit(eqx.Module):
 
         Args:
             level: Probability (0 to 1) that an interval contains the truth.
+
+        Raises:
+            InputError: If `level` is not between 0 and 1.
         """
         half, p = self.uncertainty.half_widths(level), self.parameters
         return np.stack([p - half, p + half], axis=1)
@@ -158,14 +161,22 @@ class Fit(eqx.Module):
 
     @property
     def time_blocks(self) -> Blocks:
-        """The factors by contiguous blocks of time."""
+        """The factors by contiguous blocks of time.
+
+        Raises:
+            InputError: If the fit does not hold its factors.
+        """
         if self.blocks is None:
             raise InputError(f"the fit `{self.name}` does not hold its factors: identify again.")
         return self.blocks
 
     @property
     def factor(self) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix and right-hand side with the norms of all weighted rows (Eq. 29)."""
+        """Matrix and right-hand side with the norms of all weighted rows (Eq. 29).
+
+        Raises:
+            InputError: If the fit does not hold its factors.
+        """
         return self.time_blocks.total.weighted(self.weights)
 
     @property
@@ -273,7 +284,11 @@ class Fit(eqx.Module):
         return str(self.summary())
 
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
-        """Return the forces of a motion, without a known tool's [N m or N] (Eq. 39)."""
+        """Return the forces of a motion, without a known tool's [N m or N] (Eq. 39).
+
+        Raises:
+            InputError: If the motion is of another number of joints.
+        """
         robot = self.base.model.robot
         if motion.joints != robot.joints:
             raise InputError(f"`motion` must be of {robot.joints} joints, not {motion.joints}.")
@@ -291,6 +306,10 @@ class Fit(eqx.Module):
 
         Args:
             path: Path of the file; an existing file is replaced.
+
+        Raises:
+            InputError: If the model holds something that no file can hold, such as a term with
+                functions in it.
         """
         document = {"format": FORMAT, "version": VERSION, "checksum": self.checksum}
         write_text(path, json_text({**document, "model": self._content()}))

@@ -37,6 +37,9 @@ def shards(folder: str | Path) -> tuple[Path, ...]:
 
     Args:
         folder: Folder of the data set, which all processes see.
+
+    Raises:
+        InputError: If there is no such file.
     """
     files = list(Path(folder).glob("*.parquet"))
     if not files:
@@ -71,6 +74,7 @@ def factorise_across_processes(
     Raises:
         RuntimeError: If another process is lost, or JAX's 64-bit mode is off.
         TimeoutError: If another process does not arrive in time: it died, or still reads.
+        InputError: If the processes' base parameters differ.
     """
     require_float64("factors across processes")
     own, processes = Blocks(()), jax.process_count()

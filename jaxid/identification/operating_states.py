@@ -71,7 +71,11 @@ class StatesFit(eqx.Module):
         return str(self.summary())
 
     def fit(self, state: str) -> Fit:
-        """Return the fit of one state: to validate, predict and report."""
+        """Return the fit of one state: to validate, predict and report.
+
+        Raises:
+            InputError: If there is no such state.
+        """
         k, known = self._indices(state), self.uncertainty
         C = known.covariance[np.ix_(k, k)]
         fit = self.fits[self.states.index(state)]
@@ -87,6 +91,9 @@ class StatesFit(eqx.Module):
             first: Name of one state.
             second: Name of the other.
             level: Confidence of intervals and tests, a fraction from 0 to 1.
+
+        Raises:
+            InputError: If there is no such state, or `level` is no fraction.
         """
         a, b = (self._indices(state)[list(self.varying)] for state in (first, second))
         cross = self.uncertainty.covariance[np.ix_(a, b)]

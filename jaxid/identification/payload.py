@@ -62,7 +62,11 @@ class Payload(eqx.Module):
 
     @property
     def tool(self) -> Tool:
-        """The payload as a known load: `robot.replace(tool=payload.tool)`."""
+        """The payload as a known load: `robot.replace(tool=payload.tool)`.
+
+        Raises:
+            InputError: If it is no body that can exist.
+        """
         centre, inertia = self.centre_of_mass, self.inertia
         return Tool(self.body, mass=self.mass, centre_of_mass=centre, inertia=inertia)
 

@@ -104,7 +104,11 @@ class RegressionProblem:
         return self.blocks.total
 
     def require_samples(self) -> None:
-        """Check that the rows themselves are known."""
+        """Check that the rows themselves are known.
+
+        Raises:
+            InputError: If only factors are known.
+        """
         if not self.recordings:
             raise InputError("this estimate needs the rows themselves: `identify` the recordings.")
 
@@ -112,6 +116,9 @@ class RegressionProblem:
         """Return the problem of the same recordings with other base parameters.
 
         For estimators that search for constants of the model's terms.
+
+        Raises:
+            InputError: If only factors are known.
         """
         self.require_samples()
         return RegressionProblem(base, self.recordings, self.progress)
@@ -130,6 +137,9 @@ class RegressionProblem:
             columns: Parameters to which these columns belong; by default those of the rows.
             size: Number of all parameters; by default that of the base parameters.
             chunks: Rows; by default all.
+
+        Raises:
+            InputError: If only factors are known.
         """
         columns = self.base.acting_columns if columns is None else columns
         size = self.base.size if size is None else size
@@ -143,6 +153,9 @@ class RegressionProblem:
 
         Args:
             spans: Rows that are needed, in their order; others may come too. By default all.
+
+        Raises:
+            InputError: If only factors are known.
         """
         self.require_samples()
         for number in range(len(self.recordings)):

@@ -135,6 +135,9 @@ class Observations(eqx.Module):
             segments: Half-open ranges of samples without gaps; one segment if None.
             mask: Rows that count (rows x joints); all if None.
             name: Name of the observations.
+
+        Raises:
+            InputError: If shapes differ, values are not finite, or `sample_time` is not positive.
         """
         arrays = {"q": q, "qd": qd, "qdd": qdd, "forces": forces}
         shape = np.shape(q)
@@ -291,6 +294,9 @@ class Observations(eqx.Module):
 
         Args:
             fraction: Fraction (0 to 1) of the recording's duration in the first part.
+
+        Raises:
+            InputError: If `fraction` is not between 0 and 1, or a part has no rows.
         """
         if not 0 < fraction < 1:
             raise InputError(f"`fraction` must lie between 0 and 1, but is {fraction:g}.")

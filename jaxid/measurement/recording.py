@@ -89,6 +89,10 @@ class Recording(eqx.Module):
             bridged: Pause that is bridged in any case [s].
             name: Name of the log.
             first_row: Number of the first row in its file, for messages.
+
+        Raises:
+            InputError: If shapes differ, a value is not finite, time runs backwards or does not
+                advance, or there are fewer than ten samples.
         """
         if not largest_gap > 1.0:
             raise InputError(f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}.")
@@ -151,12 +155,20 @@ class Recording(eqx.Module):
         return TimeGrid(self.sample_time, self.segments, starts, self.notes)
 
     def crop(self, start: float | int = -np.inf, stop: float | int = np.inf) -> "Recording":
-        """Return the part from `start` [s] on and before `stop` [s], on the clock of `time`."""
+        """Return the part from `start` [s] on and before `stop` [s], on the clock of `time`.
+
+        Raises:
+            InputError: If fewer than ten samples are left.
+        """
         grid = self.grid.cropped(start, stop, self.name)
         return self._range(grid.ranges[0][0], grid.ranges[-1][1])
 
     def split(self, fraction: float) -> "tuple[Recording, Recording]":
-        """Return the first fraction (0 to 1) of the recorded time, and the rest."""
+        """Return the first fraction (0 to 1) of the recorded time, and the rest.
+
+        Raises:
+            InputError: If a part has fewer than ten samples.
+        """
         cut = round(fraction * self.samples)
         if not FEWEST <= cut <= self.samples - FEWEST:
             raise InputError(
@@ -214,6 +226,9 @@ def remove_delay(recording: Recording, seconds: float) -> Recording:
     Args:
         recording: Recording whose forces are delayed.
         seconds: Delay of the forces [s]; negative if they are early.
+
+    Raises:
+        InputError: If the delay is longer than the segments.
     """
     require_finite_delay(seconds)
     lost = math.ceil(abs(seconds) / recording.sample_time - 1e-9)

@@ -201,6 +201,9 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
     Args:
         joints: Number of joints.
         length: Lengths of the links [m], one for all or one for each.
+
+    Raises:
+        InputError: If there is no joint, or the lengths do not fit.
     """
     if joints < 1 or np.shape(length) not in ((), (joints,)):
         raise InputError("`joints` must be at least 1, and `length` one number or one for each.")

@@ -193,7 +193,11 @@ class Robot(eqx.Module):
 
     @property
     def max_forces(self) -> Float[AnyArray, " joints"]:
-        """Largest force of every joint: its limit, or that of its motors [N m or N] (Eq. 30)."""
+        """Largest force of every joint: its limit, or else that of its motors [N m or N] (Eq. 30).
+
+        Raises:
+            InputError: If neither is known for some joint.
+        """
         forces = self.known_max_forces
         if not np.isfinite(forces).all():
             j = int(np.flatnonzero(~np.isfinite(forces))[0])
@@ -212,6 +216,9 @@ class Robot(eqx.Module):
 
         Args:
             tolerance: Entries of axes and attitudes this close to zero become zero [rad].
+
+        Raises:
+            InputError: If the tolerance is no small angle.
         """
         return self.replace(
             axis=snapped(self.axis, tolerance),
@@ -226,6 +233,9 @@ class Robot(eqx.Module):
         Args:
             rotation: Attitude of the former ground frame on the new ground; upright if None.
             position: Origin of the former ground frame on the new ground [m].
+
+        Raises:
+            InputError: If the attitude is no rotation, or the position no point.
         """
         R = _rotations("`rotation`", np.eye(3) if rotation is None else rotation, (3, 3))
         r = _checked("`position`", position, (3,))
@@ -255,6 +265,9 @@ class Robot(eqx.Module):
             centre_of_mass: Centre of mass in the end-effector's frame [m].
             inertia: Inertia tensor about the centre of mass, along the end-effector's axes [kg m²];
                 a point mass if None.
+
+        Raises:
+            InputError: If the mass is not positive, or no body has such an inertia.
         """
         own = Tool(self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia)
         there = own.body_inertia.moved(self.tip_rotation, self.tip_offset)

@@ -81,6 +81,13 @@ def write_example(folder: Path, seed: int = 0) -> list[Path]:
     Args:
         folder: Folder of the files; made with its parents.
         seed: Seed of the parameters, the motions and the noise.
+
+    Returns:
+        Paths of the files.
+
+    Raises:
+        InputError: If `folder` is a file, or contains one of the files with other content.
+        RuntimeError: If JAX runs in single precision.
     """
     robot = virtual_panda(seed)
     with atomic_folder(folder) as staging:

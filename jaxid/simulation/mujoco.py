@@ -34,6 +34,7 @@ class MujocoRobot(VirtualRobot):
         """Return a simulation of the robot with a time step [s].
 
         Raises:
+            InputError: If the equations of motion contain more than bodies and rotors.
             ModuleNotFoundError: If MuJoCo is not installed.
         """
         library, friction = import_mujoco(), self.present_friction

@@ -226,6 +226,9 @@ class VirtualRobot(Hashable):
 
         Args:
             temperature: Temperature of all gears, or of each [°C].
+
+        Raises:
+            InputError: If friction does not depend on temperature.
         """
         return self.replace(temperature=np.full(self.robot.joints, temperature, np.float64))
 
@@ -241,6 +244,10 @@ class VirtualRobot(Hashable):
 
         Returns:
             Times from now on [s], and temperatures [°C].
+
+        Raises:
+            InputError: If friction does not depend on temperature.
+            RuntimeError: If JAX runs in single precision.
         """
         require_float64("warming a virtual robot")
         heating = self.heating
@@ -325,7 +332,11 @@ class VirtualRobot(Hashable):
         return Servo(w**2 * inertia, 2.0 * w * inertia, sample_time)
 
     def plant(self, step: float) -> Any:
-        """Return a simulation of the robot with a time step [s]: `start`, `step`, `read`."""
+        """Return a simulation of the robot with a time step [s]: `start`, `step`, `read`.
+
+        Raises:
+            InputError: If an elastic gear has a motor without inertia.
+        """
         elastic = np.asarray(self.gear.twist(np.ones(self.robot.joints))) != 0.0
         if (elastic & ~(self.rotors > 0)).any():
             raise InputError(
@@ -363,6 +374,10 @@ class VirtualRobot(Hashable):
                 servo if None.
             substeps: Steps of the simulation in one tick of the servo.
             name: Name of the recording.
+
+        Raises:
+            InputError: If the times do not fit together, or the motion diverges.
+            RuntimeError: If JAX runs in single precision.
         """
         require_float64("a virtual experiment")
         servo = self.servo() if servo is None else servo

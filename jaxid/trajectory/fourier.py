@@ -33,6 +33,9 @@ class FourierBasis(AbstractBasis):
     Attributes:
         harmonics: Number of harmonics $N$.
         omega: Ground frequency $\omega$ [rad/s].
+
+    Raises:
+        InputError: If one of them is not positive.
     """
 
     harmonics: int = eqx.field(static=True)
@@ -106,6 +109,9 @@ class RestToRestBasis(PeriodsBasis):
         harmonics: Number of harmonics, at least 2.
         omega: Ground frequency [rad/s].
         periods: Number of periods.
+
+    Raises:
+        InputError: If there is one harmonic only, or another number is not positive.
     """
 
     def __check_init__(self):

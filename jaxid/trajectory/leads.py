@@ -54,6 +54,9 @@ class LeadsBasis(PeriodsBasis):
         omega: Ground frequency [rad/s].
         lead: Time of a lead [s].
         periods: Number of periods between the leads.
+
+    Raises:
+        InputError: If one of them is not positive.
     """
 
     lead: Float[AnyArray, ""] = eqx.field(converter=as_scalar, default=0.5, kw_only=True)
@@ -172,6 +175,10 @@ def with_leads(series: AbstractTrajectory, robot: Robot, *, periods: int = 1) ->
         series: Periodic motion, for instance of a `FourierBasis`.
         robot: Robot whose limits hold.
         periods: Number of periods between the leads.
+
+    Raises:
+        InputError: If there is no period, the motion is not one of this robot, or no instant of
+            the period can be reached within the limits; the message names the joint.
     """
     if periods < 1:
         raise InputError(f"`periods` must be at least 1, but is {periods}.")

@@ -82,6 +82,10 @@ class TipPath(eqx.Module):
         rotation: Attitude of the end-effector: columns are its axes in the frame of the ground.
         speed: Largest speed [m/s].
         acceleration: Largest acceleration along the path, and largest across it [m/s²].
+
+    Raises:
+        InputError: If there is no piece, one has no length or does not start where the one before
+            it ends, or a limit is not positive.
     """
 
     pieces: tuple[Line | Circle, ...] = eqx.field(converter=tuple)
@@ -162,6 +166,9 @@ def iso9283_path(
         leans_along: Horizontal axis along which the plane rises: 0 for x, 1 for y.
         speed: Largest speed [m/s].
         acceleration: Largest acceleration along the path, and largest across it [m/s²].
+
+    Raises:
+        InputError: If the centre is no point, the cube has no size, or a limit is not positive.
     """
     c = as_array("centre", centre)
     if c.shape != (3,):
@@ -201,6 +208,10 @@ def joint_path(
         path: Path of the end-effector.
         posture: Preferred coordinates [rad or m]; the middle of the ranges if None.
         spacing: Largest time between two instants [s].
+
+    Raises:
+        InputError: If a part of the path is out of reach, a joint would have to move faster than it
+            can, or `spacing` is not positive.
     """
     if not 0 < spacing < np.inf:
         raise InputError(f"`spacing` must be positive [s], but is {spacing:g}.")

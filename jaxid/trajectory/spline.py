@@ -80,6 +80,9 @@ class RestToRestSplineBasis(AbstractBasis):
     Attributes:
         points: Number of coefficients of a joint.
         duration: Time from standstill to standstill [s].
+
+    Raises:
+        InputError: If there are fewer than two points, or the duration is not positive.
     """
 
     points: int = eqx.field(static=True, default=12)
@@ -124,6 +127,9 @@ def spline_through(points: Numbers, duration: float) -> LinearTrajectory:
     Args:
         points: Start, way points and end, one row each [rad or m].
         duration: Time from standstill to standstill [s].
+
+    Raises:
+        InputError: If there are not at least two points, or the duration is not positive.
     """
     way = np.asarray(as_array("points", points), np.float64)
     if way.ndim != 2 or len(way) < 2 or not np.isfinite(way).all():

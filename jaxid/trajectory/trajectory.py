@@ -58,6 +58,10 @@ class AbstractTrajectory(Hashable):
 
         Args:
             sample_time: Largest time between two samples [s].
+
+        Raises:
+            InputError: If `sample_time` is not positive.
+            RuntimeError: If JAX runs in single precision.
         """
         require_float64("sampling a trajectory")
         if not 0 < sample_time < np.inf:
@@ -82,6 +86,10 @@ class Segments(AbstractTrajectory):
 
     Attributes:
         members: Trajectories in the order in which they are run.
+
+    Raises:
+        InputError: If there is no member, or one does not start as the one before it ends: with the
+            same coordinates, velocities and accelerations, up to 1e-6.
     """
 
     members: tuple[AbstractTrajectory, ...] = eqx.field(converter=tuple)

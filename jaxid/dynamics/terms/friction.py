@@ -339,7 +339,11 @@ class LoadFriction(AbstractDryFriction):
     roles = ("load",)
 
     def parameters(self, robot):
-        """Return `fl1`, …: friction for each unit of load [1]."""
+        """Return `fl1`, …: friction for each unit of load [1].
+
+        Raises:
+            InputError: If `bodies` holds fewer than ten numbers for each body.
+        """
         self._bodies(robot)
         return super().parameters(robot)
 
@@ -423,7 +427,11 @@ class CoupledDrives(AbstractTerm):
     transition: AbstractTransition = Tanh()
 
     def couplings(self, robot: Robot) -> tuple[tuple[int, np.ndarray], ...]:
-        """Return the motors that turn several axes, with ratios relative to their own joint."""
+        """Return the motors that turn several axes, with ratios relative to their own joint.
+
+        Raises:
+            InputError: If the motors are not in the order of their joints.
+        """
         A = np.asarray(robot.drives.reduction)
         scale = np.abs(A).max()
         if not np.diag(A).all():

@@ -88,7 +88,11 @@ class BodyBounds(eqx.Module):
         return cls(100.0 * reach**2, farthest + 0.25 * reach)
 
     def replace(self, **fields: Any) -> "BodyBounds":
-        """Return a copy with some bounds replaced; scalars count for all bodies."""
+        """Return a copy with some bounds replaced; scalars count for all bodies.
+
+        Raises:
+            InputError: If shapes do not fit, or no body satisfies all bounds.
+        """
         return dataclasses.replace(self, **fields)
 
     def __str__(self):
@@ -114,7 +118,11 @@ class BodyBounds(eqx.Module):
 
     @property
     def inner_centres(self) -> Float[np.ndarray, "bodies 3"]:
-        """Centres of mass well inside all bounds [m]."""
+        """Centres of mass well inside all bounds [m].
+
+        Raises:
+            InputError: If there are none for some body.
+        """
         radius, known = self.radius[:, None], self.has_ellipsoid[:, None]
         low = np.maximum(self.centre_min, -radius)
         high = np.minimum(self.centre_max, radius)

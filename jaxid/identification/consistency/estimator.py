@@ -128,6 +128,7 @@ class PhysicallyConsistent(AbstractEstimator):
         """Solve a small convex program on the triangular factor of the rows.
 
         Raises:
+            InputError: If weights are not known, or bounds and margin leave no body.
             RuntimeError: If the optimum was not proved and `throw` is set.
         """
         base, weights = rows.base, self.weights(rows.robot, rows.factors)
@@ -181,7 +182,11 @@ class PhysicallyConsistent(AbstractEstimator):
         )
 
     def feasible_set(self, base: BaseParameters) -> FeasibleSet:
-        """Return the feasible set of a model."""
+        """Return the feasible set of a model.
+
+        Raises:
+            InputError: If the bounds do not fit the model.
+        """
         robot = base.model.robot
         bounds = BodyBounds.from_geometry(robot) if self.bounds is None else self.bounds
         return feasible_set(base.model, bounds, self.margin)
@@ -251,6 +256,7 @@ def consistent_body(
         not unusual); bound of half the squared distance's distance to the optimum.
 
     Raises:
+        InputError: If the covariance is not positive definite.
         RuntimeError: If the optimum was not proved and `throw` is set.
     """
     C = np.asarray(covariance)
@@ -329,6 +335,9 @@ class ConsistentSolver(Hashable):
             R: Upper triangle of the weighted rows.
             z: Weighted forces, of the same decomposition.
             rows: Number of rows behind the factor.
+
+        Raises:
+            InputError: If the bounds do not fit the model.
         """
         require_float64("a physically consistent estimate")
         R, z = jnp.asarray(R), jnp.asarray(z)
@@ -367,6 +376,10 @@ def consistent_batch(
         z: Weighted forces, of the same decompositions.
         rows: Numbers of rows behind the factors.
         estimator: Bounds, margin and priors; wide bounds if None.
+
+    Raises:
+        InputError: If shapes do not fit, or bounds leave no body.
+        RuntimeError: If JAX's 64-bit mode is off.
     """
     count = len(R)
     if not count or R.shape[-1] != base.size or z.shape != R.shape[:-1] or rows.shape != (count,):

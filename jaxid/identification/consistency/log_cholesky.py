@@ -33,6 +33,10 @@ class LogCholesky(eqx.Module):
 
         Args:
             bodies: Parameters of each body along the last axis, or of all bodies in a row.
+
+        Raises:
+            InputError: If there are not ten numbers for each body, or a body cannot exist, or is
+                flat: points and plates lie at infinity.
         """
         p = as_array("bodies", bodies)
         if p.shape[-1:] != (10,):

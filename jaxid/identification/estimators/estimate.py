@@ -143,7 +143,12 @@ class AbstractEstimator(eqx.Module):
 
     @abstractmethod
     def __call__(self, problem: RegressionProblem) -> Estimate:
-        """Return the estimate of a regression problem."""
+        """Return the estimate of a regression problem.
+
+        Raises:
+            InputError: If weights are not known, the estimator needs rows and only factors are
+                known, or its settings do not fit the model or the recordings.
+        """
 
 
 class EstimatorInWords(AbstractEstimator):

@@ -137,7 +137,11 @@ class Shapes(eqx.Module):
 
 
 def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
-    """Return the shapes of these names; without names, those that the terms propose."""
+    """Return the shapes of these names; without names, those that the terms propose.
+
+    Raises:
+        InputError: If there are none.
+    """
     if base.model.memory is not None:
         raise InputError("shapes are not searched for beside `Presliding`: take `Tanh`.")
     members = []

@@ -103,6 +103,10 @@ def bootstrap(
 
     Returns:
         Parameters of each draw; their covariance is that of the estimates.
+
+    Raises:
+        InputError: If there are fewer than two blocks, or draws do not determine all parameters.
+        RuntimeError: If JAX's 64-bit mode is off.
     """
     from ..batch_solver import RIDGE, inverse_information
 

@@ -53,6 +53,9 @@ class Uncertainty(eqx.Module):
 
         Args:
             level: Probability (0 to 1) that an interval contains the truth.
+
+        Raises:
+            InputError: If `level` is not between 0 and 1.
         """
         if not 0 < level < 1:
             raise InputError(f"`level` must lie between 0 and 1, like 0.95, but is {level:g}.")
