@@ -39,8 +39,8 @@ class HeldOutErrors(eqx.Module):
 
     @property
     def pays(self) -> bool:
-        """Whether the gain exceeds its standard deviation and 1 %."""
-        return self.gain > max(self.gain_deviation, 0.01)
+        """Whether the gain exceeds twice its standard deviation, and 1 %."""
+        return self.gain > max(2.0 * self.gain_deviation, 0.01)
 
     def __str__(self):
         verdict = "pays" if self.pays else "does not pay"
@@ -140,25 +140,24 @@ def identify_nonlinear(
         shapes=x,
         shape_covariance=both.covariance[size:, size:],
         linear=before,
-        held_out=_held_out_errors(linear_problem.blocks, search, x, weights, progress),
+        held_out=_held_out_errors(linear_problem.blocks, search, weights, progress),
     )
 
 
 def _held_out_errors(
     blocks,
     search: ShapeSearch,
-    found,
     weights,
     progress,
 ) -> HeldOutErrors:
-    """Test both models on held-out blocks; searches begin at the shapes of all blocks."""
+    """Test both models on blocks that neither has seen, nor the search for shapes."""
     squares, errors, every = weights**2, [], np.arange(len(blocks.parts))
     folds = np.array_split(every, min(5, len(every)))
     for out in folds:
         rest = np.setdiff1d(every, out)
         p = Decomposition.of(*blocks.select(rest).total.weighted(weights)).solve()
         kept = np.isin(every, rest).astype(float)
-        x, _ = eqx.filter_jit(search)(weights, found, kept)
+        x, _ = eqx.filter_jit(search)(weights, kept)
         _, left = eqx.filter_jit(search.fit)(x, search.row_weights(weights, kept))
         nonlinear = np.sum((search.row_weights(weights, 1.0 - kept) * left) ** 2)
         test = blocks.select(out).total

@@ -95,7 +95,7 @@ def test_the_search_can_be_mapped_and_differentiated():
     change = change - search.forces
 
     def found(forces):
-        return dataclasses.replace(search, forces=forces)(weights, search.start)[0]
+        return dataclasses.replace(search, forces=forces)(weights)[0]
 
     before, first, after = jax.jit(jax.vmap(found))(jnp.stack([draw - change, draw, draw + change]))
     alone, slopes = jax.jit(lambda a, b: jax.jvp(found, (a,), (b,)))(draw, change)
@@ -108,7 +108,7 @@ def test_deviations_of_shapes_agree_with_their_scatter():
     found = []
     for seed in range(14):
         search = search_of(START, observations(samples=600, noise=0.3, noise_seed=seed))
-        found.append(eqx.filter_jit(search)(np.ones(3), search.start)[0])
+        found.append(eqx.filter_jit(search)(np.ones(3))[0])
     o = observations(samples=600, noise=0.3)
     fit = jid.identify_nonlinear(START, o, NonlinearFriction(WLS))
     # 14 draws tell a deviation to 19 %: 1.6 is less than three of these.

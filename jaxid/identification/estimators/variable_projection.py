@@ -60,11 +60,8 @@ class NonlinearFriction(AbstractEstimator):
     def search(self, problem: RegressionProblem, weights: np.ndarray):
         """Return the search, the shapes found, and notes about it."""
         search = ShapeSearch.of(problem, select_shapes(problem.base, self.shapes))
-        begin, every = (
-            eqx.filter_jit(search.best_multiples)(weights),
-            np.ones(max(search.blocks) + 1),
-        )
-        x, converged = eqx.filter_jit(search)(weights, begin, every)
+        every = np.ones(max(search.blocks) + 1)
+        x, converged = eqx.filter_jit(search)(weights, every)
         notes = ()
         if not converged:
             notes = (
@@ -200,24 +197,23 @@ class ShapeSearch(eqx.Module):
     def __call__(
         self,
         weights: Float[AnyArray, " joints"],
-        begin: Float[AnyArray, " shapes"] | None = None,
         kept: Float[AnyArray, " blocks"] | None = None,
     ) -> tuple[Float[Array, " shapes"], Array]:
         """Search by Levenberg-Marquardt over logarithms; return shapes, and whether it converged.
 
-        Where the rows hardly determine a shape, a weak pull keeps it near that of the model: as
-        strong as one row that tells that it differs by a factor of ten.
+        It begins at the model's shapes, and at the best of a few multiples of them, and keeps the
+        better end: from one start, a Stribeck speed can stop at ten times its value. Where the rows
+        hardly determine a shape, a weak pull keeps it near that of the model: as strong as one row
+        that tells that it differs by a factor of ten.
 
         Args:
             weights: Weight of each joint [1/(N m) or 1/N].
-            begin: Shapes at which the search begins; by default the best of a few multiples.
             kept: One for each block of time that counts, zero for others; by default all count.
         """
         # Fits without nonlinear friction do not wait for it.
         import optimistix as optx
 
         start = jnp.asarray(self.start)
-        begin = self.best_multiples(weights) if begin is None else begin
         rows = self.row_weights(weights, kept)
         count = jnp.sum(jnp.where(rows > 0, 1.0, 0.0)) - float(self.fixed.shape[-1])
         information = self.information(rows)
@@ -235,17 +231,22 @@ class ShapeSearch(eqx.Module):
             found = optx.least_squares(left, solver, u, args=scale, max_steps=STEPS, throw=False)
             return found.value, found.result == optx.RESULTS.successful
 
-        # Twice: the strength of the pull depends on the noise, which is known at the end only.
-        u, successes = jax.lax.scan(search, jnp.log(begin / start), length=2)
-        return start * jnp.exp(u), successes[-1]
+        def from_start(begin: Array) -> tuple[Array, Array, Array]:
+            # Twice: the strength of the pull depends on the noise, which is known at the end only.
+            u, successes = jax.lax.scan(search, jnp.log(begin / start), length=2)
+            return u, successes[-1], jnp.sum(weighted(u) ** 2)
 
-    def best_multiples(self, weights: Float[AnyArray, " joints"]) -> Float[Array, " shapes"]:
+        starts = jnp.stack([start, self._best_multiples(rows)])
+        ends, successes, squares = jax.lax.map(from_start, starts)
+        best = jnp.argmin(squares)
+        return start * jnp.exp(ends[best]), successes[best]
+
+    def _best_multiples(self, rows: Float[AnyArray, "rows joints"]) -> Float[Array, " shapes"]:
         """Return for each joint the multiples of its shapes that explain its own rows best."""
         kinds = len(self.shapes.members)
         multiples = np.ones((3 ** min(kinds, 2), kinds, 1))
         multiples[:, :2, 0] = list(itertools.product((0.2, 1.0, 5.0), repeat=min(kinds, 2)))
         grid = jnp.reshape(self.start, (1, kinds, -1)) * multiples
-        rows = self.row_weights(weights)
 
         def squares(x: Array) -> Array:
             return jnp.sum((rows * self.fit(x.ravel(), rows)[1]) ** 2, axis=0)
