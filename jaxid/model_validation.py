@@ -38,6 +38,7 @@ class TorqueErrors(eqx.Module):
         counted: Rows that count, for each joint.
         max_forces: Largest force of each joint [N m or N]; NaN where not known.
         speeds: Velocities, filtered and decimated alike [rad/s or m/s].
+        positions: Coordinates, filtered and decimated alike [rad or m]; None if not known.
     """
 
     name: str = eqx.field(static=True)
@@ -47,6 +48,7 @@ class TorqueErrors(eqx.Module):
     counted: Bool[AnyArray, "rows joints"]
     max_forces: Float[AnyArray, " joints"]
     speeds: Float[AnyArray, "rows joints"]
+    positions: Float[AnyArray, "rows joints"] | None = None
 
     @property
     def moving(self) -> Bool[np.ndarray, "rows joints"]:
@@ -258,7 +260,7 @@ def torque_errors(
     observations = with_memory(observations, fit.base.model.memory)
     step = comparison_step(observations)
     mask = np.asarray(observations.mask)
-    measured, predicted, speeds = np.zeros((3, len(mask[::step]), observations.joints))
+    measured, predicted, speeds, q = np.zeros((4, len(mask[::step]), observations.joints))
     for chunk in observations.chunks(65536):
         first, stop = chunk.rows
         # Masked parts are not evaluated.
@@ -270,6 +272,7 @@ def torque_errors(
             measured[rows] = chunk.reduce(forces)[taken]
             predicted[rows] = chunk.reduce(model_forces)[taken]
             speeds[rows] = chunk.reduce(motion.qd)[taken]
+            q[rows] = chunk.reduce(motion.q)[taken]
         if progress is not None:
             progress(stop / observations.rows)
     return TorqueErrors(
@@ -280,6 +283,7 @@ def torque_errors(
         counted=mask[::step],
         max_forces=np.where(np.isfinite(known), known, np.nan),
         speeds=speeds,
+        positions=q,
     )
 
 

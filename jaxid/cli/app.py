@@ -189,8 +189,9 @@ def identify(
     ] = None,
     output: options.OutputFolder = Path("report"),
     figures: Annotated[
-        Literal["svg", "png", "pdf"], typer.Option(help="Format of the files with figures.")
-    ] = "svg",
+        Literal["svg", "png", "pdf"] | None,
+        typer.Option(help="Also write each figure to a file of this format."),
+    ] = None,
     force: options.Force = False,
 ) -> None:
     """Estimate the parameters and write a report.

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
 from jaxid.result_table import Remark, Status, Table, printable, versions
 
-from .style import svg_text
+from .figure import AbstractFigure
+from .interactive import library
 
 STYLES = {
     Status.GOOD: "green",
@@ -34,17 +34,21 @@ def render_page(
     lead: str = "",
     footer: str = "",
 ) -> str:
-    """Return a page: readable without network and script, on a phone, on a desk and on paper.
+    """Return a page: one file that needs no network, for a phone, a desk and paper.
+
+    Its figures are drawn by the browser, from data and a library that the page holds.
 
     Blocks of a section are texts (paragraphs), tables, figures, a remark (the headline), lists of
-    remarks, tuples of blocks beside each other, and what `picture`, `code` and `folded` return.
+    remarks, tuples of blocks beside each other, and what `tiles`, `code` and `folded` return.
     All texts are escaped.
     """
     shown = [
         (name, re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-"), [*map(_render, blocks)])
         for name, blocks in sections
     ]
-    return printable(str(_macros().page(title, shown, lead, footer)))
+    drawn = any('class="chart"' in block for *_, blocks in shown for block in blocks)
+    code = library() if drawn else ""
+    return printable(str(_macros().page(title, shown, lead, footer, code)))
 
 
 def _render(block: Any) -> Markup:
@@ -58,7 +62,7 @@ def _render(block: Any) -> Markup:
             return macros.headline(block)
         case Table():
             return macros.table(block)
-        case Figure():
+        case AbstractFigure():
             return picture(block)
         case tuple():
             return macros.abreast(*map(_render, block))
@@ -66,12 +70,14 @@ def _render(block: Any) -> Markup:
             return macros.remarks(block)
 
 
-def picture(figure: Figure, caption: str = "") -> Markup:
-    """Return a block with a figure, as the plotting library draws it, and a text below it."""
-    svg = svg_text(figure)
-    # Names of groups are the same in every figure of a page, and nothing refers to them.
-    svg = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
-    return _macros().picture(svg, figure.get_suptitle(), caption)
+def picture(figure: AbstractFigure, caption: str = "") -> Markup:
+    """Return a block with a figure, and a text below it."""
+    return _macros().figure(figure, caption)
+
+
+def tiles(*numbers: tuple[str, str, Status]) -> Markup:
+    """Return a block with large texts, what each of them is, and their judgement."""
+    return _macros().tiles(numbers)
 
 
 def code(text: str) -> Markup:
@@ -80,7 +86,7 @@ def code(text: str) -> Markup:
 
 
 def folded(summary: str, *blocks: Any) -> Markup:
-    """Return blocks that are shown when the reader opens them."""
+    """Return blocks that are shown when the reader opens them, and on paper."""
     return _macros().folded(summary, *map(_render, blocks))
 
 
