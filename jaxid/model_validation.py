@@ -11,7 +11,7 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.identification.fit_result import Fit
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.result_table import Column, Remark, Status, Table, percent, significant
+from jaxid.result_table import Column, Remark, Status, Summarised, Table, percent, significant
 
 POSES = 2000
 """Random poses in which the mass matrix is evaluated."""
@@ -185,7 +185,7 @@ class Definiteness(eqx.Module):
         )
 
 
-class Validation(eqx.Module):
+class Validation(Summarised, eqx.Module):
     """Torque errors on recordings, and definiteness of the mass matrix.
 
     Attributes:
@@ -220,9 +220,6 @@ class Validation(eqx.Module):
             remarks=[Remark(str(self.definiteness), status)],
             rules=range(count, len(rows), count),
         )
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
 
 def validate(

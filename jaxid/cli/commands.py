@@ -135,6 +135,8 @@ def identify(
             result.findings,
             result.mistakes,
             result.choice,
+            result.claimed,
+            result.claimed_mass,
         )
         written = write_report(output, report, figures or "")
     fit, robot = result.fit, result.experiment.robot

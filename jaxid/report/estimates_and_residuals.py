@@ -66,8 +66,10 @@ def parameter_figure(fit: Fit) -> Figure:
 
     known = fit.trust.count(Status.GOOD)
     name = fit.base.model.robot.name
-    return _listing(f"{name}: {known} of {len(relative)} base parameters are known to 10 %",
-                    [panel(shown) for shown in _columns(order)])
+    return _listing(
+        f"{name}: {known} of {len(relative)} base parameters are known to 10 %",
+        [panel(shown) for shown in _columns(order)],
+    )
 
 
 def comparison_figure(comparison: Comparison) -> Figure:
@@ -114,8 +116,10 @@ def comparison_figure(comparison: Comparison) -> Figure:
         )
 
     changed = comparison.verdicts.count(Verdict.CHANGED)
-    return _listing(f"{changed} of {len(k)} parameters have changed",
-                    [panel(shown) for shown in _columns(np.arange(len(k)))])
+    return _listing(
+        f"{changed} of {len(k)} parameters have changed",
+        [panel(shown) for shown in _columns(np.arange(len(k)))],
+    )
 
 
 def _columns(order: np.ndarray) -> list[np.ndarray]:

@@ -110,7 +110,10 @@ def write_excitation(
         f"{robot.name}: a motion to record",
         [
             ("Verdict", [_headline(plan, remarks), every]),
-            ("The motion", [picture(space, "Links are coloured by the speed of their joint."), *figures]),
+            (
+                "The motion",
+                [picture(space, "Links are coloured by the speed of their joint."), *figures],
+            ),
             ("Use of the limits", use),
             ("Gain over a random motion", [text, criteria]),
             ("Expected standard deviations", [deviations]),

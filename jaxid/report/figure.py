@@ -99,6 +99,11 @@ class Panel:
         return (self, *self.below)
 
     @property
+    def in_time(self) -> bool:
+        """Whether the abscissa is time, in which lines have gaps and may be long."""
+        return self.x.startswith("time")
+
+    @property
     def y_label(self) -> str:
         """Label of the ordinate with its unit."""
         return " ".join(filter(None, (self.y, self.unit and f"[{self.unit}]")))

@@ -1,5 +1,7 @@
 """Page of an identification: verdict, task, estimates, errors; and the tables of its results."""
 
+import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -34,6 +36,7 @@ def identification_page(report: Report, figures: Mapping[str, AbstractFigure]) -
     base, robot = fit.base, fit.base.model.robot
     overall, *criteria = verdict(report)
     open_points = [r for r in criteria if r.status in (Status.BAD, Status.DOUBTFUL)]
+    others = [r for r in criteria if r not in open_points]
     sections = [
         (
             "At a glance",
@@ -42,7 +45,7 @@ def identification_page(report: Report, figures: Mapping[str, AbstractFigure]) -
                 _three_numbers(report),
                 Table("", facts=_data(report)),
                 *([open_points] if open_points else []),
-                folded("All criteria of the verdict", criteria),
+                folded("What else was checked", others),
             ],
         ),
         *_physics(report, figures),
@@ -88,17 +91,22 @@ def _data(report: Report) -> list[tuple[str, str]]:
     """Return robot, logs, estimator and total mass, each with its word."""
     fit, robot = report.fit, report.fit.base.model.robot
     facts = [("robot", f"{robot.name}, {robot.joints} joints")]
-    for word, logs in (("identified with", report.identification), ("verified with", report.verification)):
+    for word, logs in (
+        ("identified with", report.identification),
+        ("verified with", report.verification),
+    ):
         for e in logs:
             time = np.asarray(e.time)
             length = significant(float(time[-1] - time[0]))
             facts.append((word, f"{e.name}: {length} s, {len(time)} rows of each joint"))
-    facts += [("estimator", str(fit.estimator)), ("mass matrix", str(report.definiteness))]
+    facts.append(("estimator", words_of(fit.estimator)))
     if fit.consistency is not None:
         mass = np.asarray(fit.consistency.bodies)[:, 0]
         loose = len(fit.consistency.masses_from_bounds)
         proof = f", of which {loose} bodies follow from bounds too" if loose else ""
-        facts.append(("total mass of the moving bodies", f"{significant(float(mass.sum()))} kg{proof}"))
+        facts.append(
+            ("total mass of the moving bodies", f"{significant(float(mass.sum()))} kg{proof}")
+        )
     else:
         text = "forces tell combinations of masses only; physically consistent bodies have masses"
         facts.append(("total mass", text))
@@ -133,9 +141,11 @@ def _physics(report: Report, figures: Mapping[str, AbstractFigure]) -> list[Sect
 
 def _torques(figures: Mapping[str, AbstractFigure], robot: Robot) -> list[Any]:
     """Return the figures of the recordings: with 42 panels at most, the first one unfolded."""
-    found = [figure for name, figure in figures.items() if name.startswith("torque_")]
+    found: list[Any] = [figure for name, figure in figures.items() if name.startswith("torque_")]
     shown = found[: max(1, 42 // robot.joints)]
-    blocks: list[Any] = [shown[0], *(folded(f.title, f) for f in shown[1:])]
+    untitled = [dataclasses.replace(figure, title="") for figure in shown[1:]]
+    folds = [folded(f.title, g) for f, g in zip(shown[1:], untitled, strict=True)]
+    blocks: list[Any] = [shown[0], *folds]
     if left := len(found) - len(shown):
         blocks.append(f"{left} more recordings are not shown here; result.json has their errors.")
     return blocks
@@ -157,7 +167,13 @@ def _parameters(fit: Fit) -> list[Any]:
         "* together with what forces cannot tell apart from it: see the combinations below. A "
         "parameter near zero is never known to a few percent, and that is no fault."
     )
-    return [Table("", *columns, status=fit.trust), text, folded("Glossary of all symbols", glossary(base))]
+    table = Table("", *columns, status=fit.trust)
+    return [glossary(base), folded(f"All {base.size} estimates, in words", table, text)]
+
+
+def words_of(x: Any) -> str:
+    """Return the name of an object's class in words, as `least squares`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(x).__name__).lower()
 
 
 def _details(report: Report, figures: Mapping[str, AbstractFigure]) -> list[Section]:
@@ -167,7 +183,7 @@ def _details(report: Report, figures: Mapping[str, AbstractFigure]) -> list[Sect
     task = [
         ("experiment", settings.get("experiment")),
         *((key, settings.get(key)) for key in ("split", "filter", "decimation")),
-        ("solution", fit.solution),
+        ("estimator", fit.estimator),
         *fit.facts[:-1],
     ]
     about = robot.summary()

@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from .figure import GREY, PALE, Curve, Figure, Panel, Scene, decimate
+from .figure import GREY, ORANGE, PALE, SKY, VERMILION, Curve, Figure, Panel, Scene, decimate
 
 PIXELS = 96
 """Pixels of an inch on the page."""
+SCALE = [[0.0, SKY], [0.5, ORANGE], [1.0, VERMILION]]
+"""Colours of small to large values."""
 _GAP = 0.05
 """Gap between panels with one abscissa, relative to their height."""
 
@@ -47,32 +49,41 @@ def scene_chart(scene: Scene) -> dict[str, Any]:
     # A line with gaps: ends of each link, and nothing.
     gaps = np.full_like(bones[:, :, :1], np.nan)
     lines = np.concatenate([bones, gaps], axis=2).reshape(count, -1, 3)
+    coloured = scene.values is not None
     values = np.zeros((count, len(scene.parent) + 1))
-    if scene.values is not None:
+    if coloured:
         values[:, :-1] = scene.values[scene.frames]
-    most = float(np.nanmax(scene.mean, initial=0.0) if scene.values is not None else 1.0) or 1.0
-    scale = {"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.5 * most}
-    bar = {"title": {"text": html.escape(scene.label), "side": "right"}, "thickness": 12}
-    line = {"color": _floats(scene.mean), "width": 5, **scale, "colorbar": bar | {"len": 0.7}}
-    line |= {"showscale": scene.values is not None}
+    most = float(np.percentile(values[:, :-1], 98)) or 1.0
+    scale = {"colorscale": SCALE, "cmin": 0.0, "cmax": most} if coloured else {}
+    bar = {"title": {"text": html.escape(scene.label), "side": "top"}, "thickness": 10}
+    bar |= {"orientation": "h", "len": 0.6, "y": 0.0, "yanchor": "bottom"}
+    line = {"color": _floats(scene.mean), "width": 4, "showscale": coloured, "colorbar": bar}
     trace = {"type": "scatter3d", "hoverinfo": "skip", "showlegend": False}
-    tip = trace | {"mode": "lines", "line": line, **_coordinates(path)}
-    thick = {"width": 14, "color": GREY} | (scale if scene.values is not None else {})
+    tip = trace | {"mode": "lines", "line": line | scale, **_coordinates(path)}
     dots = {"size": 5, "color": PALE, "line": {"color": GREY, "width": 2}}
+    thick = {"width": 14, "color": GREY} | scale
     robot = trace | {"mode": "lines+markers", "line": thick, "marker": dots}
-    axes = {f"{axis}axis": {"title": {"text": f"{axis} [m]"}} for axis in "xyz"}
+    low, high = scene.bones.min(axis=(0, 1, 2)), scene.bones.max(axis=(0, 1, 2))
+    margin = 0.06 * float(np.max(high - low))
+    ranges = np.stack([low - margin, high + margin], axis=1).tolist()
+    axes: dict[str, Any] = {
+        f"{axis}axis": {"title": {"text": f"{axis} [m]"}, "range": limits}
+        for axis, limits in zip("xyz", ranges, strict=True)
+    }
+    axes |= {"aspectmode": "data", "camera": {"eye": {"x": 1.4, "y": -1.7, "z": 0.8}}}
+    axes["domain"] = {"x": [0.0, 1.0], "y": [0.12, 1.0]}
     packed = {
         "data": [tip, robot],
-        "layout": {"scene": axes | {"aspectmode": "data"}},
+        "layout": {"scene": axes},
         "frames": {
             "points": [_coordinates(pose) for pose in lines],
             "time": scene.time[scene.frames].tolist(),
         },
     }
-    if scene.values is not None:
+    if coloured:
         colours = np.repeat(values[:, links], 3, axis=1)
         packed["frames"]["colours"] = [_floats(row) for row in colours]
-    return {"title": "", "value": "", "height": 520, "content": pack(_json(packed))}
+    return {"title": "", "value": "", "height": 560, "content": pack(_json(packed))}
 
 
 def _coordinates(points: np.ndarray) -> dict[str, Any]:
@@ -158,7 +169,7 @@ def _trace(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:
             ring = {"color": GREY, "width": 1}
             trace |= {"mode": "markers", "marker": {"color": curve.colour, "size": 7, "line": ring}}
         case _:
-            x, y = decimate(curve.x, curve.y, bins)
+            x, y = decimate(curve.x, curve.y, bins) if panel.in_time else (curve.x, curve.y)
             dash = "dash" if curve.dashed else "solid"
             line = {"color": curve.colour, "width": 0.4 + curve.width, "dash": dash}
             mode = "lines+markers" if curve.marker else "lines"

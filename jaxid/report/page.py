@@ -10,7 +10,15 @@ from markupsafe import Markup
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import Remark, Status, Table, printable, versions
+from jaxid.result_table import (
+    Remark,
+    Status,
+    Table,
+    marked_up,
+    printable,
+    remarks_in_html,
+    versions,
+)
 
 from .figure import AbstractFigure
 from .interactive import library
@@ -61,13 +69,13 @@ def _render(block: Any) -> Markup:
         case Remark():
             return macros.headline(block)
         case Table():
-            return macros.table(block)
+            return Markup(block.html())
         case AbstractFigure():
             return picture(block)
         case tuple():
             return macros.abreast(*map(_render, block))
         case _:
-            return macros.remarks(block)
+            return Markup(remarks_in_html(block))
 
 
 def picture(figure: AbstractFigure, caption: str = "") -> Markup:
@@ -108,11 +116,6 @@ def _macros() -> Any:
     # Commands that write no page do not wait for it.
     import jinja2
 
-    def aligned(number: str) -> str:
-        # Blanks behind a number become as wide as the digits and the point left out.
-        pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
-        return pointed.replace(" ", "\N{FIGURE SPACE}")
-
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
@@ -120,7 +123,7 @@ def _macros() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["aligned"] = aligned
+    environment.filters["marked_up"] = lambda text: Markup(marked_up(text))
     return environment.get_template("page.html").module
 
 

@@ -80,7 +80,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         line = axes.axvline if which == "x" else axes.axhline
         line(level, color=colour, lw=0.7, ls="--" if level else "-", zorder=1)
     for curve in panel.curves:
-        _draw_curve(axes, curve)
+        _draw_curve(axes, curve, panel.in_time)
     axes.set_title(panel.title, loc="left", fontweight="bold")
     axes.set_title(panel.value, loc="right", color=GREY, fontsize=8)
     axes.set_ylabel(panel.y_label)
@@ -112,7 +112,7 @@ def _name_rows(axes: Axes, panel: Panel) -> None:
         label.set_fontweight("bold" if bold else "normal")
 
 
-def _draw_curve(axes: Axes, curve: Curve) -> None:
+def _draw_curve(axes: Axes, curve: Curve, in_time: bool) -> None:
     look: dict[str, Any] = {"color": curve.colour, "lw": curve.width}
     if curve.kind == "band":
         axes.fill_between(curve.x, curve.low, curve.high, color=curve.colour, alpha=0.3, lw=0)
@@ -126,7 +126,8 @@ def _draw_curve(axes: Axes, curve: Curve) -> None:
         axes.scatter(curve.x, curve.y, s=16, c="white", edgecolors=curve.colour, zorder=3)
     else:
         look |= {"ls": "--" if curve.dashed else "-", "marker": "o" if curve.marker else ""}
-        axes.plot(*decimate(curve.x, curve.y, BINS), ms=2.6, **look)
+        points = decimate(curve.x, curve.y, BINS) if in_time else (curve.x, curve.y)
+        axes.plot(*points, ms=2.6, **look)
 
 
 def _handle(name: str, curve: Curve) -> Any:

@@ -12,7 +12,10 @@ BODY = {
     "m": "mass",
     **{f"m{a}": f"mass times {a} of the centre of mass" for a in "xyz"},
     **{symbol: f"moment of inertia about {a}" for symbol, a in zip("ABC", "xyz", strict=True)},
-    **{s: f"product of inertia in {p}" for s, p in zip("DEF", ("y, z", "x, z", "x, y"), strict=True)},
+    **{
+        s: f"product of inertia in {p}"
+        for s, p in zip("DEF", ("y, z", "x, z", "x, y"), strict=True)
+    },
 }
 """Meanings of the inertial parameters of a body."""
 JOINT = {
@@ -52,8 +55,10 @@ def in_words(name: str, robot: Robot) -> tuple[str, str]:
 
 
 def _joint(robot: Robot, place: str) -> str:
-    known = place and 0 < int(place) <= robot.joints
-    return f"joint {robot.joint_names[int(place) - 1]}" if known else ""
+    if not place or not 0 < int(place) <= robot.joints:
+        return ""
+    name = robot.joint_names[int(place) - 1]
+    return name if name.lower().startswith("joint") else f"joint {name}"
 
 
 def word_columns(base: BaseParameters) -> list[Column]:

@@ -16,6 +16,8 @@ from .motion import pose_figure
 
 SPEEDS = 81
 """Speeds of a friction curve."""
+ROWS = 2000
+"""Largest number of poses whose weight is computed."""
 CLASSES = 24
 """Classes of speed whose mean friction is shown."""
 
@@ -102,33 +104,43 @@ def gravity_figure(fit: Fit, log: TorqueErrors) -> Figure:
         fit: Identified parameters.
         log: Errors on the recording, with its positions.
     """
-    robot, values = fit.base.model.robot, gravity_forces(fit, np.asarray(log.positions))
+    robot, rows = fit.base.model.robot, _some(log)
+    values = gravity_forces(fit, np.asarray(log.positions)[rows])
     curves = [
-        Curve(log.time, values[:, j], shortened(name, 26), CYCLE[j % len(CYCLE)])
+        Curve(np.asarray(log.time)[rows], values[:, j], shortened(name, 26), CYCLE[j % len(CYCLE)])
         for j, name in enumerate(robot.joint_names)
     ]
     unit = " or ".join(dict.fromkeys(robot.force_unit(j) for j in range(robot.joints)))
     panel = Panel(curves, y="force of the weight", unit=unit)
-    return Figure(f"Torque that carries the weight, along {shortened(log.name, 40)}", [panel], height=3.2)
-
-
-def gravity_forces(fit: Fit, q: Float[np.ndarray, "rows joints"]) -> Float[np.ndarray, "rows joints"]:
-    """Return the forces of the drives against gravity at standstill [N m or N]."""
-    model = fit.base.model
-    p = np.concatenate(
-        [values if term.body_parameters else 0.0 * values
-         for term, values in model.split(np.asarray(fit.base.to_standard(fit.parameters)))]
+    return Figure(
+        f"Torque that carries the weight, along {shortened(log.name, 40)}", [panel], height=3.2
     )
+
+
+def gravity_forces(
+    fit: Fit, q: Float[np.ndarray, "rows joints"]
+) -> Float[np.ndarray, "rows joints"]:
+    """Return the forces of the drives against gravity at standstill [N m or N]."""
+    base, model = fit.base, fit.base.model
+    bodies = [bool(t.body_parameters) for t in model.terms for _ in t.parameters(model.robot)]
+    p = np.where([bodies[k] for k in base.indices], fit.parameters, 0.0)
     rest = np.zeros_like(q)
     state = None if model.memory is None else np.asarray(model.memory.settled(rest))
-    motion = Motion(q, rest, rest, state)
-    return in_numpy(model, model.forces, *model.arguments(motion), shared=(p,))
+    return in_numpy(base, base.columns, *model.arguments(Motion(q, rest, rest, state))) @ p
+
+
+def _some(log: TorqueErrors) -> np.ndarray:
+    """Return rows of a recording in which its slow changes are seen."""
+    rows = len(log.time)
+    return np.unique(np.linspace(0, rows - 1, min(rows, ROWS)).round().astype(int))
 
 
 def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     """Return the largest force against gravity of each joint along a recording."""
     robot = fit.base.model.robot
-    most = np.max(np.abs(gravity_forces(fit, np.asarray(log.positions))), axis=0)
+    most = np.max(np.abs(gravity_forces(fit, np.asarray(log.positions)[_some(log)])), axis=0)
+    # What is rounding is zero.
+    most[most < 1e-9 * np.max(most)] = 0.0
     columns = [
         Column("joint", robot.joint_names),
         Column("largest torque\nof the weight", most),

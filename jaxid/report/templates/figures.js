@@ -2,14 +2,16 @@
 // Draws the figures of this page with plotly, which the page holds in packed form.
 (async () => {
   const charts = [...document.querySelectorAll(".chart")];
-  const coarse = matchMedia("(pointer: coarse)").matches;
+  const coarse = matchMedia("(hover: none)").matches;
   const grey = "#7b8794", faint = "rgba(123, 135, 148, 0.28)";
-  const config = {
+  const options = {
     displaylogo: false, responsive: false, scrollZoom: false,
-    displayModeBar: coarse ? true : "hover",
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"],
+    displayModeBar: true,
+    modeBarButtons: [["toImage", "zoomIn2d", "zoomOut2d", "resetScale2d"]],
     toImageButtonOptions: { format: "svg" },
   };
+
+  const optionsOf = (chart) => (chart.content.frames ? { ...options, modeBarButtons: [["toImage", "resetCameraDefault3d"]] } : options);
 
   async function unpack(text) {
     const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -31,10 +33,10 @@
       layout.scene = { ...own.scene, dragmode: "turntable" };
       for (const key of ["xaxis", "yaxis", "zaxis"]) layout.scene[key] = { ...plane, ...own.scene[key] };
     }
-    const margin = own.scene ? { l: 0, r: 0, t: 0, b: 0 } : { l: 52, r: 8, t: 8, b: 40 };
+    const margin = own.scene ? { l: 0, r: 0, t: 0, b: 0 } : { l: 52, r: 8, t: coarse ? 28 : 8, b: 40 };
     return {
       ...layout, margin, showlegend: false, dragmode: own.scene ? undefined : coarse ? false : "zoom",
-      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", bargap: 0.2, barmode: "overlay",
+      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", modebar: { bgcolor: "rgba(0,0,0,0)" }, bargap: 0.2, barmode: "overlay",
       font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: grey },
       width: widthOf(chart), height: parseFloat(chart.style.height),
     };
@@ -55,7 +57,7 @@
     if (drawn(chart)) return;
     chart.classList.add("drawn");
     const { data, frames } = chart.content;
-    Plotly.newPlot(chart, data, layoutOf(chart), config);
+    Plotly.newPlot(chart, data, layoutOf(chart), optionsOf(chart));
     for (const button of chart.closest("figure").querySelectorAll("[data-curve][aria-pressed=false]"))
       show(chart, button.dataset.curve, false);
     if (frames) animate(chart, frames); else chart.on("plotly_relayout", (change) => follow(chart, change));

@@ -1,0 +1,121 @@
+"""A headless Chromium over its debugging protocol: opens a page, evaluates, prints."""
+
+import base64
+import itertools
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+FLAGS = (
+    "--headless=new --no-sandbox --remote-debugging-port=0 --use-angle=swiftshader "
+    "--enable-unsafe-swiftshader --hide-scrollbars --no-first-run --disable-extensions "
+    "--host-resolver-rules=MAP*~NOTFOUND"
+).split()
+
+
+class Browser:
+    """One page of a browser; all messages of errors are kept in `errors`."""
+
+    def __init__(self):
+        from websockets.sync.client import connect
+
+        self.folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        flags = [*FLAGS, f"--user-data-dir={self.folder.name}", "about:blank"]
+        self.process = subprocess.Popen([CHROMIUM, *flags], stderr=subprocess.DEVNULL)
+        port = self._port()
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
+            address = next(x for x in json.load(answer) if x["type"] == "page")
+        self.socket = connect(address["webSocketDebuggerUrl"], max_size=None)
+        self.numbers, self.errors = itertools.count(1), []
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+
+    def _port(self) -> str:
+        file = Path(self.folder.name) / "DevToolsActivePort"
+        for _ in range(600):
+            if file.is_file() and (lines := file.read_text().split()):
+                return lines[0]
+            time.sleep(0.05)
+        raise RuntimeError("the browser does not start")
+
+    def call(self, method: str, **params):
+        number = next(self.numbers)
+        self.socket.send(json.dumps({"id": number, "method": method, "params": params}))
+        while True:
+            answer = json.loads(self.socket.recv(timeout=120))
+            if answer.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(answer["params"]["exceptionDetails"])
+            if (
+                answer.get("method") == "Log.entryAdded"
+                and answer["params"]["entry"]["level"] == "error"
+            ):
+                self.errors.append(answer["params"]["entry"])
+            if answer.get("id") == number:
+                if "error" in answer:
+                    raise RuntimeError(answer["error"])
+                return answer["result"]
+
+    def evaluate(self, expression: str):
+        found = self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
+        if "exceptionDetails" in found:
+            raise RuntimeError(found["exceptionDetails"])
+        return found["result"].get("value")
+
+    def look(self, width: int, scheme: str = "light", media: str = "") -> None:
+        """Choose the width of the window [px], and light, dark or print."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=900,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self.call("Emulation.setEmulatedMedia", media=media, features=features)
+
+    def open(self, path: Path) -> None:
+        """Open a file, and wait until its figures can be drawn."""
+        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.wait(
+            "document.readyState === 'complete' && (!document.querySelector('.chart') || 'ready' in document.documentElement.dataset)"
+        )
+
+    def wait(self, condition: str) -> None:
+        for _ in range(600):
+            if self.evaluate(condition):
+                return
+            time.sleep(0.05)
+        raise RuntimeError(f"waited in vain for {condition}")
+
+    def screenshot(self, path: Path, height: int | None = None) -> None:
+        """Write a picture of the whole page."""
+        box = self.call("Page.getLayoutMetrics")["cssContentSize"]
+        clip = {
+            "x": 0,
+            "y": 0,
+            "width": box["width"],
+            "height": height or box["height"],
+            "scale": 1,
+        }
+        shot = self.call("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)
+        path.write_bytes(base64.b64decode(shot["data"]))
+
+    def pdf(self, path: Path) -> None:
+        path.write_bytes(
+            base64.b64decode(self.call("Page.printToPDF", preferCSSPageSize=True)["data"])
+        )
+
+    def close(self) -> None:
+        self.socket.close()
+        self.process.terminate()
+        self.process.wait(30)
+        self.folder.cleanup()
