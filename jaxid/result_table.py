@@ -8,6 +8,7 @@ are texts for two columns of `kind="number"`.
 
 import dataclasses
 import enum
+import functools
 import html
 import importlib.metadata
 import math
@@ -16,6 +17,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -29,16 +31,6 @@ _CONTROLS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
 """Controls, marks of direction and others that nobody sees, and halves of characters."""
-
-
-_NOTEBOOK = (
-    ".jaxid .number { text-align: right; white-space: pre } .jaxid :is(td, th) { text-align: left; "
-    "vertical-align: bottom } .jaxid th { white-space: pre-line } .jaxid .remarks { list-style: "
-    "none; padding: 0 } .jaxid dl > div { display: flex; gap: 1em } .jaxid .good .sign { color: "
-    "#009e73 } .jaxid .doubtful .sign { color: #b07800 } .jaxid .bad .sign { color: #d55e00 } "
-    ".jaxid .sign { display: inline-block; width: 1.3em } .jaxid caption { text-align: left }"
-)
-"""Style of tables in notebooks."""
 
 
 class Status(enum.Enum):
@@ -75,23 +67,33 @@ class Remark:
         object.__setattr__(self, "detail", printable(self.detail))
 
 
+def in_html(macro: str, *arguments: Any) -> str:
+    """Return what a macro of `result_table.html` makes of results."""
+    return str(getattr(_macros(), macro)(*arguments))
+
+
 def marked_up(text: str) -> str:
     """Return a text for HTML; what stands between backticks becomes a name in other letters."""
     return re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', html.escape(printable(text)))
 
 
-def remarks_in_html(remarks: "Iterable[Remark]") -> str:
-    """Return remarks as a list in HTML, each with its mark."""
-    items = []
-    for remark in remarks:
-        detail = f"<small>{marked_up(remark.detail)}</small>" if remark.detail else ""
-        text = f"<span>{marked_up(remark.text)}{detail}</span>"
-        items.append(f'<li class="{remark.status.name.lower()}">{_sign(remark.status)}{text}</li>')
-    return f'<ul class="remarks">{"".join(items)}</ul>' if items else ""
+@functools.cache
+def _macros() -> Any:
+    # Commands that write no page do not wait for it.
+    import jinja2
+    from markupsafe import Markup
 
+    def aligned(number: str) -> str:
+        # Blanks behind a number become as wide as the digits and the point left out.
+        pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
+        return pointed.replace(" ", "\N{FIGURE SPACE}")
 
-def _sign(status: Status) -> str:
-    return f'<span class="sign" aria-hidden="true">{status.value}</span>'
+    folder = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"aligned": aligned, "marked_up": lambda text: Markup(marked_up(text))}
+    return environment.get_template("result_table.html").module
 
 
 def significant(value: float, digits: int = 3) -> str:
@@ -185,15 +187,6 @@ class Column:
         longest = max(tails, default=0)
         return [s + " " * (longest - tail) for s, tail in zip(texts, tails, strict=True)]
 
-    def cell(self, text: str) -> str:
-        """Return one of the texts as a cell of a table in HTML."""
-        kind = self.kind if len(text) >= 26 or self.kind == "code" else f"{self.kind} short"
-        if self.kind == "number":
-            # Blanks behind a number become as wide as the digits and the point left out.
-            text = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", text)
-            text = text.replace(" ", "\N{FIGURE SPACE}")
-        return f'<td class="{kind}">{marked_up(text)}</td>'
-
 
 class Summarised:
     """Result with tables, which terminals print and notebooks show."""
@@ -256,39 +249,8 @@ class Table:
     def __str__(self) -> str:
         return self.text()
 
-    def html(self) -> str:
-        """Return the table as HTML; the page or the notebook gives it its style."""
-        facts = "".join(
-            f"<div><dt>{marked_up(word)}</dt><dd>{marked_up(text)}</dd></div>"
-            for word, text in self.facts
-        )
-        facts = f"<dl>{facts}</dl>" if facts else ""
-        return facts + self._grid_in_html() + remarks_in_html(self.remarks)
-
-    def _grid_in_html(self) -> str:
-        if not self.columns:
-            return ""
-        caption = f"<caption>{marked_up(self.title)}</caption>" if self.title else ""
-        corner = "<th></th>" if self.status else ""
-        heads = [
-            f'<th scope="col" class="{c.kind}">{html.escape(chr(10).join(c.header))}</th>'
-            for c in self.columns
-        ]
-        rows = []
-        for k, row in enumerate(self.rows):
-            mark = ""
-            if self.status:
-                status = self.status[k]
-                mark = f'<td class="{status.name.lower()}">{_sign(status)}</td>'
-            cells = [column.cell(text) for column, text in zip(self.columns, row, strict=True)]
-            line = ' class="rule"' if k in self.rules else ""
-            rows.append(f"<tr{line}>{mark}{''.join(cells)}</tr>")
-        head = f"<thead><tr>{corner}{''.join(heads)}</tr></thead>"
-        grid = f"<table>{caption}{head}<tbody>{''.join(rows)}</tbody></table>"
-        return f'<div class="scroll" tabindex="0">{grid}</div>'
-
     def _repr_html_(self) -> str:
-        return f'<div class="jaxid"><style>{_NOTEBOOK}</style>{self.html()}</div>'
+        return in_html("notebook", self)
 
     def lines(self, width: int | None = None) -> Lines:
         """Yield the lines of the text as parts with a style each, for renderers with colours.

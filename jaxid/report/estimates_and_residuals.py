@@ -76,7 +76,7 @@ def comparison_figure(comparison: Comparison) -> Figure:
     """Return both estimates of every parameter with their intervals.
 
     Each parameter is drawn relative to the farthest end of its two intervals, so that what is known
-    to lie away from zero stands there. Names of parameters that have changed are bold.
+    to lie away from zero stands there. A star marks the names of parameters that have changed.
 
     Args:
         comparison: Comparison of two fits.
@@ -109,9 +109,11 @@ def comparison_figure(comparison: Comparison) -> Figure:
             curves,
             x="estimate / farthest end of both intervals",
             x_range=(-1.08, 1.08),
-            y_names=[comparison.names[i] for i in shown],
+            y_names=[
+                comparison.names[i] + " *" * (comparison.verdicts[i] is Verdict.CHANGED)
+                for i in shown
+            ],
             beside=[texts[i] for i in shown],
-            bold=[comparison.verdicts[i] is Verdict.CHANGED for i in shown],
             levels=[("x", 0.0, GREY)],
         )
 

@@ -1,14 +1,14 @@
 """Figures, each defined once: `interactive.py` shows them on pages, `paper.py` by matplotlib."""
 
 import dataclasses
-from abc import ABC, abstractmethod
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bool, Float, Int
+from jaxid.arrays import AnyArray, Float, Int
 
 # The palette of Okabe and Ito, which colour-blind readers can tell apart.
 BLUE, ORANGE, VERMILION = "#0072B2", "#E69F00", "#D55E00"
@@ -70,7 +70,6 @@ class Panel:
         x_names: Names of the abscissas 0, 1, …, instead of numbers.
         y_names: Names of the ordinates 0, 1, … from the top, instead of numbers.
         beside: Texts to the right of these names.
-        bold: Which of these names are bold.
         levels: Thin lines across: `x` or `y`, value, colour.
         below: Panels below this one with the same abscissa, smaller by their share.
         share: Height relative to the first panel.
@@ -88,7 +87,6 @@ class Panel:
     x_names: Sequence[str] = ()
     y_names: Sequence[str] = ()
     beside: Sequence[str] = ()
-    bold: Sequence[bool] = ()
     levels: Sequence[tuple[str, float, str]] = ()
     below: Sequence["Panel"] = ()
     share: float = 1.0
@@ -109,47 +107,44 @@ class Panel:
         return " ".join(filter(None, (self.y, self.unit and f"[{self.unit}]")))
 
 
-class AbstractFigure(ABC):
-    """Figure or scene: shown by notebooks as a picture, by pages to explore."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """Robot along a motion in space.
 
-    title: str
-    columns: int = 1
-    legend: Sequence[tuple[str, Curve]] = ()
+    Attributes:
+        time: Instants of the samples [s].
+        points: Origins of all bodies, and the end-effector [m].
+        links: Body from whose origin the line to each point leads; -1 for the ground.
+        frames: Samples at which the page shows the robot.
+        poses: Number of poses on paper.
+        values: Values of the joints at the samples, as colours; None for none.
+        label: Name of the values, with their unit.
+    """
 
-    @abstractmethod
-    def matplotlib(self) -> Any:
-        """Return a `matplotlib.figure.Figure`, to be changed for a paper."""
+    time: Float[np.ndarray, " samples"]
+    points: Float[np.ndarray, "samples points 3"]
+    links: tuple[int, ...]
+    frames: Int[np.ndarray, " frames"]
+    poses: int = 6
+    values: Float[np.ndarray, "samples joints"] | None = None
+    label: str = ""
 
     @property
-    @abstractmethod
-    def charts(self) -> list[dict[str, Any]]:
-        """Charts of the page: each with its title and value, its height [px], and its traces."""
+    def bones(self) -> Float[np.ndarray, "samples points 2 3"]:
+        """Lines from joint to joint, and to the end-effector."""
+        ground = np.zeros_like(self.points[:, :1])
+        starts = np.concatenate([self.points, ground], axis=1)[:, list(self.links)]
+        return np.stack([starts, self.points], axis=2)
 
-    def save(self, path: str | Path) -> None:
-        """Write a page to explore (`.html`), or PNG, PDF or SVG, without date in the file.
-
-        Args:
-            path: Path of the file, whose suffix tells the format.
-        """
-        if Path(path).suffix == ".html":
-            from .page import render_page
-
-            text = render_page(self.title, [("Figure", [self])])
-            Path(path).write_text(text, encoding="utf-8")
-        else:
-            from .paper import save
-
-            save(self.matplotlib(), path)
-
-    def _repr_png_(self) -> bytes:
-        from .paper import png
-
-        return png(self.matplotlib())
+    @property
+    def mean(self) -> Float[np.ndarray, " samples"]:
+        """Mean of the values of all joints."""
+        return np.zeros(len(self.time)) if self.values is None else self.values.mean(axis=1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Figure(AbstractFigure):
-    """Panels with a title and one legend.
+class Figure:
+    """Panels with a title and one legend, or a robot in space.
 
     Attributes:
         title: Title above all panels.
@@ -157,13 +152,15 @@ class Figure(AbstractFigure):
         columns: Panels beside each other, where there is room.
         height: Height of each panel with those below it [inch].
         width: Width of all on paper [inch].
+        scene: Robot in space, in place of panels.
     """
 
     title: str
-    panels: Sequence[Panel]
+    panels: Sequence[Panel] = ()
     columns: int = 1
     height: float = 2.1
     width: float = 11.0
+    scene: Scene | None = None
 
     @property
     def parts(self) -> Iterator[Panel]:
@@ -180,84 +177,38 @@ class Figure(AbstractFigure):
         entries.pop("", None)
         return [*entries.items()]
 
-    def matplotlib(self) -> Any:  # noqa: D102
-        from .paper import draw_panels
-
-        return draw_panels(self)
-
-    @property
-    def charts(self) -> list[dict[str, Any]]:  # noqa: D102
-        from .interactive import panel_chart
-
-        return [panel_chart(self, panel) for panel in self.panels]
-
     @property
     def bins(self) -> int:
         """Pixel columns of each line."""
         return min(2000, POINTS // max(1, sum(len(part.curves) for part in self.parts)))
 
+    def matplotlib(self) -> Any:
+        """Return a `matplotlib.figure.Figure`, to be changed for a paper."""
+        from .paper import draw
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Scene(AbstractFigure):
-    """Robot along a motion in space.
+        return draw(self)
 
-    Attributes:
-        title: Title above it.
-        time: Instants of the samples [s].
-        points: Origins of all bodies, and the end-effector [m].
-        parent: Parents of the bodies, -1 for the ground.
-        tip_body: Body of the end-effector.
-        revolute: For each joint whether it turns.
-        ends: Ends of the axes of capsules [m].
-        radii: Radii of the capsules [m].
-        moving: Which capsules move.
-        frames: Samples at which the page shows the robot.
-        poses: Number of poses on paper.
-        values: Values of the joints at the samples, as colours; None for none.
-        label: Name of the values, with their unit.
-    """
+    def save(self, path: str | Path) -> None:
+        """Write a page to explore (`.html`), or PNG, PDF or SVG, without date in the file.
 
-    title: str
-    time: Float[np.ndarray, " samples"]
-    points: Float[np.ndarray, "samples points 3"]
-    parent: tuple[int, ...]
-    tip_body: int
-    revolute: tuple[bool, ...]
-    ends: Float[np.ndarray, "samples capsules 2 3"]
-    radii: Float[np.ndarray, " capsules"]
-    moving: Bool[np.ndarray, " capsules"]
-    frames: Int[np.ndarray, " frames"]
-    poses: int = 6
-    values: Float[np.ndarray, "samples joints"] | None = None
-    label: str = ""
+        Args:
+            path: Path of the file, whose suffix tells the format.
+        """
+        if Path(path).suffix == ".html":
+            from .page import render_page
 
-    def matplotlib(self) -> Any:  # noqa: D102
-        from .robot_on_paper import draw_poses
+            text = render_page(self.title, [("Figure", [self])])
+            Path(path).write_text(text, encoding="utf-8")
+        else:
+            from .paper import save
 
-        return draw_poses(self)
+            save(self, path, Path(path).suffix[1:])
 
-    @property
-    def charts(self) -> list[dict[str, Any]]:  # noqa: D102
-        from .interactive import scene_chart
+    def _repr_png_(self) -> bytes:
+        from .paper import save
 
-        return [scene_chart(self)]
-
-    @property
-    def links(self) -> tuple[int, ...]:
-        """Body to which the line to each point belongs: from the body's origin; -1 the ground."""
-        return (*self.parent, self.tip_body)
-
-    @property
-    def bones(self) -> Float[np.ndarray, "samples points 2 3"]:
-        """Lines from joint to joint, and to the end-effector."""
-        ground = np.zeros_like(self.points[:, :1])
-        starts = np.concatenate([self.points, ground], axis=1)[:, list(self.links)]
-        return np.stack([starts, self.points], axis=2)
-
-    @property
-    def mean(self) -> Float[np.ndarray, " samples"]:
-        """Mean of the values of all joints."""
-        return np.zeros(len(self.time)) if self.values is None else self.values.mean(axis=1)
+        save(self, file := io.BytesIO(), "png")
+        return file.getvalue()
 
 
 def decimate(

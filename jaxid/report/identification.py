@@ -23,14 +23,14 @@ from jaxid.result_table import (
 )
 from jaxid.robot.robot import Robot
 
-from .figure import AbstractFigure
+from .figure import Figure
 from .page import Section, folded, picture, provenance, render_page, tiles
 from .parameter_words import glossary, word_columns
 from .physics import gravity_table
 from .verdict import RMS_ERROR, Report, verdict
 
 
-def identification_page(report: Report, figures: Mapping[str, AbstractFigure]) -> str:
+def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
     """Return the page of an identification as HTML: what matters first, then the details."""
     fit, settings = report.fit, report.settings
     base, robot = fit.base, fit.base.model.robot
@@ -115,7 +115,7 @@ def _data(report: Report) -> list[tuple[str, str]]:
     return facts
 
 
-def _physics(report: Report, figures: Mapping[str, AbstractFigure]) -> list[Section]:
+def _physics(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
     """Return what the model says of the robot: in motion, before and after, friction, weight."""
     sections: list[Section] = []
     if "robot" in figures:
@@ -139,7 +139,7 @@ def _physics(report: Report, figures: Mapping[str, AbstractFigure]) -> list[Sect
     return sections
 
 
-def _torques(figures: Mapping[str, AbstractFigure], robot: Robot) -> list[Any]:
+def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
     """Return the figures of the recordings: with 42 panels at most, the first one unfolded."""
     found: list[Any] = [figure for name, figure in figures.items() if name.startswith("torque_")]
     shown = found[: max(1, 42 // robot.joints)]
@@ -176,7 +176,7 @@ def words_of(x: Any) -> str:
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(x).__name__).lower()
 
 
-def _details(report: Report, figures: Mapping[str, AbstractFigure]) -> list[Section]:
+def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
     """Return what experts ask for."""
     fit, settings, robot = report.fit, report.settings, report.fit.base.model.robot
     base, errors = fit.base, report.every_error

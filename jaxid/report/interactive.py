@@ -35,14 +35,18 @@ def pack(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
 
 
-def panel_chart(figure: Figure, panel: Panel) -> dict[str, Any]:
-    """Return the chart of a panel and those below it."""
-    content = pack(_json(_content(figure, panel)))
+def charts(figure: Figure) -> list[dict[str, Any]]:
+    """Return the charts of a figure: titles, values, heights [px] and packed contents."""
+    if figure.scene is not None:
+        return [{"title": "", "value": "", "height": 560, "content": _scene(figure.scene)}]
     height = figure.height * PIXELS
-    return {"title": panel.title, "value": panel.value, "height": height, "content": content}
+    return [
+        {"title": p.title, "value": p.value, "height": height, "content": _panel(figure, p)}
+        for p in figure.panels
+    ]
 
 
-def scene_chart(scene: Scene) -> dict[str, Any]:
+def _scene(scene: Scene) -> str:
     """Return the chart of a robot in space: its path, and all poses of the robot."""
     path, links = scene.points[:, -1], np.array(scene.links)
     bones, count = scene.bones[scene.frames], len(scene.frames)
@@ -50,7 +54,7 @@ def scene_chart(scene: Scene) -> dict[str, Any]:
     gaps = np.full_like(bones[:, :, :1], np.nan)
     lines = np.concatenate([bones, gaps], axis=2).reshape(count, -1, 3)
     coloured = scene.values is not None
-    values = np.zeros((count, len(scene.parent) + 1))
+    values = np.zeros((count, len(scene.links)))
     if coloured:
         values[:, :-1] = scene.values[scene.frames]
     most = float(np.percentile(values[:, :-1], 98)) or 1.0
@@ -83,14 +87,15 @@ def scene_chart(scene: Scene) -> dict[str, Any]:
     if coloured:
         colours = np.repeat(values[:, links], 3, axis=1)
         packed["frames"]["colours"] = [_floats(row) for row in colours]
-    return {"title": "", "value": "", "height": 560, "content": pack(_json(packed))}
+    return pack(_json(packed))
 
 
 def _coordinates(points: np.ndarray) -> dict[str, Any]:
     return {axis: _floats(points[:, k]) for k, axis in enumerate("xyz")}
 
 
-def _content(figure: Figure, panel: Panel) -> dict[str, Any]:
+def _panel(figure: Figure, panel: Panel) -> str:
+    """Return the chart of a panel and those below it."""
     parts = panel.parts
     layout: dict[str, Any] = {"xaxis": _x_axis(panel, f"y{len(parts)}" if panel.below else "y")}
     heights = np.array([part.share for part in parts])
@@ -105,7 +110,7 @@ def _content(figure: Figure, panel: Panel) -> dict[str, Any]:
         shapes += [_level(level, number) for level in part.levels]
     lines = all(c.kind in ("line", "band") for part in parts for c in part.curves)
     layout |= {"shapes": shapes, "hovermode": "x" if lines or panel.x_names else "closest"}
-    return {"data": traces, "layout": layout}
+    return pack(_json({"data": traces, "layout": layout}))
 
 
 def _x_axis(panel: Panel, anchor: str) -> dict[str, Any]:

@@ -1,9 +1,6 @@
 """Figures of a motion (Figs. 3, 4, 5 and 8): joints, end-effector, and the robot in space."""
 
 import dataclasses
-from pathlib import Path
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,7 +8,6 @@ from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints import tip_motion
-from jaxid.robot.collision import GROUND, CollisionModel
 from jaxid.robot.forward_and_inverse_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
@@ -115,86 +111,44 @@ def filtered_figure(
 def pose_figure(
     robot: Robot,
     q: Float[AnyArray, "samples joints"],
-    collision: CollisionModel | None = None,
-    poses: int = 6,
-    title: str | None = None,
     time: Float[AnyArray, " samples"] | None = None,
     values: Float[AnyArray, "samples joints"] | None = None,
     label: str = "",
-) -> Scene:
-    """Return the robot along a motion: moving on a page, in some poses on paper.
+    poses: int = 6,
+    title: str | None = None,
+) -> Figure:
+    """Return the robot along a motion: moving on a page, in some poses on paper (Figs. 3, 8).
 
     Args:
         robot: Robot to draw.
         q: Joint coordinates along a motion [rad or m].
-        collision: Collision model, whose capsules are drawn on paper.
-        poses: Number of poses on paper, evenly spaced from the first to the last.
-        title: Title of the figure; the robot's name if None.
         time: Instants of the samples [s]; without them the page counts samples.
         values: Values of the joints that colour their links, and on average the path of the
             end-effector, such as torque errors.
         label: Name of these values, with their unit.
+        poses: Number of poses on paper, evenly spaced from the first to the last.
+        title: Title of the figure; the robot's name if None.
     """
     q = np.atleast_2d(np.asarray(q, np.float64))
     path = np.unique(np.linspace(0, len(q) - 1, min(PATH, len(q))).round().astype(int))
     shown = np.linspace(0, len(path) - 1, min(FRAMES, len(path))).round().astype(int)
-    points, ends = _place(robot, collision, q[path])
-    capsules = () if collision is None else collision.capsules
     if values is not None:
         # Each point stands for all samples up to the next.
-        values = np.asarray(values, np.float64)
-        values = np.sqrt(np.maximum.reduceat(np.nan_to_num(values) ** 2, path, axis=0))
-    return Scene(
-        title=robot.name if title is None else title,
-        time=np.arange(len(q))[path] if time is None else np.asarray(time)[path],
+        sizes = np.nan_to_num(np.abs(np.asarray(values, np.float64)))
+        values = np.maximum.reduceat(sizes, path, axis=0)
+
+    def place(x):
+        return jnp.concatenate([placements(robot, x)[1], tip_placement(robot, x)[1][None]])
+
+    with double_precision():
+        points = in_numpy(robot, place, q[path])
+    scene = Scene(
+        time=np.asarray(np.arange(len(q)) if time is None else time)[path],
         points=points,
-        parent=robot.parent,
-        tip_body=robot.tip_body,
-        revolute=robot.revolute,
-        ends=ends,
-        radii=np.array([float(c.radius) for c in capsules]),
-        moving=np.array([c.body != GROUND for c in capsules], bool),
+        links=(*robot.parent, robot.tip_body),
         frames=np.unique(shown),
         poses=poses,
         values=values,
         label=label,
     )
-
-
-def _place(robot: Robot, collision: CollisionModel | None, q: np.ndarray) -> Any:
-    """Return origins of all bodies and the end-effector, and ends of all capsules in space [m]."""
-
-    def place(x):
-        ends = [] if collision is None else [collision.ends(robot, x).reshape(-1, 3)]
-        return jnp.concatenate([placements(robot, x)[1], tip_placement(robot, x)[1][None], *ends])
-
-    with double_precision():
-        points = in_numpy(robot, place, q)
-    bodies, ends = np.split(points, [robot.joints + 1], axis=1)
-    return bodies, ends.reshape(len(q), -1, 2, 3)
-
-
-def animation(
-    path: Path,
-    robot: Robot,
-    time: Float[AnyArray, " samples"],
-    q: Float[AnyArray, "samples joints"],
-    collision: CollisionModel | None = None,
-    frames: int = 60,
-) -> None:
-    """Write an animation of the robot with its capsules, as a GIF that repeats.
-
-    Args:
-        path: GIF file.
-        robot: Robot to draw.
-        time: Instants of the samples [s].
-        q: Joint coordinates [rad or m].
-        collision: Collision model, whose capsules are drawn.
-        frames: Number of pictures, two at least.
-    """
-    from .robot_on_paper import write_animation
-
-    t, q = np.asarray(time, np.float64), np.asarray(q, np.float64)
-    instants = np.linspace(t[0], t[-1], frames)
-    shown = np.stack([np.interp(instants, t, column) for column in q.T], axis=1)
-    write_animation(path, pose_figure(robot, shown, collision, time=instants))
+    return Figure(robot.name if title is None else title, height=2.6, width=7.5, scene=scene)

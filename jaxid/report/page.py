@@ -14,14 +14,14 @@ from jaxid.result_table import (
     Remark,
     Status,
     Table,
+    in_html,
     marked_up,
     printable,
-    remarks_in_html,
     versions,
 )
 
-from .figure import AbstractFigure
-from .interactive import library
+from .figure import Figure
+from .interactive import charts, library
 
 STYLES = {
     Status.GOOD: "green",
@@ -67,20 +67,20 @@ def _render(block: Any) -> Markup:
         case str():
             return macros.paragraph(block)
         case Remark():
-            return macros.headline(block)
+            return Markup(in_html("headline", block))
         case Table():
-            return Markup(block.html())
-        case AbstractFigure():
+            return Markup(in_html("table", block))
+        case Figure():
             return picture(block)
         case tuple():
             return macros.abreast(*map(_render, block))
         case _:
-            return Markup(remarks_in_html(block))
+            return Markup(in_html("remarks", block))
 
 
-def picture(figure: AbstractFigure, caption: str = "") -> Markup:
+def picture(figure: Figure, caption: str = "") -> Markup:
     """Return a block with a figure, and a text below it."""
-    return _macros().figure(figure, caption)
+    return _macros().figure(figure, charts(figure), caption)
 
 
 def tiles(*numbers: tuple[str, str, Status]) -> Markup:

@@ -11,7 +11,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import Column, Table, percent, shortened, significant
 
-from .figure import BLUE, CYCLE, GREY, MEASURED, Curve, Figure, Panel, Scene
+from .figure import BLUE, CYCLE, GREY, MEASURED, Curve, Figure, Panel
 from .motion import pose_figure
 
 SPEEDS = 81
@@ -152,7 +152,7 @@ def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
     return Table("", *columns)
 
 
-def error_scene(fit: Fit, log: TorqueErrors) -> Scene:
+def error_scene(fit: Fit, log: TorqueErrors) -> Figure:
     """Return the robot along a recording, coloured by the torque errors of its joints."""
     robot, largest = fit.base.model.robot, np.asarray(log.max_forces)
     known = bool(np.isfinite(largest).all())

@@ -14,7 +14,6 @@ from .estimates_and_residuals import (
     residual_figure as residuals,
 )
 from .motion import (
-    animation as animation,
     filtered_figure as filtered,
     joint_figure as joints,
     pose_figure as poses,

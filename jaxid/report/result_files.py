@@ -30,7 +30,7 @@ from .estimates_and_residuals import (
     parameter_figure,
     residual_figure,
 )
-from .figure import AbstractFigure
+from .figure import Figure
 from .identification import identification_page
 from .page import render_page
 from .physics import error_scene, friction_figure, gravity_figure
@@ -68,11 +68,11 @@ def write_report(folder: Path, report: Report, suffix: str = "") -> list[Path]:
     return [folder / name for name in names]
 
 
-def _draw(report: Report) -> dict[str, AbstractFigure]:
+def _draw(report: Report) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
     robot = report.fit.base.model.robot
     spectra = report.fit.residual_spectra
-    figures: dict[str, AbstractFigure] = {
+    figures: dict[str, Figure] = {
         "errors": error_figure(report.identification, report.verification, robot),
         "parameters": parameter_figure(report.fit),
         "friction": friction_figure(report.fit, report.identification),

@@ -1,6 +1,7 @@
 """A headless Chromium over its debugging protocol: opens a page, evaluates, prints."""
 
 import base64
+import contextlib
 import itertools
 import json
 import shutil
@@ -26,13 +27,15 @@ class Browser:
     def __init__(self):
         from websockets.sync.client import connect
 
+        self.open_things = contextlib.ExitStack()
         self.folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         flags = [*FLAGS, f"--user-data-dir={self.folder.name}", "about:blank"]
         self.process = subprocess.Popen([CHROMIUM, *flags], stderr=subprocess.DEVNULL)
         port = self._port()
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
             address = next(x for x in json.load(answer) if x["type"] == "page")
-        self.socket = connect(address["webSocketDebuggerUrl"], max_size=None)
+        socket = connect(address["webSocketDebuggerUrl"], max_size=None)
+        self.socket = self.open_things.enter_context(socket)
         self.numbers, self.errors = itertools.count(1), []
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
@@ -115,7 +118,7 @@ class Browser:
         )
 
     def close(self) -> None:
-        self.socket.close()
+        self.open_things.close()
         self.process.terminate()
         self.process.wait(30)
         self.folder.cleanup()
