@@ -18,8 +18,6 @@ import pytest
 from jaxid.cli import app as cli
 from jaxid.experiment.experiment import load_experiment
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 ROOT = Path(__file__).resolve().parent.parent
 EXPERIMENT = """\
 [robot]
@@ -86,7 +84,7 @@ def call(*args):
 
 
 @pytest.fixture(scope="module")
-def material(tmp_path_factory, blank_figures):
+def material(tmp_path_factory):
     """An experiment file, three logs, and a report on the first of them in `first`."""
     place = tmp_path_factory.mktemp("material")
     (place / "experiment.toml").write_text(EXPERIMENT)

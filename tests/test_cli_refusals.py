@@ -8,8 +8,6 @@ from test_cli import EXPERIMENT, first, folder, material, refused, run  # noqa: 
 
 from jaxid.cli.app import main
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 KEYS = [
     ('"t"', '"t"\ntime_unit = "ns"', "has 2e+11 samples in a second: check"),
     ('"t"', '"t"\nforce_delay = 100', "but the longest segment of `a` lasts 6 s"),

@@ -24,8 +24,6 @@ from jaxid.experiment import choose
 from jaxid.experiment.experiment import load_experiment
 from jaxid.simulation.virtual import random_bodies
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 SPATIAL = """\
 [robot]
 name = "spatial"

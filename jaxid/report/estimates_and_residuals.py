@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -242,7 +243,10 @@ def autocorrelation_figure(
         white = [Curve(lags, filtered, "white noise behind the filters", GREY, dashed=True)]
 
     def panel(j: int) -> Panel:
-        ends = {"low": np.full(count, -limits[j]), "high": np.full(count, limits[j])}
+        ends: dict[str, Any] = {
+            "low": np.full(count, -limits[j]),
+            "high": np.full(count, limits[j]),
+        }
         return Panel(
             [
                 Curve(lags, lags, "white residuals: 95 % within", MEASURED, "band", **ends),

@@ -55,7 +55,7 @@ def _scene(scene: Scene) -> str:
     lines = np.concatenate([bones, gaps], axis=2).reshape(count, -1, 3)
     coloured = scene.values is not None
     values = np.zeros((count, len(scene.links)))
-    if coloured:
+    if scene.values is not None:
         values[:, :-1] = scene.values[scene.frames]
     most = float(np.percentile(values[:, :-1], 98)) or 1.0
     scale = {"colorscale": SCALE, "cmin": 0.0, "cmax": most} if coloured else {}

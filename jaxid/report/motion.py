@@ -1,6 +1,7 @@
 """Figures of a motion (Figs. 3, 4, 5 and 8): joints, end-effector, and the robot in space."""
 
 import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 

@@ -46,7 +46,7 @@ def in_words(name: str, robot: Robot) -> tuple[str, str]:
     if wave:
         side, times, place = wave.groups()
         kind = "sine" if side[0] == "s" else "cosine"
-        return f"ripple: {kind}, {times} × per turn of the {RIPPLE[side]}", _joint(robot, place)
+        return f"ripple: {kind}, {times} times a turn of the {RIPPLE[side]}", _joint(robot, place)
     found = re.fullmatch(r"([A-Za-z]+?)(\d+)", name)
     symbol, place = found.groups() if found else (name, "")
     if symbol in BODY:

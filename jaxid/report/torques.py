@@ -10,8 +10,19 @@ from jaxid.model_validation import TorqueErrors
 from jaxid.result_table import percent, shortened, significant
 from jaxid.robot.robot import Robot
 
-from .figure import BLUE, ERROR, GREEN, GREY, MEASURED, ORANGE, PREDICTED, PURPLE
-from .figure import Curve, Figure, Panel
+from .figure import (
+    BLUE,
+    ERROR,
+    GREEN,
+    GREY,
+    MEASURED,
+    ORANGE,
+    PREDICTED,
+    PURPLE,
+    Curve,
+    Figure,
+    Panel,
+)
 
 
 def torque_figure(

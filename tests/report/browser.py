@@ -17,8 +17,13 @@ CHROMIUM = next(
 FLAGS = (
     "--headless=new --no-sandbox --remote-debugging-port=0 --use-angle=swiftshader "
     "--enable-unsafe-swiftshader --hide-scrollbars --no-first-run --disable-extensions "
-    "--host-resolver-rules=MAP*~NOTFOUND"
+    # A mouse, which machines without a screen do not have.
+    "--blink-settings=primaryHoverType=2,availableHoverTypes=2,primaryPointerType=4,"
+    "availablePointerTypes=4"
 ).split()
+
+
+FUNCTIONS = Path(__file__).with_name("browser.js").read_text(encoding="utf-8")
 
 
 class Browser:
@@ -53,13 +58,11 @@ class Browser:
         self.socket.send(json.dumps({"id": number, "method": method, "params": params}))
         while True:
             answer = json.loads(self.socket.recv(timeout=120))
+            params = answer.get("params", {})
             if answer.get("method") == "Runtime.exceptionThrown":
-                self.errors.append(answer["params"]["exceptionDetails"])
-            if (
-                answer.get("method") == "Log.entryAdded"
-                and answer["params"]["entry"]["level"] == "error"
-            ):
-                self.errors.append(answer["params"]["entry"])
+                self.errors.append(params["exceptionDetails"])
+            if params.get("entry", {}).get("level") == "error":
+                self.errors.append(params["entry"])
             if answer.get("id") == number:
                 if "error" in answer:
                     raise RuntimeError(answer["error"])
@@ -75,22 +78,18 @@ class Browser:
 
     def look(self, width: int, scheme: str = "light", media: str = "") -> None:
         """Choose the width of the window [px], and light, dark or print."""
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=900,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **size)
         features = [{"name": "prefers-color-scheme", "value": scheme}]
         self.call("Emulation.setEmulatedMedia", media=media, features=features)
 
     def open(self, path: Path) -> None:
-        """Open a file, and wait until its figures can be drawn."""
+        """Open a file, wait until its figures can be drawn, and add the functions of the tests."""
+        self.errors.clear()
         self.call("Page.navigate", url=path.resolve().as_uri())
-        self.wait(
-            "document.readyState === 'complete' && (!document.querySelector('.chart') || 'ready' in document.documentElement.dataset)"
-        )
+        ready = "document.documentElement.dataset.ready === '' || !document.querySelector('.chart')"
+        self.wait(f"document.readyState === 'complete' && ({ready})")
+        self.call("Runtime.evaluate", expression=FUNCTIONS)
 
     def wait(self, condition: str) -> None:
         for _ in range(600):

@@ -234,7 +234,7 @@ def test_weight_is_the_slope_of_the_potential_energy(fit):
         ("my2", "mass times y of the centre of mass", "body 2, moved by joint swing_$1_$"),
         ("D2", "product of inertia in y, z", "body 2, moved by joint swing_$1_$"),
         ("fo1", "constant offset: of the sensor, or of friction", "joint rail"),
-        ("sm2_1", "ripple: sine, 2 × per turn of the motor", "joint rail"),
+        ("sm2_1", "ripple: sine, 2 times a turn of the motor", "joint rail"),
         ("odd9", "effect of a model of your own", ""),
     ],
 )
