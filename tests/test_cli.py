@@ -255,7 +255,10 @@ def test_help_needs_no_jax(run):
 
 def test_an_earlier_report_is_replaced_and_foreign_files_are_kept(folder, first, run):
     (first / "notes.txt").write_text("mine")
-    assert run("identify", "experiment.toml", "b.csv", "-o", "first")[0] == 0
+    figures = ("--figures", "svg")
+    assert run("identify", "experiment.toml", "a.csv", "-o", "first", *figures)[0] == 0
+    assert "torque_a.svg" in os.listdir("first")
+    assert run("identify", "experiment.toml", "b.csv", "-o", "first", *figures)[0] == 0
     assert result(folder, "first")["fit"]["recordings"] == ["b"]
     assert {"torque_b.svg", "notes.txt"} <= set(os.listdir("first"))
     assert "torque_a.svg" not in os.listdir("first")
@@ -381,7 +384,7 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     said = words("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
     assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
     assert "2 Hz" in said
-    assert "filter.svg" in result(folder)["files"]
+    assert "Choice of the filter" in (folder / "report" / "report.html").read_text("utf-8")
 
 
 @pytest.mark.parametrize("moment", [1.0, 4.0])

@@ -2,8 +2,8 @@
 """Figures for notebooks and papers, as `jid.plot.torques(…)`.
 
 The figures of the paper: `poses` (Figs. 3, 8), `joints` (Fig. 4), `filtered` (Fig. 5), `torques`
-(Figs. 6, 7, 9), `errors` (Fig. 10). Their method `save` writes `.html` to explore, or `.png`, `.pdf`
-or `.svg`; `matplotlib()` returns a `matplotlib.figure.Figure`, and notebooks show a picture.
+(Figs. 6, 7, 9), `errors` (Fig. 10). Their method `save` writes `.html` to explore, or `.png`,
+`.pdf` or `.svg`; `matplotlib()` returns a `matplotlib.figure.Figure`; notebooks show a picture.
 """
 
 from .estimates_and_residuals import (

@@ -14,15 +14,18 @@ from pathlib import Path
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
-FLAGS = (
-    "--headless=new --no-sandbox --remote-debugging-port=0 --use-angle=swiftshader "
-    "--enable-unsafe-swiftshader --hide-scrollbars --no-first-run --disable-extensions "
+FLAGS = [
+    "--headless=new",
+    "--no-sandbox",
+    "--remote-debugging-port=0",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--hide-scrollbars",
+    "--no-first-run",
     # A mouse, which machines without a screen do not have.
     "--blink-settings=primaryHoverType=2,availableHoverTypes=2,primaryPointerType=4,"
-    "availablePointerTypes=4"
-).split()
-
-
+    "availablePointerTypes=4",
+]
 FUNCTIONS = Path(__file__).with_name("browser.js").read_text(encoding="utf-8")
 
 
