@@ -1,4 +1,4 @@
-"""Draw docs/picture.png: the TX90L on its rail along a motion, and the path of its end-effector."""
+"""Draw docs/picture.png: the TX90L on its rail along a motion, and its end-effector."""
 
 from pathlib import Path
 
@@ -20,15 +20,14 @@ def main() -> None:
     robot = jid.robots.tx90l_on_rail()
     time = np.linspace(0.0, 7.85, 400)
     motion = jid.random_fourier_series(robot, omega=OMEGA, seed=3).motion(time)
-    capsules = jid.robots.tx90l_on_rail_collision()
     figures = (
-        jid.plot.poses(robot, motion.q, capsules, poses=4, title="TX90L on rail: a motion"),
-        jid.plot.path(robot, motion, title="path of the end-effector"),
+        jid.plot.poses(robot, motion.q, poses=4, title="TX90L on rail: a motion"),
+        jid.plot.end_effector(robot, time, motion),
     )
     path = Path(__file__).parent / "picture.png"
     parts = []
     for figure in figures:
-        jid.plot.save(figure, path)
+        figure.save(path)
         with Image.open(path) as part:
             width = round(part.width * HEIGHT / part.height)
             parts.append(part.convert("RGB").resize((width, HEIGHT), Image.Resampling.LANCZOS))
