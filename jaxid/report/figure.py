@@ -18,9 +18,6 @@ MEASURED, PREDICTED, ERROR = "#9aa6b2", VERMILION, BLUE
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
 """Colours of joints in one panel."""
 
-POINTS = 80_000
-"""Pixel columns of all lines of one figure: of longer lines each column keeps its extremes."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Curve:
@@ -153,6 +150,7 @@ class Figure:
         height: Height of each panel with those below it [inch].
         width: Width of all on paper [inch].
         scene: Robot in space, in place of panels.
+        bins: Pixel columns of a line on a page: of longer lines each column keeps its extremes.
     """
 
     title: str
@@ -161,6 +159,7 @@ class Figure:
     height: float = 2.1
     width: float = 11.0
     scene: Scene | None = None
+    bins: int = 2000
 
     @property
     def parts(self) -> Iterator[Panel]:
@@ -176,11 +175,6 @@ class Figure:
                 entries.setdefault(curve.name, curve)
         entries.pop("", None)
         return [*entries.items()]
-
-    @property
-    def bins(self) -> int:
-        """Pixel columns of each line."""
-        return min(2000, POINTS // max(1, sum(len(part.curves) for part in self.parts)))
 
     def matplotlib(self) -> Any:
         """Return a `matplotlib.figure.Figure`, to be changed for a paper."""

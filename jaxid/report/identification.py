@@ -143,9 +143,11 @@ def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
     """Return the figures of the recordings: with 42 panels at most, the first one unfolded."""
     found: list[Any] = [figure for name, figure in figures.items() if name.startswith("torque_")]
     shown = found[: max(1, 42 // robot.joints)]
-    untitled = [dataclasses.replace(figure, title="") for figure in shown[1:]]
-    folds = [folded(f.title, g) for f, g in zip(shown[1:], untitled, strict=True)]
-    blocks: list[Any] = [shown[0], *folds]
+    # Many panels share the size of the page.
+    bins = min(shown[0].bins, 28_000 // sum(len(figure.panels) for figure in shown))
+    first, *others = (dataclasses.replace(figure, bins=bins) for figure in shown)
+    folds = [folded(f.title, dataclasses.replace(f, title="")) for f in others]
+    blocks: list[Any] = [first, *folds]
     if left := len(found) - len(shown):
         blocks.append(f"{left} more recordings are not shown here; result.json has their errors.")
     return blocks

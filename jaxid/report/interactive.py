@@ -108,6 +108,9 @@ def _panel(figure: Figure, panel: Panel) -> str:
         own = [_trace(c, part, figure.bins) | {"yaxis": f"y{number}"} for c in part.curves]
         traces += own
         shapes += [_level(level, number) for level in part.levels]
+    for k, trace in enumerate(traces):
+        # What all curves have in common is there once.
+        trace["x"] = next((j for j in range(k) if traces[j]["x"] == trace["x"]), trace["x"])
     lines = all(c.kind in ("line", "band") for part in parts for c in part.curves)
     layout |= {"shapes": shapes, "hovermode": "x" if lines or panel.x_names else "closest"}
     return pack(_json({"data": traces, "layout": layout}))

@@ -57,6 +57,7 @@
     if (drawn(chart)) return;
     chart.classList.add("drawn");
     const { data, frames } = chart.content;
+    for (const trace of data) if (Number.isInteger(trace.x)) trace.x = data[trace.x].x;
     Plotly.newPlot(chart, data, layoutOf(chart), optionsOf(chart));
     for (const button of chart.closest("figure").querySelectorAll("[data-curve][aria-pressed=false]"))
       show(chart, button.dataset.curve, false);
