@@ -298,6 +298,15 @@ def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch)
         cli.main()
 
 
+def test_a_missing_extra_is_one_sentence_with_the_command(folder, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    (folder / "arm.xml").write_text("<mujoco><worldbody/></mujoco>")
+    code, out, err = run("init", "arm.xml")
+    assert (code, out) == (2, "")
+    assert len(err.strip().splitlines()) == 1
+    assert "`pip install 'jaxid-robotics[mujoco]'`" in err
+
+
 def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     write_log(folder / "d.csv", 2, viscous=-0.25)
     assert run("identify", "experiment.toml", "d.csv", "-o", "warm")[0] == 0

@@ -74,7 +74,7 @@ def _scene(scene: Scene) -> str:
         f"{axis}axis": {"title": {"text": f"{axis} [m]"}, "range": limits}
         for axis, limits in zip("xyz", ranges, strict=True)
     }
-    axes |= {"aspectmode": "data", "camera": {"eye": {"x": 1.4, "y": -1.7, "z": 0.8}}}
+    axes |= {"aspectmode": "data", "camera": {"eye": {"x": 1.2, "y": -1.5, "z": 0.7}}}
     axes["domain"] = {"x": [0.0, 1.0], "y": [0.12, 1.0]}
     packed = {
         "data": [tip, robot],
@@ -143,7 +143,8 @@ def _axis(label: str, limits: Sequence[float] | None, logarithmic: bool) -> dict
 def _ticks(names: Sequence[str]) -> dict[str, Any]:
     if not names:
         return {}
-    return {"tickvals": [*range(len(names))], "ticktext": [html.escape(name) for name in names]}
+    shown = [html.escape(name) for name in names]
+    return {"tickvals": [*range(len(names))], "ticktext": shown, "autotickangles": [0, 90]}
 
 
 def _trace(curve: Curve, panel: Panel, bins: int) -> dict[str, Any]:

@@ -221,7 +221,7 @@ def write_estimates(
     }
     logs = Table("", facts=[(key, ", ".join(map(str, paths))) for key, paths in sources.items()])
     blocks = [*([doubts] if doubts else []), *tables]
-    page = render_page(tables[0].title, [("Result", blocks), ("Logs", [logs])])
+    page = render_page(f"{kind.capitalize()}: results", [("Result", blocks), ("Logs", [logs])])
     return _write_table(folder, kind, everything, rows, page)
 
 

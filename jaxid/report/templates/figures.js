@@ -31,6 +31,8 @@
     if (own.scene) {
       const plane = { gridcolor: grey, zerolinecolor: grey, backgroundcolor: "rgba(0,0,0,0)" };
       layout.scene = { ...own.scene, dragmode: "turntable" };
+      const { x, y, z } = own.scene.camera.eye, away = widthOf(chart) < 500 ? 1.35 : 1;
+      layout.scene.camera = { eye: { x: away * x, y: away * y, z: away * z } };
       for (const key of ["xaxis", "yaxis", "zaxis"]) layout.scene[key] = { ...plane, ...own.scene[key] };
     }
     const margin = own.scene ? { l: 0, r: 0, t: 0, b: 0 } : { l: 52, r: 8, t: coarse ? 28 : 8, b: 40 };
