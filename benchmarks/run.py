@@ -76,6 +76,7 @@ METHODS = (
     Script("clean", 40),
     Script("delay", 40),
     Script("resolution", 10),
+    Script("report", 1),
 )
 SCRIPTS = SPEED + METHODS
 

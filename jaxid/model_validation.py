@@ -13,7 +13,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.result_table import Column, Remark, Status, Table, percent, significant
+from jaxid.result_table import Column, Remark, Status, Summarised, Table, percent, significant
 
 POSES = 2000
 """Random poses in which the mass matrix is evaluated."""
@@ -42,6 +42,7 @@ class TorqueErrors(eqx.Module):
         speeds: Velocities, filtered and decimated alike [rad/s or m/s].
         unexplained: Errors of the same model fitted to this recording alone: what no parameters of
             it explain; NaN where a row does not count [N m or N].
+        positions: Coordinates, filtered and decimated alike [rad or m]; None if not known.
     """
 
     name: str = eqx.field(static=True)
@@ -52,6 +53,7 @@ class TorqueErrors(eqx.Module):
     max_forces: Float[AnyArray, " joints"]
     speeds: Float[AnyArray, "rows joints"]
     unexplained: Float[AnyArray, "rows joints"]
+    positions: Float[AnyArray, "rows joints"] | None = None
 
     @property
     def moving(self) -> Bool[np.ndarray, "rows joints"]:
@@ -189,7 +191,7 @@ class Definiteness(eqx.Module):
         )
 
 
-class Validation(eqx.Module):
+class Validation(Summarised, eqx.Module):
     """Torque errors on recordings, and definiteness of the mass matrix.
 
     Attributes:
@@ -224,9 +226,6 @@ class Validation(eqx.Module):
             remarks=[Remark(str(self.definiteness), status)],
             rules=range(count, len(rows), count),
         )
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
 
 def validate(
@@ -266,7 +265,8 @@ def torque_errors(
     mask = np.asarray(observations.mask)
     estimator = WeightedLeastSquares(ResidualVariances())
     own = estimator(RegressionProblem(fit.base, [observations])).parameters
-    measured, predicted, speeds, refitted = np.zeros((4, len(mask[::step]), observations.joints))
+    shape = len(mask[::step]), observations.joints
+    measured, predicted, speeds, refitted, q = np.zeros((5, *shape))
     for chunk in observations.chunks(65536):
         first, stop = chunk.rows
         # Masked parts are not evaluated.
@@ -281,6 +281,7 @@ def torque_errors(
             predicted[rows] = chunk.reduce(model_forces)[taken]
             refitted[rows] = chunk.reduce(own_forces)[taken]
             speeds[rows] = chunk.reduce(motion.qd)[taken]
+            q[rows] = chunk.reduce(motion.q)[taken]
         if progress is not None:
             progress(stop / observations.rows)
     return TorqueErrors(
@@ -292,6 +293,7 @@ def torque_errors(
         max_forces=np.where(np.isfinite(known), known, np.nan),
         speeds=speeds,
         unexplained=np.where(mask[::step], refitted - measured, np.nan),
+        positions=q,
     )
 
 

@@ -8,6 +8,8 @@ are texts for two columns of `kind="number"`.
 
 import dataclasses
 import enum
+import functools
+import html
 import importlib.metadata
 import math
 import platform
@@ -15,6 +17,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -62,6 +65,35 @@ class Remark:
         stop = "" if self.text.endswith((".", "?", "!")) else "."
         object.__setattr__(self, "text", printable(self.text + stop))
         object.__setattr__(self, "detail", printable(self.detail))
+
+
+def in_html(macro: str, *arguments: Any) -> str:
+    """Return what a macro of `result_table.html` makes of results."""
+    return str(getattr(_macros(), macro)(*arguments))
+
+
+def marked_up(text: str) -> str:
+    """Return a text for HTML; what stands between backticks becomes a name in other letters."""
+    return re.sub(r"`([^`]+)`", r'<span class="key">\1</span>', html.escape(printable(text)))
+
+
+@functools.cache
+def _macros() -> Any:
+    # Commands that write no page do not wait for it.
+    import jinja2
+    from markupsafe import Markup
+
+    def aligned(number: str) -> str:
+        # Blanks behind a number become as wide as the digits and the point left out.
+        pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
+        return pointed.replace(" ", "\N{FIGURE SPACE}")
+
+    folder = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(
+        loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"aligned": aligned, "marked_up": lambda text: Markup(marked_up(text))}
+    return environment.get_template("result_table.html").module
 
 
 def significant(value: float, digits: int = 3) -> str:
@@ -156,6 +188,24 @@ class Column:
         return [s + " " * (longest - tail) for s, tail in zip(texts, tails, strict=True)]
 
 
+class Summarised:
+    """Result with tables, which terminals print and notebooks show."""
+
+    def summary(self) -> "Table":
+        """Return the table of the result."""
+        raise NotImplementedError
+
+    def tables(self) -> "Sequence[Table]":
+        """Return all tables of the result."""
+        return (self.summary(),)
+
+    def __str__(self) -> str:
+        return "\n\n".join(map(str, self.tables()))
+
+    def _repr_html_(self) -> str:
+        return "".join(table._repr_html_() for table in self.tables())
+
+
 class Table:
     """Table of results with facts above it and remarks below it.
 
@@ -198,6 +248,9 @@ class Table:
 
     def __str__(self) -> str:
         return self.text()
+
+    def _repr_html_(self) -> str:
+        return in_html("notebook", self)
 
     def lines(self, width: int | None = None) -> Lines:
         """Yield the lines of the text as parts with a style each, for renderers with colours.

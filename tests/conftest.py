@@ -27,13 +27,10 @@ from jaxtyping import install_import_hook
 if os.environ.get("JAXID_CHECK_SHAPES"):
     install_import_hook("jaxid", "beartype.beartype")
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 # The same examples in every run, and no clock: a busy machine is no bug.
 settings.register_profile("jaxid", deadline=None, derandomize=True)
@@ -49,15 +46,3 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("measured data (../shared/data beside the project) are not here")
     return folder
-
-
-@pytest.fixture(scope="module")
-def blank_figures() -> Iterator[None]:
-    """Figures without layout or ink, for tests of what commands say and which files they write.
-
-    Figures take most of a report's time; `tests/report` looks at them.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ConstrainedLayoutEngine, "execute", lambda engine, figure: None)
-        patch.setattr(Figure, "draw", lambda figure, renderer: None)
-        yield

@@ -18,8 +18,6 @@ import pytest
 from jaxid.cli import app as cli
 from jaxid.experiment.experiment import load_experiment
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 ROOT = Path(__file__).resolve().parent.parent
 EXPERIMENT = """\
 [robot]
@@ -86,7 +84,7 @@ def call(*args):
 
 
 @pytest.fixture(scope="module")
-def material(tmp_path_factory, blank_figures):
+def material(tmp_path_factory):
     """An experiment file, three logs, and a report on the first of them in `first`."""
     place = tmp_path_factory.mktemp("material")
     (place / "experiment.toml").write_text(EXPERIMENT)
@@ -257,7 +255,10 @@ def test_help_needs_no_jax(run):
 
 def test_an_earlier_report_is_replaced_and_foreign_files_are_kept(folder, first, run):
     (first / "notes.txt").write_text("mine")
-    assert run("identify", "experiment.toml", "b.csv", "-o", "first")[0] == 0
+    figures = ("--figures", "svg")
+    assert run("identify", "experiment.toml", "a.csv", "-o", "first", *figures)[0] == 0
+    assert "torque_a.svg" in os.listdir("first")
+    assert run("identify", "experiment.toml", "b.csv", "-o", "first", *figures)[0] == 0
     assert result(folder, "first")["fit"]["recordings"] == ["b"]
     assert {"torque_b.svg", "notes.txt"} <= set(os.listdir("first"))
     assert "torque_a.svg" not in os.listdir("first")
@@ -295,6 +296,15 @@ def test_errors_that_are_not_the_users_keep_their_traceback(folder, monkeypatch)
     monkeypatch.setattr(sys, "argv", ["jaxid", "identify", "experiment.toml", "a.csv"])
     with pytest.raises(ValueError, match="broadcast"):
         cli.main()
+
+
+def test_a_missing_extra_is_one_sentence_with_the_command(folder, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    (folder / "arm.xml").write_text("<mujoco><worldbody/></mujoco>")
+    code, out, err = run("init", "arm.xml")
+    assert (code, out) == (2, "")
+    assert len(err.strip().splitlines()) == 1
+    assert "`pip install 'jaxid-robotics[mujoco]'`" in err
 
 
 def test_what_has_changed_between_two_runs_is_told(folder, first, run):
@@ -383,7 +393,7 @@ def test_a_filter_is_chosen_from_a_list_and_the_report_shows_why(folder, words):
     said = words("identify", "experiment.toml", "a.csv", "--verify", "c.csv")
     assert re.search(r"a cut-off of (10|20) Hz predicts held-out parts", said)
     assert "2 Hz" in said
-    assert "filter.svg" in result(folder)["files"]
+    assert "Choice of the filter" in (folder / "report" / "report.html").read_text("utf-8")
 
 
 @pytest.mark.parametrize("moment", [1.0, 4.0])

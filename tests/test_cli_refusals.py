@@ -8,8 +8,6 @@ from test_cli import EXPERIMENT, first, folder, material, refused, run  # noqa: 
 
 from jaxid.cli.app import main
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 KEYS = [
     ('"t"', '"t"\ntime_unit = "ns"', "has 2e+11 samples in a second: check"),
     ('"t"', '"t"\nforce_delay = 100', "but the longest segment of `a` lasts 6 s"),
@@ -54,7 +52,7 @@ COMMANDS = [
     ("excite experiment.toml -o motion", "`motion` must end in .csv"),
     ("excite experiment.toml -o truth.csv", "`truth.json` is there al"),
     ("excite experiment.toml -o mine.csv", "`mine.ros.yaml` is there al"),
-    ("excite experiment.toml -o pictures.csv", "joints.svg` is there already"),
+    ("excite experiment.toml -o pictures.csv", "report.html` is there already"),
 ]
 
 
@@ -63,7 +61,7 @@ def test_commands(folder, run, words, sentence):  # noqa: F811
     (folder / "truth.json").write_text("{}")
     (folder / "mine.ros.yaml").write_text("mine")
     (folder / "pictures").mkdir()
-    (folder / "pictures" / "joints.svg").write_text("mine")
+    (folder / "pictures" / "report.html").write_text("mine")
     (folder / "loop.csv").symlink_to("loop.csv")
     (folder / "image.csv").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR")
     header, *rows = (folder / "a.csv").read_text().splitlines()

@@ -24,8 +24,6 @@ from jaxid.experiment import choose
 from jaxid.experiment.experiment import load_experiment
 from jaxid.simulation.virtual import random_bodies
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 SPATIAL = """\
 [robot]
 name = "spatial"
@@ -112,7 +110,7 @@ def pasted(out, title):
 def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     code, out, err = run("payload", "experiment.toml", "empty.csv", "--loaded", "loaded.csv")
     assert (code, err) == (0, "")
-    assert set(os.listdir("payload")) == {"payload.json", "payload.csv"}
+    assert set(os.listdir("payload")) == {"payload.json", "payload.csv", "report.html"}
     found = json.loads((shop / "payload" / "payload.json").read_text(encoding="utf-8"))
     assert found["body"] == "joint3"
     assert abs(found["mass"] / 3.0 - 1.0) < 0.01

@@ -11,8 +11,6 @@ from jaxid.demo.results import error_table, paper_table, remarks, tables, write_
 from jaxid.demo.study import run_study
 from jaxid.identification.parameter_changes import Verdict
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 
 @pytest.fixture(scope="module")
 def found():

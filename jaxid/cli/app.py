@@ -35,9 +35,11 @@ def main() -> None:
     try:
         options.require_one_log_per_option()
         app()
-    except (InputError, OSError, RuntimeError) as error:
+    except (ImportError, InputError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
             raise  # of JAX, not a failed search
+        if isinstance(error, ImportError) and "pip install" not in str(error):
+            raise  # a damaged installation, not a missing extra
         said = Text(f"jaxid: {options.describe_error(error)}")
         options.open_console(stderr=True).print(said, soft_wrap=True)
         raise SystemExit(2) from None
@@ -189,8 +191,9 @@ def identify(
     ] = None,
     output: options.OutputFolder = Path("report"),
     figures: Annotated[
-        Literal["svg", "png", "pdf"], typer.Option(help="Format of the files with figures.")
-    ] = "svg",
+        Literal["svg", "png", "pdf"] | None,
+        typer.Option(help="Also write each figure to a file of this format."),
+    ] = None,
     force: options.Force = False,
 ) -> None:
     """Estimate the parameters and write a report.

@@ -105,7 +105,7 @@ def identify(
     verify: list[Path],
     split: float | None,
     output: Path,
-    figures: str,
+    figures: str | None,
 ) -> None:
     """Estimate the parameters and write a report."""
     _check_logs(logs, verify, split)
@@ -135,8 +135,10 @@ def identify(
             result.findings,
             result.mistakes,
             result.choice,
+            result.claimed,
+            result.claimed_mass,
         )
-        written = write_report(output, report, figures)
+        written = write_report(output, report, figures or "")
     fit, robot = result.fit, result.experiment.robot
     tabulated = () if fit.consistency is None else fit.consistency.findings
     notes = [*result.experiment.notes, *result.notes]
@@ -289,9 +291,11 @@ def payload(
     sources = {"unloaded": logs, "loaded": loaded}
     rows = (INERTIAL_NAMES, INERTIAL_UNITS, found.parameters, found.uncertainty)
     central = (CENTRAL_NAMES, CENTRAL_UNITS, *found.central)
-    files = write_estimates(output, "payload", [rows, central], content, sources)
-    show(console, found.summary())
-    show_remarks(console, _doubts(doubts))
+    doubts = _doubts(doubts)
+    tables = [found.summary()]
+    files = write_estimates(output, "payload", [rows, central], content, sources, tables, doubts)
+    show(console, *tables)
+    show_remarks(console, doubts)
     upper = [(k, i) for k in range(3) for i in range(k, 3)]
     inertia = ", ".join(f"{'xyz'[k]}{'xyz'[i]} = {found.inertia[k, i]:.6g}" for k, i in upper)
     lines = [
@@ -329,9 +333,11 @@ def gains(
     sources = {"unloaded": logs, "loaded": loaded}
     names = found.joint_names
     rows = (names, ("1",) * len(names), found.gains, found.uncertainty)
-    files = write_estimates(output, "gains", [rows], {key: values}, sources)
-    show(console, found.summary())
-    show_remarks(console, _doubts(doubts))
+    doubts = _doubts(doubts)
+    tables = [found.summary()]
+    files = write_estimates(output, "gains", [rows], {key: values}, sources, tables, doubts)
+    show(console, *tables)
+    show_remarks(console, doubts)
     shown = ", ".join(significant(v, 5) for v in values)
     lines = ["[recording]", f"{key} = [{shown}]"]
     _show_lines(console, "to use them, in the experiment file:", lines)
@@ -357,17 +363,19 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
         "sharing_chance": chance,
     }
     rows = (found.names, found.units, found.parameters, found.uncertainty)
-    files = write_estimates(output, "states", [rows], content, {"states": logs})
     if chance < UNLIKELY:
         doubts.append(
             "the states do not agree on what they share (chance "
             f"{100 * chance:.2g} %): something else than friction and offsets differs"
         )
-    show(console, found.summary())
-    show_remarks(console, _doubts(doubts))
-    for other in names[1:]:
-        comparison = found.compare(names[0], other)
-        show(console, comparison.summary(), comparison.group_summary())
+    comparisons = [found.compare(names[0], other) for other in names[1:]]
+    pairs = [(c.group_summary(), c.summary()) for c in comparisons]
+    tables = [found.summary(), *(table for pair in pairs for table in pair)]
+    said, sources = _doubts(doubts), {"states": logs}
+    files = write_estimates(output, "states", [rows], content, sources, tables, said)
+    show(console, tables[0])
+    show_remarks(console, said)
+    show(console, *tables[1:])
     show_files(console, output, [p.name for p in files])
 
 

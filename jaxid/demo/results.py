@@ -187,7 +187,7 @@ def _excitation(study: Study) -> Section:
         "condition number; the D-optimal one beside it makes the parameters most certain.",
         *([side_by_side_table(study.plans)] if study.plans else []),
         picture(
-            jid.plot.path(robot, motion, times),
+            _speed_scene(robot, times, motion),
             "Fig. 3: path of the end-effector along the designed motion, up to "
             f"{speed:.3g} m/s and {acceleration:.3g} m/s² (in the paper 2.7 m/s and 11.3 m/s²).",
         ),
@@ -224,14 +224,13 @@ def _identification(study: Study) -> Section:
 def _verification(study: Study) -> Section:
     robot, path = study.base.model.robot, study.joint_path
     times = np.linspace(0.0, float(path.duration), 5 * POINTS)
-    motion, capsules = path.motion(times), jid.robots.tx90l_on_rail_collision()
+    motion = path.motion(times)
     first, second = study.weighted.validation.errors
     return "Verification and application on another path", [
         f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its corners, up "
         f"to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of the redundant joint "
         "angles the nearest to a posture are taken.",
-        picture(jid.plot.path(robot, motion, times), "Fig. 8: path of the end-effector."),
-        picture(jid.plot.poses(robot, motion.q[::5], capsules), "The robot with its capsules."),
+        picture(_speed_scene(robot, times, motion), "Fig. 8: path of the end-effector."),
         picture(
             jid.plot.torques(second, robot, "verification", SHOWN),
             "Fig. 9: torques of the axes 1, 3, 5 and 7 on the verification path.",
@@ -244,6 +243,13 @@ def _verification(study: Study) -> Section:
         "whose bodies are 10 to 18 % off, and those of the identified model.",
         following_table(study),
     ]
+
+
+def _speed_scene(robot: jid.Robot, times: np.ndarray, motion: jid.Motion) -> Any:
+    """Return the robot along a motion, coloured by the speeds of its joints."""
+    used = 100.0 * np.abs(np.asarray(motion.qd)) / np.asarray(robot.limits.velocity)
+    label = "speed [% of the limit]"
+    return jid.plot.poses(robot, motion.q, time=times, values=used, label=label)
 
 
 def _record(study: Study) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from jaxid.measurement.filters import ZeroPhaseButterworth
 from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import AT_ONCE, SamplesOnDisk
 from jaxid.measurement.recording import FEWEST, Recording, consecutive
-from jaxid.result_table import MISSING, Column, Remark, Status, Table, significant
+from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table, significant
 from jaxid.robot.robot import Robot
 
 from .checks_without_model import (
@@ -37,7 +37,7 @@ APART = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(Summarised):
     """Statistics of a log beside the limits of its robot, and findings.
 
     Attributes:
@@ -115,9 +115,6 @@ class Diagnosis:
                 *([] if self.findings else [Remark("Nothing suspicious was found.", Status.GOOD)]),
             ],
         )
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
 
 def _beside(name: str, values: np.ndarray, limits: AnyArray, unit: str = "") -> Column:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, Numbers, as_array
 from jaxid.errors import InputError
 from jaxid.program import Program, select_outputs
-from jaxid.result_table import MISSING, Column, Remark, Status, Table
+from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table
 
 from .base_parameter_expressions import Expression
 from .dispatch import in_numpy, on_samples, program_of
@@ -39,7 +39,7 @@ class Identifiability(enum.Enum):
     NONE = "not identifiable"
 
 
-class BaseParameters(Hashable):
+class BaseParameters(Summarised, Hashable):
     r"""A model regrouped to its base parameters: $\hat\Theta_1 (p_1 + \kappa p_2) = Q_m$ (Eq. 22).
 
     Attributes:
@@ -237,9 +237,6 @@ class BaseParameters(Hashable):
             facts=facts,
             remarks=[Remark(note, Status.DOUBTFUL) for note in self.notes],
         )
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
 
 def _one_each(kind: str, p: Numbers, size: int) -> Float[AnyArray, "*batch parameters"]:

@@ -12,7 +12,16 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Bool, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.result_table import MISSING, Column, Remark, Status, Table, percent, significant
+from jaxid.result_table import (
+    MISSING,
+    Column,
+    Remark,
+    Status,
+    Summarised,
+    Table,
+    percent,
+    significant,
+)
 from jaxid.trajectory.files import save_trajectory
 from jaxid.trajectory.trajectory import LinearTrajectory
 
@@ -48,7 +57,7 @@ class Comparison(NamedTuple):
     after: float
 
 
-class ExcitationPlan(eqx.Module):
+class ExcitationPlan(Summarised, eqx.Module):
     """Result of a design; `print(plan)` shows its tables.
 
     Attributes:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 
@@ -32,11 +33,18 @@ from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.bags import is_bag
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import NeedsMemory, Recording
-from jaxid.model_validation import Validation, comparison_step, validate
+from jaxid.model_validation import (
+    TorqueErrors,
+    Validation,
+    comparison_step,
+    torque_errors,
+    validate,
+)
 from jaxid.report.result_files import read_fit
 
 from .decoder import within
 from .experiment import Experiment
+from .robot_tables import named
 
 LoadedLog = tuple[Recording | Observations, Observations, Diagnosis]
 """Log as it was read (of a log on disk its observations), filtered log, and diagnosis."""
@@ -215,6 +223,9 @@ class Identification(NamedTuple):
     notes: list[str]  # notes on the logs, as sentences
     findings: list[str]  # findings on the logs
     mistakes: tuple[str, ...]  # likely mistakes in the columns of the logs, by the fit
+    # torque errors of the parameters that the robot's file claims, like `validation`, if any
+    claimed: tuple[TorqueErrors, ...] = ()
+    claimed_mass: float = 0.0  # mass of all bodies that it claims [kg]
 
 
 def identify_logs(
@@ -260,9 +271,27 @@ def identify_logs(
         if isinstance(log, Recording) and not diagnosis.faulty:
             notes += [f"{log.name}: {x}" for x in resolution_note(fit, log, whole)]
     notes, findings = list(dict.fromkeys(notes)), _findings(loaded)
+    claims = _errors_of_claims(experiment, fit, every)
     return Identification(
-        experiment, choice, fit, validation, len(fitted), notes, findings, mistakes
+        experiment, choice, fit, validation, len(fitted), notes, findings, mistakes, *claims
     )
+
+
+def _errors_of_claims(
+    experiment: Experiment, fit: Fit, logs: Sequence[Observations]
+) -> tuple[tuple[TorqueErrors, ...], float]:
+    """Return torque errors of the parameters that the robot's file claims, and its mass [kg]."""
+    folder = experiment.path.parent
+    try:
+        bodies = experiment.source.parameters(folder)
+    except InputError:
+        return (), 0.0  # the robot's notes name the body
+    if bodies is None or not np.any(bodies):
+        return (), 0.0
+    known = named(bodies) | experiment.source.joint_parameters(folder)
+    standard = [known.get(name, 0.0) for name in fit.base.model.parameter_names]
+    claim = dataclasses.replace(fit, parameters=np.asarray(fit.base.from_standard(standard)))
+    return tuple(torque_errors(claim, log) for log in logs), float(bodies[:, 0].sum())
 
 
 def _add_reports(

@@ -13,7 +13,7 @@ from scipy import optimize
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
-from jaxid.result_table import Table
+from jaxid.result_table import Summarised, Table
 from jaxid.robot.robot import Tool
 
 from .combination import as_least_squares, combine, require_same_base
@@ -29,7 +29,7 @@ LARGEST = 100.0
 """Ratio of a true to an assumed force beyond which something else is wrong."""
 
 
-class DriveGains(eqx.Module):
+class DriveGains(Summarised, eqx.Module):
     """True forces relative to those of nominal gains, joint by joint.
 
     Attributes:
@@ -48,9 +48,6 @@ class DriveGains(eqx.Module):
         """Return a table of the gains with their 95 % intervals."""
         units, title = ("1",) * len(self.joint_names), "true forces over those of the logs"
         return interval_table(title, self.joint_names, units, self.gains, self.uncertainty)
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
 
 def identify_drive_gains(

@@ -20,6 +20,7 @@ from jaxid.result_table import (
     Column,
     Remark,
     Status,
+    Summarised,
     Table,
     percent,
     significant,
@@ -63,7 +64,7 @@ class ConditionNumbers(eqx.Module):
     scaled: float
 
 
-class Fit(eqx.Module):
+class Fit(Summarised, eqx.Module):
     """Identified base parameters with their uncertainty.
 
     Attributes:
@@ -279,9 +280,6 @@ class Fit(eqx.Module):
             remarks.append(Remark(text))
         title = f"{base.model.robot.name}: {base.size} base parameters"
         return Table(title, *columns, facts=self.facts, status=trust, remarks=remarks)
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
     def predict(self, motion: Motion) -> Float[np.ndarray, "samples joints"]:
         """Return the forces of a motion, without a known tool's [N m or N] (Eq. 39).

@@ -11,7 +11,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.result_table import Column, Remark, Status, Table, percent
+from jaxid.result_table import Column, Remark, Status, Summarised, Table, percent
 
 from .estimators import AbstractEstimator, WeightedLeastSquares
 from .factors import Blocks
@@ -37,7 +37,7 @@ class Candidate(NamedTuple):
     estimator: AbstractEstimator = WeightedLeastSquares()
 
 
-class ModelChoice(eqx.Module):
+class ModelChoice(Summarised, eqx.Module):
     """Result of a choice of models.
 
     Attributes:

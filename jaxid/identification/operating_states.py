@@ -10,7 +10,7 @@ from jaxid.arrays import AnyArray, Bool, Float, Int
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
-from jaxid.result_table import Table
+from jaxid.result_table import Summarised, Table
 
 from .combination import (
     as_least_squares,
@@ -23,7 +23,7 @@ from .parameter_changes import LEVEL, Comparison, compare_some, joint_test
 from .uncertainty import Uncertainty
 
 
-class StatesFit(eqx.Module):
+class StatesFit(Summarised, eqx.Module):
     """Parameters that all states share, and those that each state has for itself.
 
     Attributes:
@@ -66,9 +66,6 @@ class StatesFit(eqx.Module):
         """Return a table of all estimates with their 95 % intervals."""
         title = "parameters that all states share, then those of each state"
         return interval_table(title, self.names, self.units, self.parameters, self.uncertainty)
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
     def fit(self, state: str) -> Fit:
         """Return the fit of one state: to validate, predict and report.

@@ -11,7 +11,7 @@ from scipy import special
 from jaxid.arrays import AnyArray, Bool, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.result_table import Column, Status, Table, significant, with_deviations
+from jaxid.result_table import Column, Status, Summarised, Table, significant, with_deviations
 
 from .combination import require_same_base, without_bounds
 from .fit_result import Fit
@@ -30,7 +30,7 @@ class Verdict(enum.Enum):
     UNKNOWN = "not determined"
 
 
-class Comparison(eqx.Module):
+class Comparison(Summarised, eqx.Module):
     r"""Differences of the base parameters of two fits, and which are more than chance (Sec. 6).
 
     A parameter has changed if its difference is larger than its own uncertainty allows:
@@ -180,8 +180,9 @@ class Comparison(eqx.Module):
             status=[Status.DOUBTFUL if g["changed"] else Status.NEUTRAL for g in groups],
         )
 
-    def __str__(self) -> str:
-        return f"{self.summary()}\n\n{self.group_summary()}"
+    def tables(self) -> list[Table]:
+        """Return the tables of the parameters, and of their kinds."""
+        return [self.summary(), self.group_summary()]
 
 
 def compare(first: Fit, second: Fit, level: float = LEVEL) -> Comparison:

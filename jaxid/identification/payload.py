@@ -10,7 +10,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
-from jaxid.result_table import Remark, Status, Table
+from jaxid.result_table import Remark, Status, Summarised, Table
 from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
 from jaxid.robot.robot import Tool
 
@@ -26,7 +26,7 @@ CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
 CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
 
 
-class Payload(eqx.Module):
+class Payload(Summarised, eqx.Module):
     """Mass, centre of mass and inertia of a load on a body.
 
     Attributes:
@@ -100,9 +100,6 @@ class Payload(eqx.Module):
         remarks = [Remark(text, status)]
         title = "payload in the frame of its body; moments about the centre of mass"
         return interval_table(title, CENTRAL_NAMES, CENTRAL_UNITS, *self.central, remarks)
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
 
 def identify_payload(

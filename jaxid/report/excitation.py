@@ -12,9 +12,8 @@ from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
-from .motion import joint_figure, path_figure, pose_figure, tip_figure
+from .motion import joint_figure, pose_figure, tip_figure
 from .page import picture, provenance, render_page
-from .style import write_figures
 
 
 def side_by_side_table(plans: Sequence[ExcitationPlan]) -> Table:
@@ -88,7 +87,7 @@ def write_excitation(
     remarks: Sequence[Remark] = (),
     settings: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Write the page of a design and its figures; return the files.
+    """Write the page of a design; return the file.
 
     The motion with its leads is drawn where there is one. `settings` tell the origin of the design
     as in `provenance`.
@@ -98,13 +97,12 @@ def write_excitation(
     with double_precision():
         time = np.linspace(0.0, float(shown.duration), 801)
         motion = shown.motion(time)
-    figures = {
-        "path": path_figure(robot, motion, time),
-        "poses": pose_figure(robot, motion.q),
-        "joints": joint_figure(robot, plan.limits.limits, time, motion),
-        "end_effector": tip_figure(robot, time, motion),
-    }
-    captions = {"path": "Circle: start; square: end.", "poses": "Earlier poses are paler."}
+    limits = plan.limits.limits
+    speed, fastest = np.abs(np.asarray(motion.qd)), np.asarray(limits.velocity)
+    used = 100.0 * speed / np.where(np.isfinite(fastest), fastest, np.max(speed))
+    label = "speed [% of the limit]"
+    space = pose_figure(robot, motion.q, time=time, values=used, label=label)
+    figures = [joint_figure(robot, limits, time, motion), tip_figure(robot, time, motion)]
     criteria, deviations, *use = plan.tables()
     every = ordered((*plan_remarks(plan), *remarks))
     text = "A random motion that fills the same limits is shown beside this one."
@@ -112,7 +110,10 @@ def write_excitation(
         f"{robot.name}: a motion to record",
         [
             ("Verdict", [_headline(plan, remarks), every]),
-            ("The motion", [picture(f, captions.get(name, "")) for name, f in figures.items()]),
+            (
+                "The motion",
+                [picture(space, "Links are coloured by the speed of their joint."), *figures],
+            ),
             ("Use of the limits", use),
             ("Gain over a random motion", [text, criteria]),
             ("Expected standard deviations", [deviations]),
@@ -122,8 +123,7 @@ def write_excitation(
     )
     with atomic_folder(folder) as staging:
         (staging / "report.html").write_text(page, encoding="utf-8")
-        names = ["report.html", *write_figures(staging, figures)]
-    return [folder / name for name in names]
+    return [folder / "report.html"]
 
 
 def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:

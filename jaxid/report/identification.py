@@ -1,9 +1,12 @@
 """Page of an identification: verdict, task, estimates, errors; and the tables of its results."""
 
+import dataclasses
+import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
+from markupsafe import Markup
 
 from jaxid.identification.consistency.estimator import Consistency
 from jaxid.identification.fit_result import Fit
@@ -20,55 +23,192 @@ from jaxid.result_table import (
 )
 from jaxid.robot.robot import Robot
 
-from .page import provenance, render_page
-from .verdict import Report, verdict
+from .figure import Figure
+from .page import Section, folded, picture, provenance, render_page, tiles
+from .parameter_words import glossary, word_columns
+from .physics import gravity_table
+from .verdict import RMS_ERROR, Report, verdict
 
 
-def identification_page(report: Report, figures: Mapping[str, Figure], suffix: str = "svg") -> str:
-    """Return the page of an identification as HTML; figures have files with this suffix."""
+def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
+    """Return the page of an identification as HTML: what matters first, then the details."""
     fit, settings = report.fit, report.settings
     base, robot = fit.base, fit.base.model.robot
     overall, *criteria = verdict(report)
-    notes = [Remark(note) for note in report.every_note]
-    errors = (*report.identification, *report.verification)
-    lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
+    open_points = [r for r in criteria if r.status in (Status.BAD, Status.DOUBTFUL)]
+    others = [r for r in criteria if r not in open_points]
+    sections = [
+        (
+            "At a glance",
+            [
+                overall,
+                _three_numbers(report),
+                Table("", facts=_data(report)),
+                *([open_points] if open_points else []),
+                folded("What else was checked", others),
+            ],
+        ),
+        *_physics(report, figures),
+        ("Measured and predicted forces", _torques(figures, robot)),
+        ("Parameters in words", _parameters(fit)),
+        ("Details", [folded(name, *blocks) for name, blocks in _details(report, figures)]),
+    ]
+    logs = f"{len(fit.recordings)} log{'' if len(fit.recordings) == 1 else 's'}"
+    return render_page(
+        f"{robot.name}: identified model",
+        [*sections, provenance(settings)],
+        f"{base.size} base parameters of {robot.joints} joints, from {logs}.",
+        "All numbers: result.json and parameters.csv beside this page. Lines of long logs show the "
+        "least and the largest value of each pixel column, so that no peak is lost.",
+    )
+
+
+def _three_numbers(report: Report) -> Markup:
+    """Return the torque error, the mean error of the worst joint, and the known parameters."""
+    fit = report.fit
+    logs, which = report.verification, "on motion that the fit has not seen"
+    if not logs:
+        logs, which = report.identification, "on the motion of the fit: no other log was given"
+    error = max(e.relative for e in logs)
+    limits = np.searchsorted(np.array(RMS_ERROR) / 100.0, error)
+    status = (Status.GOOD, Status.DOUBTFUL, Status.BAD)[int(limits)]
+    worst = np.max([e.mean_percent for e in logs], axis=0)
+    second, joint = f"{significant(fit.condition_numbers.scaled)}", ""
+    meaning = "condition number: how well the motion tells the parameters apart"
+    if np.isfinite(worst).all():
+        joint = fit.base.model.robot.joint_names[int(np.argmax(worst))]
+        second = f"{percent(float(np.max(worst)) / 100.0)} %"
+        meaning = f"mean error of the worst joint, {joint}, of its largest torque"
+    known = f"{fit.trust.count(Status.GOOD)} of {fit.base.size}"
+    return tiles(
+        (f"{percent(error)} %", f"torque error (RMS) {which}", status),
+        (second, meaning, Status.NEUTRAL),
+        (known, "parameters known to 10 %", Status.BAD if fit.undetermined else Status.NEUTRAL),
+    )
+
+
+def _data(report: Report) -> list[tuple[str, str]]:
+    """Return robot, logs, estimator and total mass, each with its word."""
+    fit, robot = report.fit, report.fit.base.model.robot
+    facts = [("robot", f"{robot.name}, {robot.joints} joints")]
+    for word, logs in (
+        ("identified with", report.identification),
+        ("verified with", report.verification),
+    ):
+        for e in logs:
+            time = np.asarray(e.time)
+            length = significant(float(time[-1] - time[0]))
+            facts.append((word, f"{e.name}: {length} s, {len(time)} rows of each joint"))
+    facts.append(("estimator", words_of(fit.estimator)))
+    if fit.consistency is not None:
+        mass = np.asarray(fit.consistency.bodies)[:, 0]
+        loose = len(fit.consistency.masses_from_bounds)
+        proof = f", of which {loose} bodies follow from bounds too" if loose else ""
+        facts.append(
+            ("total mass of the moving bodies", f"{significant(float(mass.sum()))} kg{proof}")
+        )
+    else:
+        text = "forces tell combinations of masses only; physically consistent bodies have masses"
+        facts.append(("total mass", text))
+    if report.claimed_mass:
+        facts.append(("total mass by the robot's file", f"{significant(report.claimed_mass)} kg"))
+    return facts
+
+
+def _physics(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
+    """Return what the model says of the robot: in motion, before and after, friction, weight."""
+    sections: list[Section] = []
+    if "robot" in figures:
+        text = "Each link has the colour of the torque error of the joint that moves it, the path "
+        text += "of the end-effector that of the mean. Turn it, and move the slider."
+        sections.append(("The robot along the motion", [picture(figures["robot"], text)]))
+    if "before_and_after" in figures:
+        text = (
+            "Torque errors with the parameters that the robot's file claims (friction and rotors "
+            "count as zero where it claims none), and with those that were identified."
+        )
+        sections.append(("Before and after", [text, figures["before_and_after"]]))
+    text = (
+        "Lines: the model. Points: means over classes of speed of the measured forces, less all "
+        "that the model explains otherwise. Points far from their line ask for another shape."
+    )
+    sections.append(("Friction", [text, figures["friction"]]))
+    if "gravity" in figures:
+        log = report.verification[0] if report.verification else report.identification[0]
+        sections.append(("Weight", [gravity_table(report.fit, log), figures["gravity"]]))
+    return sections
+
+
+def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
+    """Return the figures of the recordings: with 42 panels at most, the first one unfolded."""
+    found: list[Any] = [figure for name, figure in figures.items() if name.startswith("torque_")]
+    shown = found[: max(1, 42 // robot.joints)]
+    # Many panels share the size of the page.
+    bins = min(shown[0].bins, 28_000 // sum(len(figure.panels) for figure in shown))
+    first, *others = (dataclasses.replace(figure, bins=bins) for figure in shown)
+    folds = [folded(f.title, dataclasses.replace(f, title="")) for f in others]
+    blocks: list[Any] = [first, *folds]
+    if left := len(found) - len(shown):
+        blocks.append(f"{left} more recordings are not shown here; result.json has their errors.")
+    return blocks
+
+
+def _parameters(fit: Fit) -> list[Any]:
+    """Return the estimates with their meanings, and the meanings of all symbols."""
+    base = fit.base
+    values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
+    columns = [
+        Column("parameter", base.names),
+        *word_columns(base),
+        Column("estimate", values, kind="number"),
+        Column("±", deviations, kind="number"),
+        Column("unit", base.units),
+        Column("±", fit.relative_standard_deviations, "%", percent),
+    ]
+    text = (
+        "* together with what forces cannot tell apart from it: see the combinations below. A "
+        "parameter near zero is never known to a few percent, and that is no fault."
+    )
+    table = Table("", *columns, status=fit.trust)
+    return [glossary(base), folded(f"All {base.size} estimates, in words", table, text)]
+
+
+def words_of(x: Any) -> str:
+    """Return the name of an object's class in words, as `least squares`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(x).__name__).lower()
+
+
+def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
+    """Return what experts ask for."""
+    fit, settings, robot = report.fit, report.settings, report.fit.base.model.robot
+    base, errors = fit.base, report.every_error
     task = [
         ("experiment", settings.get("experiment")),
-        ("identified with", ", ".join(settings.get("identification", ())) or None),
-        ("verified with", ", ".join(settings.get("verification", ())) or None),
         *((key, settings.get(key)) for key in ("split", "filter", "decimation")),
         ("estimator", fit.estimator),
-        ("solution", fit.solution),
         *fit.facts[:-1],
     ]
-    # 42 panels at most; the files of the others are named.
-    names = [name for name in figures if name.startswith("torque_")]
-    shown = max(1, 42 // robot.joints)
-    blocks: list[Figure | str] = [figures[name] for name in names[:shown]]
-    if others := ", ".join(f"{name}.{suffix}" for name in names[shown:]):
-        blocks.append(f"Figures of more recordings lie beside this page: {others}.")
     about = robot.summary()
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
     assumed = ", ".join(robot.limits.assumed) or "nothing"
     facts = [*about.facts, ("gravity [m/s²]", gravity), ("assumed", assumed)]
-    sections = [
-        ("Verdict", [overall, criteria]),
-        ("Task", [Table("", facts=[fact for fact in task if fact[1] is not None]), notes]),
+    lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
+    notes = [Remark(note) for note in report.every_note]
+    sections: list[Section] = [
+        ("Task and notes", [Table("", facts=[f for f in task if f[1] is not None]), notes]),
         ("Robot and drives", [Table("", *about.columns, facts=facts), *motor_tables(robot)]),
         (
-            "Errors",
+            "Torque errors",
             [
                 "Predicted less measured forces. Bars: the mean of their absolute values (Eq. 37, "
-                "Fig. 10 of the paper); marks: their RMS. In the tables, the offset is the mean "
-                "error, which a constant of the log explains; RMS values at rest and in motion are "
-                "those about it.",
+                "Fig. 10 of the paper); points: their RMS. The offset is the mean error, which a "
+                "constant of the log explains; RMS values at rest and in motion are about it.",
                 figures["errors"],
                 tuple(error_table(e, robot) for e in errors),
             ],
         ),
-        ("Measured and predicted forces", blocks),
         (
-            f"{base.size} base parameters",
+            f"{base.size} base parameters: intervals and combinations",
             [
                 *([fit.determination] if fit.undetermined else []),
                 figures["parameters"],
@@ -89,13 +229,7 @@ def identification_page(report: Report, figures: Mapping[str, Figure], suffix: s
         sections.append(("Residuals", [text, *shown, residual_table(fit.residual_spectra, robot)]))
     if "filter" in figures:
         sections.append(("Choice of the filter", [figures["filter"]]))
-    logs = f"{len(fit.recordings)} log{'' if len(fit.recordings) == 1 else 's'}"
-    return render_page(
-        f"{robot.name}: identified parameters",
-        [*sections, provenance(settings)],
-        f"{base.size} base parameters of {robot.joints} joints, from {logs}.",
-        "All numbers: result.json and parameters.csv beside this page.",
-    )
+    return sections
 
 
 def parameter_table(fit: Fit) -> Table:

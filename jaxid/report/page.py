@@ -7,13 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
-from jaxid.result_table import Remark, Status, Table, printable, versions
+from jaxid.result_table import (
+    Remark,
+    Status,
+    Table,
+    in_html,
+    marked_up,
+    printable,
+    versions,
+)
 
-from .style import svg_text
+from .figure import Figure
+from .interactive import charts, library
 
 STYLES = {
     Status.GOOD: "green",
@@ -34,17 +42,21 @@ def render_page(
     lead: str = "",
     footer: str = "",
 ) -> str:
-    """Return a page: readable without network and script, on a phone, on a desk and on paper.
+    """Return a page: one file that needs no network, for a phone, a desk and paper.
+
+    Its figures are drawn by the browser, from data and a library that the page holds.
 
     Blocks of a section are texts (paragraphs), tables, figures, a remark (the headline), lists of
-    remarks, tuples of blocks beside each other, and what `picture`, `code` and `folded` return.
+    remarks, tuples of blocks beside each other, and what `tiles`, `code` and `folded` return.
     All texts are escaped.
     """
     shown = [
         (name, re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-"), [*map(_render, blocks)])
         for name, blocks in sections
     ]
-    return printable(str(_macros().page(title, shown, lead, footer)))
+    drawn = any('class="chart"' in block for *_, blocks in shown for block in blocks)
+    code = library() if drawn else ""
+    return printable(str(_macros().page(title, shown, lead, footer, code)))
 
 
 def _render(block: Any) -> Markup:
@@ -55,23 +67,25 @@ def _render(block: Any) -> Markup:
         case str():
             return macros.paragraph(block)
         case Remark():
-            return macros.headline(block)
+            return Markup(in_html("headline", block))
         case Table():
-            return macros.table(block)
+            return Markup(in_html("table", block))
         case Figure():
             return picture(block)
         case tuple():
             return macros.abreast(*map(_render, block))
         case _:
-            return macros.remarks(block)
+            return Markup(in_html("remarks", block))
 
 
 def picture(figure: Figure, caption: str = "") -> Markup:
-    """Return a block with a figure, as the plotting library draws it, and a text below it."""
-    svg = svg_text(figure)
-    # Names of groups are the same in every figure of a page, and nothing refers to them.
-    svg = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
-    return _macros().picture(svg, figure.get_suptitle(), caption)
+    """Return a block with a figure, and a text below it."""
+    return _macros().figure(figure, charts(figure), caption)
+
+
+def tiles(*numbers: tuple[str, str, Status]) -> Markup:
+    """Return a block with large texts, what each of them is, and their judgement."""
+    return _macros().tiles(numbers)
 
 
 def code(text: str) -> Markup:
@@ -80,7 +94,7 @@ def code(text: str) -> Markup:
 
 
 def folded(summary: str, *blocks: Any) -> Markup:
-    """Return blocks that are shown when the reader opens them."""
+    """Return blocks that are shown when the reader opens them, and on paper."""
     return _macros().folded(summary, *map(_render, blocks))
 
 
@@ -102,11 +116,6 @@ def _macros() -> Any:
     # Commands that write no page do not wait for it.
     import jinja2
 
-    def aligned(number: str) -> str:
-        # Blanks behind a number become as wide as the digits and the point left out.
-        pointed = re.sub(r"^([^. ]*) ", "\\1\N{PUNCTUATION SPACE}", number)
-        return pointed.replace(" ", "\N{FIGURE SPACE}")
-
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True,
@@ -114,7 +123,7 @@ def _macros() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["aligned"] = aligned
+    environment.filters["marked_up"] = lambda text: Markup(marked_up(text))
     return environment.get_template("page.html").module
 
 

@@ -1,9 +1,9 @@
 # ruff: noqa: F401
 """Figures for notebooks and papers, as `jid.plot.torques(…)`.
 
-The figures of the paper: `path` (Figs. 3, 8), `joints` (Fig. 4), `filtered` (Fig. 5), `torques`
-(Figs. 6, 7, 9), `errors` (Fig. 10). All return a `matplotlib.figure.Figure`, and `save` writes it.
-`jaxid` loads this module, and matplotlib, when `jid.plot` is first used.
+The figures of the paper: `poses` (Figs. 3, 8), `joints` (Fig. 4), `filtered` (Fig. 5), `torques`
+(Figs. 6, 7, 9), `errors` (Fig. 10). Their method `save` writes `.html` to explore, or `.png`,
+`.pdf` or `.svg`; `matplotlib()` returns a `matplotlib.figure.Figure`; notebooks show a picture.
 """
 
 from .estimates_and_residuals import (
@@ -14,14 +14,12 @@ from .estimates_and_residuals import (
     residual_figure as residuals,
 )
 from .motion import (
-    animation as animation,
     filtered_figure as filtered,
     joint_figure as joints,
-    path_figure as path,
     pose_figure as poses,
     tip_figure as end_effector,
 )
-from .style import save as save
+from .physics import friction_figure as friction, gravity_figure as gravity
 from .torques import (
     bar_figure as bars,
     error_figure as errors,

@@ -11,17 +11,16 @@ from typing import Any
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 from jaxid.identification.estimators.regularisation_and_weights import LARGEST_UNCERTAINTY
 from jaxid.identification.fit_result import Fit, load
-from jaxid.identification.parameter_changes import LEVEL, Comparison, parameter_kinds
+from jaxid.identification.parameter_changes import LEVEL, Comparison, Verdict, parameter_kinds
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.io import atomic_folder, json_text, read_json
 from jaxid.model_validation import TorqueErrors
-from jaxid.result_table import Status, versions
+from jaxid.result_table import Remark, Status, Table, versions
 from jaxid.robot.robot import Robot
 
 from .estimates_and_residuals import (
@@ -31,9 +30,11 @@ from .estimates_and_residuals import (
     parameter_figure,
     residual_figure,
 )
+from .figure import Figure
 from .identification import identification_page
-from .style import save, write_figures
-from .torques import error_figure, torque_figure
+from .page import render_page
+from .physics import error_scene, friction_figure, gravity_figure
+from .torques import bar_figure, error_figure, torque_figure
 from .verdict import Report, verdict
 
 MODEL = "model.json"
@@ -47,17 +48,19 @@ Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]
 """Names, units, values and uncertainty of some estimates."""
 
 
-def write_report(folder: Path, report: Report, suffix: str = "svg") -> list[Path]:
-    """Write `report.html`, `result.json`, `parameters.csv`, `model.json` and figures; return them.
+def write_report(folder: Path, report: Report, suffix: str = "") -> list[Path]:
+    """Write `report.html`, `result.json`, `parameters.csv` and `model.json`; return them.
 
-    Figures are files of the format `suffix`: `svg`, `png` or `pdf`. A folder that exists keeps its
-    other files; files of an earlier report in it are replaced.
+    With a `suffix` (`svg`, `png` or `pdf`) each figure is also written to a file of that format. A
+    folder that exists keeps its other files; files of an earlier report in it are replaced.
     """
     record, figures = _record(report), _draw(report)
-    page = identification_page(report, figures, suffix)
+    page = identification_page(report, figures)
     names = ["report.html", "result.json", "parameters.csv", MODEL]
     with atomic_folder(folder, _earlier_files) as staging:
-        names += write_figures(staging, figures, suffix)
+        for stem, figure in figures.items() if suffix else ():
+            names.append(f"{stem}.{suffix}")
+            figure.save(staging / names[-1])
         write_json(staging / "result.json", {**record, "files": names})
         write_csv(staging / "parameters.csv", parameter_rows(report.fit))
         report.fit.save(staging / MODEL)
@@ -69,15 +72,23 @@ def _draw(report: Report) -> dict[str, Figure]:
     """Return all figures of a report by the names of their files, without suffix."""
     robot = report.fit.base.model.robot
     spectra = report.fit.residual_spectra
-    figures = {
+    figures: dict[str, Figure] = {
         "errors": error_figure(report.identification, report.verification, robot),
         "parameters": parameter_figure(report.fit),
+        "friction": friction_figure(report.fit, report.identification),
     }
+    longest = max(report.identification, key=lambda errors: len(errors.time))
+    shown = report.verification[0] if report.verification else longest
+    if shown.positions is not None:
+        figures["gravity"] = gravity_figure(report.fit, shown)
+        figures["robot"] = error_scene(report.fit, shown)
+    if report.claimed:
+        groups = (("by the robot's file", report.claimed), ("identified", report.every_error))
+        figures["before_and_after"] = bar_figure(groups, robot, "Torque errors before and after")
     if report.choice is not None:
         figures["filter"] = filter_figure(report.choice)
     if spectra is not None:
         figures["residuals"] = residual_figure(spectra, robot)
-        longest = max(report.identification, key=lambda errors: len(errors.time))
         figures["autocorrelation"] = autocorrelation_figure(longest, robot, spectra)
     used: set[str] = set()
     for role in ("identification", "verification"):
@@ -138,7 +149,7 @@ def read_faults(report: Path) -> list[str]:
 def write_comparison(
     folder: Path, comparison: Comparison, sources: Sequence[Path] = ()
 ) -> list[Path]:
-    """Write `comparison.json`, `comparison.csv` and `comparison.png`; return the files."""
+    """Write `report.html`, `comparison.json` and `comparison.csv`; return the files."""
     first = comparison.first
     second = comparison.second
     k = list(comparison.indices)
@@ -166,7 +177,15 @@ def write_comparison(
         "covariance_of_differences": comparison.uncertainty.covariance,
         "groups": comparison.groups,
     }
-    return _write_table(folder, "comparison", content, rows, comparison_figure(comparison))
+    count = f"{comparison.verdicts.count(Verdict.CHANGED)} of {len(k)} parameters have changed"
+    sections = [
+        ("Result", [Remark(count), comparison.group_summary()]),
+        ("Estimates side by side", [comparison_figure(comparison)]),
+        ("All parameters", [comparison.summary()]),
+    ]
+    title = f"{first.base.model.robot.name}: two runs compared"
+    lead = f"{first.name} and {second.name}"
+    return _write_table(folder, "comparison", content, rows, render_page(title, sections, lead))
 
 
 def write_estimates(
@@ -175,8 +194,13 @@ def write_estimates(
     estimates: Sequence[Estimates],
     content: Mapping[str, Any],
     sources: Mapping[str, Sequence[Path]],
+    tables: Sequence[Table],
+    doubts: Sequence[Remark] = (),
 ) -> list[Path]:
-    """Write a payload, gains or states as `{kind}.json` and `{kind}.csv`; return the files."""
+    """Write a payload, gains or states as a page, `{kind}.json` and `{kind}.csv`; return them.
+
+    The page shows the `tables`, and the `doubts` above them.
+    """
     rows = []
     for names, units, values, uncertainty in estimates:
         deviations = uncertainty.standard_deviations
@@ -195,22 +219,20 @@ def write_estimates(
         "covariance": estimates[0][-1].covariance,
         **content,
     }
-    return _write_table(folder, kind, everything, rows)
+    logs = Table("", facts=[(key, ", ".join(map(str, paths))) for key, paths in sources.items()])
+    blocks = [*([doubts] if doubts else []), *tables]
+    page = render_page(f"{kind.capitalize()}: results", [("Result", blocks), ("Logs", [logs])])
+    return _write_table(folder, kind, everything, rows, page)
 
 
 def _write_table(
-    folder: Path,
-    stem: str,
-    content: Mapping[str, Any],
-    rows: list[dict[str, Any]],
-    figure: Figure | None = None,
+    folder: Path, stem: str, content: Mapping[str, Any], rows: list[dict[str, Any]], page: str
 ) -> list[Path]:
-    names = [f"{stem}.json", f"{stem}.csv", *([f"{stem}.png"] if figure else [])]
+    names = ["report.html", f"{stem}.json", f"{stem}.csv"]
     with atomic_folder(folder) as staging:
-        write_json(staging / names[0], plain({**header(names[0]), **content}))
-        write_csv(staging / names[1], rows)
-        if figure is not None:
-            save(figure, staging / names[2])
+        (staging / names[0]).write_text(page, encoding="utf-8")
+        write_json(staging / names[1], plain({**header(names[1]), **content}))
+        write_csv(staging / names[2], rows)
     return [folder / name for name in names]
 
 

@@ -45,6 +45,9 @@ class Report:
         doubts: Findings on the logs that deserve attention, as sentences.
         mistakes: Likely mistakes in the description of the logs or the robot, as sentences.
         choice: Choice of the filter, where it was left to the logs.
+        claimed: Errors of the parameters that the robot's file claims, on all logs; empty if it
+            claims none.
+        claimed_mass: Mass of all bodies that the robot's file claims [kg]; 0 if it claims none.
     """
 
     fit: Fit
@@ -56,6 +59,13 @@ class Report:
     doubts: Sequence[str] = ()
     mistakes: Sequence[str] = ()
     choice: FilterChoice | None = None
+    claimed: Sequence[TorqueErrors] = ()
+    claimed_mass: float = 0.0
+
+    @property
+    def every_error(self) -> tuple[TorqueErrors, ...]:
+        """Errors on all logs."""
+        return (*self.identification, *self.verification)
 
     @property
     def every_note(self) -> tuple[str, ...]:

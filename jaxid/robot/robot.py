@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Numbers, as_array, given, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.result_table import Column, Table
+from jaxid.result_table import Column, Summarised, Table
 
 from .inertia import Inertia
 from .limits_and_drives import FARTHEST, Drives, Limits, far_notes, limit_notes
@@ -59,7 +59,7 @@ class Tool(eqx.Module):
         return self.body_inertia.parameters
 
 
-class Robot(eqx.Module):
+class Robot(Summarised, eqx.Module):
     r"""An open kinematic chain or tree: joint $i$ moves body $i$ against its parent.
 
     The frame of a body has its origin on the joint's axis. At $q_i = 0$ it is placed in its parent
@@ -307,9 +307,6 @@ class Robot(eqx.Module):
             facts=facts,
             remarks=self.notes,
         )
-
-    def __str__(self) -> str:
-        return str(self.summary())
 
 
 def _checked(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:

@@ -15,8 +15,6 @@ from golden_results import TOLERANCE, command, compare, golden, numbers_of_repor
 
 import jaxid as jid
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory):
@@ -25,7 +23,6 @@ def example(tmp_path_factory):
     return folder
 
 
-@pytest.mark.usefixtures("blank_figures")
 def test_example(example, tmp_path):
     logs = (example / "identification.csv", "--verify", example / "verification.csv")
     command("identify", example / "experiment.toml", *logs, "-o", tmp_path / "report")

@@ -13,8 +13,6 @@ from golden_results import command, compare, numbers_of_report
 import jaxid as jid
 from jaxid.experiment.experiment import load_experiment
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 HERE = Path(__file__).resolve().parent
 
 

@@ -1,20 +1,22 @@
-"""Figures: what they show and where it stands, not their pixels; for small robots and logs."""
+"""Figures: what they show, on a page and on paper; for small robots and logs."""
 
+import base64
 import dataclasses
+import gzip
+import json
 import sys
 
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_hex
-from PIL import Image
 
 import jaxid as jid
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.estimates_and_residuals import autocorrelation
-from jaxid.report.style import BLUE, ERROR, GREY, MEASURED, ORANGE, PREDICTED
-from jaxid.report.torques import decimate
+from jaxid.report.figure import BLUE, ORANGE, decimate
+from jaxid.report.interactive import charts, library
+from jaxid.report.parameter_words import in_words
+from jaxid.report.physics import gravity_forces
 
 T = np.linspace(0.0, 2.0, 101)
 
@@ -23,18 +25,23 @@ def arm_of(joints):
     return jid.robots.planar_arm(joints)
 
 
-def line(axes, colour):
-    (found,) = [x for x in axes.get_lines() if x.get_color() == colour]
+def curve(panel, name):
+    (found,) = [c for c in panel.curves if c.name == name]
     return found
 
 
-def heights(figure, colour):
-    bars = figure.axes[0].patches
-    return [p.get_height() for p in bars if to_hex(p.get_facecolor()) == colour.lower()]
+def unpacked(figure):
+    """What the browser reads: the content of each chart."""
+    return [json.loads(gzip.decompress(base64.b64decode(c["content"]))) for c in charts(figure)]
 
 
-def require_everything_inside(figure):
-    """No text is cut off by the edge, and no panel's title touches another panel or title."""
+def numbers(packed):
+    return np.frombuffer(base64.b64decode(packed["bdata"]), packed["dtype"])
+
+
+def require_everything_inside(shown):
+    """On paper no text is cut off by the edge, and no panel's title touches another panel."""
+    figure = shown.matplotlib()
     figure.canvas.draw()
     page, to_inches = figure.bbox_inches, figure.dpi_scale_trans.inverted()
     texts = [t.get_window_extent().transformed(to_inches) for t in figure.texts]
@@ -52,17 +59,35 @@ def require_everything_inside(figure):
 def test_torques_show_what_was_measured_and_predicted(fit, validation):
     errors, robot = validation.errors[0], fit.base.model.robot
     figure = jid.plot.torques(errors, robot)
-    assert len(figure.axes) == 4
     for j, (unit, word) in enumerate((("N", "force"), ("N m", "torque"))):
-        upper, lower = figure.axes[2 * j : 2 * j + 2]
-        np.testing.assert_array_equal(line(upper, MEASURED).get_ydata(), errors.measured[:, j])
-        np.testing.assert_array_equal(line(upper, PREDICTED).get_ydata(), errors.predicted[:, j])
-        np.testing.assert_array_equal(line(lower, ERROR).get_ydata(), errors.errors[:, j])
-        assert upper.get_title(loc="left") == robot.joint_names[j]
-        assert (upper.get_ylabel(), lower.get_ylabel()) == (f"{word} [{unit}]", f"[{unit}]")
-        said = upper.get_title(loc="right").split(f" {unit} = ")[1].split(" %")[0]
+        upper, lower = figure.panels[j].parts
+        np.testing.assert_array_equal(curve(upper, "measured").y, errors.measured[:, j])
+        np.testing.assert_array_equal(curve(upper, "predicted").y, errors.predicted[:, j])
+        np.testing.assert_array_equal(lower.curves[0].y, errors.errors[:, j])
+        assert upper.title == robot.joint_names[j]
+        assert (upper.y_label, lower.y_label) == (f"{word} [{unit}]", f"[{unit}]")
+        said = upper.value.split(f" {unit} = ")[1].split(" %")[0]
         assert float(said) == pytest.approx(errors.mean_percent[j], rel=0.06)
     require_everything_inside(figure)
+    names = [name for name, _ in figure.legend]
+    for shown, j in zip(unpacked(figure), range(2), strict=True):
+        assert [trace["name"] for trace in shown["data"]] == names
+        y = numbers(shown["data"][0]["y"])
+        np.testing.assert_array_equal(y, errors.measured[:, j].astype("f4"))
+        assert [trace["yaxis"] for trace in shown["data"]] == ["y", "y", "y2"]
+
+
+def test_a_page_keeps_the_peaks_of_a_long_log(errors_of):
+    errors = errors_of(2, rows=60_000)
+    errors.predicted[40_001, 1] = 1e4
+    _, second = unpacked(jid.plot.torques(errors, arm_of(2)))
+    measured, predicted, difference = (numbers(trace["y"]) for trace in second["data"])
+    assert len(measured) <= 4000
+    assert predicted.max() == np.float32(1e4)
+    assert difference.max() == np.float32(errors.errors[:, 1].max())
+    assert [second["data"][k]["x"] for k in (1, 2)] == [0, 0], "the same abscissas"
+    times = numbers(second["data"][0]["x"])
+    assert abs(times[np.argmax(predicted)] - errors.time[40_001]) < 2 * 600.0 / 2000
 
 
 def test_long_names_fit_on_the_page(errors_of):
@@ -80,30 +105,29 @@ def test_long_names_fit_on_the_page(errors_of):
 
 def test_residuals_stand_beside_white_ones(fit):
     spectra = fit.residual_spectra
-    figure = jid.plot.residuals(spectra, fit.base.model.robot)
-    for j, axes in enumerate(figure.axes):
-        own, white = line(axes, BLUE), line(axes, GREY).get_ydata()
-        shown = np.isin(np.asarray(spectra.frequency), own.get_xdata())
-        np.testing.assert_array_equal(own.get_ydata(), np.asarray(spectra.density)[j][shown])
-        np.testing.assert_allclose(white.sum(), own.get_ydata().sum())
-        assert axes.get_ylabel() == ("N²/Hz", "(N m)²/Hz")[j]
-        assert ("not white" in axes.get_title(loc="right")) != spectra.white[j]
-    require_everything_inside(figure)
+    for j, panel in enumerate(jid.plot.residuals(spectra, fit.base.model.robot).panels):
+        own, white = panel.curves
+        shown = np.isin(np.asarray(spectra.frequency), own.x)
+        np.testing.assert_array_equal(own.y, np.asarray(spectra.density)[j][shown])
+        np.testing.assert_allclose(white.y.sum(), own.y.sum())
+        assert panel.unit == ("N²/Hz", "(N m)²/Hz")[j]
+        assert ("not white" in panel.value) != spectra.white[j]
 
 
 def test_bars_are_percents_of_the_largest_forces(errors_of):
     first, second = errors_of(3, seed=1), errors_of(3, seed=2)
-    figure = jid.plot.errors((first,), (second,), arm_of(3))
-    np.testing.assert_allclose(heights(figure, BLUE), first.mean_percent)
-    np.testing.assert_allclose(heights(figure, ORANGE), second.mean_percent)
-    marks = [x.get_ydata() for x in figure.axes[0].get_lines() if x.get_marker() == "D"]
+    (panel,) = jid.plot.errors((first,), (second,), arm_of(3)).panels
+    bars = {c.colour: c.y for c in panel.curves if c.kind == "bars"}
+    np.testing.assert_allclose(bars[BLUE], first.mean_percent)
+    np.testing.assert_allclose(bars[ORANGE], second.mean_percent)
+    marks = [c.y for c in panel.curves if c.name == "RMS"]
     np.testing.assert_allclose(marks, [first.rms_percent, second.rms_percent])
-    assert figure.axes[0].get_ylabel() == "error [% of the largest force]"
+    assert panel.unit == "% of the largest force"
     unknown = dataclasses.replace(first, max_forces=np.array([50.0, np.nan, 50.0]))
-    figure = jid.plot.errors((unknown,), (), arm_of(3))
-    np.testing.assert_allclose(heights(figure, BLUE), 100 * first.mean / first.force_rms)
-    assert figure.axes[0].get_ylabel() == "error [% of RMS force]"
-    assert not heights(figure, ORANGE)
+    (panel,) = jid.plot.errors((unknown,), (), arm_of(3)).panels
+    np.testing.assert_allclose(panel.curves[0].y, 100 * first.mean / first.force_rms)
+    assert panel.unit == "% of RMS force"
+    assert [c.kind for c in panel.curves] == ["bars", "points"]
 
 
 def test_long_lines_keep_every_peak_and_their_ends_and_short_ones_all_points():
@@ -141,47 +165,97 @@ def motion():
     return jid.Motion(q, qd, qdd)
 
 
-def test_the_path_is_that_of_the_tip_and_its_colours_are_speeds(motion):
-    robot = arm_of(2)
-    tip, speed, _ = (np.asarray(x) for x in jid.constraints.tip_motion(robot, motion))
+def test_the_robot_in_space_is_a_chain_to_its_tip_coloured_by_values(motion):
+    robot, values = arm_of(2), np.stack([T, 2.0 * T], axis=1)
+    figure = jid.plot.poses(robot, motion.q, T, values, "load [%]")
     first, both = motion.q[:, 0], motion.q.sum(axis=1)
+    elbow = np.hypot(np.cos(first), np.sin(first))
     planar = np.hypot(np.cos(first) + np.cos(both), np.sin(first) + np.sin(both))
-    np.testing.assert_allclose(np.linalg.norm(tip, axis=1), planar, atol=1e-12)
-    figure = jid.plot.path(robot, motion, T)
-    (line,) = [c for c in figure.axes[0].collections if c.get_array() is not None]
-    np.testing.assert_allclose(np.array(line._segments3d)[:, 0], tip[:-1], atol=1e-12)
-    numerical = np.linalg.norm(np.gradient(tip, T, axis=0), axis=1)
-    middle = 0.5 * (numerical[1:] + numerical[:-1])
-    np.testing.assert_allclose(np.asarray(line.get_array())[2:-2], middle[2:-2], atol=5e-3)
-    fastest = np.linalg.norm(speed, axis=1).max()
-    assert f"up to {fastest:.3g}" in figure.texts[0].get_text()
+    lines = figure.scene.bones
+    np.testing.assert_allclose(np.linalg.norm(lines[:, 1, 1], axis=1), elbow, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(lines[:, -1, 1], axis=1), planar, atol=1e-12)
+    np.testing.assert_array_equal(lines[:, 1:, 0], lines[:, :-1, 1], err_msg="a chain")
+    (shown,) = unpacked(figure)
+    frames = shown["frames"]
+    assert len(frames["points"]) == len(frames["time"]) == len(T)
+    pose, colours = frames["points"][7], numbers(frames["colours"][7])
+    x = numbers(pose["x"]).reshape(-1, 3)
+    np.testing.assert_allclose(x[:, :2], lines[7, :, :, 0], atol=1e-6)
+    assert np.isnan(x[:, 2]).all()
+    # The line from each joint has that joint's colour; the one from the ground has none.
+    np.testing.assert_allclose(colours[::3], [0.0, T[7], 2.0 * T[7]], atol=1e-6)
+    np.testing.assert_allclose(numbers(shown["data"][0]["line"]["color"]), 1.5 * T, atol=1e-6)
+    require_everything_inside(figure)
 
 
-def test_poses_show_joints_capsules_and_what_stands_still(motion):
+def test_motions_are_drawn_between_their_limits(motion):
     robot = arm_of(2)
-    shapes = (
-        jid.collision.Capsule("link", 1, start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), radius=0.1),
-        jid.collision.Capsule("post", -1, start=(0.0, 1.5, 0.0), end=(0.0, 2.5, 0.0), radius=0.2),
+    limits = jid.Limits(2, velocity=[2.0, np.inf])
+    for j, panel in enumerate(jid.plot.joints(robot, limits, T, motion).panels):
+        for part, values in zip(panel.parts, (motion.q, motion.qd, motion.qdd), strict=True):
+            np.testing.assert_array_equal(part.curves[0].y, values[:, j])
+        assert [len(part.levels) for part in panel.parts] == [0, 2 - 2 * j, 0]
+    position, speed, _ = jid.plot.end_effector(robot, T, motion).panels
+    tip = np.stack([c.y for c in position.curves], axis=1)
+    numerical = np.linalg.norm(np.gradient(tip, T, axis=0), axis=1)
+    np.testing.assert_allclose(speed.curves[0].y[2:-2], numerical[2:-2], atol=5e-3)
+
+
+def test_friction_is_that_of_the_estimates_and_of_the_log(fit, validation):
+    estimates = dict(zip(fit.base.names, np.asarray(fit.parameters), strict=True))
+    figure = jid.plot.friction(fit, validation.errors)
+    assert [panel.x for panel in figure.panels] == ["speed [m/s]", "speed [rad/s]"]
+    for j, panel in enumerate(figure.panels, 1):
+        model, points = curve(panel, "model"), panel.curves[-1]
+        fast = np.abs(model.x) > 0.1
+        expected = estimates[f"fv{j}"] * model.x + estimates[f"fc{j}"] * np.sign(model.x)
+        np.testing.assert_allclose(model.y[fast], expected[fast], rtol=1e-6)
+        fast = np.abs(points.x) > 0.2 * model.x.max()
+        own = np.interp(points.x[fast], model.x, model.y)
+        np.testing.assert_allclose(points.y[fast], own, atol=0.15 * np.abs(model.y).max())
+        band = curve(panel, "95 % band")
+        assert (band.low <= model.y).all()
+        assert (band.high >= model.y).all()
+
+
+def test_weight_is_the_slope_of_the_potential_energy(fit):
+    p = dict(zip(fit.base.names, np.asarray(fit.parameters), strict=True))
+    q = np.stack([np.linspace(-1.0, 1.0, 9), np.linspace(-2.0, 2.0, 9)], axis=1)
+    # The pendulum turns about y: its centre of mass has the height z cos q - x sin q.
+    slope = -9.81 * (p["mx2"] * np.cos(q[:, 1]) + p["mz2"] * np.sin(q[:, 1]))
+    found = gravity_forces(fit, q)
+    np.testing.assert_allclose(found[:, 1], slope, atol=1e-9)
+    np.testing.assert_allclose(found[:, 0], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "place"),
+    [
+        ("C1", "moment of inertia about z", "body 1, moved by joint rail"),
+        ("my2", "mass times y of the centre of mass", "body 2, moved by joint swing_$1_$"),
+        ("D2", "product of inertia in y, z", "body 2, moved by joint swing_$1_$"),
+        ("fo1", "constant offset: of the sensor, or of friction", "joint rail"),
+        ("sm2_1", "ripple: sine, 2 times a turn of the motor", "joint rail"),
+        ("odd9", "effect of a model of your own", ""),
+    ],
+)
+def test_parameters_are_named_in_words(fit, name, words, place):
+    assert in_words(name, fit.base.model.robot) == (words, place)
+
+
+def test_every_standard_parameter_has_words(fit):
+    terms = (
+        jid.terms.AsymmetricViscousFriction(),
+        jid.terms.StribeckFriction(),
+        jid.terms.SquareRootFriction(),
+        jid.terms.LinearSpring(),
+        jid.terms.TorqueRipple(),
     )
-    collision = jid.collision.CollisionModel(robot, shapes, pairs=(("link", "post"),))
-    (axes,) = jid.plot.poses(robot, motion.q, collision, poses=4).axes
-    polygons = [c for c in axes.collections if isinstance(c, PolyCollection)]
-    bones = [c for c in axes.collections if isinstance(c, LineCollection)][1:]
-    # What stands still once; capsules and joints in each pose.
-    assert [len(p.get_paths()) for p in polygons] == [1, 1, 2, 1, 2, 1, 2, 1, 2]
-    strengths = [b.get_alpha() for b in bones]
-    assert strengths == sorted(strengths)
-    last = np.array(bones[-1].get_segments())
-    np.testing.assert_allclose(last[1:, 0], last[:-1, 1], atol=1e-12, err_msg="a chain")
-    # The stick figure ends where the drawn path does.
-    np.testing.assert_allclose(last[-1, 1], axes.lines[0].get_xydata()[-1], atol=1e-12)
-
-
-def test_the_animation_has_its_frames_and_its_time(motion, tmp_path):
-    jid.plot.animation(tmp_path / "arm.gif", arm_of(2), T, motion.q, frames=5)
-    with Image.open(tmp_path / "arm.gif") as picture:
-        assert picture.n_frames == 5
-        assert picture.info["duration"] == pytest.approx(500.0, abs=10.0)
+    robot = fit.base.model.robot
+    for name in jid.Model(robot, (*jid.Model(robot).terms, *terms[:1])).parameter_names:
+        assert "your own" not in in_words(name, robot)[0]
+    for name in jid.Model(robot, (jid.RigidBodies(), *terms[1:])).parameter_names:
+        assert "your own" not in in_words(name, robot)[0]
 
 
 def test_autocorrelation_is_that_of_the_plain_formula(errors_of):
@@ -199,20 +273,25 @@ def test_autocorrelation_is_that_of_the_plain_formula(errors_of):
         np.testing.assert_allclose(found[:, j], np.array(products) / products[0], atol=1e-12)
     assert abs(found[1] - 0.7).max() < 0.12
     figure = jid.plot.autocorrelation(errors, arm_of(2))
-    drawn = figure.axes[0].get_lines()[1].get_ydata()
+    drawn = curve(figure.panels[0], "residuals").y
     np.testing.assert_allclose(drawn[:6], found[:, 0], atol=1e-12)
 
 
-def test_files_are_the_same_each_time_and_leave_figure_and_settings_alone(errors_of, tmp_path):
+def test_files_are_the_same_each_time_and_leave_settings_alone(errors_of, tmp_path):
     before = dict(matplotlib.rcParams)
-    figures = [jid.plot.bars((("a", (errors_of(2),)),), arm_of(2)) for _ in range(2)]
-    canvas, dpi = figures[0].canvas, figures[0].dpi
-    for suffix in (".png", ".pdf", ".svg"):
-        files = [tmp_path / f"{name}{suffix}" for name in "abc"]
-        for file, figure in zip(files, (*figures, figures[0]), strict=True):
-            jid.plot.save(figure, file)
+    figure = jid.plot.bars((("a", (errors_of(2),)),), arm_of(2))
+    for suffix in (".png", ".pdf", ".svg", ".html"):
+        files = [tmp_path / f"{name}{suffix}" for name in "ab"]
+        for file in files:
+            figure.save(file)
         assert len({file.read_bytes() for file in files}) == 1
-    assert (figures[0].canvas, figures[0].dpi) == (canvas, dpi)
+    assert figure._repr_png_().startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
     if "matplotlib.pyplot" in sys.modules:
         assert sys.modules["matplotlib.pyplot"].get_fignums() == []
+
+
+def test_the_page_holds_the_whole_library():
+    code = gzip.decompress(base64.b64decode(library()))
+    assert b"plotly.js" in code[:200]
+    assert len(library()) < 2_100_000

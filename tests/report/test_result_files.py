@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxid.identification.parameter_changes import Verdict, compare
-from jaxid.report import result_files, style
+from jaxid.report import result_files
+from jaxid.report.figure import Figure
 from jaxid.report.result_files import (
     consistency_record,
     plain,
@@ -23,12 +24,11 @@ from jaxid.report.verdict import Report
 @pytest.fixture
 def quick(monkeypatch):
     """Figures and pages are tested elsewhere."""
-    monkeypatch.setattr(style, "save", lambda figure, path: path.write_bytes(b"figure"))
-    monkeypatch.setattr(style, "svg_text", lambda figure: "figure")
+    monkeypatch.setattr(Figure, "save", lambda figure, path: path.write_bytes(b"figure"))
     monkeypatch.setattr(result_files, "identification_page", lambda *_: "page")
 
 
-def report(folder, fit, validation, suffix="svg", **changes):
+def report(folder, fit, validation, suffix="", **changes):
     arguments = {
         "identification": validation.errors[:1],
         "verification": validation.errors[1:],
@@ -51,7 +51,8 @@ def names(folder):
 
 
 def test_writes_all_files_with_their_parents(written):
-    figures = ("autocorrelation", "errors", "parameters", "residuals")
+    figures = ("autocorrelation", "errors", "friction", "gravity", "parameters", "residuals")
+    figures += ("robot",)
     figures += ("torque_first-run", "torque_second")
     expected = ["model.json", "parameters.csv", "report.html", "result.json"]
     expected += [f"{name}.png" for name in figures]
@@ -121,7 +122,7 @@ def test_a_new_report_takes_the_place_of_the_old_one(tmp_path, fit, validation, 
     for name in ("log.csv", "torque_mine.svg"):
         (tmp_path / name).write_text("mine")
     report(tmp_path, fit, validation, suffix="pdf")
-    report(tmp_path, fit, validation, verification=())
+    report(tmp_path, fit, validation, suffix="svg", verification=())
     assert "torque_second.svg" not in names(tmp_path)
     assert "torque_first-run.svg" in names(tmp_path)
     assert not [name for name in names(tmp_path) if name.endswith(".pdf")]
@@ -133,7 +134,7 @@ def test_recordings_of_one_name_keep_their_figures_apart(
     tmp_path, fit, validation, quick, errors_of
 ):
     same = tuple(dataclasses.replace(errors_of(2), name=name) for name in ("Run", "run", "run"))
-    report(tmp_path, fit, validation, identification=same[:1], verification=same[1:])
+    report(tmp_path, fit, validation, "svg", identification=same[:1], verification=same[1:])
     figures = [n for n in names(tmp_path) if n.startswith("torque")]
     assert len({n.lower() for n in figures}) == 3
     assert "torque_run_verification.svg" in figures
@@ -141,15 +142,15 @@ def test_recordings_of_one_name_keep_their_figures_apart(
 
 def test_comparisons_hold_the_numbers_exactly(tmp_path, changed):
     files = write_comparison(tmp_path / "out", changed)
-    assert [p.name for p in files] == ["comparison.json", "comparison.csv", "comparison.png"]
-    content = json.loads(files[0].read_text(encoding="utf-8"))
+    assert [p.name for p in files] == ["report.html", "comparison.json", "comparison.csv"]
+    content = json.loads(files[1].read_text(encoding="utf-8"))
     assert content["schema"] == "jaxid-comparison/1"
     assert [r["difference"] for r in content["parameters"]] == changed.difference.tolist()
     assert content["groups"][1]["changed"] is True
-    with files[1].open(encoding="utf-8", newline="") as file:
+    with files[2].open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [float(r["half_width"]) for r in rows] == changed.half_widths.tolist()
-    assert files[2].read_bytes().startswith(b"\x89PNG")
+    assert all(name in files[0].read_text(encoding="utf-8") for name in changed.names)
 
 
 @pytest.mark.parametrize(

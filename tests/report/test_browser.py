@@ -1,0 +1,106 @@
+"""Pages in a real browser: nothing is cut off or overlaps, no error, zoom and legends work."""
+
+import shutil
+import subprocess
+
+import pytest
+from browser import CHROMIUM, Browser
+
+pytest.importorskip("websockets.sync.client")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    browser = Browser()
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def pages(written, changed, tmp_path_factory):
+    """An identification, and a comparison."""
+    from jaxid.report.result_files import write_comparison
+
+    folder = tmp_path_factory.mktemp("comparison") / "out"
+    page, *_ = write_comparison(folder, changed)
+    return {"identification": written / "report.html", "comparison": page}
+
+
+@pytest.mark.parametrize("name", ["identification", "comparison"])
+@pytest.mark.parametrize("width", [390, 768, 1280])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_cut_off(browser, pages, name, width, scheme):
+    browser.look(width, scheme)
+    browser.open(pages[name])
+    assert browser.evaluate("drawAll()") == 0
+    assert browser.evaluate("faults()") == []
+    assert browser.errors == []
+
+
+def test_dark_pages_are_dark(browser, pages):
+    ink, light = "getComputedStyle(document.querySelector('.xtick text')).fill", []
+    inks = set()
+    for scheme in ("light", "dark"):
+        browser.look(1280, scheme)
+        browser.open(pages["comparison"])
+        browser.evaluate("drawAll()")
+        ground = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+        light.append(sum(map(int, ground[4:-1].split(","))) > 382)
+        inks.add(browser.evaluate(ink))
+    assert light == [True, False]
+    assert len(inks) == 2
+
+
+@pytest.fixture
+def opened(browser, pages):
+    browser.look(1280)
+    browser.open(pages["identification"])
+    browser.evaluate("drawAll()")
+    return browser
+
+
+def test_zooming_one_joint_with_the_mouse_zooms_all(opened):
+    first, second = opened.evaluate("ranges()")
+    assert first == second
+    left, right, height = opened.evaluate("firstPanel()")
+    middle = 0.5 * (left + right)
+    steps = [("Moved", left, 0), ("Pressed", left, 1), ("Moved", middle, 1), ("Moved", right, 1)]
+    for kind, x, buttons in (*steps, ("Released", right, 0)):
+        button = "none" if kind == "Moved" else "left"
+        event = {"x": x, "y": height, "button": button, "buttons": buttons, "clickCount": 1}
+        opened.call("Input.dispatchMouseEvent", type=f"mouse{kind}", **event)
+    opened.wait(f"ranges().every((range) => range[0] > {first[0]} && range[1] < {first[1]})")
+    expected = [0.75 * first[0] + 0.25 * first[1], 0.25 * first[0] + 0.75 * first[1]]
+    for zoomed in opened.evaluate("ranges()"):
+        assert zoomed == pytest.approx(expected, abs=0.02)
+
+
+def test_legends_switch_curves_and_come_back(opened):
+    press = "torques().querySelector('[data-curve=measured]').click()"
+    assert opened.evaluate("shown()") == [3, 3]
+    opened.evaluate(press)
+    assert opened.evaluate("shown()") == [2, 2]
+    opened.evaluate(press)
+    assert opened.evaluate("shown()") == [3, 3]
+
+
+def test_the_robot_moves_with_the_slider(opened):
+    assert opened.evaluate("slide(3)") != opened.evaluate("slide(70)")
+
+
+def test_paper_has_every_figure_and_what_was_folded(browser, pages, tmp_path):
+    browser.look(1280)
+    browser.open(pages["identification"])
+    folded = browser.evaluate("document.querySelectorAll('details:not([open])').length")
+    assert folded > 3
+    browser.pdf(tmp_path / "page.pdf")
+    browser.wait("document.querySelectorAll('.chart:not(.drawn)').length === 0")
+    assert browser.errors == []
+    # After printing the page is as it was.
+    assert browser.evaluate("document.querySelectorAll('details:not([open])').length") == folded
+    if shutil.which("pdftotext"):
+        command = ["pdftotext", "-layout", tmp_path / "page.pdf", "-"]
+        text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        assert "Residuals" in text
+        assert "frequency [Hz]" in text
