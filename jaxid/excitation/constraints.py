@@ -1,5 +1,6 @@
 """Constraints of a motion beside the limits of the joints: forces, end-effector, collisions."""
 
+import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
@@ -136,28 +137,44 @@ class Clearance(AbstractConstraint):
 
     Attributes:
         model: Shapes and pairs.
-        distance: Least distance between surfaces [m].
+        distance: Least distance between surfaces [m]; half of the largest one of two bodies that
+            are nearer in every pose.
     """
 
     model: CollisionModel
     distance: float = 0.03
 
+    @property
+    def distances(self) -> Float[np.ndarray, " pairs"]:
+        """Least distance of each pair [m]."""
+        return np.minimum(self.distance, 0.5 * np.array(self.model.room))
+
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the missing distance of each pair."""
         ends = eqx.Partial(self.model.ends, robot)
         axes = on_samples(ends, ends.__call__, motion.q)
-        return (self.distance - self.model.clearances(axes)) / 0.1
+        gaps = self.model.clearances(axes)
+        return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / 0.1
 
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the pairs."""
 
-        def usage(value: float) -> float:
-            left = self.distance - 0.1 * value
-            return self.distance / left if left > 0 else math.inf
+        def usage(value: float, distance: float) -> float:
+            left = distance - 0.1 * value
+            return distance / left if left > 0 else math.inf
 
         return tuple(
-            Finding(f"the clearance of {name}", 0.1, "m", self.distance, least=True, usage=usage)
-            for name in self.model.pair_names
+            Finding(
+                f"the clearance of {name}",
+                0.1,
+                "m",
+                distance,
+                least=True,
+                usage=functools.partial(usage, distance=distance),
+            )
+            for name, distance in zip(
+                self.model.pair_names, self.distances.tolist(), strict=True
+            )
         )
 
 

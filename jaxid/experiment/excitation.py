@@ -23,9 +23,9 @@ from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, 
 from jaxid.trajectory.leads import with_leads
 from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
 
-from .collision_check import collision_remarks
 from .decoder import within
 from .experiment import Experiment
+from .motion_check import gravity_fault, motion_checks
 from .robot_tables import named
 
 
@@ -46,6 +46,18 @@ class Nominal(NamedTuple):
     def force_limits(self, base: BaseParameters, margin: float) -> ForceLimits:
         """Return the limits of forces that these parameters need."""
         return ForceLimits(base, np.nan_to_num(self.parameters), self.covariance, margin)
+
+
+class Limited(NamedTuple):
+    """Constraints of a motion beside the limits of the joints, and why they leave out forces.
+
+    Attributes:
+        constraints: The constraints.
+        fault: Why forces are no part of them; empty if they are.
+    """
+
+    constraints: tuple[AbstractConstraint, ...]
+    fault: str
 
 
 class Design(NamedTuple):
@@ -80,6 +92,7 @@ def design_motion(
     table = experiment.excitation
     with within("excitation", experiment.path.name):
         nominal = find_nominal(experiment)
+        limited = find_constraints(experiment, nominal)
         plan = design_excitation(
             experiment.base,
             criterion=table.objective,
@@ -89,9 +102,9 @@ def design_motion(
             progress=progress,
             state=state,
             resume=resume,
-            **_settings(experiment, nominal),
+            **_settings(experiment, nominal, limited),
         )
-        return _add_leads(experiment, plan, nominal)
+        return _add_leads(experiment, plan, nominal, limited)
 
 
 def compare_criteria(
@@ -99,6 +112,8 @@ def compare_criteria(
 ) -> list[ExcitationPlan]:
     """Design by every criterion, from few starts and without polishing, until Ctrl-C."""
     plans, table = [], experiment.excitation
+    nominal = find_nominal(experiment)
+    limited = find_constraints(experiment, nominal)
     for number, criterion in enumerate(CRITERIA, 1):
 
         def tell(step: DesignProgress, number: int = number) -> None:
@@ -115,7 +130,7 @@ def compare_criteria(
                     polish=0,
                     progress=tell,
                     throw=False,
-                    **_settings(experiment, find_nominal(experiment), bool(criterion.weighted)),
+                    **_settings(experiment, nominal, limited, bool(criterion.weighted)),
                 )
         except KeyboardInterrupt:
             break
@@ -144,18 +159,20 @@ def write_design(
     return [output.parent / n for n in names] + pictures
 
 
-def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = True) -> dict:
+def _settings(
+    experiment: Experiment, nominal: Nominal | None, limited: Limited, weighted: bool = True
+) -> dict:
     """Return what all designs of one experiment have in common."""
     table = experiment.excitation
     noise = assumed_noise(experiment.robot) if table.noise is None else np.array(table.noise)
-    constraints, sizes = find_constraints(experiment, nominal), None
+    sizes = None
     if nominal is not None:
         # An estimate of what is not determined means nothing alone.
         open_ones = np.isin(experiment.base.names, nominal.undetermined)
         sizes = np.where(open_ones, np.nan, nominal.parameters)
     return {
-        "basis": table.basis(bool(constraints)),
-        "constraints": constraints,
+        "basis": table.basis(bool(limited.constraints)),
+        "constraints": limited.constraints,
         "key": jax.random.key(table.seed),
         "noise": noise,
         "nominal": sizes,
@@ -164,33 +181,27 @@ def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = 
     }
 
 
-def find_constraints(
-    experiment: Experiment, nominal: Nominal | None
-) -> tuple[AbstractConstraint, ...]:
+def find_constraints(experiment: Experiment, nominal: Nominal | None) -> Limited:
     """Return the constraints of the motion beside the limits of the joints.
 
     Raises:
-        InputError: If forces are limited, but no parameters or no largest forces are known.
+        InputError: If `force_margin` is given, but no motion can keep the limits of forces.
     """
-    table = experiment.excitation
-    constraints: list[AbstractConstraint] = []
-    if experiment.clearance is not None:
-        constraints.append(experiment.clearance)
+    table, robot = experiment.excitation, experiment.robot
+    clearance = experiment.surroundings.clearance
+    constraints: list[AbstractConstraint] = [] if clearance is None else [clearance]
     tip = TipLimits(table.tip_speed, table.tip_acceleration, *(table.workspace or ()))
-    if tip.entries(experiment.robot):
+    if tip.entries(robot):
         constraints.append(tip)
-    if table.force_margin is None:
-        return tuple(constraints)
-    if nominal is None:
-        raise InputError(
-            "`force_margin` needs parameters: say in `nominal` where an earlier report is."
-        )
-    forces = nominal.force_limits(experiment.base, table.force_margin)
-    if not forces.entries(experiment.robot):
-        raise InputError(
-            "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
-        )
-    return (*constraints, forces)
+    fault = "not checked: no inertias are known; say in `excitation.nominal` where a report is"
+    if nominal is not None:
+        forces = nominal.force_limits(experiment.base, table.force_margin or 0.0)
+        fault = "not checked: no largest forces are known; give `limits.force`"
+        if forces.entries(robot) and not (fault := gravity_fault(experiment, forces)):
+            constraints.append(forces)
+    if fault and table.force_margin is not None:
+        raise InputError(f"`force_margin`: {fault}.")
+    return Limited(tuple(constraints), fault)
 
 
 def _earlier_information(
@@ -252,7 +263,9 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
     return Nominal(np.asarray(fit.parameters), covariance, names)
 
 
-def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None) -> Design:
+def _add_leads(
+    experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None, limited: Limited
+) -> Design:
     """Return the motion from standstill to standstill, in samples of the controller."""
     motion, table = plan.trajectory, experiment.excitation
     leads, times = table.chosen_leads, np.asarray(plan.limits.basis.times(plan.samples))
@@ -286,8 +299,8 @@ def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | 
         ),
     }
     remarks += [Remark(text) for text, holds in notes.items() if holds]
-    remarks += force_remarks(experiment, nominal, motion)
-    remarks += collision_remarks(experiment, motion)
+    remarks += motion_checks(experiment, plan, limited.fault)
+    remarks += _force_doubts(experiment, nominal)
     sampled = motion
     if table.sample_time is not None:
         step = table.sample_time
@@ -295,37 +308,11 @@ def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | 
     return Design(plan, motion, tuple(remarks), sampled, step)
 
 
-def force_remarks(
-    experiment: Experiment, nominal: Nominal | None, played: AbstractTrajectory
-) -> list[Remark]:
-    """Return remarks about the forces of a motion, where any are limited."""
-    if not np.isfinite(experiment.robot.known_max_forces).any():
-        return []
+def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> list[Remark]:
+    """Return what the forces of a motion leave out."""
     if nominal is None:
-        text = (
-            "forces were not checked, although they have limits, for no parameters are known: "
-            "say in `excitation.nominal` where an earlier report is, and give `force_margin`"
-        )
-        return [Remark(text, Status.DOUBTFUL)]
-    remarks = []
-    if experiment.excitation.force_margin is None:
-        with double_precision():
-            motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
-            limits = nominal.force_limits(experiment.base, 0.0)
-            values = np.asarray(limits(experiment.robot, motion))
-        worst = max(limits.describe(experiment.robot, values), key=lambda found: found.value)
-        nearest = f"{worst.name} with {100 * worst.used:.1f} % of {worst.limit:.4g} {worst.unit}"
-        text = (
-            "forces were not part of the design; by the nominal parameters they stay within their "
-            f"limits, the nearest being {nearest} (`force_margin` keeps them with room)"
-        )
-        if worst.value > 0:
-            text = (
-                "by the nominal parameters this motion needs more than robot and motors can give: "
-                f"{nearest}; give `force_margin`, and the design keeps these limits"
-            )
-        remarks.append(Remark(text, Status.BAD if worst.value > 0 else Status.NEUTRAL))
-    names = experiment.base.names
+        return []
+    remarks, names = [], experiment.base.names
     unknown = [n for n, p in zip(names, nominal.parameters, strict=True) if np.isnan(p)]
     if unknown:
         text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"

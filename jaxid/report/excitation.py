@@ -111,7 +111,7 @@ def write_excitation(
     page = render_page(
         f"{robot.name}: a motion to record",
         [
-            ("Verdict", [_headline(plan, remarks), every]),
+            ("Verdict", [headline(plan, remarks), every]),
             ("The motion", [picture(f, captions.get(name, "")) for name, f in figures.items()]),
             ("Use of the limits", use),
             ("Gain over a random motion", [text, criteria]),
@@ -126,17 +126,16 @@ def write_excitation(
     return [folder / name for name in names]
 
 
-def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
+def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
+    """Return the verdict on a motion in one sentence; `remarks` hold one for each check."""
     if plan.undetermined:
         return Remark("This motion does not determine all base parameters.", Status.BAD)
     if not plan.feasible:
         return Remark("This motion does not keep all limits.", Status.BAD)
-    text = "A motion that keeps all limits, and determines all parameters."
-    status = Status.GOOD
     if any(remark.status is Status.BAD for remark in remarks):
         text = "Do not record this motion yet: what is marked ✗ comes first."
-        status = Status.BAD
-    elif plan.interrupted:
-        text = "The design of this motion was stopped."
-        status = Status.DOUBTFUL
-    return Remark(text, status)
+        return Remark(text, Status.BAD)
+    text = "A motion that can be recorded: it keeps all limits, and determines all parameters."
+    if plan.interrupted:
+        text += " The search was stopped: `--resume` may find a better one."
+    return Remark(text, Status.GOOD)
