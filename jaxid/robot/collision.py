@@ -10,16 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Hashable, double_precision
+from jaxid.arrays import AnyArray, Array, Float, Hashable, Int, double_precision, namespace
 from jaxid.errors import InputError
 
 from .forward_and_inverse_kinematics import placements
 from .robot import Robot
 from .shapes import (
     GROUND as GROUND,
+    ROUNDING,
     Box as Box,
     Capsule as Capsule,
     HalfSpace as HalfSpace,
+    closest_places,
     segment_distance,
 )
 
@@ -96,7 +98,8 @@ class CollisionModel(Hashable):
         found = [_indices(names, len(self.capsules), pair) for pair in pairs]
         if not found:
             raise InputError("a collision model needs at least one pair of shapes that can meet.")
-        self.pairs = tuple(sorted(found, key=lambda pair: pair[1] >= len(self.capsules)))
+        # Pairs of capsules first, then obstacle by obstacle.
+        self.pairs = tuple(sorted(found, key=lambda p: max(p[1], len(self.capsules) - 1)))
         groups: dict[tuple, list[int]] = {}
         for place, pair in enumerate(self.pairs):
             groups.setdefault(tuple(self._owner(shape) for shape in pair), []).append(place)
@@ -136,35 +139,63 @@ class CollisionModel(Hashable):
 
     def clearances(
         self, ends: Float[AnyArray, "*batch capsules 2 3"]
-    ) -> Float[Array, "*batch groups"]:
+    ) -> Float[AnyArray, "*batch groups"]:
         """Return the clearances [m] for given ends of all axes on the ground [m]."""
         return self._grouped(self._gaps(ends))
 
-    def _gaps(self, ends: Float[AnyArray, "*batch capsules 2 3"]) -> Float[Array, "*batch pairs"]:
-        ends, count = jnp.asarray(ends), len(self.capsules)
+    def _gaps(self, ends: Float[AnyArray, "*batch capsules 2 3"]) -> Float[AnyArray, "*batch pairs"]:
+        xp, count = namespace(ends), len(self.capsules)
         start, end = ends[..., 0, :], ends[..., 1, :]
-        radii = jnp.stack([jnp.asarray(c.radius) for c in self.capsules])
+        radii = xp.stack([xp.asarray(c.radius) for c in self.capsules])
         gaps = []
         if inner := [pair for pair in self.pairs if pair[1] < count]:
             i, k = np.transpose(inner)
             gap = segment_distance(
                 start[..., i, :], end[..., i, :], start[..., k, :], end[..., k, :]
             )
-            gaps.append(gap - jnp.broadcast_to(radii[i] + radii[k], gap.shape))
-        outer = sorted(self.pairs[len(inner) :], key=lambda pair: pair[1])
-        for k, pairs in itertools.groupby(outer, key=lambda pair: pair[1]):
+            gaps.append(gap - xp.broadcast_to(radii[i] + radii[k], gap.shape))
+        for k, pairs in itertools.groupby(self.pairs[len(inner) :], key=lambda pair: pair[1]):
             i = np.array([pair[0] for pair in pairs])
             gap = self.obstacles[k - count].distance(start[..., i, :], end[..., i, :])
-            gaps.append(gap - jnp.broadcast_to(radii[i], gap.shape))
-        return jnp.concatenate(gaps, axis=-1)
+            gaps.append(gap - xp.broadcast_to(radii[i], gap.shape))
+        return xp.concatenate(gaps, axis=-1)
+
+    def slopes(
+        self, ends: Float[np.ndarray, "samples capsules 2 3"], chosen: Int[np.ndarray, " samples"]
+    ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples capsules 2 3"]]:
+        """Return one clearance of each sample [m], and its derivative by the ends, in NumPy."""
+        gaps, samples = np.asarray(self._gaps(ends)), np.arange(len(ends))
+        filled = self._filled[chosen]
+        nearest = filled[samples, gaps[samples[:, None], filled].argmin(axis=1)]
+        pairs, found = np.array(self.pairs)[nearest], np.zeros(ends.shape)
+        for k in np.unique(pairs[:, 1]):
+            at = samples[pairs[:, 1] == k]
+            i = pairs[at, 0]
+            if k >= len(self.capsules):
+                found[at, i] = _obstacle_slopes(self.obstacles[k - len(self.capsules)], ends[at, i])
+                continue
+            first, second = ends[at, i], ends[at, k]
+            a, b = closest_places(first[:, 0], first[:, 1], second[:, 0], second[:, 1])
+            a, b = (np.stack([1.0 - x, x], axis=1) for x in (a, b))
+            apart = (a * first).sum(axis=1) - (b * second).sum(axis=1)
+            away = apart / np.sqrt((apart**2).sum(axis=1) + ROUNDING**2)[:, None]
+            found[at, i], found[at, k] = a * away[:, None], -b * away[:, None]
+        return gaps[samples, nearest], found
+
+    @property
+    def _filled(self) -> Int[np.ndarray, "groups pairs"]:
+        """Places of each group's pairs, the first one repeated."""
+        most = max(map(len, self.groups))
+        return np.array([[*group, *group[:1] * (most - len(group))] for group in self.groups])
 
     def _grouped(self, gaps: Float[AnyArray, "*batch pairs"]) -> Any:
         """Return the least gap of each group, with the derivative of one of its pairs."""
-        most = max(map(len, self.groups))
-        if most == 1:
+        xp, filled = namespace(gaps), self._filled
+        if filled.shape[1] == 1:
             return gaps
-        filled = np.array([[*group, *group[:1] * (most - len(group))] for group in self.groups])
-        gathered = jnp.asarray(gaps)[..., filled]
+        gathered = gaps[..., filled]
+        if xp is np:
+            return gathered.min(axis=-1)
         least = jnp.argmin(jax.lax.stop_gradient(gathered), axis=-1, keepdims=True)
         return jnp.take_along_axis(gathered, least, axis=-1)[..., 0]
 
@@ -180,7 +211,7 @@ class CollisionModel(Hashable):
         )
         with double_precision():
             ends = jax.jit(jax.vmap(lambda x: self.ends(robot, x)))(q)
-            return np.asarray(jax.jit(self._gaps)(ends)).max(axis=0)
+            return np.asarray(self._gaps(np.asarray(ends))).max(axis=0)
 
     @eqx.filter_jit
     def clearance(
@@ -196,6 +227,22 @@ class CollisionModel(Hashable):
         poses = jnp.reshape(q, (-1, robot.joints))
         gaps = self.clearances(jax.vmap(lambda x: self.ends(robot, x))(poses))
         return gaps.reshape(*q.shape[:-1], gaps.shape[-1])
+
+
+@eqx.filter_jit
+def _jax_slopes(obstacle: HalfSpace | Box, start: Array, end: Array) -> tuple[Array, ...]:
+    distance, pull = jax.vjp(obstacle.distance, start, end)
+    return pull(jnp.ones_like(distance))
+
+
+def _obstacle_slopes(
+    obstacle: HalfSpace | Box, ends: Float[np.ndarray, "samples 2 3"]
+) -> Float[np.ndarray, "samples 2 3"]:
+    """Return the derivatives of the distances of segments from an obstacle by their ends."""
+    size = -(-len(ends) // 64) * 64  # few sizes, so that little is compiled
+    padded = np.concatenate([ends, np.broadcast_to(ends[:1], (size - len(ends), 2, 3))])
+    found = _jax_slopes(obstacle, jnp.asarray(padded[:, 0]), jnp.asarray(padded[:, 1]))
+    return np.stack([np.asarray(x) for x in found], axis=1)[: len(ends)]
 
 
 def _stem(name: str) -> str:

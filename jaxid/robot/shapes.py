@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Numbers
+from jaxid.arrays import AnyArray, Array, Float, Numbers, namespace
 from jaxid.errors import InputError
 
 GROUND = -1
@@ -19,7 +19,7 @@ ROUNDING = 1e-6
 """Largest error of a distance, by which it is smooth at zero [m]."""
 
 Vectors = Float[AnyArray, "*batch 3"]
-Lengths = Float[Array, "*batch"]
+Lengths = Float[AnyArray, "*batch"]
 
 
 class Capsule(eqx.Module):
@@ -88,8 +88,7 @@ class HalfSpace(eqx.Module):
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""
-        n, start, end = (jnp.asarray(x) for x in (self.normal, start, end))
-        return _smaller(start @ n, end @ n) - self.height
+        return _smaller(start @ self.normal, end @ self.normal) - self.height
 
 
 class Box(eqx.Module):
@@ -165,34 +164,43 @@ def _smaller(x: Array, y: Array) -> Array:
     Derivatives of `jnp.minimum` ask which argument equals the result. None does where a compiler
     rounds the two in different ways.
     """
-    return jnp.where(x < y, x, y)
+    return namespace(x, y).where(x < y, x, y)
 
 
 def _rounded_norm(vector: Vectors) -> Lengths:
     """Return lengths of vectors, smooth at zero and there at most `ROUNDING` too small [m]."""
-    return jnp.sqrt(jnp.sum(vector**2, axis=-1) + ROUNDING**2) - ROUNDING
+    xp = namespace(vector)
+    return xp.sqrt(xp.einsum("...i,...i->...", vector, vector) + ROUNDING**2) - ROUNDING
 
 
 def segment_distance(
     start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
 ) -> Lengths:
     """Return the distance between segments, which may be parallel, touch, or be points [m]."""
-    start, end, other_start, other_end = map(jnp.asarray, (start, end, other_start, other_end))
     u, v = end - start, other_end - other_start
-    # The closest points are found without derivatives: theirs add nothing to that of the distance,
-    # and they have none at parallel axes.
-    a, b = jax.lax.stop_gradient(_closest(u, v, start - other_start))
+    a, b = closest_places(start, end, other_start, other_end)
     return _rounded_norm(start + a * u - other_start - b * v)
 
 
-def _closest(u: Array, v: Array, r: Array) -> tuple[Array, Array]:
-    """Return the places of the closest points along two segments, from 0 to 1."""
+def closest_places(
+    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
+) -> tuple[AnyArray, AnyArray]:
+    """Return the places of the closest points along two segments, from 0 to 1, as constants.
 
-    def dot(x: Array, y: Array) -> Array:
-        return jnp.sum(x * y, axis=-1, keepdims=True)
+    Their derivatives add nothing to that of the distance, and they have none at parallel axes.
+    """
+    xp = namespace(start, end, other_start, other_end)
+    ends = (start, end, other_start, other_end)
+    if xp is jnp:
+        ends = jax.lax.stop_gradient(tuple(map(jnp.asarray, ends)))
+    start, end, other_start, other_end = ends
+    u, v, r = end - start, other_end - other_start, start - other_start
 
-    def share(part: Array, whole: Array, usable: Array) -> Array:
-        return jnp.where(usable, jnp.clip(part / jnp.where(usable, whole, 1.0), 0.0, 1.0), 0.0)
+    def dot(x: AnyArray, y: AnyArray) -> AnyArray:
+        return xp.einsum("...i,...i->...", x, y)[..., None]
+
+    def share(part: AnyArray, whole: AnyArray, usable: AnyArray) -> AnyArray:
+        return xp.where(usable, xp.clip(part / xp.where(usable, whole, 1.0), 0.0, 1.0), 0.0)
 
     uu, vv, uv, ur, vr = dot(u, u), dot(v, v), dot(u, v), dot(u, r), dot(v, r)
     area = uu * vv - uv * uv
