@@ -38,6 +38,8 @@ PENALTY = 3.0
 """Penalty of a relative excess beside the criterion's logarithm, where it is to be improved."""
 NEAR = 0.1
 """Relative excess from which a motion is not made smaller until it keeps its constraints."""
+SURE = 0.02
+"""Relative distance from all limits from which fewer instants tell that they are kept."""
 SEARCHED = 64
 """Samples on which motions with few coefficients are evaluated during a search."""
 
@@ -319,9 +321,10 @@ class ExcitationProblem:
         """Return the largest excess over constraints for all times; minus infinity if none."""
         if not self.constraints:
             return -np.inf
-        # What is far beyond its limits need not be known closely.
-        coarse = max(float(v.max()) for v in self._by_constraint(x, slice(None, None, EVERY)))
-        return coarse if coarse > NEAR else float(_tops(self.checked(x)).max())
+        # What is far from its limits need not be known closely.
+        rough = self._by_constraint(x, slice(None, None, EVERY))
+        coarse = float(_tops(np.concatenate(rough, axis=1)).max())
+        return coarse if not -SURE < coarse < NEAR else float(_tops(self.checked(x)).max())
 
     def findings(self, x: Float[AnyArray, " scaled"]) -> list[Finding]:
         """Return all limited quantities with their largest values."""

@@ -49,10 +49,18 @@ SCHEDULE = (
 )
 """Relaxed limits, then the limits (0.998 leaves room for rounding); slightly relaxed once more;
 sharper in the end."""
-SETTLING = tuple(Stage(0.998, 1e-4, 1e-6, n, 20.0, 100.0) for n in (100, 50, 50))
-"""Further stages where there are constraints: their peaks move, and exceeding them is expensive."""
-EVALUATED = frozenset({5, 7, 10, 11, 12, 13, 14})
-"""Stages of both whose results are compared with the best so far."""
+CONSTRAINED = (
+    Stage(1.25, 1e-2, 1e-3, 50),
+    Stage(0.998, 1e-3, 1e-4, 75, 4.0, 30.0),
+    Stage(0.998, 1e-4, 1e-6, 75, 20.0, 100.0),
+    Stage(0.998, 1e-4, 1e-6, 50, 20.0, 100.0),
+    Stage(1.1, 1e-3, 1e-3, 25, 8.0, 30.0),
+    Stage(0.998, 1e-4, 1e-6, 100, 20.0, 100.0),
+    Stage(0.998, 1e-4, 1e-6, 50, 20.0, 100.0),
+)
+"""The same where there are constraints: exceeding them becomes more and more expensive."""
+EVALUATED = frozenset({5, 7, 10, 11})
+"""Stages without constraints whose results are compared with the best so far."""
 GENERATION = Stage(0.998, 1e-3, 1e-6, 150, 20.0, 100.0)
 """Improvement of children."""
 LAST = Stage(0.998, 1e-4, 1e-6, 300, 20.0, 100.0)
@@ -101,9 +109,9 @@ class Search:
             x[0] = begin
         self.best = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
         self._x, self.history = x, [self.best.best_value]
-        schedule = len(SCHEDULE) + (len(SETTLING) if problem.constraints else 0)
+        schedule = len(CONSTRAINED if problem.constraints else SCHEDULE)
         batches = -(-starts // BATCH)
-        self.steps = batches * (schedule + generations + 1) + self._polished
+        self.steps = batches * (schedule + 1) + generations + self._polished
 
     @property
     def feasible(self) -> bool:
@@ -124,9 +132,8 @@ class Search:
             yield from self._start_batches()
         else:
             yield "searching from many starts"
-        schedule = SCHEDULE + (SETTLING if problem.constraints else ())
-        for start in range(0, len(self._x), BATCH):
-            places = np.arange(start, min(start + BATCH, len(self._x)))
+        schedule = CONSTRAINED if problem.constraints else SCHEDULE
+        for places in self._batches():
             yield from self._improve_batch(places, schedule)
         for _ in range(self._generations):
             if self._is_late:
@@ -144,6 +151,14 @@ class Search:
             yield self._done("improving descendants")
         yield from self._finish()
 
+    def _batches(self) -> Iterator[np.ndarray]:
+        """Yield the places of starts; with constraints the first batch is one start alone."""
+        every = np.arange(len(self._x))
+        first = 1 if self._problem.constraints else 0
+        for batch in (every[:first], *np.split(every[first:], range(BATCH, len(every), BATCH))):
+            if len(batch) and not self._is_late:
+                yield batch
+
     def _start_batches(self) -> Iterator[str]:
         """Look for a first motion that keeps all constraints, then for more."""
         yield "looking for a first motion that keeps all limits"
@@ -152,9 +167,10 @@ class Search:
                 break
             self.best = self.best.survivors(shrink_to_constraints(self._problem, x))
             yield self._done("looking for a first motion that keeps all limits")
-        found = self.best.x[int(self.best.order()[0])]
-        self.best = evaluate_within_limits(self._problem, self._x)
-        self.best = self.best.improved(evaluate(self._problem, np.array([found] * len(self._x))))
+        found, unknown = self.best, np.full(len(self._x), np.inf)
+        self.best = Candidates(self._x, unknown, unknown.copy())
+        for part, one in zip(self.best, found, strict=True):
+            part[0] = one[int(found.order()[0])]
 
     def _improve_batch(self, places: np.ndarray, schedule: tuple[Stage, ...]) -> Iterator[str]:
         states, task = _begin(self._problem, SEARCHED, self._x[places]), "searching from many starts"
@@ -163,7 +179,7 @@ class Search:
                 if self._is_late:
                     return
                 yield task
-            if number in EVALUATED:
+            if number in EVALUATED or (self._problem.constraints and stage.bound < 1.0):
                 self._take(states, places)
             yield self._done(task)
 

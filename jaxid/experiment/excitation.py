@@ -1,6 +1,6 @@
 """Design of the motion that an experiment file asks for, and the files that a robot can play."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,8 +20,9 @@ from jaxid.report.excitation import write_excitation
 from jaxid.report.result_files import read_fit
 from jaxid.result_table import Remark, Status
 from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
-from jaxid.trajectory.leads import with_leads
-from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
+from jaxid.trajectory.fourier import FourierBasis, complete_limits
+from jaxid.trajectory.leads import WithLeads, with_leads
+from jaxid.trajectory.trajectory import AbstractTrajectory, LinearTrajectory, PaddedToCycle
 
 from .decoder import within
 from .experiment import Experiment
@@ -60,29 +61,81 @@ class Limited(NamedTuple):
     fault: str
 
 
+class Played(NamedTuple):
+    """A motion as a robot can play it.
+
+    Attributes:
+        motion: Motion from standstill to standstill where that is possible.
+        sampled: Motion as it is written in samples: until a sample meets its end.
+        sample_time: Time between those samples [s].
+        window: Times between which it is the designed motion [s].
+        fault: Why it does not start and end at rest; empty if it does, or need not.
+    """
+
+    motion: AbstractTrajectory
+    sampled: AbstractTrajectory
+    sample_time: float
+    window: tuple[float, float]
+    fault: str
+
+
 class Design(NamedTuple):
     """Designed motion as a robot can play it.
 
     Attributes:
         plan: Result of the optimisation.
-        played: Motion from standstill to standstill where that is possible.
+        played: Motion that the robot plays.
         remarks: Remarks beside those of the plan.
-        sampled: Motion as it is written in samples: until a sample meets its end.
-        sample_time: Time between those samples [s].
     """
 
     plan: ExcitationPlan
-    played: AbstractTrajectory
+    played: Played
     remarks: tuple[Remark, ...]
-    sampled: AbstractTrajectory
-    sample_time: float
+
+
+class Preparation(NamedTuple):
+    """What a design needs to know before its search.
+
+    Attributes:
+        nominal: Parameters that are known.
+        limited: Constraints beside the limits of the joints.
+        begin: Motion to go on with; None to begin anew.
+    """
+
+    nominal: Nominal | None
+    limited: Limited
+    begin: LinearTrajectory | None
+
+    def faults(self, experiment: Experiment) -> tuple[str, ...]:
+        """Return what will not be checked, in sentences."""
+        forces = (f"forces: {self.limited.fault}",) if self.limited.fault else ()
+        return (*experiment.surroundings.faults, *forces)
+
+
+def prepare_design(experiment: Experiment, written: Path | None) -> Preparation:
+    """Find the constraints of a design, and the motion of an earlier one to go on with.
+
+    Raises:
+        InputError: If the table does not fit the robot, or the earlier motion does not fit either.
+    """
+    with within("excitation", experiment.path.name):
+        nominal = find_nominal(experiment)
+        limited = find_constraints(experiment, nominal)
+    if written is None:
+        return Preparation(nominal, limited, None)
+    begin = load_trajectory(written)
+    begin = begin.inner if isinstance(begin, WithLeads) else begin
+    basis = experiment.excitation.basis(bool(limited.constraints))
+    if not (isinstance(begin, LinearTrajectory) and str(begin.basis) == str(basis)):
+        raise InputError(f"`{written}` holds a motion of another kind: design anew.")
+    return Preparation(nominal, limited, begin)
 
 
 def design_motion(
     experiment: Experiment,
+    preparation: Preparation,
     progress: Callable[[DesignProgress], None],
-    state: Path,
-    resume: bool,
+    seconds: float | None = None,
 ) -> Design:
     """Design the motion that the experiment file asks for.
 
@@ -91,8 +144,6 @@ def design_motion(
     """
     table = experiment.excitation
     with within("excitation", experiment.path.name):
-        nominal = find_nominal(experiment)
-        limited = find_constraints(experiment, nominal)
         plan = design_excitation(
             experiment.base,
             criterion=table.objective,
@@ -100,11 +151,12 @@ def design_motion(
             generations=table.generations,
             polish=min(table.polish, table.starts),
             progress=progress,
-            state=state,
-            resume=resume,
-            **_settings(experiment, nominal, limited),
+            begin=preparation.begin,
+            seconds=table.time if seconds is None else seconds,
+            **_settings(experiment, preparation.nominal, preparation.limited),
         )
-        return _add_leads(experiment, plan, nominal, limited)
+    played = play(experiment, plan.trajectory)
+    return Design(plan, played, tuple(_remarks(experiment, plan, played, preparation)))
 
 
 def compare_criteria(
@@ -140,23 +192,27 @@ def compare_criteria(
     return plans
 
 
+def write_motion(experiment: Experiment, played: Played, output: Path) -> list[Path]:
+    """Write table, trajectory and ROS message of a motion; return the files."""
+    robot, step, table = experiment.robot, played.sample_time, experiment.excitation
+    names = [output.name, f"{output.stem}.ros.{table.ros}", f"{output.stem}.json"]
+    with double_precision(), atomic_folder(output.parent) as folder:
+        write_csv(played.sampled, robot, folder / names[0], sample_time=step)
+        write_ros(played.sampled, robot, folder / names[1], sample_time=step)
+        save_trajectory(jax.tree.map(np.asarray, played.motion), folder / names[2])
+    return [output.parent / name for name in names]
+
+
 def write_design(
     experiment: Experiment, design: Design, output: Path, command: str = ""
 ) -> list[Path]:
-    """Write table, trajectory, ROS message and pictures; return the files."""
-    plan, step, table = design.plan, design.sample_time, experiment.excitation
-    robot = experiment.robot
-    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{table.ros}"]
-    seed = (("seed", str(table.seed)),)
+    """Write a motion as `write_motion` does, and its page; return the files."""
+    seed = (("seed", str(experiment.excitation.seed)),)
     settings = {"facts": seed, "experiment_text": experiment.text, "command": command}
-    with double_precision(), atomic_folder(output.parent) as folder:
-        write_csv(design.sampled, robot, folder / names[0], sample_time=step)
-        save_trajectory(jax.tree.map(np.asarray, design.played), folder / names[1])
-        write_ros(design.sampled, robot, folder / names[2], sample_time=step)
-        # Before the others take their places: where there is no room for pictures, nothing changes.
-        place = output.with_suffix("")
-        pictures = write_excitation(place, plan, design.played, design.remarks, settings)
-    return [output.parent / n for n in names] + pictures
+    # First the page: where there is no room for pictures, nothing changes.
+    place, motion = output.with_suffix(""), design.played.motion
+    pictures = write_excitation(place, design.plan, motion, design.remarks, settings)
+    return write_motion(experiment, design.played, output) + pictures
 
 
 def _settings(
@@ -263,30 +319,43 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
     return Nominal(np.asarray(fit.parameters), covariance, names)
 
 
-def _add_leads(
-    experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None, limited: Limited
-) -> Design:
-    """Return the motion from standstill to standstill, in samples of the controller."""
-    motion, table = plan.trajectory, experiment.excitation
-    leads, times = table.chosen_leads, np.asarray(plan.limits.basis.times(plan.samples))
+def play(experiment: Experiment, motion: LinearTrajectory) -> Played:
+    """Return a motion from standstill to standstill, in samples of the controller."""
+    table = experiment.excitation
+    leads, times = table.chosen_leads, np.asarray(motion.basis.times(table.samples))
     begin, end = float(times[0]), float(times[-1] + times[1] - times[0])
-    step = float(times[1] - times[0])
-    remarks = []
+    step, fault, played = float(times[1] - times[0]), "", motion
     # Where there are constraints, leads were designed together with the motion.
-    if leads is not None and leads.time is None and not plan.findings:
-        robot = experiment.robot.replace(limits=plan.limits.limits)
+    if leads is not None and isinstance(motion.basis, FourierBasis):
+        robot = experiment.robot.replace(limits=complete_limits(experiment.robot))
         try:
-            motion = with_leads(motion, robot, periods=leads.periods)
-            begin, end = (float(t) for t in motion.window)
+            played = with_leads(motion, robot, periods=leads.periods)
+            begin, end = (float(t) for t in played.window)
         except InputError as error:
-            text = f"the motion is without leads, and starts and ends at full speed: {error}"
-            remarks.append(Remark(f"{text} `rest = true` designs one at rest there.", Status.BAD))
+            fault = (
+                f"the motion is without leads, and starts and ends at full speed: {error} "
+                "`rest = true` designs one at rest there."
+            )
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
-    rests = not remarks and (leads is not None or table.rest or table.spline is not None)
+    rests = not fault and (leads is not None or table.rest or table.spline is not None)
+    sampled = played
+    if table.sample_time is not None:
+        step = table.sample_time
+        sampled = PaddedToCycle(played, step) if rests else played
+    return Played(played, sampled, step, (begin, end), fault)
+
+
+def _remarks(
+    experiment: Experiment, plan: ExcitationPlan, played: Played, preparation: Preparation
+) -> Iterator[Remark]:
+    """Yield what must be known of a designed motion beside its plan."""
+    table, leads, (begin, end) = experiment.excitation, experiment.excitation.chosen_leads, played.window
+    if played.fault:
+        yield Remark(played.fault, Status.BAD)
     if begin > 0:
-        text = f"from {begin:.3f} to {end:.3f} s of {float(motion.duration):.3f} s"
-        remarks.append(Remark(f"the robot starts at rest and is in the designed motion {text}"))
+        text = f"from {begin:.3f} to {end:.3f} s of {float(played.motion.duration):.3f} s"
+        yield Remark(f"the robot starts at rest and is in the designed motion {text}")
     count = 1 if leads is None else leads.periods
     notes = {
         "the noise is assumed as 1 % of the largest forces: give `noise` if it is known": (
@@ -295,17 +364,14 @@ def _add_leads(
         f"deviations are those together with {', '.join(table.earlier)}": table.earlier,
         f"the motion runs through {count} periods; the deviations are of one": count > 1,
         "for relative deviations, say in `excitation.nominal` where an earlier result is": (
-            nominal is None
+            preparation.nominal is None
         ),
     }
-    remarks += [Remark(text) for text, holds in notes.items() if holds]
-    remarks += motion_checks(experiment, plan, limited.fault)
-    remarks += _force_doubts(experiment, nominal)
-    sampled = motion
-    if table.sample_time is not None:
-        step = table.sample_time
-        sampled = PaddedToCycle(motion, step) if rests else motion
-    return Design(plan, motion, tuple(remarks), sampled, step)
+    for text, holds in notes.items():
+        if holds:
+            yield Remark(text)
+    yield from motion_checks(experiment, plan, preparation.limited.fault)
+    yield from _force_doubts(experiment, preparation.nominal)
 
 
 def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> list[Remark]:

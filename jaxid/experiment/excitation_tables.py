@@ -202,6 +202,7 @@ class Excitation:
         starts: Number of random motions to start from.
         generations: Number of times that the motions found have children.
         polish: Number of the best motions that are polished.
+        time: Time for the search [s], like `60.0`; by default all of its steps are done.
         seed: Seed of the random motions.
         sample_time: Time between two rows of the written table, the controller's cycle [s], like
             `0.004`; by default that of the samples.
@@ -228,6 +229,7 @@ class Excitation:
     starts: Count = 32
     generations: Annotated[int, Bounds(least=0, most=10_000)] = 12
     polish: Annotated[int, Bounds(least=0, most=10_000)] = 4
+    time: Positive | None = None
     seed: Annotated[int, Bounds(least=0, most=2**32 - 1)] = 0
     sample_time: Annotated[float, Bounds(least=1e-5)] | None = None
     ros: Literal["yaml", "json"] = "yaml"

@@ -1,9 +1,9 @@
 """Collision models: capsules on a robot's bodies, obstacles of its world, and their clearances."""
 
+import functools
 import itertools
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -84,14 +84,15 @@ class CollisionModel(Hashable):
         if pairs is not None:
             return
         best = self._largest_gaps(robot)
-        left = [pair for pair, gap in zip(self.pairs, best, strict=True) if gap <= 0]
+        room = {pair: float(gap) for pair, gap in zip(self.pairs, best, strict=True)}
+        left = [pair for pair, gap in room.items() if gap <= 0]
         self.notes = tuple(
             f"{names[i]} and {names[k]} overlap in every pose that was tried, so they are not "
             "watched."
             for i, k in left
         )
         self._watch([(names[i], names[k]) for i, k in self.pairs if (i, k) not in left], names)
-        self.room = tuple(float(x) for x in self._grouped(best[best > 0]))
+        self.room = tuple(min(room[self.pairs[k]] for k in group) for group in self.groups)
 
     def _watch(self, pairs: Sequence[Sequence[str]], names: list[str]) -> None:
         """Enter pairs by their names, and group them."""
@@ -99,6 +100,8 @@ class CollisionModel(Hashable):
         if not found:
             raise InputError("a collision model needs at least one pair of shapes that can meet.")
         # Pairs of capsules first, then obstacle by obstacle.
+        for name in ("_indices", "_sizes", "_filled"):
+            self.__dict__.pop(name, None)
         self.pairs = tuple(sorted(found, key=lambda p: max(p[1], len(self.capsules) - 1)))
         groups: dict[tuple, list[int]] = {}
         for place, pair in enumerate(self.pairs):
@@ -141,38 +144,42 @@ class CollisionModel(Hashable):
         self, ends: Float[AnyArray, "*batch capsules 2 3"]
     ) -> Float[AnyArray, "*batch groups"]:
         """Return the clearances [m] for given ends of all axes on the ground [m]."""
-        return self._grouped(self._gaps(ends))
-
-    def _gaps(self, ends: Float[AnyArray, "*batch capsules 2 3"]) -> Float[AnyArray, "*batch pairs"]:
-        xp, count = namespace(ends), len(self.capsules)
-        start, end = ends[..., 0, :], ends[..., 1, :]
-        radii = xp.stack([xp.asarray(c.radius) for c in self.capsules])
-        gaps = []
-        if inner := [pair for pair in self.pairs if pair[1] < count]:
-            i, k = np.transpose(inner)
-            gap = segment_distance(
-                start[..., i, :], end[..., i, :], start[..., k, :], end[..., k, :]
+        if namespace(ends) is np:
+            return self._nearest_gaps(ends.reshape(-1, *ends.shape[-3:])).reshape(
+                *ends.shape[:-3], len(self.groups)
             )
-            gaps.append(gap - xp.broadcast_to(radii[i] + radii[k], gap.shape))
-        for k, pairs in itertools.groupby(self.pairs[len(inner) :], key=lambda pair: pair[1]):
-            i = np.array([pair[0] for pair in pairs])
-            gap = self.obstacles[k - count].distance(start[..., i, :], end[..., i, :])
-            gaps.append(gap - xp.broadcast_to(radii[i], gap.shape))
-        return xp.concatenate(gaps, axis=-1)
+        start, end = ends[..., 0, :], ends[..., 1, :]
+        radii = jnp.stack([jnp.asarray(c.radius) for c in self.capsules])
+        i, k = self._indices.T
+        inner = k < len(self.capsules)
+        gaps = []
+        if inner.any():
+            sides = (x[..., j[inner], :] for j in (i, k) for x in (start, end))
+            gap, sizes = segment_distance(*sides), radii[i[inner]] + radii[k[inner]]
+            gaps.append(gap - jnp.broadcast_to(sizes, gap.shape))
+        for number, obstacle in enumerate(self.obstacles, len(self.capsules)):
+            if (own := k == number).any():
+                gap = obstacle.distance(start[..., i[own], :], end[..., i[own], :])
+                gaps.append(gap - jnp.broadcast_to(radii[i[own]], gap.shape))
+        gathered = jnp.concatenate(gaps, axis=-1)[..., self._filled]
+        # With the derivative of one of the pairs.
+        least = jnp.argmin(jax.lax.stop_gradient(gathered), axis=-1, keepdims=True)
+        return jnp.take_along_axis(gathered, least, axis=-1)[..., 0]
 
     def slopes(
         self, ends: Float[np.ndarray, "samples capsules 2 3"], chosen: Int[np.ndarray, " samples"]
     ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples capsules 2 3"]]:
         """Return one clearance of each sample [m], and its derivative by the ends, in NumPy."""
-        gaps, samples = np.asarray(self._gaps(ends)), np.arange(len(ends))
-        filled = self._filled[chosen]
-        nearest = filled[samples, gaps[samples[:, None], filled].argmin(axis=1)]
-        pairs, found = np.array(self.pairs)[nearest], np.zeros(ends.shape)
+        filled, samples = self._filled[chosen], np.arange(len(ends))
+        gaps = self._gaps(ends, np.repeat(samples, filled.shape[1]), filled.ravel())
+        gaps = gaps.reshape(filled.shape)
+        least = gaps.argmin(axis=1)
+        pairs, found = self._indices[filled[samples, least]], np.zeros(ends.shape)
         for k in np.unique(pairs[:, 1]):
             at = samples[pairs[:, 1] == k]
             i = pairs[at, 0]
             if k >= len(self.capsules):
-                found[at, i] = _obstacle_slopes(self.obstacles[k - len(self.capsules)], ends[at, i])
+                found[at, i] = self.obstacles[k - len(self.capsules)].slopes(ends[at, i])
                 continue
             first, second = ends[at, i], ends[at, k]
             a, b = closest_places(first[:, 0], first[:, 1], second[:, 0], second[:, 1])
@@ -180,24 +187,63 @@ class CollisionModel(Hashable):
             apart = (a * first).sum(axis=1) - (b * second).sum(axis=1)
             away = apart / np.sqrt((apart**2).sum(axis=1) + ROUNDING**2)[:, None]
             found[at, i], found[at, k] = a * away[:, None], -b * away[:, None]
-        return gaps[samples, nearest], found
+        return gaps[samples, least], found
 
-    @property
+    def _nearest_gaps(
+        self, ends: Float[np.ndarray, "samples capsules 2 3"]
+    ) -> Float[np.ndarray, "samples groups"]:
+        """Return the least gap of each group, without computing those that cannot be it."""
+        i, k = self._indices.T
+        inner = k < len(self.capsules)
+        middle, half = ends.mean(axis=2), 0.5 * np.diff(ends, axis=2)[:, :, 0]
+        reach = np.sqrt(np.einsum("tci,tci->tc", half, half))
+        apart = middle[:, i[inner]] - middle[:, k[inner]]
+        most = np.full((len(ends), len(i)), np.inf)
+        most[:, inner] = np.sqrt(np.einsum("tpi,tpi->tp", apart, apart)) - self._sizes[inner]
+        least = np.full(most.shape, -np.inf)
+        least[:, inner] = most[:, inner] - reach[:, i[inner]] - reach[:, k[inner]]
+        owner = np.zeros(len(i), int)
+        for number, group in enumerate(self.groups):
+            owner[list(group)] = number
+        needed = least <= most[:, self._filled].min(axis=2)[:, owner]
+        gaps = np.full(most.shape, np.inf)
+        gaps[needed] = self._gaps(ends, *np.nonzero(needed))
+        return gaps[:, self._filled].min(axis=2)
+
+    def _gaps(
+        self,
+        ends: Float[np.ndarray, "samples capsules 2 3"],
+        samples: Int[np.ndarray, " gaps"],
+        pairs: Int[np.ndarray, " gaps"],
+    ) -> Float[np.ndarray, " gaps"]:
+        """Return the gaps of some pairs in some samples [m], in NumPy."""
+        i, k = self._indices[pairs].T
+        inner, gaps = k < len(self.capsules), np.empty(len(pairs))
+        first, second = ends[samples[inner], i[inner]], ends[samples[inner], k[inner]]
+        gaps[inner] = segment_distance(first[:, 0], first[:, 1], second[:, 0], second[:, 1])
+        for number in np.unique(k[~inner]):
+            at = k == number
+            own = ends[samples[at], i[at]]
+            obstacle = self.obstacles[number - len(self.capsules)]
+            gaps[at] = np.asarray(obstacle.distance(own[:, 0], own[:, 1]))
+        return gaps - self._sizes[pairs]
+
+    @functools.cached_property
+    def _indices(self) -> Int[np.ndarray, "pairs 2"]:
+        return np.array(self.pairs)
+
+    @functools.cached_property
+    def _sizes(self) -> Float[np.ndarray, " pairs"]:
+        """Sums of the pairs' radii [m]."""
+        radii = np.array([float(c.radius) for c in self.capsules])
+        radii = np.concatenate([radii, np.zeros(len(self.obstacles))])
+        return radii[self._indices].sum(axis=1)
+
+    @functools.cached_property
     def _filled(self) -> Int[np.ndarray, "groups pairs"]:
         """Places of each group's pairs, the first one repeated."""
         most = max(map(len, self.groups))
         return np.array([[*group, *group[:1] * (most - len(group))] for group in self.groups])
-
-    def _grouped(self, gaps: Float[AnyArray, "*batch pairs"]) -> Any:
-        """Return the least gap of each group, with the derivative of one of its pairs."""
-        xp, filled = namespace(gaps), self._filled
-        if filled.shape[1] == 1:
-            return gaps
-        gathered = gaps[..., filled]
-        if xp is np:
-            return gathered.min(axis=-1)
-        least = jnp.argmin(jax.lax.stop_gradient(gathered), axis=-1, keepdims=True)
-        return jnp.take_along_axis(gathered, least, axis=-1)[..., 0]
 
     def _largest_gaps(self, robot: Robot) -> Float[np.ndarray, " pairs"]:
         """Return the largest gap of each pair in random poses."""
@@ -211,7 +257,9 @@ class CollisionModel(Hashable):
         )
         with double_precision():
             ends = jax.jit(jax.vmap(lambda x: self.ends(robot, x)))(q)
-            return np.asarray(self._gaps(np.asarray(ends))).max(axis=0)
+        shape = (_POSES, len(self.pairs))
+        every = np.unravel_index(np.arange(np.prod(shape)), shape)
+        return self._gaps(np.asarray(ends), *every).reshape(shape).max(axis=0)
 
     @eqx.filter_jit
     def clearance(
@@ -227,22 +275,6 @@ class CollisionModel(Hashable):
         poses = jnp.reshape(q, (-1, robot.joints))
         gaps = self.clearances(jax.vmap(lambda x: self.ends(robot, x))(poses))
         return gaps.reshape(*q.shape[:-1], gaps.shape[-1])
-
-
-@eqx.filter_jit
-def _jax_slopes(obstacle: HalfSpace | Box, start: Array, end: Array) -> tuple[Array, ...]:
-    distance, pull = jax.vjp(obstacle.distance, start, end)
-    return pull(jnp.ones_like(distance))
-
-
-def _obstacle_slopes(
-    obstacle: HalfSpace | Box, ends: Float[np.ndarray, "samples 2 3"]
-) -> Float[np.ndarray, "samples 2 3"]:
-    """Return the derivatives of the distances of segments from an obstacle by their ends."""
-    size = -(-len(ends) // 64) * 64  # few sizes, so that little is compiled
-    padded = np.concatenate([ends, np.broadcast_to(ends[:1], (size - len(ends), 2, 3))])
-    found = _jax_slopes(obstacle, jnp.asarray(padded[:, 0]), jnp.asarray(padded[:, 1]))
-    return np.stack([np.asarray(x) for x in found], axis=1)[: len(ends)]
 
 
 def _stem(name: str) -> str:

@@ -90,6 +90,14 @@ class HalfSpace(eqx.Module):
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""
         return _smaller(start @ self.normal, end @ self.normal) - self.height
 
+    def slopes(
+        self, ends: Float[np.ndarray, "segments 2 3"]
+    ) -> Float[np.ndarray, "segments 2 3"]:
+        """Return the derivatives of the distances of segments by their ends, in NumPy."""
+        heights = ends @ self.normal
+        lower = heights[:, 0] < heights[:, 1]
+        return np.stack([lower, ~lower], axis=1)[:, :, None] * self.normal
+
 
 class Box(eqx.Module):
     """A box in the world.
@@ -150,12 +158,27 @@ class Box(eqx.Module):
         before, after = (self._signed(first + place * along) for place in (low, high))
         return share * before + (1.0 - share) * after
 
+    def slopes(
+        self, ends: Float[np.ndarray, "segments 2 3"]
+    ) -> Float[np.ndarray, "segments 2 3"]:
+        """Return the derivatives of the distances of segments by their ends, in NumPy."""
+        count = -(-len(ends) // 64) * 64  # few sizes, so that little is compiled
+        padded = np.resize(ends, (count, 2, 3))
+        found = _box_slopes(self, jnp.asarray(padded[:, 0]), jnp.asarray(padded[:, 1]))
+        return np.stack([np.asarray(x) for x in found], axis=1)[: len(ends)]
+
     def _signed(self, point: Array) -> Array:
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
         x, y, z = jnp.unstack(-beyond, axis=-1)
         depth = _smaller(_smaller(x, y), z)
         outside = jnp.where(beyond > 0, beyond, 0.0)
         return _rounded_norm(outside) - jnp.where(depth > 0, depth, 0.0)
+
+
+@eqx.filter_jit
+def _box_slopes(box: Box, start: Array, end: Array) -> tuple[Array, ...]:
+    distance, pull = jax.vjp(box.distance, start, end)
+    return pull(jnp.ones_like(distance))
 
 
 def _smaller(x: Array, y: Array) -> Array:
