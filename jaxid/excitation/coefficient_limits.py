@@ -55,9 +55,7 @@ class Grid(NamedTuple):
         shift = xp.clip((1.0 - s) * q.mean(axis=1), low, xp.maximum(low, high))
         return self._moved(y, s, shift)
 
-    def shrink(
-        self, y: Float[AnyArray, " scaled"], fraction: Any
-    ) -> Float[AnyArray, " scaled"]:
+    def shrink(self, y: Float[AnyArray, " scaled"], fraction: Any) -> Float[AnyArray, " scaled"]:
         """Return a motion made smaller by a factor, each joint's about its mean position."""
         q, _ = self._positions(y)
         return self._moved(y, fraction, (1.0 - fraction) * q.mean(axis=1))

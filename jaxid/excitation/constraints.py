@@ -2,6 +2,7 @@
 
 import functools
 import math
+import operator
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -109,7 +110,8 @@ class AbstractConstraint(eqx.Module):
             motion: Joint motion in NumPy, with one axis of samples.
             chosen: Place of each sample's value in `entries`.
         """
-        values, slopes = _linearise(self, robot, motion, jnp.asarray(chosen))
+        parts = (motion.q, motion.qd, motion.qdd)
+        values, slopes = _compiled(_Same(self, robot))(jnp.asarray(chosen), *parts)
         return np.asarray(values), [np.asarray(x) for x in slopes]
 
     def describe(self, robot: Robot, values: Float[AnyArray, "*batch values"]) -> list[Finding]:
@@ -119,16 +121,33 @@ class AbstractConstraint(eqx.Module):
         return [e._replace(value=float(v)) for e, v in zip(entries, peaks, strict=True)]
 
 
-@eqx.filter_jit
-def _linearise(
-    constraint: AbstractConstraint, robot: Robot, motion: Motion, chosen: Array
-) -> tuple[Array, tuple[Array, ...]]:
-    def value(*parts: Array) -> Array:
-        values = constraint(robot, Motion(*parts))
-        return jnp.take_along_axis(values, chosen[:, None], axis=1)[:, 0]
+class _Same:
+    """Constraint and robot as the key of a compiled function: by identity, as their arrays are."""
 
-    values, pull = jax.vjp(value, *map(jnp.asarray, (motion.q, motion.qd, motion.qdd)))
-    return values, pull(jnp.ones_like(values))
+    def __init__(self, constraint: AbstractConstraint, robot: Robot):
+        self.parts = constraint, robot
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self.parts)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and all(map(operator.is_, self.parts, other.parts))
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(key: _Same) -> Callable:
+    constraint, robot = key.parts
+
+    @jax.jit
+    def linearised(chosen: Array, *parts: Array) -> tuple[Array, tuple[Array, ...]]:
+        def value(*parts: Array) -> Array:
+            values = constraint(robot, Motion(*parts))
+            return jnp.take_along_axis(values, chosen[:, None], axis=1)[:, 0]
+
+        values, pull = jax.vjp(value, *parts)
+        return values, pull(jnp.ones_like(values))
+
+    return linearised
 
 
 def _pull(
@@ -220,9 +239,7 @@ class Clearance(AbstractConstraint):
                 least=True,
                 usage=functools.partial(usage, distance=distance),
             )
-            for name, distance in zip(
-                self.model.pair_names, self.distances.tolist(), strict=True
-            )
+            for name, distance in zip(self.model.pair_names, self.distances.tolist(), strict=True)
         )
 
 
@@ -375,14 +392,14 @@ class ForceLimits(AbstractConstraint):
 
     def _forces(self, motion: Motion) -> Float[AnyArray, "*batch 3 joints"]:
         known = not isinstance(motion.q, jax.Array) and motion.q.ndim == 2
-        return (in_numpy if known else on_samples)(self, self.forces, motion.q, motion.qd, motion.qdd)
+        return (in_numpy if known else on_samples)(
+            self, self.forces, motion.q, motion.qd, motion.qdd
+        )
 
     def linearise(
         self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
     ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
         """Return one relative excess of each sample, and its derivatives, in NumPy."""
-        if self.covariance is not None:
-            return super().linearise(robot, motion, chosen)
         limits, to_limited = self._limited(robot)
         samples = np.arange(len(chosen))
         sides = np.einsum("tsj,jt->ts", self._forces(motion), to_limited[:, chosen])
@@ -392,7 +409,19 @@ class ForceLimits(AbstractConstraint):
         scale = np.sign(largest) / limits[chosen]
         weights[samples, side] = (to_limited[:, chosen] * scale).T
         slopes = _pull(self, self.forces, weights, motion.q, motion.qd, motion.qdd)
-        return np.abs(largest) / limits[chosen] - 1.0, slopes
+        size = np.abs(largest)
+        if self.covariance is not None:
+            base, share = self.base, to_limited[:, chosen].T
+            rows = np.einsum("tjb,tj->tb", np.asarray(base.regressor(motion)), share)
+            spread = rows @ self.covariance
+            smooth = (1e-12 * limits[chosen]) ** 2
+            deviation = np.sqrt(np.maximum((rows * spread).sum(axis=1), 0.0) + smooth)
+            weight = self.deviations / deviation / limits[chosen]
+            weights = share[:, :, None] * (spread * weight[:, None])[:, None]
+            more = _pull(base, base.columns, weights, *base.model.arguments(motion))
+            slopes = [x + y for x, y in zip(slopes, more, strict=True)]
+            size = size + self.deviations * deviation
+        return size / limits[chosen] - 1.0, slopes
 
     def forces(
         self,

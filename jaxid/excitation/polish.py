@@ -116,7 +116,9 @@ def _watched(problem: ExcitationProblem, x: np.ndarray, peaks: list[np.ndarray])
         now = np.stack([instants, entries])
         peaks += [now[:, :0]] if number == len(peaks) else []
         both = np.unique(np.concatenate([now, peaks[number]], axis=1), axis=1)
-        peaks[number] = np.unique(np.concatenate([peaks[number], now[:, len(WATCHED) :]], 1), axis=1)
+        peaks[number] = np.unique(
+            np.concatenate([peaks[number], now[:, len(WATCHED) :]], 1), axis=1
+        )
         found.append((both[0], both[1]))
     return found
 

@@ -234,7 +234,9 @@ class ExcitationProblem:
         self, plain: np.ndarray, weighted: np.ndarray, sharpness: float | None
     ) -> tuple[np.ndarray, ...]:
         """Return the criterion of several motions, and its derivatives by their information."""
-        found = [self._judged(*matrices, sharpness) for matrices in zip(plain, weighted, strict=True)]
+        found = [
+            self._judged(*matrices, sharpness) for matrices in zip(plain, weighted, strict=True)
+        ]
         values, slopes = zip(*found, strict=True)
         return np.array(values), *(np.array(x) for x in zip(*slopes, strict=True))
 

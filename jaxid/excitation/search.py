@@ -173,7 +173,10 @@ class Search:
             part[0] = one[int(found.order()[0])]
 
     def _improve_batch(self, places: np.ndarray, schedule: tuple[Stage, ...]) -> Iterator[str]:
-        states, task = _begin(self._problem, SEARCHED, self._x[places]), "searching from many starts"
+        states, task = (
+            _begin(self._problem, SEARCHED, self._x[places]),
+            "searching from many starts",
+        )
         for number, stage in enumerate(schedule):
             for states in _improve(self._problem, SEARCHED, states, stage):
                 if self._is_late:
@@ -244,7 +247,9 @@ def first_motions(
     values = [np.asarray(c(problem.robot, still)).max(axis=1) for c in problem.constraints]
     good = np.argsort(np.max(values, axis=0))[: len(x)]
     fill = problem.limits.grid().fill
-    many = [fill(y, place, size) for size in SIZES for y, place in zip(x, places[good], strict=True)]
+    many = [
+        fill(y, place, size) for size in SIZES for y, place in zip(x, places[good], strict=True)
+    ]
     excess = np.array([problem.watched_excess(y) for y in many])
     best = np.argsort(np.maximum(excess, 0.0), kind="stable")[: len(x)]
     return np.array(many)[best]

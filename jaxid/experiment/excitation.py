@@ -350,7 +350,11 @@ def _remarks(
     experiment: Experiment, plan: ExcitationPlan, played: Played, preparation: Preparation
 ) -> Iterator[Remark]:
     """Yield what must be known of a designed motion beside its plan."""
-    table, leads, (begin, end) = experiment.excitation, experiment.excitation.chosen_leads, played.window
+    table, leads, (begin, end) = (
+        experiment.excitation,
+        experiment.excitation.chosen_leads,
+        played.window,
+    )
     if played.fault:
         yield Remark(played.fault, Status.BAD)
     if begin > 0:

@@ -124,7 +124,9 @@ class CollisionModel(Hashable):
             first.setdefault(self._owner(shape), _stem(shapes[shape].name))
 
         def name(shape: int, alone: bool) -> str:
-            return shapes[shape].name if alone else first.get(self._owner(shape), shapes[shape].name)
+            return (
+                shapes[shape].name if alone else first.get(self._owner(shape), shapes[shape].name)
+            )
 
         pairs = [(self.pairs[group[0]], len(group) == 1) for group in self.groups]
         return tuple(f"{name(i, alone)} and {name(k, alone)}" for (i, k), alone in pairs)
@@ -252,9 +254,7 @@ class CollisionModel(Hashable):
         low = np.where(np.isfinite(low), low, -np.pi)
         high = np.where(np.isfinite(high), high, np.pi)
         random = np.random.default_rng(0)
-        q = random.uniform(
-            np.minimum(low, high), np.maximum(low, high), (_POSES, robot.joints)
-        )
+        q = random.uniform(np.minimum(low, high), np.maximum(low, high), (_POSES, robot.joints))
         with double_precision():
             ends = jax.jit(jax.vmap(lambda x: self.ends(robot, x)))(q)
         shape = (_POSES, len(self.pairs))

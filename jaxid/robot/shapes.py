@@ -90,9 +90,7 @@ class HalfSpace(eqx.Module):
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""
         return _smaller(start @ self.normal, end @ self.normal) - self.height
 
-    def slopes(
-        self, ends: Float[np.ndarray, "segments 2 3"]
-    ) -> Float[np.ndarray, "segments 2 3"]:
+    def slopes(self, ends: Float[np.ndarray, "segments 2 3"]) -> Float[np.ndarray, "segments 2 3"]:
         """Return the derivatives of the distances of segments by their ends, in NumPy."""
         heights = ends @ self.normal
         lower = heights[:, 0] < heights[:, 1]
@@ -158,9 +156,7 @@ class Box(eqx.Module):
         before, after = (self._signed(first + place * along) for place in (low, high))
         return share * before + (1.0 - share) * after
 
-    def slopes(
-        self, ends: Float[np.ndarray, "segments 2 3"]
-    ) -> Float[np.ndarray, "segments 2 3"]:
+    def slopes(self, ends: Float[np.ndarray, "segments 2 3"]) -> Float[np.ndarray, "segments 2 3"]:
         """Return the derivatives of the distances of segments by their ends, in NumPy."""
         count = -(-len(ends) // 64) * 64  # few sizes, so that little is compiled
         padded = np.resize(ends, (count, 2, 3))
