@@ -12,9 +12,9 @@ import enum
 import json
 import math
 import os
-import threading
 import re
 import shutil
+import threading
 import types
 import typing
 import uuid

@@ -4,9 +4,9 @@ import types
 
 import numpy as np
 import pytest
+from jaxid.experiment.collision_check import collision_remarks
 
 import jaxid as jid
-from jaxid.experiment.collision_check import collision_remarks
 from jaxid.experiment.experiment import load_experiment
 from jaxid.result_table import Status
 

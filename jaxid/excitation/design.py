@@ -194,7 +194,6 @@ def _run(
             if time.monotonic() > until and search.feasible:
                 break
     except KeyboardInterrupt:
-        search.finish()
         return DesignStatus.STOPPED
     search.finish()
     history = search.history

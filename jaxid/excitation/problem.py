@@ -431,7 +431,6 @@ def evaluate_within_limits(
     Where they almost keep the other constraints, they are made smaller until they do; without
     constraints they fill their limits where that is better.
     """
-
     grid = problem.limits.grid()
 
     def mended(y: np.ndarray) -> np.ndarray:
@@ -450,7 +449,6 @@ def evaluate_within_limits(
 
 def shrink_to_constraints(problem: ExcitationProblem, x: Float[AnyArray, " scaled"]) -> Candidates:
     """Return a motion made so small that it keeps all constraints; unchanged if no size does."""
-
     x, shrink = np.asarray(x), problem.limits.grid().shrink
 
     def keeps(fraction: float) -> bool:

@@ -142,7 +142,7 @@ class Search:
             found = [*self.best.x]
             for start in range(0, len(found), BATCH):
                 states = _begin(problem, SEARCHED, children[start : start + BATCH])
-                for states in _improve(problem, SEARCHED, states, GENERATION):
+                for _ in _improve(problem, SEARCHED, states, GENERATION):
                     if self._is_late:
                         break
                     yield "improving descendants"
@@ -178,7 +178,7 @@ class Search:
             "searching from many starts",
         )
         for number, stage in enumerate(schedule):
-            for states in _improve(self._problem, SEARCHED, states, stage):
+            for _ in _improve(self._problem, SEARCHED, states, stage):
                 if self._is_late:
                     return
                 yield task
@@ -193,7 +193,7 @@ class Search:
         for start in range(0, len(promising) if self._seconds is None else BATCH, BATCH):
             places = promising[start : start + BATCH]
             states = _begin(problem, FINE, self.best.x[places])
-            for states in _improve(problem, FINE, states, LAST):
+            for _ in _improve(problem, FINE, states, LAST):
                 yield task
             self._take(states, places)
             yield self._done(task)
@@ -227,7 +227,8 @@ class Search:
     def finish(self) -> None:
         """Make motions smaller where no other keeps all constraints."""
         if self.best.broken.all():
-            for place, x in enumerate(np.asarray(self.best.x)):
+            for place in self.best.order()[:4]:
+                x = np.asarray(self.best.x[place])
                 small = shrink_to_constraints(self._problem, x)
                 self.best = self.best.improved(small, np.arange(len(self.best.x)) == place)
 
@@ -266,8 +267,8 @@ def _begin(problem: ExcitationProblem, points: int, x: Any) -> list[State]:
 
 def _improve(
     problem: ExcitationProblem, points: int, states: list[State], stage: Stage
-) -> Iterator[list[State]]:
-    """Run one stage in parts, and yield their states; peaks of constraints are found anew."""
+) -> Iterator[None]:
+    """Run one stage in parts, on the list of states; peaks of constraints are found anew."""
     grid = problem.limits.grid(points)
     for start in range(0, stage.iterations, PART):
         barrier = max(stage.least, stage.barrier * interior_point.COOLING**start)
@@ -278,8 +279,8 @@ def _improve(
             return problem.evaluate(y, stage.sharpness, [watched[k] for k in active])
 
         now = stage._replace(barrier=barrier, iterations=count)
-        states = interior_point.run(grid, objective, states, now)
-        yield states
+        states[:] = interior_point.run(grid, objective, states, now)
+        yield
 
 
 def crossover(

@@ -79,8 +79,8 @@ class Collision:
             `[{ name = "gun", body = "ground", start = [0, 0, 0], end = [0, 0, 1], radius = 0.1 }]`.
         boxes: Boxes in the world, with angles in degrees, like
             `[{ name = "table", centre = [0.8, 0, 0.2], size = [1, 1, 1], rotation = [0, 0, 45] }]`.
-        pairs: Pairs of shapes to watch, like `[["gun", "table"]]`; by default all that the joints can
-            bring together.
+        pairs: Pairs of shapes to watch, like `[["gun", "table"]]`; by default all that the joints
+            can bring together.
     """
 
     distance: Positive = 0.03

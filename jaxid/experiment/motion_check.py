@@ -47,6 +47,8 @@ def motion_checks(
         yield Remark("floor: not checked, as `floor = false` asks", Status.DOUBTFUL)
     else:
         yield Remark("floor: not checked, for no shape of the robot is known", Status.BAD)
+    for note in () if clearance is None else clearance.model.notes:
+        yield Remark(f"self-collision: {note}", Status.DOUBTFUL)
     for fault in faults:
         yield Remark(f"self-collision: {fault}", Status.BAD)
     if apart:

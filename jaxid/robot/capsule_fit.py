@@ -55,11 +55,11 @@ def fit_capsules(
     """Fit capsules around the collision geometry of a URDF or MJCF file.
 
     A link without collision geometry counts with its visual one. Spheres remain spheres, cylinders
-    get round ends, boxes and meshes a small capsule that holds all their corners. A capsule is named after its link, with a number from the second on. Bodies are those of
-    `load_urdf` with the same arguments; a capsule of a link that stands on the ground belongs to
-    the ground. Grippers count even where `tip` leaves their joints out: held, like joints that
-    mimic others, as near to zero as they can be. Meshes of a URDF file are read by the package
-    trimesh (extra `meshes`).
+    get round ends, boxes and meshes a small capsule that holds all their corners. A capsule is
+    named after its link, with a number from the second on. Bodies are those of `load_urdf` with the
+    same arguments; a capsule of a link that stands on the ground belongs to the ground. Grippers
+    count even where `tip` leaves their joints out: held, like joints that mimic others, as near to
+    zero as they can be. Meshes of a URDF file are read by the package trimesh (extra `meshes`).
 
     Args:
         path: URDF or MJCF file.

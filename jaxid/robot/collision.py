@@ -86,11 +86,9 @@ class CollisionModel(Hashable):
         best = self._largest_gaps(robot)
         room = {pair: float(gap) for pair, gap in zip(self.pairs, best, strict=True)}
         left = [pair for pair, gap in room.items() if gap <= 0]
-        self.notes = tuple(
-            f"{names[i]} and {names[k]} overlap in every pose that was tried, so they are not "
-            "watched."
-            for i, k in left
-        )
+        if left:
+            said = ", ".join(f"{names[i]} and {names[k]}" for i, k in left)
+            self.notes = (f"not watched, for they overlap in every pose that was tried: {said}.",)
         self._watch([(names[i], names[k]) for i, k in self.pairs if (i, k) not in left], names)
         self.room = tuple(min(room[self.pairs[k]] for k in group) for group in self.groups)
 

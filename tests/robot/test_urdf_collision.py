@@ -5,7 +5,8 @@ import pytest
 from forward_kinematics import body_transforms
 from urdf_text import joint, link, robot
 
-from jaxid.robot.collision import CollisionModel, enclose, fit_capsules
+from jaxid.robot.capsule_fit import enclose, fit_capsules
+from jaxid.robot.collision import CollisionModel
 from jaxid.robot.urdf import load_urdf
 
 
