@@ -109,7 +109,9 @@ class Collision:
         if self.floor is not False and not any(isinstance(o, HalfSpace) for o in obstacles):
             obstacles.append(self._floor(source))
         if self.fit:
-            bare = sorted({*range(-1, robot.joints)} - {c.body for c in capsules})
+            # The base may be a frame alone.
+            first = 0 if capsules else GROUND
+            bare = sorted({*range(first, robot.joints)} - {c.body for c in capsules})
             stout = stand_in_capsules(robot, bare)
             capsules += stout
             if names := ", ".join(f"`{c.name}`" for c in stout):
@@ -118,9 +120,12 @@ class Collision:
                     "joints stand in for it; give `capsules` in `[collision]`, or a file with "
                     "collision geometry"
                 )
-        if len(capsules) + len(obstacles) < 2 and not self.pairs:
-            return Surroundings(None, ("no shape is known that could meet another",))
-        model = CollisionModel(robot, capsules, obstacles, self.pairs or pairs)
+        try:
+            model = CollisionModel(robot, capsules, obstacles, self.pairs or pairs)
+        except InputError:
+            if self.capsules or self.boxes or self.pairs:
+                raise
+            return Surroundings(None, tuple(faults))
         return Surroundings(Clearance(model, self.distance), tuple(faults))
 
     def _floor(self, source: RobotSource) -> HalfSpace:

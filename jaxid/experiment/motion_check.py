@@ -53,6 +53,8 @@ def motion_checks(
         yield Remark(f"self-collision: {fault}", Status.BAD)
     if apart:
         yield _judge("self-collision", apart)
+    elif not experiment.collision.fit:
+        yield Remark("self-collision: not checked, as `fit = false` asks", Status.DOUBTFUL)
     elif not faults:
         yield Remark("self-collision: no two bodies can meet", Status.GOOD)
     forces = [f for f in plan.findings if f.name.startswith(("the force of", "the torque of"))]

@@ -58,7 +58,7 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         published and f"Limits that nobody published, assumed: {published}",
         assumed and f"Assumed, because not given: {assumed}",
         vague and f"Deviations above {100 * VAGUE:g} % of the nominal value: {vague}",
-        "The design was stopped: `--resume` goes on where it was" if plan.interrupted else "",
+        "The search was stopped: `--resume` may find a better motion" if plan.interrupted else "",
     )
     found = [Remark(text, Status.DOUBTFUL) for text in doubts if text]
     start, then = plan.limits.basis.times(plan.samples)[:2]
@@ -135,7 +135,8 @@ def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
     if any(remark.status is Status.BAD for remark in remarks):
         text = "Do not record this motion yet: what is marked ✗ comes first."
         return Remark(text, Status.BAD)
+    if left := [r.text.split(":")[0] for r in remarks if ": not checked, as" in r.text]:
+        text = f"This motion keeps all limits that were checked; not checked: {', '.join(left)}."
+        return Remark(text, Status.DOUBTFUL)
     text = "A motion that can be recorded: it keeps all limits, and determines all parameters."
-    if plan.interrupted:
-        text += " The search was stopped: `--resume` may find a better one."
     return Remark(text, Status.GOOD)
