@@ -151,11 +151,13 @@ def _compiled(key: _Same) -> Callable:
 
 
 def _pull(
-    owner: eqx.Module, definition: Callable, weights: np.ndarray, *arrays: np.ndarray
+    owner: eqx.Module, definition: Callable, weights: np.ndarray, *arrays: AnyArray
 ) -> list[Float[np.ndarray, "samples joints"]]:
     """Return derivatives of weighted results of a method for one sample, for rows of samples."""
     program = program_of(owner, definition, *(x.shape[1:] for x in arrays))
-    slopes = pull_back(program, weights.reshape(len(weights), -1).T, *(x.T for x in arrays))
+    slopes = pull_back(
+        program, weights.reshape(len(weights), -1).T, *(np.asarray(x).T for x in arrays)
+    )
     return [x.T for x in slopes]
 
 
@@ -217,7 +219,7 @@ class Clearance(AbstractConstraint):
         self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
     ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
         """Return one missing distance of each sample, and its derivatives, in NumPy."""
-        gaps, slopes = self.model.slopes(self._axes(robot, motion.q), chosen)
+        gaps, slopes = self.model.slopes(np.asarray(self._axes(robot, motion.q)), chosen)
         ends = eqx.Partial(self.model.ends, robot)
         (by_q,) = _pull(ends, ends.__call__, slopes / -0.1, np.asarray(motion.q))
         none = np.zeros(by_q.shape)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
+from jaxid.arrays import AnyArray, Float, PRNGKeyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
@@ -21,7 +21,7 @@ from .design_result import SETTLED, DesignStatus, ExcitationPlan
 from .problem import ExcitationProblem, evaluate, evaluate_within_limits
 from .search import Search
 
-Solver = Callable[[ExcitationProblem, Float[Array, "starts scaled"]], AnyArray]
+Solver = Callable[[ExcitationProblem, Float[AnyArray, "starts scaled"]], AnyArray]
 """A solver of excitation problems: from random motions to better ones."""
 
 

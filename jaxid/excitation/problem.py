@@ -437,12 +437,15 @@ def evaluate_within_limits(
         if not 0.0 < problem.excess(y) <= NEAR:
             return y
         fractions = (0.9995, 0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9)
-        smaller = (grid.shrink(y, fraction) for fraction in fractions)
+        smaller = (np.asarray(grid.shrink(y, fraction)) for fraction in fractions)
         return next((z for z in smaller if problem.excess(z) <= 0.0), y)
 
     # A larger motion mostly tells more, but a condition number may well become worse by it.
     growths = (1.0,) if problem.constraints else (1.0, 1.05)
-    scaled = [[grid.scale_into_limits(y, growth=growth) for y in x] for growth in growths]
+    scaled = [
+        [np.asarray(grid.scale_into_limits(y, growth=growth)) for y in np.asarray(x)]
+        for growth in growths
+    ]
     found = [evaluate(problem, np.array([mended(y) for y in some])) for some in scaled]
     return functools.reduce(Candidates.improved, found)
 

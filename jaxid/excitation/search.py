@@ -138,7 +138,7 @@ class Search:
         for _ in range(self._generations):
             if self._is_late:
                 break
-            children = crossover(problem, self.best.x, self._random)
+            children = crossover(problem, np.asarray(self.best.x), self._random)
             found = [*self.best.x]
             for start in range(0, len(found), BATCH):
                 states = _begin(problem, SEARCHED, children[start : start + BATCH])
@@ -249,7 +249,9 @@ def first_motions(
     good = np.argsort(np.max(values, axis=0))[: len(x)]
     fill = problem.limits.grid().fill
     many = [
-        fill(y, place, size) for size in SIZES for y, place in zip(x, places[good], strict=True)
+        np.asarray(fill(y, place, size))
+        for size in SIZES
+        for y, place in zip(x, places[good], strict=True)
     ]
     excess = np.array([problem.watched_excess(y) for y in many])
     best = np.argsort(np.maximum(excess, 0.0), kind="stable")[: len(x)]

@@ -80,16 +80,17 @@ class CollisionModel(Hashable):
                 bodies = f"from 0 to {robot.joints - 1}, or -1 for the ground"
                 raise InputError(f"`body` of capsule `{c.name}` must be {bodies}, but is {c.body}.")
         self.notes = ()
-        self._watch(_meeting_pairs(robot, capsules, names) if pairs is None else pairs, names)
         if pairs is not None:
+            self._watch(pairs, names)
             return
-        best = self._largest_gaps(robot)
-        room = {pair: float(gap) for pair, gap in zip(self.pairs, best, strict=True)}
+        every = CollisionModel(robot, capsules, obstacles, _meeting_pairs(robot, capsules, names))
+        best = every._largest_gaps(robot).tolist()
+        room = dict(zip(every.pairs, best, strict=True))
         left = [pair for pair, gap in room.items() if gap <= 0]
         if left:
             said = ", ".join(f"{names[i]} and {names[k]}" for i, k in left)
             self.notes = (f"not watched, for they overlap in every pose that was tried: {said}.",)
-        self._watch([(names[i], names[k]) for i, k in self.pairs if (i, k) not in left], names)
+        self._watch([(names[i], names[k]) for i, k in every.pairs if (i, k) not in left], names)
         self.room = tuple(min(room[self.pairs[k]] for k in group) for group in self.groups)
 
     def _watch(self, pairs: Sequence[Sequence[str]], names: list[str]) -> None:
@@ -98,8 +99,6 @@ class CollisionModel(Hashable):
         if not found:
             raise InputError("a collision model needs at least one pair of shapes that can meet.")
         # Pairs of capsules first, then obstacle by obstacle.
-        for name in ("_indices", "_sizes", "_filled"):
-            self.__dict__.pop(name, None)
         self.pairs = tuple(sorted(found, key=lambda p: max(p[1], len(self.capsules) - 1)))
         groups: dict[tuple, list[int]] = {}
         for place, pair in enumerate(self.pairs):
@@ -144,10 +143,9 @@ class CollisionModel(Hashable):
         self, ends: Float[AnyArray, "*batch capsules 2 3"]
     ) -> Float[AnyArray, "*batch groups"]:
         """Return the clearances [m] for given ends of all axes on the ground [m]."""
-        if namespace(ends) is np:
-            return self._nearest_gaps(ends.reshape(-1, *ends.shape[-3:])).reshape(
-                *ends.shape[:-3], len(self.groups)
-            )
+        if isinstance(ends, np.ndarray):
+            least = self._nearest_gaps(ends.reshape(-1, *ends.shape[-3:]))
+            return least.reshape(*ends.shape[:-3], len(self.groups))
         start, end = ends[..., 0, :], ends[..., 1, :]
         radii = jnp.stack([jnp.asarray(c.radius) for c in self.capsules])
         i, k = self._indices.T
@@ -262,7 +260,7 @@ class CollisionModel(Hashable):
     @eqx.filter_jit
     def clearance(
         self, robot: Robot, q: Float[AnyArray, "*batch joints"]
-    ) -> Float[Array, "*batch groups"]:
+    ) -> Float[AnyArray, "*batch groups"]:
         """Return the distance between the surfaces of every pair, negative where they overlap [m].
 
         Args:

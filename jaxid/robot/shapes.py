@@ -5,6 +5,8 @@ root is rounded near zero, so that a distance comes out at most `ROUNDING` too s
 large. Where the closest points are not unique, the derivative is that at one pair of them.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -163,7 +165,7 @@ class Box(eqx.Module):
         found = _box_slopes(self, jnp.asarray(padded[:, 0]), jnp.asarray(padded[:, 1]))
         return np.stack([np.asarray(x) for x in found], axis=1)[: len(ends)]
 
-    def _signed(self, point: Array) -> Array:
+    def _signed(self, point: Array) -> Any:
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
         x, y, z = jnp.unstack(-beyond, axis=-1)
         depth = _smaller(_smaller(x, y), z)
@@ -177,7 +179,7 @@ def _box_slopes(box: Box, start: Array, end: Array) -> tuple[Array, ...]:
     return pull(jnp.ones_like(distance))
 
 
-def _smaller(x: Array, y: Array) -> Array:
+def _smaller(x: AnyArray, y: AnyArray) -> Any:
     """Return the smaller numbers, with the derivatives of one of both.
 
     Derivatives of `jnp.minimum` ask which argument equals the result. None does where a compiler
@@ -186,7 +188,7 @@ def _smaller(x: Array, y: Array) -> Array:
     return namespace(x, y).where(x < y, x, y)
 
 
-def _rounded_norm(vector: Vectors) -> Lengths:
+def _rounded_norm(vector: Vectors) -> Any:
     """Return lengths of vectors, smooth at zero and there at most `ROUNDING` too small [m]."""
     xp = namespace(vector)
     return xp.sqrt(xp.einsum("...i,...i->...", vector, vector) + ROUNDING**2) - ROUNDING
