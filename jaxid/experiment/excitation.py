@@ -94,7 +94,7 @@ class Design(NamedTuple):
 
 
 class Preparation(NamedTuple):
-    """What a design needs to know before its search.
+    """Knowledge that a design needs before its search.
 
     Attributes:
         nominal: Parameters that are known.

@@ -284,9 +284,12 @@ def parse_experiment(text: str, path: Path) -> Experiment:
         said = str(error).rstrip(".")
         raise InputError(f"{path.name}: is no TOML in UTF-8: {said}.") from error
     try:
-        return Experiment(path=path, text=text, **_build(content, path.parent))
+        experiment = Experiment(path=path, text=text, **_build(content, path.parent))
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
+    if "collision" in content:
+        _ = experiment.surroundings  # for its mistakes
+    return experiment
 
 
 def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:

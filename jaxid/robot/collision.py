@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Hashable, Int, double_precision, namespace
+from jaxid.arrays import AnyArray, Array, Float, Hashable, Int, double_precision
 from jaxid.errors import InputError
 
 from .forward_and_inverse_kinematics import placements
