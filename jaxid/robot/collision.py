@@ -13,6 +13,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Array, Float, Hashable, Int, double_precision
 from jaxid.errors import InputError
 
+from .capsule_fit import fit_capsules as fit_capsules
 from .forward_and_inverse_kinematics import placements
 from .robot import Robot
 from .shapes import (
