@@ -14,6 +14,7 @@ import math
 import os
 import re
 import shutil
+import threading
 import types
 import typing
 import uuid
@@ -27,6 +28,8 @@ import numpy as np
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 
+PLACING = threading.Lock()
+"""Held while files take their places."""
 TEMPORARY: set[Path] = set()
 """Temporary folders in use; who ends the process at once removes them."""
 _DTYPES = ("float64", "float32", "int64", "int32", "bool")
@@ -57,11 +60,12 @@ def atomic_folder(
     folder = Path(folder).absolute()
     with _temporary_folder(folder) as staging:
         yield staging
-        if folder.exists():
-            _move_files(staging, folder, outdated(folder))
-        else:
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(staging, folder)
+        with PLACING:
+            if folder.exists():
+                _move_files(staging, folder, outdated(folder))
+            else:
+                folder.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(staging, folder)
 
 
 def require_writable(folder: str | Path) -> None:

@@ -407,6 +407,7 @@ def test_a_signal_ends_a_command_at_once_and_leaves_nothing(folder, moment, numb
     time.sleep(moment)
     process.send_signal(number)
     said = process.communicate(timeout=60)[1]
-    assert (process.returncode, said.count("\n")) == (128 + number, 1), said
-    assert said.startswith("jaxid: ")
+    assert process.returncode == 128 + number, said
+    # Before it stand the checks that cannot be made.
+    assert said.splitlines()[-1].startswith("jaxid: stopped")
     assert not list(folder.rglob(".jaxid-*"))

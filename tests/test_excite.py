@@ -26,14 +26,13 @@ from jaxid.experiment.excitation import (
     design_motion,
     find_constraints,
     find_nominal,
-    force_remarks,
+    prepare_design,
     write_design,
 )
 from jaxid.experiment.excitation_tables import Excitation, Leads
 from jaxid.experiment.experiment import load_experiment
 from jaxid.report.excitation import plan_remarks
-from jaxid.result_table import Status
-from jaxid.trajectory.files import save_trajectory
+from jaxid.trajectory.files import load_trajectory, save_trajectory
 from jaxid.trajectory.fourier import FourierBasis, fourier_series
 from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
@@ -56,6 +55,9 @@ EXPERIMENT = """\
 urdf = "pendulum.urdf"
 [limits]
 acceleration = [4]
+[collision]
+floor = false
+fit = false
 [excitation]
 harmonics = 2
 starts = 2
@@ -65,18 +67,33 @@ samples = 100
 seed = 5
 """
 FAST = EXPERIMENT.replace("polish = 1", "polish = 0")
-STAGES = {"SCHEDULE": search.SCHEDULE, "SETTLING": search.SETTLING}
-LAST_STAGE_ALONE = """
-import jaxid.excitation.search as search
-search.SCHEDULE = search.SETTLING = ()
-from jaxid.cli.app import main
-main()
-"""
+FREE = FAST.replace("[4]", "[4]\nforce = [inf]").replace("seed", "noise = [0.12]\nseed")
+STAGES = {"SCHEDULE": search.SCHEDULE, "CONSTRAINED": search.CONSTRAINED}
+LINK = """<link name="l{k}"><inertial><origin xyz="0 0 0.2"/><mass value="1"/><inertia ixx="0.1"
+ iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>{shape}</link>"""
+SHAPE = """<collision><origin xyz="0 0 0.2"/><geometry><cylinder radius="0.04" length="0.3"/>
+</geometry></collision>"""
+JOINT = """<joint name="j{k}" type="revolute"><parent link="l{p}"/><child link="l{k}"/>
+<origin xyz="0 0 {z}"/><axis xyz="0 1 0"/><limit lower="-3.1" upper="3.1" velocity="2"
+ effort="{effort}"/></joint>"""
+
+
+def arm(folder, shape=SHAPE, effort=50.0, keys=""):
+    """Write a robot that stands upright at zero, and its experiment file."""
+    links = "".join(LINK.format(k=k, shape=shape if k else "") for k in range(4))
+    joints = "".join(
+        JOINT.format(k=k, p=k - 1, z=0.4 if k > 1 else 0.5, effort=effort) for k in range(1, 4)
+    )
+    (folder / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    path = folder / "arm.toml"
+    text = '[robot]\nurdf = "arm.urdf"\n[excitation]\nharmonics = 2\nstarts = 4\n'
+    path.write_text(text + "generations = 0\npolish = 0\n" + keys)
+    return path
 
 
 @pytest.fixture(scope="module", autouse=True)
 def last_stage_alone():
-    """Designs without the stages before the last one, whose programs take long to compile."""
+    """Designs without the stages before the last one."""
     with pytest.MonkeyPatch.context() as patch:
         for stages in STAGES:
             patch.setattr(search, stages, ())
@@ -89,7 +106,7 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("excite")
     (folder / "pendulum.urdf").write_text(PENDULUM)
     (folder / "experiment.toml").write_text(EXPERIMENT)
-    (folder / "fast.toml").write_text(FAST)
+    (folder / "free.toml").write_text(FREE)
     return folder
 
 
@@ -120,8 +137,11 @@ def designed(written, run):
 @pytest.fixture(scope="module")
 def excited(written):
     """A motion as fast as it can be had, for what is said of it."""
-    experiment = load_experiment(written / "fast.toml")
-    return design_motion(experiment, lambda _: None, written / "fast.npz", False)
+    return designed_by(load_experiment(written / "free.toml"))
+
+
+def designed_by(experiment):
+    return design_motion(experiment, prepare_design(experiment, None), lambda _: None)
 
 
 @pytest.fixture
@@ -140,9 +160,9 @@ def table(path):
     return np.loadtxt(path, delimiter=",", skiprows=1)
 
 
-def with_keys(folder, name, *keys):
+def with_keys(folder, name, *keys, text=FAST):
     path = folder / name
-    path.write_text(FAST + "\n".join(keys) + "\n")
+    path.write_text(text + "\n".join(keys) + "\n")
     return path
 
 
@@ -166,7 +186,8 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "of 100 samples in 7.854 s (12.73 Hz), of one run",
         "standard deviation 0.120 N m",
         "give `noise` if it is known",
-        "by the nominal parameters they stay within their limits",
+        "forces by the nominal parameters: 1 quantities keep their limits",
+        "not checked: floor, self-collision",
     ):
         assert said in " ".join(out.split())
     page = html.unescape((written / "plan" / "motion" / "report.html").read_text())
@@ -179,30 +200,75 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         assert said in page
 
 
-def test_a_killed_design_goes_on_to_the_same_motion(designed, run):
-    written = designed
-    arguments = ["excite", "experiment.toml", "-o", "killed/motion.csv"]
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_search_leaves_its_best_motion_and_another_goes_on(tmp_path, number):
+    arm(tmp_path)
+    command = [sys.executable, "-m", "jaxid", "excite", "arm.toml", "-o", "run/motion.csv"]
+    settings = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}}
     process = subprocess.Popen(
-        [sys.executable, "-c", LAST_STAGE_ALONE, *arguments],
-        cwd=written,
-        stdout=subprocess.DEVNULL,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **settings
     )
-    state = written / "killed" / "motion.state.npz"
-    until = time.monotonic() + 120
-    while not state.exists() and process.poll() is None and time.monotonic() < until:
+    motion, until = tmp_path / "run" / "motion.json", time.monotonic() + 120
+    while not motion.exists() and process.poll() is None and time.monotonic() < until:
         time.sleep(0.005)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
-    assert listing(written / "killed") == ["motion.state.npz"]
-    code, out, err = run(*arguments)
-    assert (code, out) == (2, "")
-    assert "to begin anew, remove the file" in err
-    code, _, err = run(*arguments, "--resume")
+    process.send_signal(number)
+    _, err = process.communicate()
+    files = listing(tmp_path / "run")
+    assert files == ["motion.csv", "motion.json", "motion.ros.yaml"]
+    if number is signal.SIGINT:
+        assert process.returncode == 130
+        assert err.startswith("jaxid: stopped: `run/motion.csv` and the files beside it hold the")
+        assert "`--resume` goes on" in err
+        found, rows = load_trajectory(motion), table(tmp_path / "run" / "motion.csv")
+        expected = np.concatenate([getattr(found.motion(rows[:, 0]), x) for x in ("q", "qd")], 1)
+        np.testing.assert_allclose(rows[:, 1:7], expected, atol=1e-9)
+    before = load_trajectory(motion)
+    done = subprocess.run(
+        [*command, "--resume", "--time", "1"], capture_output=True, text=True, **settings
+    )
+    assert done.returncode == 0, done.stderr
+    assert "A motion that can be recorded" in done.stdout
+    assert load_trajectory(motion).basis.lead == before.basis.lead
+
+
+def test_floor_self_collision_and_forces_are_kept_by_default(tmp_path, run):
+    arm(tmp_path)
+    code, out, err = run("excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv")
     assert code == 0, err
-    assert not state.exists()
-    same = [(written / folder / "motion.json").read_text() for folder in ("plan", "killed")]
-    assert same[0] == same[1]
+    said = " ".join(out.split())
+    for words in ("floor: 3 quantities", "self-collision: 1 quant", "forces by the nominal"):
+        assert f"✓ {words}" in said
+    assert said.index("✓ A motion that can be recorded: it keeps all limits") > said.index("floor:")
+    experiment = load_experiment(tmp_path / "arm.toml")
+    q = table(tmp_path / "motion.csv")[:, 1:4]
+    # The ends of all links in the plane in which they turn, from sums of angles.
+    angles = np.cumsum(q, axis=1)
+    up = np.cos(angles)
+    ends = 0.5 + 0.4 * np.cumsum(np.pad(up, ((0, 0), (1, 0)))[:, :3], axis=1) + 0.35 * up
+    assert ends.min() >= 0.04 + 0.029
+    assert np.ptp(q, axis=0).min() > 0.1
+    gaps = np.asarray(experiment.surroundings.clearance.model.clearance(experiment.robot, q))
+    assert gaps.min() >= 0.029
+
+
+def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
+    # Ahead of its base the arm cannot be held by 1 N m.
+    ahead = "[limits]\nposition_min = [1.2, -0.3, -0.3]\nposition_max = [1.9, 0.3, 0.3]\n"
+    arm(tmp_path, shape="", effort=1.0, keys=ahead)
+    code, out, err = run("excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv")
+    assert code == 3, err
+    said = " ".join(out.split())
+    assert "can be recorded" not in said
+    assert "✗ Do not record this motion yet" in said
+    before = " ".join(err.split())
+    for text in (before, said):
+        assert "the shape of" in text
+        assert "stout capsules" in text
+        assert re.search(r"gravity needs more .* at best the force of joint `j[12]` needs", text)
+    keys = f"force_margin = 0.1\n{ahead}"
+    code, out, err = run("excite", arm(tmp_path, effort=1.0, keys=keys), "-o", tmp_path / "x.csv")
+    assert (code, out) == (2, "")
+    assert "`force_margin`: in every one of" in err
 
 
 def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
@@ -224,7 +290,7 @@ def test_limits_forces_by_nominal_parameters_and_adds_to_earlier_motions(
     assert largest_force("weak") <= 6.0 < 7.5 < largest_force("plan")
     assert "use of the other limits" in out
     assert re.search(
-        r"force of joint `hinge` +5\.\d+ N m +≤ 6 N m +9\d\.\d +12 less a margin of", out
+        r"force of joint `hinge` +[45]\.\d+ N m +≤ 6 N m +[89]\d\.\d +12 less a margin of", out
     )
     assert "counted as zero in the forces: fv1" in " ".join(out.split())
     assert "the robot starts at rest and is in the designed motion from 0.500 to" in out
@@ -272,45 +338,23 @@ def test_earlier_results_are_nominal(written, excited, monkeypatch):
         find_nominal(experiment)
 
 
-def test_forces_that_the_design_has_not_limited_are_looked_at(written, excited):
-    def remarks(force, known=True):
-        text = EXPERIMENT.replace("[4]", f"[4]\nforce = [{force}]")
-        (written / "forces.toml").write_text(text)
-        experiment = load_experiment(written / "forces.toml")
-        nominal = find_nominal(experiment) if known else None
-        return force_remarks(experiment, nominal, excited.played)
-
-    # Holding the rod where it points ahead takes 7.8 N m.
-    within, zero = remarks(50.0)
-    assert within.status is Status.NEUTRAL
-    assert re.search(r"hinge` with (1[4-9]|2\d)(\.\d)? % of 50 N m", within.text)
-    assert zero.text == "not known, and counted as zero in the forces: fv1, fc1, fo1."
-    beyond, _ = remarks(5.0)
-    assert beyond.status is Status.BAD
-    assert re.search(
-        r"joint `hinge` with 1[4-9]\d\.\d % of 5 N m; give `force_margin`", beyond.text
-    )
-    (unknown,) = remarks(5.0, known=False)
-    assert unknown.text.startswith("forces were not checked, although they have limits")
-
-
 def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pictures, monkeypatch):
     monkeypatch.setattr(
         "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
     )
     keys = ("sample_time = 0.03", "leads = { periods = 2 }", 'ros = "json"')
-    experiment = load_experiment(with_keys(written, "cycles.toml", *keys))
-    found = design_motion(experiment, lambda _: None, written / "no.npz", False)
-    begin, end = found.played.window
+    experiment = load_experiment(with_keys(written, "cycles.toml", *keys, text=FREE))
+    found = designed_by(experiment)
+    begin, end = found.played.motion.window
     assert end - begin == pytest.approx(4 * np.pi / 0.8)
     files = write_design(experiment, found, written / "cycles" / "motion.csv")
     t, q, qd, qdd = table(files[0]).T
     np.testing.assert_allclose(t, 0.03 * np.arange(len(t)), atol=1e-12)
-    assert 0.0 <= t[-1] - float(found.played.duration) < 0.03
-    np.testing.assert_allclose(q[-1], found.played.motion(found.played.duration).q[0])
+    assert 0.0 <= t[-1] - float(found.played.motion.duration) < 0.03
+    np.testing.assert_allclose(q[-1], found.played.motion.motion(found.played.motion.duration).q[0])
     assert np.abs([qd[-1], qdd[-1]]).max() < 1e-9
-    assert files[2].name == "motion.ros.json"
-    assert len(json.loads(files[2].read_text())["points"]) == len(t)
+    assert files[1].name == "motion.ros.json"
+    assert len(json.loads(files[1].read_text())["points"]) == len(t)
     said = [remark.text for remark in found.remarks]
     assert "the motion runs through 2 periods; the deviations are of one." in said
 
@@ -341,10 +385,8 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(written, excit
     monkeypatch.setattr(
         "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
     )
-    led = design_motion(
-        load_experiment(written / "fast.toml"), lambda _: None, written / "no.npz", False
-    )
-    assert led.played is led.plan.trajectory
+    led = designed_by(load_experiment(written / "free.toml"))
+    assert led.played.motion is led.plan.trajectory
     text = " ".join(remark.text for remark in led.remarks)
     assert "the motion is without leads, and starts and ends at full speed: no lead is" in text
 
@@ -362,31 +404,25 @@ def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
 
     monkeypatch.setattr("jaxid.cli.commands.design_motion", lambda *_: excited)
     monkeypatch.setattr("jaxid.experiment.excitation.design_excitation", one_design)
-    arguments = ["excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria", "--resume"]
+    arguments = ["excite", "experiment.toml", "-o", "some/motion.csv", "--all-criteria"]
     code, out, err = run(*arguments)
-    assert code == 0, err
-    assert "`some/motion.state.npz` is not there: the design begins anew" in out
+    assert code == 3, err  # forces have no limits there
     assert asked == [c.name for c in CRITERIA[:2]]
     assert "motions that minimise one of the criteria each" in out
     assert "stopped after 1 of 6 criteria" in out
 
 
-@pytest.mark.parametrize(
-    ("kept", "said"), [(True, "`--resume` goes on with `early/"), (False, "start again")]
-)
-def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch, kept, said):
-    def stopped(loaded, tell, state, resume):
-        if kept:
-            state.parent.mkdir()
-            state.touch()
+def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
+    def stopped(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("jaxid.cli.commands.design_motion", stopped)
-    folder = "early" if kept else "never"
-    code, out, err = run("excite", "experiment.toml", "-o", f"{folder}/motion.csv")
+    code, out, err = run("excite", "experiment.toml", "-o", "never/motion.csv")
     assert (code, out) == (130, "")
-    assert err.startswith("jaxid: the design was stopped before a motion kept all limits")
-    assert said in err
+    assert "jaxid: stopped before a motion kept all limits, and nothing was written." in err
+    code, out, err = run("excite", "experiment.toml", "-o", "never/motion.csv", "--resume")
+    assert (code, out) == (2, "")
+    assert "`never/motion.json` is not there: `--resume` needs" in err
 
 
 @pytest.mark.parametrize(

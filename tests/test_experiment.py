@@ -54,7 +54,8 @@ dh = [
 
 [collision]
 distance = 0.05
-ground = -0.1
+fit = false
+floor = -0.1
 
 [[collision.capsules]]
 name = "column"
@@ -317,8 +318,8 @@ REFUSALS = [
     ("[robot\n", "TOML"),
     (ARM + "x = " + 3000 * "[", "TOML"),
     (SHAPES.replace('body = "bend"', 'body = "wrist"'), "`collision`: `body`.*turn, lift"),
-    (SHAPES.replace("ground = -0.1", 'pairs = [["hand", "chair"]]'), "`chair`"),
-    (SHAPES.replace("ground = -0.1", "fit = true"), "`fit`.*`robot.urdf`"),
+    (SHAPES.replace("floor = -0.1", 'pairs = [["hand", "chair"]]'), "`chair`"),
+    (SHAPES.replace("floor = -0.1", "ground = 0.0"), "`collision.ground` was renamed to `floor`"),
 ]
 
 
@@ -438,18 +439,20 @@ def test_no_name_of_a_urdf_writes_into_the_template(tmp_path):
 
 def test_shapes_come_from_the_file(load):
     experiment = load(SHAPES)
-    model = experiment.clearance.model
-    assert model.pair_names == ("column and hand", "hand and table", "hand and ground")
-    assert experiment.clearance.distance == 0.05
+    model = experiment.surroundings.clearance.model
+    assert model.pair_names == ("column and hand", "hand and table", "hand and floor")
+    assert experiment.surroundings.clearance.distance == 0.05
     gaps = np.asarray(model.clearance(experiment.robot, np.zeros(3)))
     # At zero the hand is at 0.9 m along x, at the height of the shoulder.
     assert gaps[2] == pytest.approx(0.3 + 0.1 - 0.08, abs=1e-5)
     assert gaps[0] == pytest.approx(0.9 - 0.18, abs=1e-5)
-    named = SHAPES.replace("ground = -0.1", 'pairs = [["hand", "table"]]')
-    assert load(named).clearance.model.pair_names == ("hand and table",)
-    assert load(ARM).clearance is None
+    named = SHAPES.replace("floor = -0.1", 'pairs = [["hand", "table"]]')
+    assert load(named).surroundings.clearance.model.pair_names == ("hand and table",)
+    # Without shapes the lines between the joints stand in.
+    found = load(ARM).surroundings
+    assert "stout capsules" in found.faults[0]
 
 
 def test_the_built_in_shapes_are_those_of_the_library(load):
-    model = load('[robot]\nbuiltin = "tx90l_on_rail"\n[collision]\nfit = true\n').clearance.model
+    model = load('[robot]\nbuiltin = "tx90l_on_rail"\n').surroundings.clearance.model
     assert model.pair_names == jid.robots.tx90l_on_rail_collision().pair_names

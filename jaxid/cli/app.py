@@ -134,11 +134,12 @@ def excite(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE.CSV", help="Table of the motion.")
     ] = Path("trajectory.csv"),
+    time: Annotated[
+        float | None,
+        typer.Option("--time", metavar="S", min=1.0, help="Time for the search [s]."),
+    ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on where a design was stopped.")
-    ] = False,
-    best: Annotated[
-        bool, typer.Option("--best", help="Write the best motion of a stopped design.")
+        bool, typer.Option("--resume", help="Go on with the motion that was written.")
     ] = False,
     all_criteria: Annotated[
         bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
@@ -146,15 +147,16 @@ def excite(
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
-    Beside the table lie the trajectory itself (.json), the same for ROS (.ros.yaml), pictures of
-    joints and end-effector in a folder, and the state of the design until it is done. After Ctrl-C
-    `--resume` goes on, and `--best` writes the best motion so far.
+    Floor, self-collision and forces count as far as the robot's file describes them. A first motion
+    is written after seconds, and every better one replaces it: the table, the trajectory itself
+    (.json) and the same for ROS (.ros.yaml); at the end also a page with pictures. Ctrl-C keeps
+    the best motion so far. The exit code is 3 if something was not checked.
     """
     console = options.start(experiment)
     from . import commands
 
     options.refuse_foreign_table(output)
-    commands.excite(console, experiment, output, resume, best, all_criteria)
+    commands.excite(console, experiment, output, resume, time, all_criteria)
 
 
 @app.command()

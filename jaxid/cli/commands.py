@@ -15,7 +15,14 @@ from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.excitation.design import DesignProgress
 from jaxid.experiment import choose as choosing, identify_logs
-from jaxid.experiment.excitation import compare_criteria, design_motion, write_design
+from jaxid.experiment.excitation import (
+    compare_criteria,
+    design_motion,
+    play,
+    prepare_design,
+    write_design,
+    write_motion,
+)
 from jaxid.experiment.experiment import Experiment, load_experiment
 from jaxid.experiment.robot_tables import joint_number
 from jaxid.experiment.template import toml_text
@@ -29,7 +36,7 @@ from jaxid.identification.operating_states import identify_states
 from jaxid.identification.parameter_changes import compare as compare_fits
 from jaxid.identification.payload import CENTRAL_NAMES, CENTRAL_UNITS, identify_payload
 from jaxid.io import atomic_folder, require_writable
-from jaxid.report.excitation import ordered, plan_remarks, side_by_side_table
+from jaxid.report.excitation import headline, ordered, plan_remarks, side_by_side_table
 from jaxid.report.identification import body_table, motor_tables, residual_table
 from jaxid.report.page import show, show_files, show_remarks
 from jaxid.report.result_files import (
@@ -49,7 +56,7 @@ from .options import command_line, open_console
 STOPPED = 130
 """Exit code of a command that Ctrl-C has ended, as shells expect it."""
 UNUSABLE = 3
-"""Exit code of `jaxid identify` if the verdict is that the model must not be used."""
+"""Exit code if the verdict is that a model must not be used, or a motion not be recorded."""
 MARKED = (Status.DOUBTFUL, Status.BAD)
 """Statuses that the terminal shows of a verdict."""
 SOURCES = (".urdf", ".xacro", ".xml")
@@ -163,60 +170,88 @@ def _doubts(texts: Any) -> list[Remark]:
 
 
 def excite(
-    console: Console, path: Path, output: Path, resume: bool, best: bool, all_criteria: bool
+    console: Console,
+    path: Path,
+    output: Path,
+    resume: bool,
+    seconds: float | None,
+    all_criteria: bool,
 ) -> None:
-    """Design a motion and write it; the state of the design is kept until it is done."""
-    state = output.with_suffix(".state.npz")
-    if best and not state.exists():
-        raise InputError(f"`{state}` is not there: `--best` needs the state of a stopped design.")
-    resume = resume or best
-    if state.exists() and not resume:
-        raise InputError(
-            f"`{state}` is there: `--resume` goes on with it, `--best` writes the best motion in "
-            "it; to begin anew, remove the file."
-        )
+    """Design a motion; the best one so far is written whenever there is a better one."""
     experiment, errors = load_experiment(path), open_console(stderr=True)
-    if resume and not state.exists():
-        show_remarks(console, _doubts([f"`{state}` is not there: the design begins anew"]))
-    farewell = f"stopped: once `{state}` is there, `--resume` goes on with it, and `--best` writes "
-    with process.handing_over(farewell + "the best motion in it"):
+    written = output.with_suffix(".json") if resume else None
+    if written is not None and not written.is_file():
+        raise InputError(f"`{written}` is not there: `--resume` needs a motion to go on with.")
+    preparation = prepare_design(experiment, written)
+    faults = preparation.faults(experiment)
+    show_remarks(errors, [Remark(text, Status.BAD) for text in faults])
+    motion = _BestMotion(experiment, output, faults)
+    with process.handing_over(motion.farewell), identify_logs.stages(errors) as stage:
         try:
-            with identify_logs.stages(errors) as stage:
-                design = design_motion(experiment, _until_stopped(stage, best), state, resume)
+            design = design_motion(experiment, preparation, motion.keep(stage), seconds)
         except KeyboardInterrupt:
-            cure = "start again, and give it more time"
-            if state.is_file():
-                cure = f"`--resume` goes on with `{state}`, where it was"
-            said = "the design was stopped before a motion kept all limits, and nothing was written"
-            errors.print(Text(f"jaxid: {said}: {cure}."), soft_wrap=True)
+            errors.print(Text(f"jaxid: {motion.farewell()}."), soft_wrap=True)
             raise typer.Exit(STOPPED) from None
-        written = write_design(experiment, design, output, command_line())
-    if not design.plan.interrupted:
-        state.unlink(missing_ok=True)
+        stage("writing the report")
+        files = write_design(experiment, design, output, command_line())
     show(console, *design.plan.tables())
-    show_remarks(console, ordered((*plan_remarks(design.plan), *design.remarks)))
-    show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in written])
+    verdict = headline(design.plan, design.remarks)
+    show_remarks(console, [*ordered((*plan_remarks(design.plan), *design.remarks)), verdict])
+    show_files(console, output.parent, [str(p.relative_to(output.parent)) for p in files])
     if all_criteria and not design.plan.interrupted:
         with identify_logs.stages(errors) as stage:
-            plans = compare_criteria(experiment, _until_stopped(stage))
+            plans = compare_criteria(experiment, _until_stopped(stage.design))
         if plans:
             show(console, side_by_side_table(plans))
         done = sum(not plan.interrupted for plan in plans)
         if done < len(CRITERIA):
             show_remarks(console, _doubts([f"stopped after {done} of {len(CRITERIA)} criteria"]))
+    if design.plan.interrupted:
+        raise typer.Exit(STOPPED)
+    if verdict.status is Status.BAD:
+        raise typer.Exit(UNUSABLE)
+
+
+class _BestMotion:
+    """The best motion of a search so far, in its files."""
+
+    def __init__(self, experiment: Experiment, output: Path, faults: tuple[str, ...]):
+        self._experiment, self._output, self._faults = experiment, output, faults
+        self._value = np.inf
+
+    def keep(self, stage: identify_logs.Stages) -> Callable[[DesignProgress], None]:
+        """Return the callback of a design, which writes every better motion."""
+
+        def progress(now: DesignProgress) -> None:
+            stage.design(now)
+            if now.feasible and now.best < self._value:
+                write_motion(self._experiment, play(self._experiment, now.trajectory), self._output)
+                self._value = now.best
+
+        return _until_stopped(progress)
+
+    def farewell(self) -> str:
+        """Return what is said when Ctrl-C ends the search."""
+        if self._value == np.inf:
+            return "stopped before a motion kept all limits, and nothing was written"
+        unchecked = f"; NOT CHECKED: {'; '.join(self._faults)}" if self._faults else ""
+        return (
+            f"stopped: `{self._output}` and the files beside it hold the best motion so far, which "
+            f"keeps all limits that were checked{unchecked}; `--resume` goes on with it"
+        )
 
 
 def _until_stopped(
-    stage: identify_logs.Stages, already: bool = False
+    progress: Callable[[DesignProgress], None],
 ) -> Callable[[DesignProgress], None]:
-    """Return the callback of a design, which stops it after a signal, or at once."""
+    """Return a callback that calls another one, and ends a design after a signal."""
 
-    def progress(now: DesignProgress) -> None:
-        if already or process.STOP.is_set():
+    def run(now: DesignProgress) -> None:
+        if process.STOP.is_set():
             raise KeyboardInterrupt
-        stage.design(now)
+        progress(now)
 
-    return progress
+    return run
 
 
 def export(

@@ -117,7 +117,7 @@ def describe_error(error: Exception) -> str:
 
 def command_line() -> str:
     """Return the command line that gives the same result again."""
-    words = (word for word in sys.argv[1:] if word not in ("--force", "--resume", "--best"))
+    words = (word for word in sys.argv[1:] if word not in ("--force", "--resume"))
     return shlex.join(["jaxid", *words])
 
 

@@ -42,8 +42,18 @@ class JointRegressor(eqx.Module):
             arrays: Arguments of the definition, batch and samples last.
             fence: Whether shared values get fences; by default on a CPU, see `lower`.
         """
-        groups = tuple(tuple(j * self.size + k for k in own) for j, own in enumerate(self.columns))
-        return lower(self.program, fence).stacked(groups, *arrays)
+        packed = lower(self.program, fence)(*arrays)
+        like = jnp.zeros(jnp.shape(arrays[0])[1:], jnp.result_type(*arrays, float))
+
+        def row(x: Array | float) -> Array:
+            return jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape)
+
+        none = jnp.zeros((*like.shape[:-1], 0, *like.shape[-1:]), like.dtype)
+        rows = [
+            [row(packed[joint * self.size + k]) for k in own]
+            for joint, own in enumerate(self.columns)
+        ]
+        return [jnp.stack(own, axis=-2) if own else none for own in rows]
 
     def gram(self, weights: AnyArray, *arrays: AnyArray) -> Float[Array, "columns columns"]:
         r"""Return $\sum_k \Theta_k^T W^2 \Theta_k$ over samples, without storing the columns."""

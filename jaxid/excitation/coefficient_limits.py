@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
+from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray, namespace
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
@@ -37,35 +36,33 @@ class Grid(NamedTuple):
     bound: float
     constant: Float[np.ndarray, "joints variables"]
 
-    def rows(self, y: Float[Array, " scaled"]) -> Float[Array, "joints rows"]:
+    def rows(self, y: Float[AnyArray, " scaled"]) -> Float[AnyArray, "joints rows"]:
         """Return the rows of a motion, R y."""
-        return jnp.einsum("jrk,jk->jr", self.R, y.reshape(np.shape(self.constant)))
+        return namespace(y).einsum("jrk,jk->jr", self.R, y.reshape(np.shape(self.constant)))
 
     def scale_into_limits(
-        self, y: Float[Array, " scaled"], bound: Array | float | None = None, growth: float = 1.0
-    ) -> Float[Array, " scaled"]:
+        self, y: Float[AnyArray, " scaled"], bound: Any | None = None, growth: float = 1.0
+    ) -> Float[AnyArray, " scaled"]:
         """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
 
         Each joint's motion is scaled about its mean, where limits leave room by up to `growth`,
         then shifted into its range.
         """
-        bound = self.bound if bound is None else bound
+        xp, bound = namespace(y), self.bound if bound is None else bound
         q, peak = self._positions(y)
-        s = jnp.minimum(growth, bound / jnp.maximum(peak, 1e-12))
+        s = xp.minimum(growth, bound / xp.maximum(peak, 1e-12))
         low, high = self._shifts(q, s, bound)
-        shift = jnp.clip((1.0 - s) * q.mean(axis=1), low, jnp.maximum(low, high))
+        shift = xp.clip((1.0 - s) * q.mean(axis=1), low, xp.maximum(low, high))
         return self._moved(y, s, shift)
 
-    def shrink(
-        self, y: Float[Array, " scaled"], fraction: Array | float
-    ) -> Float[Array, " scaled"]:
+    def shrink(self, y: Float[AnyArray, " scaled"], fraction: Any) -> Float[AnyArray, " scaled"]:
         """Return a motion made smaller by a factor, each joint's about its mean position."""
         q, _ = self._positions(y)
         return self._moved(y, fraction, (1.0 - fraction) * q.mean(axis=1))
 
     def fill(
-        self, y: Float[Array, " scaled"], places: Float[Array, " joints"], size: Array | float
-    ) -> Float[Array, " scaled"]:
+        self, y: Float[AnyArray, " scaled"], places: Float[AnyArray, " joints"], size: Any
+    ) -> Float[AnyArray, " scaled"]:
         """Return a motion of the same shape that fills a fraction of 95 % of its limits.
 
         `places` are those of the joints in the range that is left, from 0 to 1.
@@ -76,22 +73,23 @@ class Grid(NamedTuple):
         low, high = self._shifts(q, s, bound)
         return self._moved(y, s, low + (high - low) * places)
 
-    def _positions(self, y: Array) -> tuple[Array, Array]:
+    def _positions(self, y: AnyArray) -> tuple[Any, Any]:
         """Return the positions, and the largest use of a limit by each joint."""
         rows, positions = self.rows(y), len(self.kinds[0])
         q, rest = rows[:, :positions], rows[:, positions:]
         half = 0.5 * (q.max(axis=1) - q.min(axis=1))
-        return q, jnp.maximum(jnp.abs(rest).max(axis=1), half)
+        xp = namespace(y)
+        return q, xp.maximum(xp.abs(rest).max(axis=1), half)
 
-    def _shifts(self, q: Array, s: Array, bound: Array | float) -> tuple[Any, Any]:
+    def _shifts(self, q: Array, s: Array, bound: Any) -> tuple[Any, Any]:
         """Return the least and largest shift that keep scaled positions in their range."""
         centre = self.c[:, 0]
         return centre - bound - s * q.min(axis=1), centre + bound - s * q.max(axis=1)
 
-    def _moved(self, y: Array, s: Array | float, shift: Array) -> Array:
+    def _moved(self, y: AnyArray, s: Any, shift: Array) -> Any:
         """Return the motion of each joint times a factor, and shifted."""
         motion = y.reshape(np.shape(self.constant))
-        scaled = jnp.reshape(jnp.asarray(s), (-1, 1)) * motion
+        scaled = namespace(y).reshape(namespace(y).asarray(s), (-1, 1)) * motion
         return (scaled + shift[:, None] * self.constant).reshape(y.shape)
 
 
@@ -158,6 +156,10 @@ class JointLimits(eqx.Module):
         scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
         return y.reshape((*y.shape[:-1], *self.shape)) * scale
 
+    def scaled(self, x: Float[AnyArray, "joints variables"]) -> Float[np.ndarray, " scaled"]:
+        """Return the scaled coefficients of a trajectory."""
+        return (np.asarray(x) / np.asarray(self.scale)).ravel()
+
     def grid(self, points: int = 512) -> Grid:
         """Return the limits on a grid of times; bases with many coefficients get more points."""
         envelope, factor = self.basis.envelope(scale_samples(points, self.basis))
@@ -185,14 +187,14 @@ class JointLimits(eqx.Module):
 
     def random(
         self, key: PRNGKeyArray, count: int, size: float = 1.0
-    ) -> Float[Array, "count scaled"]:
+    ) -> Float[np.ndarray, "count scaled"]:
         """Draw motions of random shapes and places, of a size relative to 95 % of the limits."""
         joints, variables = self.shape
         shape, place = jax.random.split(key)
-        draws = jax.random.normal(shape, (count, joints * variables), float)
-        places = jax.random.uniform(place, (count, joints), float)
+        draws = np.asarray(jax.random.normal(shape, (count, joints * variables), float))
+        places = np.asarray(jax.random.uniform(place, (count, joints), float))
         fill = self.grid().fill
-        return jax.vmap(lambda y, place: fill(y, place, size))(draws, places)
+        return np.array([fill(y, place, size) for y, place in zip(draws, places, strict=True)])
 
 
 def scale_samples(samples: int, basis: AbstractBasis) -> int:

@@ -1,6 +1,8 @@
 """Constraints of a motion beside the limits of the joints: forces, end-effector, collisions."""
 
+import functools
 import math
+import operator
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,13 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, as_array
+from jaxid.arrays import AnyArray, Array, Float, Int, as_array, namespace
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.dispatch import on_samples
+from jaxid.dynamics.dispatch import in_numpy, on_samples, program_of
 from jaxid.dynamics.model import Coordinates
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
+from jaxid.program.gradient import pull_back
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.forward_and_inverse_kinematics import tip_placement
 from jaxid.robot.robot import Robot
@@ -97,11 +100,65 @@ class AbstractConstraint(eqx.Module):
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the limited quantities in the order of the values, without their values."""
 
+    def linearise(
+        self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
+    ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
+        """Return one value of each sample, and its derivatives by q, qd, qdd, in NumPy.
+
+        Args:
+            robot: Robot that moves.
+            motion: Joint motion in NumPy, with one axis of samples.
+            chosen: Place of each sample's value in `entries`.
+        """
+        parts = (motion.q, motion.qd, motion.qdd)
+        values, slopes = _compiled(_Same(self, robot))(jnp.asarray(chosen), *parts)
+        return np.asarray(values), [np.asarray(x) for x in slopes]
+
     def describe(self, robot: Robot, values: Float[AnyArray, "*batch values"]) -> list[Finding]:
         """Return the limited quantities with the largest of their values."""
         entries = self.entries(robot)
         peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)
         return [e._replace(value=float(v)) for e, v in zip(entries, peaks, strict=True)]
+
+
+class _Same:
+    """Constraint and robot as the key of a compiled function: by identity, as their arrays are."""
+
+    def __init__(self, constraint: AbstractConstraint, robot: Robot):
+        self.parts = constraint, robot
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self.parts)))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and all(map(operator.is_, self.parts, other.parts))
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(key: _Same) -> Callable:
+    constraint, robot = key.parts
+
+    @jax.jit
+    def linearised(chosen: Array, *parts: Array) -> tuple[Array, tuple[Array, ...]]:
+        def value(*parts: Array) -> Array:
+            values = constraint(robot, Motion(*parts))
+            return jnp.take_along_axis(values, chosen[:, None], axis=1)[:, 0]
+
+        values, pull = jax.vjp(value, *parts)
+        return values, pull(jnp.ones_like(values))
+
+    return linearised
+
+
+def _pull(
+    owner: eqx.Module, definition: Callable, weights: np.ndarray, *arrays: AnyArray
+) -> list[Float[np.ndarray, "samples joints"]]:
+    """Return derivatives of weighted results of a method for one sample, for rows of samples."""
+    program = program_of(owner, definition, *(x.shape[1:] for x in arrays))
+    slopes = pull_back(
+        program, weights.reshape(len(weights), -1).T, *(np.asarray(x).T for x in arrays)
+    )
+    return [x.T for x in slopes]
 
 
 def tip_motion(robot: Robot, motion: Motion) -> tuple[Float[AnyArray, "*batch 3"], ...]:
@@ -136,28 +193,55 @@ class Clearance(AbstractConstraint):
 
     Attributes:
         model: Shapes and pairs.
-        distance: Least distance between surfaces [m].
+        distance: Least distance between surfaces [m]; half of the largest one of two bodies that
+            are nearer in every pose.
     """
 
     model: CollisionModel
     distance: float = 0.03
 
+    @property
+    def distances(self) -> Float[np.ndarray, " pairs"]:
+        """Least distance of each pair [m]."""
+        return np.minimum(self.distance, 0.5 * np.array(self.model.room))
+
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the missing distance of each pair."""
+        gaps = self.model.clearances(self._axes(robot, motion.q))
+        return (namespace(gaps).broadcast_to(self.distances, gaps.shape) - gaps) / 0.1
+
+    def _axes(self, robot: Robot, q: AnyArray) -> Float[AnyArray, "*batch capsules 2 3"]:
         ends = eqx.Partial(self.model.ends, robot)
-        axes = on_samples(ends, ends.__call__, motion.q)
-        return (self.distance - self.model.clearances(axes)) / 0.1
+        run = on_samples if isinstance(q, jax.Array) or q.ndim != 2 else in_numpy
+        return run(ends, ends.__call__, q)
+
+    def linearise(
+        self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
+    ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
+        """Return one missing distance of each sample, and its derivatives, in NumPy."""
+        gaps, slopes = self.model.slopes(np.asarray(self._axes(robot, motion.q)), chosen)
+        ends = eqx.Partial(self.model.ends, robot)
+        (by_q,) = _pull(ends, ends.__call__, slopes / -0.1, np.asarray(motion.q))
+        none = np.zeros(by_q.shape)
+        return (self.distances[chosen] - gaps) / 0.1, [by_q, none, none]
 
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the pairs."""
 
-        def usage(value: float) -> float:
-            left = self.distance - 0.1 * value
-            return self.distance / left if left > 0 else math.inf
+        def usage(value: float, distance: float) -> float:
+            left = distance - 0.1 * value
+            return distance / left if left > 0 else math.inf
 
         return tuple(
-            Finding(f"the clearance of {name}", 0.1, "m", self.distance, least=True, usage=usage)
-            for name in self.model.pair_names
+            Finding(
+                f"the clearance of {name}",
+                0.1,
+                "m",
+                distance,
+                least=True,
+                usage=functools.partial(usage, distance=distance),
+            )
+            for name, distance in zip(self.model.pair_names, self.distances.tolist(), strict=True)
         )
 
 
@@ -288,20 +372,58 @@ class ForceLimits(AbstractConstraint):
 
     def __call__(self, robot: Robot, motion: Motion) -> Float[Array, "*batch values"]:
         """Return the relative excess over each limit."""
+        limits, to_limited = self._limited(robot)
+        forces = self._forces(motion)
+        xp = namespace(forces)
+        size = xp.max(xp.abs(forces @ to_limited), axis=-2)
+        if self.covariance is not None:
+            rows = xp.einsum("...jb,jm->...mb", self.base.regressor(motion), to_limited)
+            variance = xp.einsum("...mb,bc,...mc->...m", rows, self.covariance, rows)
+            # A negligible fraction of the limits makes standard deviations smooth at zero.
+            smooth = xp.broadcast_to((1e-12 * limits) ** 2, variance.shape)
+            size = size + self.deviations * xp.sqrt(xp.maximum(variance, 0.0) + smooth)
+        return size / xp.broadcast_to(limits, size.shape) - 1.0
+
+    def _limited(self, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+        """Return all limits, and the matrix from joint forces to what they limit."""
         whole = self._whole(robot)
         finite = np.isfinite(whole)
-        limits = (1 - self.margin) * whole[finite]
         to_motors = np.linalg.inv(np.asarray(robot.drives.reduction))
         to_limited = np.concatenate([np.eye(robot.joints), to_motors], axis=1)[:, finite]
-        forces = on_samples(self, self.forces, motion.q, motion.qd, motion.qdd)
-        size = jnp.max(jnp.abs(forces @ to_limited), axis=-2)
+        return (1 - self.margin) * whole[finite], to_limited
+
+    def _forces(self, motion: Motion) -> Float[AnyArray, "*batch 3 joints"]:
+        known = not isinstance(motion.q, jax.Array) and motion.q.ndim == 2
+        return (in_numpy if known else on_samples)(
+            self, self.forces, motion.q, motion.qd, motion.qdd
+        )
+
+    def linearise(
+        self, robot: Robot, motion: Motion, chosen: Int[np.ndarray, " samples"]
+    ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
+        """Return one relative excess of each sample, and its derivatives, in NumPy."""
+        limits, to_limited = self._limited(robot)
+        samples = np.arange(len(chosen))
+        sides = np.einsum("tsj,jt->ts", self._forces(motion), to_limited[:, chosen])
+        side = np.abs(sides).argmax(axis=1)
+        largest = sides[samples, side]
+        weights = np.zeros((len(samples), 3, robot.joints))
+        scale = np.sign(largest) / limits[chosen]
+        weights[samples, side] = (to_limited[:, chosen] * scale).T
+        slopes = _pull(self, self.forces, weights, motion.q, motion.qd, motion.qdd)
+        size = np.abs(largest)
         if self.covariance is not None:
-            rows = jnp.einsum("...jb,jm->...mb", self.base.regressor(motion), to_limited)
-            variance = jnp.einsum("...mb,bc,...mc->...m", rows, self.covariance, rows)
-            # A negligible fraction of the limits makes standard deviations smooth at zero.
-            smooth = jnp.broadcast_to((1e-12 * limits) ** 2, variance.shape)
-            size = size + self.deviations * jnp.sqrt(jnp.maximum(variance, 0.0) + smooth)
-        return size / jnp.broadcast_to(limits, size.shape) - 1.0
+            base, share = self.base, to_limited[:, chosen].T
+            rows = np.einsum("tjb,tj->tb", np.asarray(base.regressor(motion)), share)
+            spread = rows @ self.covariance
+            smooth = (1e-12 * limits[chosen]) ** 2
+            deviation = np.sqrt(np.maximum((rows * spread).sum(axis=1), 0.0) + smooth)
+            weight = self.deviations / deviation / limits[chosen]
+            weights = share[:, :, None] * (spread * weight[:, None])[:, None]
+            more = _pull(base, base.columns, weights, *base.model.arguments(motion))
+            slopes = [x + y for x, y in zip(slopes, more, strict=True)]
+            size = size + self.deviations * deviation
+        return size / limits[chosen] - 1.0, slopes
 
     def forces(
         self,

@@ -1,18 +1,19 @@
 """Design of the motion of an experiment (Eq. 36)."""
 
+import math
+import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
+from jaxid.arrays import AnyArray, Float, PRNGKeyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory.fourier import FourierBasis
-from jaxid.trajectory.trajectory import AbstractBasis
+from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
@@ -20,7 +21,7 @@ from .design_result import SETTLED, DesignStatus, ExcitationPlan
 from .problem import ExcitationProblem, evaluate, evaluate_within_limits
 from .search import Search
 
-Solver = Callable[[ExcitationProblem, Float[Array, "starts scaled"]], AnyArray]
+Solver = Callable[[ExcitationProblem, Float[AnyArray, "starts scaled"]], AnyArray]
 """A solver of excitation problems: from random motions to better ones."""
 
 
@@ -33,12 +34,14 @@ class DesignProgress(NamedTuple):
         best: Value of the criterion for the best motion so far that keeps all limits, or of the
             best of all if none does.
         feasible: Whether it keeps all limits.
+        trajectory: That motion.
     """
 
     fraction: float
     task: str
     best: float
     feasible: bool
+    trajectory: LinearTrajectory
 
 
 def design_excitation(
@@ -76,7 +79,7 @@ def design_excitation(
             covariance; the design adds to it.
         samples: Number of measured samples of one run of the motion.
         settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `polish`, `key`,
-            `nominal`, `progress`, `state`, `resume`, `throw`.
+            `nominal`, `progress`, `begin`, `seconds`, `throw`.
 
     Raises:
         InputError: If arguments do not fit, or no motion keeps all constraints: the message says
@@ -101,16 +104,16 @@ def minimise(
     key: PRNGKeyArray | None = None,
     nominal: Float[AnyArray, " base"] | None = None,
     progress: Callable[[DesignProgress], None] | None = None,
-    state: str | Path | None = None,
-    resume: bool = False,
+    begin: LinearTrajectory | None = None,
+    seconds: float | None = None,
     throw: bool = True,
 ) -> ExcitationPlan:
     """Solve an excitation problem from many starts.
 
-    Random motions are improved together by an interior point method in JAX, and so are their
-    descendants, which move some joints as one parent and some as the other; the best of them are
-    polished one by one. Ctrl-C ends the design with the best motion so far. Functions that were
-    compiled for a problem are used again when the same problem is solved again.
+    Random motions are improved together by an interior point method, and so are their descendants,
+    which move some joints as one parent and some as the other; the best of them are polished one by
+    one. With constraints the search starts from small motions that keep them, so that there is a
+    result after seconds. Ctrl-C ends the design with the best motion so far.
 
     Args:
         problem: Problem to be solved.
@@ -119,12 +122,12 @@ def minimise(
             all times, and the best motion is taken.
         starts: Number of random motions to start from.
         generations: Number of generations.
-        polish: Number of the best motions that are polished; 0 for the path in JAX alone.
+        polish: Number of the best motions that are polished.
         key: Key of the random motions; `jax.random.key(0)` if None.
         nominal: Base parameters as far as they are known, NaN where not, for relative deviations.
         progress: Callback, called with the progress after each step.
-        state: File in which the design keeps its state, so that it can be resumed.
-        resume: Whether to go on from the state file if there is one.
+        begin: Motion of the same basis in place of the first random one, to go on with.
+        seconds: Time after which the best motion so far is returned [s]; None for all steps.
         throw: Whether to raise an error if no feasible motion is found; otherwise the plan says
             which limits are not kept.
 
@@ -137,13 +140,13 @@ def minimise(
         if value < low:
             raise InputError(f"`{name}` must be at least {low}, but is {value}.")
     key = jax.random.key(0) if key is None else key
-    path = None if state is None else Path(state)
+    if begin is not None and begin.coefficients.shape != problem.limits.shape:
+        raise InputError("`begin` must be a motion of the problem's basis.")
+    x = None if begin is None else problem.limits.scaled(begin.coefficients)
     if solver is None:
-        search = Search(problem, key, starts, generations, polish)
-        if resume and path is not None and path.is_file():
-            search.resume(path)
-        status = _advance(search, path, progress)
-        best, first, history = search.best, search.first, search.history[: search.done + 1]
+        search = Search(problem, key, starts, generations, polish, x, seconds)
+        status = _run(search, problem, seconds, progress)
+        best, first, history = search.best, search.first, search.history
     else:
         x = problem.limits.random(key, starts)
         random = evaluate(problem, x)
@@ -170,37 +173,29 @@ def minimise(
         unkept = "; ".join(plan.diagnosis)
         if status is DesignStatus.STOPPED:
             raise KeyboardInterrupt(f"stopped before a motion kept all limits: {unkept}")
-        if path is not None:
-            # The design is complete: resuming it would end in the same place.
-            path.unlink(missing_ok=True)
         raise InputError(f"no motion was found that keeps all limits: {unkept}")
     return plan
 
 
-def _advance(
-    search: Search, path: Path | None, progress: Callable[[DesignProgress], None] | None
+def _run(
+    search: Search,
+    problem: ExcitationProblem,
+    seconds: float | None,
+    progress: Callable[[DesignProgress], None] | None,
 ) -> DesignStatus:
-    """Do all steps of a search, or those until Ctrl-C."""
-
-    def report() -> None:
-        if progress is not None:
-            task = "searching from many starts" if search.searching else "polishing the best"
-            best = float(search.history[search.done])
-            progress(DesignProgress(search.done / search.steps, task, best, search.feasible))
-
-    stopped = False
+    """Do all steps of a search, or those until the time is over or Ctrl-C."""
+    until = math.inf if seconds is None else time.monotonic() + seconds
     try:
-        report()
-        while search.done < search.steps:
-            search.advance()
-            if path is not None:
-                search.save(path)
-            report()
+        for task in search.run():
+            if progress is not None:
+                x = search.best.x[int(search.best.order()[0])]
+                known = search.history[-1], search.feasible, problem.trajectory(x)
+                progress(DesignProgress(search.spent, task, *known))
+            if time.monotonic() > until and search.feasible:
+                break
     except KeyboardInterrupt:
-        stopped = True
-    search.finish()
-    if stopped:
         return DesignStatus.STOPPED
-    before = search.history[search.steps - search.steps // 4]
-    improved = search.history[-1] < (1.0 - SETTLED) * before
+    search.finish()
+    history = search.history
+    improved = history[-1] < (1.0 - SETTLED) * history[len(history) - 1 - len(history) // 4]
     return DesignStatus.IMPROVING if improved else DesignStatus.CONVERGED

@@ -5,18 +5,19 @@ linear, which a common slack may exceed at a penalty. Each iteration evaluates v
 every start once; the step towards the barrier's minimum needs products with the rows and one
 Cholesky factor for each start. Curvature is a damped BFGS matrix [1, procedure 18.2].
 
+In NumPy: its matrices are small, and nothing is compiled.
+
 [1] J. Nocedal, S. Wright, Numerical Optimization, 2nd ed., 2006, chapters 18 and 19.
 """
 
-import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 
-from jaxid.arrays import AnyArray, Array, Bool, Float, Int
+from jaxid.arrays import Float
 
 from .coefficient_limits import Grid
 
@@ -30,18 +31,12 @@ INSIDE = 0.985  # fraction of the bound within which a stage starts
 
 
 class Evaluation(NamedTuple):
-    """Objective, and constraints that are not linear, of some starts, with their derivatives."""
+    """Objective, and constraints that are not linear, of one start, with their derivatives."""
 
-    value: Float[Array, "*starts"]
-    gradient: Float[Array, "*starts scaled"]
-    excess: Float[Array, "*starts constraints"]
-    slopes: Float[Array, "*starts constraints scaled"]
-
-    @classmethod
-    def unconstrained(cls, value: Array, gradient: Array) -> "Evaluation":
-        """Return the evaluation of an objective without constraints."""
-        none = gradient[..., None, :][..., :0, :]
-        return cls(value, gradient, none[..., 0], none)
+    value: float
+    gradient: Float[np.ndarray, " scaled"]
+    excess: Float[np.ndarray, " constraints"]
+    slopes: Float[np.ndarray, "constraints scaled"]
 
 
 class Inequalities(NamedTuple):
@@ -50,32 +45,37 @@ class Inequalities(NamedTuple):
     Limits of the joints, upwards and downwards; constraints; sign of the slack if there are any.
     """
 
-    limits: Float[Array, "*starts 2 joints rows"]
-    constraints: Float[Array, "*starts constraints"]
-    slack: Float[Array, "*starts slacks"]
+    limits: Float[np.ndarray, "2 joints rows"]
+    constraints: Float[np.ndarray, " constraints"]
+    slack: Float[np.ndarray, " slacks"]
 
 
 class State(NamedTuple):
-    """State of the method; a leading axis for the starts.
+    """State of one start.
 
     `y`, `slack`, `evaluation` and `duals` are the present point, `step`, `dual_step`, `length` and
     `dual_length` the next trial, `slope` is the derivative of the merit along the step, `refused`
     counts refused steps in a row, and `fresh` says that the point is yet to be evaluated.
     """
 
-    y: Float[Array, "*starts scaled"]
-    slack: Float[Array, "*starts slacks"]
+    y: Float[np.ndarray, " scaled"]
+    slack: Float[np.ndarray, " slacks"]
     evaluation: Evaluation
     duals: Inequalities
-    curvature: Float[Array, "*starts scaled scaled"]
-    barrier: Float[Array, "*starts"]
-    step: Float[Array, "*starts scaled_and_slack"]
+    curvature: Float[np.ndarray, "scaled scaled"]
+    barrier: float
+    step: Float[np.ndarray, " scaled_and_slack"]
     dual_step: Inequalities
-    length: Float[Array, "*starts"]
-    dual_length: Float[Array, "*starts"]
-    slope: Float[Array, "*starts"]
-    refused: Int[Array, "*starts"]
-    fresh: Bool[Array, "*starts"]
+    length: float = 0.0
+    dual_length: float = 0.0
+    slope: float = 0.0
+    refused: int = 0
+    fresh: bool = True
+
+    @property
+    def trial(self) -> Float[np.ndarray, " scaled"]:
+        """Point to be evaluated next."""
+        return self.y + self.length * self.step[: len(self.y)]
 
 
 class Stage(NamedTuple):
@@ -90,242 +90,233 @@ class Stage(NamedTuple):
         penalty: Penalty of the slack by which constraints are exceeded.
     """
 
-    bound: Float[Array, ""] | float
-    barrier: Float[Array, ""] | float
-    least: Float[Array, ""] | float
-    iterations: Int[Array, ""] | int
-    sharpness: Float[Array, ""] | float = 4.0
-    penalty: Float[Array, ""] | float = 10.0
+    bound: float
+    barrier: float
+    least: float
+    iterations: int
+    sharpness: float = 4.0
+    penalty: float = 10.0
 
 
-def begin(grid: Grid, y: Float[AnyArray, "starts scaled"], constraints: int = 0) -> State:
+def begin(grid: Grid, y: Float[np.ndarray, "starts scaled"], constraints: int = 0) -> list[State]:
     """Return the state of some starts before the first stage, with a number of constraints."""
-    starts, size = np.shape(y)
-    slack = jnp.zeros((starts, 1 if constraints else 0))
-    none, excess = jnp.zeros(starts), jnp.zeros((starts, constraints))
-    duals = Inequalities(jnp.zeros((starts, 2, *grid.c.shape)), excess, slack)
-    slopes = jnp.zeros((starts, constraints, size))
-    return State(
-        y=jnp.asarray(y),
-        slack=slack,
-        evaluation=Evaluation(none, jnp.zeros((starts, size)), excess, slopes),
-        duals=duals,
-        curvature=jnp.tile(STIFFNESS * jnp.eye(size), (starts, 1, 1)),
-        barrier=none,
-        step=jnp.zeros((starts, size + slack.shape[1])),
-        dual_step=duals,
-        length=none,
-        dual_length=none,
-        slope=none,
-        refused=jnp.zeros(starts, int),
-        fresh=jnp.ones(starts, bool),
-    )
+    size, slack = np.shape(y)[1], np.zeros(1 if constraints else 0)
+    duals = Inequalities(np.zeros((2, *grid.c.shape)), np.zeros(constraints), slack)
+    none = Evaluation(0.0, np.zeros(size), np.zeros(constraints), np.zeros((constraints, size)))
+    curvature, step = STIFFNESS * np.eye(size), np.zeros(size + len(slack))
+    return [State(np.array(x), slack, none, duals, curvature, 0.0, step, duals) for x in y]
 
 
 def run(
     grid: Grid,
-    objective: Callable[[Array], Evaluation],
-    state: State,
+    objective: Callable[[np.ndarray, Sequence[int]], Sequence[Evaluation]],
+    states: list[State],
     stage: Stage,
-) -> State:
-    """Move the starts inside the bound of a stage, then iterate until all have converged."""
+) -> list[State]:
+    """Move the starts inside the bound of a stage, then iterate until all have converged.
 
-    def proceed(carry: tuple[Array, State]) -> Array:
-        number, state = carry
-        # The promised decrease is rounding.
-        settled = (state.barrier <= stage.least) & ~state.fresh
-        scale = 1.0 + jnp.abs(state.evaluation.value)
-        converged = settled & (jnp.abs(state.slope) <= 1e-14 * scale)
-        return (number < stage.iterations) & ~jnp.all(converged)
-
-    def iterate(carry: tuple[Array, State]) -> tuple[Array, State]:
-        number, state = carry
-        trial = state.y + state.length[:, None] * state.step[:, : state.y.shape[-1]]
-        update = functools.partial(_update, grid, stage)
-        return number + 1, map_starts(update, state, trial, objective(trial))
-
-    begun = jax.vmap(functools.partial(_begin_stage, grid, stage))(state)
-    return jax.lax.while_loop(proceed, iterate, (jnp.asarray(0), begun))[1]
-
-
-def map_starts(function: Callable, *arguments: Any) -> Any:
-    """Apply a function of one start to many: at once, or on a CPU one by one.
-
-    There the matrices of one start stay in the cache, and its products are not loops of XLA.
+    Args:
+        grid: Limits of the joints.
+        objective: Function from points [points, scaled] and the numbers of their starts to the
+            evaluations of the points.
+        states: Starts.
+        stage: Settings.
     """
+    states = [_begin_stage(grid, stage, one) for one in states]
+    for _ in range(stage.iterations):
+        active = [k for k, one in enumerate(states) if not _has_converged(stage, one)]
+        if not active:
+            break
+        found = objective(np.array([states[k].trial for k in active]), active)
+        for k, evaluation in zip(active, found, strict=True):
+            with np.errstate(all="ignore"):
+                states[k] = _update(grid, stage, states[k], evaluation)
+    return states
 
-    def one_by_one(*arguments: Any) -> Any:
-        return jax.lax.map(lambda one: function(*one), arguments)
 
-    return jax.lax.platform_dependent(*arguments, cpu=one_by_one, default=jax.vmap(function))
+def _has_converged(stage: Stage, one: State) -> bool:
+    """Return whether the promised decrease is rounding."""
+    settled = one.barrier <= stage.least and not one.fresh
+    return settled and abs(one.slope) <= 1e-14 * (1.0 + abs(one.evaluation.value))
 
 
 def _begin_stage(grid: Grid, stage: Stage, one: State) -> State:
     """Move one start inside the bound, with multipliers on the central path."""
-    y = grid.scale_into_limits(one.y, INSIDE * (stage.bound * grid.bound))
+    y = np.asarray(grid.scale_into_limits(one.y, INSIDE * (stage.bound * grid.bound)))
     central = stage.barrier / _room(grid, stage, y)
-    duals = jnp.clip(one.duals.limits, central / 1e3, central * 1e3)
-    moved = jnp.all(one.duals.limits == 0) | jnp.any(y != one.y)
+    moved = not one.duals.limits.any() or (y != one.y).any()
+    limits = central if moved else np.clip(one.duals.limits, central / 1e3, central * 1e3)
     return one._replace(
         y=y,
-        duals=one.duals._replace(limits=jnp.where(moved, central, duals)),
-        barrier=jnp.asarray(stage.barrier, float),
-        step=jnp.zeros_like(one.step),
-        length=jnp.zeros_like(one.length),
-        fresh=jnp.ones((), bool),
+        duals=one.duals._replace(limits=limits),
+        barrier=stage.barrier,
+        step=np.zeros_like(one.step),
+        length=0.0,
+        fresh=True,
     )
 
 
-def _update(grid: Grid, stage: Stage, old: State, trial: Array, evaluation: Evaluation) -> State:
+def _update(grid: Grid, stage: Stage, old: State, evaluation: Evaluation) -> State:
     """Take the step of one start, or shorten it."""
-    size = old.y.shape[-1]
+    trial = old.trial
     slack = _cheapest_slack(old.slack, evaluation.excess, stage.penalty, old.barrier)
     room = _rooms(grid, stage, trial, slack, evaluation.excess)
+    if old.fresh:
+        return _directed(grid, stage, _taken(stage, old, trial, slack, evaluation, room))
     before = _rooms(grid, stage, old.y, old.slack, old.evaluation.excess)
     merit = _merit(old.evaluation.value, old.slack, before, stage.penalty, old.barrier)
     new = _merit(evaluation.value, slack, room, stage.penalty, old.barrier)
     promised = DECREASE * old.length * old.slope
-    good = new <= merit + promised + 1e-10 * jnp.abs(merit)
-    finite = jnp.isfinite(evaluation.value) & jnp.all(jnp.isfinite(evaluation.gradient))
-    good = (good & finite) | old.fresh
-    taken = _taken(stage, old, trial, slack, evaluation, room)
+    finite = math.isfinite(evaluation.value) and np.isfinite(evaluation.gradient).all()
+    if finite and new <= merit + promised + 1e-10 * abs(merit):
+        return _directed(grid, stage, _taken(stage, old, trial, slack, evaluation, room))
+    if old.refused >= PATIENCE:
+        flat = np.eye(len(trial)) * np.trace(old.curvature) / len(trial)
+        return _directed(grid, stage, old._replace(curvature=flat, refused=0))
     # A refused step is shortened to the minimum of a parabola through what is known.
-    rise = 2 * (new - merit - old.slope * old.length)
-    shorter = -old.slope * old.length**2 / rise
+    shorter = -old.slope * old.length**2 / (2 * (new - merit - old.slope * old.length))
     least, most = 0.1 * old.length, 0.5 * old.length
-    shorter = jnp.where(jnp.isfinite(shorter), jnp.clip(shorter, least, most), least)
-    forget = old.refused >= PATIENCE
-    flat = jnp.eye(size) * jnp.trace(old.curvature) / size
-    kept = old._replace(
-        curvature=jnp.where(forget, flat, old.curvature),
-        refused=jnp.where(forget, 0, old.refused + 1),
-    )
-    state = jax.tree.map(lambda a, b: jnp.where(good, a, b), taken, kept)
-    turned = _directed(grid, stage, state)
-    straight = state._replace(length=shorter)
-    return jax.tree.map(lambda a, b: jnp.where(good | forget, a, b), turned, straight)
+    shorter = float(np.clip(shorter, least, most)) if math.isfinite(shorter) else least
+    return old._replace(length=shorter, refused=old.refused + 1)
 
 
 def _taken(
     stage: Stage,
     old: State,
-    trial: Array,
-    slack: Array,
+    trial: np.ndarray,
+    slack: np.ndarray,
     evaluation: Evaluation,
     room: Inequalities,
 ) -> State:
     """Return the state of one start after its step was taken."""
-    barrier = jnp.where(old.length > 0.1, old.barrier * COOLING, old.barrier)
-    barrier = jnp.where(old.fresh, old.barrier, jnp.maximum(stage.least, barrier))
-    central = jax.tree.map(lambda x: barrier / x, room)
-    moved = jax.tree.map(
-        lambda dual, step, c: jnp.clip(dual + old.dual_length * step, c / 1e3, c * 1e3),
-        old.duals,
-        old.dual_step,
-        central,
+    if old.fresh:
+        central = (old.barrier / x for x in room)
+        duals = Inequalities(*central)._replace(limits=old.duals.limits)
+        fresh = {"slack": slack, "evaluation": evaluation, "duals": duals}
+        return old._replace(y=trial, refused=0, fresh=False, **fresh)
+    barrier = max(stage.least, old.barrier * (COOLING if old.length > 0.1 else 1.0))
+    duals = Inequalities(
+        *(
+            np.clip(dual + old.dual_length * step, barrier / x / 1e3, barrier / x * 1e3)
+            for dual, step, x in zip(old.duals, old.dual_step, room, strict=True)
+        )
     )
-    begun = central._replace(limits=old.duals.limits)
-    duals = jax.tree.map(lambda a, b: jnp.where(old.fresh, a, b), begun, moved)
     # Curvature is that of the Lagrangian: of the value and of constraints that bend.
     change = evaluation.gradient - old.evaluation.gradient
     change = change + duals.constraints @ (evaluation.slopes - old.evaluation.slopes)
-    curvature = _damped_bfgs(old.curvature, trial - old.y, change)
     return old._replace(
         y=trial,
         slack=slack,
         evaluation=evaluation,
         duals=duals,
-        curvature=jnp.where(old.fresh, old.curvature, curvature),
+        curvature=_damped_bfgs(old.curvature, trial - old.y, change),
         barrier=barrier,
-        refused=jnp.zeros((), old.refused.dtype),
-        fresh=jnp.zeros((), bool),
+        refused=0,
     )
 
 
 def _directed(grid: Grid, stage: Stage, state: State) -> State:
     """Return one start with the step to the barrier's minimum, and how far it may go."""
-    evaluation, size, R = state.evaluation, state.y.shape[-1], grid.R
+    evaluation, size, R = state.evaluation, len(state.y), grid.R
+    joints, _, variables = R.shape
     room = _rooms(grid, stage, state.y, state.slack, evaluation.excess)
-    ratio = jax.tree.map(lambda dual, x: dual / x, state.duals, room)
-    central = jax.tree.map(lambda x: state.barrier / x, room)
-    blocks = jnp.einsum("jrk,jr,jrl->jkl", R, ratio.limits[0] + ratio.limits[1], R)
-    joints = jnp.eye(len(blocks))[:, None, :, None]
+    ratio = Inequalities(*(dual / x for dual, x in zip(state.duals, room, strict=True)))
+    central = Inequalities(*(state.barrier / x for x in room))
     stiff = ratio.constraints[:, None] * evaluation.slopes
-    H = state.curvature + (joints * blocks[:, :, None, :]).reshape(size, size)
-    H = H + evaluation.slopes.T @ stiff
-    ridge = 1e-9 * jnp.trace(H) / size
-    push = jnp.einsum("jrk,jr->jk", R, central.limits[0] - central.limits[1]).reshape(size)
+    slacks = len(state.slack)
+    H = np.zeros((size + slacks, size + slacks))
+    H[:size, :size] = state.curvature + evaluation.slopes.T @ stiff
+    weighted = R * (ratio.limits[0] + ratio.limits[1])[:, :, None]
+    for j, block in enumerate(np.swapaxes(R, 1, 2) @ weighted):
+        place = slice(j * variables, (j + 1) * variables)
+        H[place, place] += block
+    ridge = 1e-9 * np.trace(H[:size, :size]) / size
+    push = np.einsum("jrk,jr->jk", R, central.limits[0] - central.limits[1]).reshape(size)
     downhill = -(evaluation.gradient + push + central.constraints @ evaluation.slopes)
-    one = jnp.ones_like(state.slack)
-    across = -jnp.outer(jnp.sum(stiff, axis=0), one)
-    corner = jnp.diag(jnp.sum(ratio.constraints) + ratio.slack)
-    H = jnp.block([[H, across], [across.T, corner]]) + ridge * jnp.eye(size + len(one))
-    spare = one * (jnp.sum(central.constraints) - stage.penalty) + central.slack
-    downhill = jnp.concatenate([downhill, spare])
-    step = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(H), True), downhill)
-    # Where rounding makes the matrix indefinite, its diagonal alone decides.
-    step = jnp.where(jnp.all(jnp.isfinite(step)), step, downhill / jnp.diagonal(H))
-    rows, more = grid.rows(step[:size]), step[size:]
-    bent = evaluation.slopes @ step[:size] - jnp.sum(more)
-    change = Inequalities(jnp.stack([rows, -rows]), bent, -more)
-    dual_step = jax.tree.map(
-        lambda c, dual, r, x: c - dual + r * x, central, state.duals, ratio, change
+    if slacks:
+        H[:size, size] = H[size, :size] = -stiff.sum(axis=0)
+        H[size, size] = ratio.constraints.sum() + ratio.slack[0]
+        spare = central.constraints.sum() - stage.penalty + central.slack
+        downhill = np.concatenate([downhill, spare])
+    H[np.diag_indices(size + slacks)] += ridge
+    try:
+        factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
+        step = scipy.linalg.cho_solve(factor, downhill, check_finite=False)
+    except np.linalg.LinAlgError:
+        step = np.full(size + slacks, np.nan)
+    if not np.isfinite(step).all():
+        # Where rounding makes the matrix indefinite, its diagonal alone decides.
+        step = downhill / np.diagonal(H)
+    rows, more = np.einsum("jrk,jk->jr", R, step[:size].reshape(joints, variables)), step[size:]
+    bent = evaluation.slopes @ step[:size] - more.sum()
+    change = Inequalities(np.stack([rows, -rows]), bent, -more)
+    dual_step = Inequalities(
+        *(
+            c - dual + r * x
+            for c, dual, r, x in zip(central, state.duals, ratio, change, strict=True)
+        )
     )
-    approach = jax.tree.map(lambda x, y: x / y, change, room)
-    dual_approach = jax.tree.map(lambda x, y: -x / y, dual_step, state.duals)
     return state._replace(
         step=step,
         dual_step=dual_step,
-        length=_longest(approach),
-        dual_length=_longest(dual_approach),
-        slope=-jnp.sum(downhill * step),
+        length=_longest(change, room),
+        dual_length=_longest(Inequalities(*(-x for x in dual_step)), state.duals),
+        slope=-float(downhill @ step),
     )
 
 
-def _room(grid: Grid, stage: Stage, y: Float[Array, " scaled"]) -> Float[Array, "2 joints rows"]:
+def _room(grid: Grid, stage: Stage, y: np.ndarray) -> Float[np.ndarray, "2 joints rows"]:
     """Return the distances from the limits of the joints, upwards and downwards."""
-    rows = grid.rows(y)
-    return stage.bound * grid.bound - (jnp.stack([rows, -rows]) - np.stack([grid.c, -grid.c]))
+    away = np.einsum("jrk,jk->jr", grid.R, y.reshape(grid.constant.shape)) - grid.c
+    return stage.bound * grid.bound - np.stack([away, -away])
 
 
-def _rooms(grid: Grid, stage: Stage, y: Array, slack: Array, excess: Array) -> Inequalities:
-    return Inequalities(_room(grid, stage, y), jnp.sum(slack) - excess, slack)
+def _rooms(
+    grid: Grid, stage: Stage, y: np.ndarray, slack: np.ndarray, excess: np.ndarray
+) -> Inequalities:
+    return Inequalities(_room(grid, stage, y), slack.sum() - excess, slack)
 
 
-def _longest(approach: Inequalities) -> Array:
+def _longest(change: Inequalities, room: Inequalities) -> float:
     """Return the longest step, at most 1, that stays inside all bounds."""
-    nearest = jnp.max(jnp.stack([jnp.max(x, initial=1e-12) for x in approach]))
-    return jnp.minimum(1.0, TO_BOUNDARY / nearest)
+    nearest = max(float((x / y).max(initial=1e-12)) for x, y in zip(change, room, strict=True))
+    return min(1.0, TO_BOUNDARY / nearest)
 
 
-def _damped_bfgs(B: Array, s: Array, change: Array) -> Array:
+def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return the damped BFGS update, which stays positive definite [1, procedure 18.2]."""
     Bs = B @ s
-    expected, actual = s @ Bs, s @ change
+    expected, actual = float(s @ Bs), float(s @ change)
+    if not expected > 1e-16:
+        return B
     damped = DAMPING * expected
-    mix = jnp.where(actual >= damped, 1.0, (expected - damped) / (expected - actual))
+    mix = 1.0 if actual >= damped else (expected - damped) / (expected - actual)
     r = mix * change + (1.0 - mix) * Bs
-    new = B - jnp.outer(Bs, Bs) / expected + jnp.outer(r, r) / (s @ r)
-    return jnp.where((expected > 1e-16) & jnp.all(jnp.isfinite(new)), new, B)
+    new = B - np.outer(Bs, Bs / expected) + np.outer(r, r / (s @ r))
+    return new if np.isfinite(new).all() else B
 
 
-def _cheapest_slack(like: Array, excess: Array, penalty: Any, barrier: Any) -> Array:
+def _cheapest_slack(
+    like: np.ndarray, excess: np.ndarray, penalty: float, barrier: float
+) -> np.ndarray:
     """Return the slack of least cost, with the barrier that keeps all constraints below it.
 
     So a step may exceed a constraint that bends: the slack follows, and is penalised.
     """
+    if not len(like):
+        return like
     # From below, where the largest term alone balances the penalty, Newton's method grows to it.
-    start = jnp.maximum(0.0, jnp.max(excess, initial=0.0)) + barrier / penalty
-
-    def grow(_: Any, x: Array) -> Array:
-        room = jnp.concatenate([x - excess, x[None]])
-        pull = jnp.sum(barrier / room) - penalty
-        return x + jnp.maximum(0.0, pull / jnp.sum(barrier / room**2))
-
-    return jnp.full_like(like, jax.lax.fori_loop(0, 12, grow, start))
+    x = max(0.0, float(excess.max())) + barrier / penalty
+    for _ in range(12):
+        room = np.append(x - excess, x)
+        pull = (barrier / room).sum() - penalty
+        x += max(0.0, pull / (barrier / room**2).sum())
+    return np.array([x])
 
 
-def _merit(value: Array, slack: Array, room: Inequalities, penalty: Any, barrier: Any) -> Array:
+def _merit(
+    value: float, slack: np.ndarray, room: Inequalities, penalty: float, barrier: float
+) -> float:
     """Return the merit function, which a step must decrease."""
-    logs = sum(jnp.sum(jnp.log(jnp.maximum(x, 1e-300))) for x in room)
-    return value + penalty * jnp.sum(slack) - barrier * logs
+    logs = sum(float(np.log(np.maximum(x, 1e-300)).sum()) for x in room)
+    return value + penalty * float(slack.sum()) - barrier * logs

@@ -7,39 +7,37 @@ to the solver; after each run new peaks are added. Constraints are treated in th
 import functools
 from typing import Any
 
-import jax
 import numpy as np
 import scipy.optimize
 
-from jaxid.arrays import AnyArray, Array, Bool, Float
+from jaxid.arrays import Bool, Float
 
 from .coefficient_limits import scale_samples
 from .problem import (
-    CHECKED,
     MARGIN,
-    PEAKS,
     WATCHED,
     Candidates,
     ExcitationProblem,
+    Watched,
     evaluate_within_limits,
 )
 
 
-def polish(problem: ExcitationProblem, start: Float[AnyArray, " scaled"]) -> Candidates:
+def polish(problem: ExcitationProblem, start: Float[np.ndarray, " scaled"]) -> Candidates:
     """Return a better motion within all limits, or the same."""
     x: np.ndarray = np.array(start, np.float64)
     grid = problem.limits.grid()
     rows = np.zeros((2, *grid.c.shape), bool)
     for kind in grid.kinds:
         rows[:, :, kind[:: max(1, len(kind) // 12)]] = True
-    instants = np.zeros((CHECKED, problem.conditions // (len(WATCHED) + PEAKS)), bool)
+    peaks: list[np.ndarray] = []
     best = evaluate_within_limits(problem, x[None])
     rounds = ((8.0, 5), (None, 8)) if problem.criterion.extreme else ((None, 8),)
     for sharpness, runs in rounds:
         _add_peaks(problem, x, rows, 0.8)
         smooth = np.inf
         for _ in range(runs):
-            watched = _add_instants(problem, x, instants)
+            watched = _watched(problem, x, peaks)
             result = _minimise(problem, x, sharpness, rows, watched)
             if not np.isfinite(result.x).all():
                 break
@@ -50,7 +48,7 @@ def polish(problem: ExcitationProblem, start: Float[AnyArray, " scaled"]) -> Can
             if sharpness is not None:
                 # A smooth round's steps need not show in the exact value at once.
                 gained, smooth = smooth - float(result.fun), float(result.fun)
-            kept = not problem.constraints or problem.checked(x).max() <= 0.0
+            kept = problem.excess(x) <= 0.0
             if peak < 1.003 and kept and (result.nit <= 3 or gained < 1e-4):
                 break
     return best
@@ -61,7 +59,7 @@ def _minimise(
     x: np.ndarray,
     sharpness: float | None,
     rows: Bool[np.ndarray, "2 joints rows"],
-    watched: Bool[np.ndarray, "checked values"],
+    watched: Watched,
 ) -> Any:
     grid = problem.limits.grid()
     side, joint, row = np.nonzero(rows)
@@ -70,17 +68,23 @@ def _minimise(
     G[np.arange(len(side)), joint] = sign[:, None] * grid.R[joint, row]
     G, h = G.reshape(len(side), -1), grid.bound + sign * grid.c[joint, row]
     conditions = [{"type": "ineq", "fun": lambda z: h - G @ z, "jac": lambda z: -G}]
-    if watched.any():
+    if watched:
 
         @functools.lru_cache(maxsize=1)
         def linearised(z: bytes) -> tuple[np.ndarray, np.ndarray]:
-            return _linearise(problem, np.frombuffer(z), watched)
+            return problem.linearise(np.frombuffer(z), watched)
 
         fun, jac = (lambda z, k=k: -linearised(z.tobytes())[k] for k in (0, 1))
         conditions.append({"type": "ineq", "fun": lambda z: fun(z) - MARGIN, "jac": jac})
 
+    samples = scale_samples(100, problem.basis)
+
+    def objective(z: np.ndarray) -> tuple[float, np.ndarray]:
+        values, gradients = problem.value_and_gradient(z[None], sharpness, samples)
+        return float(values[0]), gradients[0]
+
     return scipy.optimize.minimize(
-        lambda z: jax.device_get(_value_and_gradient(problem, z, sharpness)),
+        objective,
         x,
         jac=True,
         method="SLSQP",
@@ -105,43 +109,19 @@ def _add_peaks(
     return float(use.max())
 
 
-def _add_instants(
-    problem: ExcitationProblem, x: np.ndarray, peaks: Bool[np.ndarray, "checked values"]
-) -> Bool[np.ndarray, "checked values"]:
-    """Mark the peaks of constraints; return them with equidistant instants that are not far off."""
-    if not problem.constraints:
-        return peaks
-    values = problem.checked(x)
-    peaks |= _are_peaks(values, 0) & (values > -0.3)
-    watched = peaks.copy()
-    watched[WATCHED] |= values[WATCHED] > -0.6
-    return watched
+def _watched(problem: ExcitationProblem, x: np.ndarray, peaks: list[np.ndarray]) -> Watched:
+    """Return the watched values of constraints with the peaks of this and earlier runs."""
+    found = []
+    for number, (instants, entries) in enumerate(problem.watched(x)):
+        now = np.stack([instants, entries])
+        peaks += [now[:, :0]] if number == len(peaks) else []
+        both = np.unique(np.concatenate([now, peaks[number]], axis=1), axis=1)
+        peaks[number] = np.unique(
+            np.concatenate([peaks[number], now[:, len(WATCHED) :]], 1), axis=1
+        )
+        found.append((both[0], both[1]))
+    return found
 
 
 def _are_peaks(values: np.ndarray, axis: int) -> np.ndarray:
     return (values >= np.roll(values, 1, axis)) & (values >= np.roll(values, -1, axis))
-
-
-def _linearise(
-    problem: ExcitationProblem, x: np.ndarray, watched: Bool[np.ndarray, "checked values"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the watched values of the constraints, and their derivatives."""
-    instants = np.flatnonzero(watched.any(axis=1))
-    # All calls have the same shape, so that one compiled function serves all.
-    padded = np.concatenate([instants, np.full(-len(instants) % 64, instants[0])])
-    parts = [_linearised(problem, x, part) for part in padded.reshape(-1, 64)]
-    values, slopes = (
-        np.concatenate([np.asarray(part[k]) for part in parts])[: len(instants)] for k in (0, 1)
-    )
-    return values[watched[instants]], slopes[watched[instants]]
-
-
-_linearised = jax.jit(ExcitationProblem.linearise, static_argnums=0)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _value_and_gradient(
-    problem: ExcitationProblem, x: AnyArray, sharpness: float | None
-) -> tuple[Array, Array]:
-    samples = scale_samples(100, problem.basis)
-    return jax.value_and_grad(lambda z: problem.value(z, sharpness, samples))(x)

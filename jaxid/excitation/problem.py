@@ -1,6 +1,7 @@
 """Design problem: criterion, limits and constraints as functions of one vector; its candidates."""
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ from jaxid.arrays import AnyArray, Array, Float, Int, PRNGKeyArray, require_floa
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+from jaxid.program.gradient import pull_back
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierBasis
@@ -20,20 +22,30 @@ from . import criteria
 from .coefficient_limits import JointLimits, scale_samples
 from .constraints import AbstractConstraint, Finding
 from .criteria import AbstractCriterion, Information, Sharpness
-from .interior_point import Evaluation, map_starts
+from .interior_point import Evaluation
 
 CHECKED = 8160
 """Instants at which constraints are checked."""
+EVERY = 8
+"""Instants from one to the next at which peaks are looked for during a search."""
 WATCHED = np.arange(0, CHECKED, CHECKED // 48)
-"""Equidistant instants among them at which constraints are always watched during a search."""
-PEAKS = 10
-"""Further watched instants for each value of the constraints: its highest peaks."""
+"""Equidistant instants at which the worst value of each constraint is watched in a search."""
+PEAKS = 48
+"""Further watched values of each constraint: its highest peaks."""
 MARGIN = 1e-3
 """Relative distance that is kept from constraints, for what happens between instants."""
 PENALTY = 3.0
 """Penalty of a relative excess beside the criterion's logarithm, where it is to be improved."""
+NEAR = 0.1
+"""Relative excess from which a motion is not made smaller until it keeps its constraints."""
+SURE = 0.02
+"""Relative distance from all limits from which fewer instants tell that they are kept."""
 SEARCHED = 64
 """Samples on which motions with few coefficients are evaluated during a search."""
+
+
+Watched = Sequence[tuple[Int[np.ndarray, " values"], Int[np.ndarray, " values"]]]
+"""Instants and entries of the watched values of each constraint."""
 
 
 class ExcitationProblem:
@@ -58,6 +70,7 @@ class ExcitationProblem:
 
     Attributes:
         limits: Limits of the joints on the trajectories of the basis.
+        robot: Robot with the limits that constraints ask it for.
         sizes: Typical sizes of the base parameters: the standard deviation of each in random
             motions if it were the only unknown one.
 
@@ -98,10 +111,10 @@ class ExcitationProblem:
             raise InputError(
                 f"`noise` must hold one positive number for each joint, but is {self.noise}."
             )
-        # Constraints ask the robot for its limits of force.
-        self._robot = robot.replace(limits=self.limits.limits)
+        self.robot = robot.replace(limits=self.limits.limits)
         self._rows = np.asarray(self.basis.rows(self.basis.instants(CHECKED))[:3])
-        self._checked = jax.jit(self._constrained)
+        self._samples: dict[int, tuple[np.ndarray, ...]] = {}
+        self._judged = jax.jit(jax.value_and_grad(self._criterion, argnums=(0, 1)))
         self.sizes = np.ones(base.size)
         motions = self.limits.random(jax.random.key(0), 8)
         squares = np.mean([np.diag(self.information(x).weighted) for x in motions], axis=0)
@@ -182,96 +195,146 @@ class ExcitationProblem:
         )
 
         def evaluate(plain: Array, weighted: Array) -> Array:
-            return self.criterion(Information(plain, weighted, self.sizes), sharpness)
+            return self._criterion(plain, weighted, sharpness)
 
         return jax.vmap(evaluate)(jnp.asarray(plain), jnp.asarray(weighted))
 
+    def _criterion(self, plain: Array, weighted: Array, sharpness: Sharpness) -> Array:
+        return self.criterion(Information(plain, weighted, self.sizes), sharpness)
+
+    def value_and_gradient(
+        self, x: Float[np.ndarray, "starts scaled"], sharpness: float | None, samples: int
+    ) -> tuple[Float[np.ndarray, " starts"], Float[np.ndarray, "starts scaled"]]:
+        """Return `value` of several motions and its derivatives, in NumPy."""
+        rows = self._sampled(samples)
+        coefficients = self.limits.coefficients(x)
+        arrays = [np.einsum("sk,bjk->jbs", part, coefficients) for part in rows]
+        regressor = self.base.joint_regressor
+        columns = [np.swapaxes(y, 0, 1) for y in regressor.in_numpy(*arrays)]
+        plain, weighted = np.zeros((2, len(x), self.base.size, self.base.size))
+        scale, w = self.samples / samples, 1.0 / self.noise
+        places = [np.ix_(own, own) for own in regressor.columns]
+        for place, y, weight in zip(places, columns, w, strict=True):
+            gram = scale * (y @ np.swapaxes(y, 1, 2))
+            plain[:, *place] += gram
+            weighted[:, *place] += weight**2 * gram
+        weighted += self.prior
+        values, by_plain, by_weighted = self._judge(plain, weighted, sharpness)
+        pulled = np.zeros((len(self.noise), self.base.size, *arrays[0].shape[1:]))
+        for joint, (place, y, weight) in enumerate(zip(places, columns, w, strict=True)):
+            slope = by_plain[:, *place] + weight**2 * by_weighted[:, *place]
+            both = scale * (slope + np.swapaxes(slope, 1, 2))
+            pulled[joint, regressor.columns[joint]] = np.swapaxes(both @ y, 0, 1)
+        slopes = pull_back(regressor.program, pulled.reshape(-1, *pulled.shape[2:]), *arrays)
+        parts = zip(slopes, rows, strict=True)
+        gradient = sum(np.einsum("jbs,sk->bjk", slope, part) for slope, part in parts)
+        return values, (gradient * np.asarray(self.limits.scale)).reshape(x.shape)
+
+    def _judge(
+        self, plain: np.ndarray, weighted: np.ndarray, sharpness: float | None
+    ) -> tuple[np.ndarray, ...]:
+        """Return the criterion of several motions, and its derivatives by their information."""
+        found = [
+            self._judged(*matrices, sharpness) for matrices in zip(plain, weighted, strict=True)
+        ]
+        values, slopes = zip(*found, strict=True)
+        return np.array(values), *(np.array(x) for x in zip(*slopes, strict=True))
+
+    def _sampled(self, samples: int) -> tuple[np.ndarray, ...]:
+        """Return the rows of the basis at samples of a run."""
+        if samples not in self._samples:
+            rows = np.asarray(self.basis.rows(self.basis.times(samples))[:3])
+            self._samples[samples] = tuple(rows)
+        return self._samples[samples]
+
     def evaluate(
         self,
-        x: Float[Array, "starts scaled"],
-        sharpness: Sharpness,
-        instants: Int[Array, "starts instants"],
-    ) -> Evaluation:
-        """Return the criterion, and the constraints at watched instants, of several motions."""
+        x: Float[np.ndarray, "starts scaled"],
+        sharpness: float | None,
+        watched: Sequence[Watched],
+    ) -> list[Evaluation]:
+        """Return the criterion, and the watched values of constraints, of several motions."""
         count = scale_samples(SEARCHED, self.basis)
-        values, pull = jax.vjp(lambda y: self.values(y, sharpness, count), x)
-        gradient = pull(jnp.ones_like(values))[0]
-        if not self.constraints:
-            return Evaluation.unconstrained(values, gradient)
-        excess, slopes = map_starts(self.linearise, x, instants)
-        starts, size = x.shape
-        # At the peaks of one value only this value counts: the others have their own peaks.
-        entries = excess.shape[-1]
-        always = len(WATCHED) * entries
-        peaks = np.arange(PEAKS * entries) * entries + np.repeat(np.arange(entries), PEAKS)
-        chosen = np.concatenate([np.arange(always), always + peaks])
-        slopes = slopes.reshape(starts, -1, size)[:, chosen]
-        return Evaluation(values, gradient, excess.reshape(starts, -1)[:, chosen] + MARGIN, slopes)
+        values, gradients = self.value_and_gradient(x, sharpness, count)
+        found = []
+        for y, value, gradient, now in zip(x, values, gradients, watched, strict=True):
+            excess, slopes = self.linearise(y, now)
+            found.append(Evaluation(float(value), gradient, excess + MARGIN, slopes))
+        return found
 
     def linearise(
-        self, x: Float[Array, " scaled"], instants: Int[AnyArray, " instants"]
-    ) -> tuple[Float[Array, "instants values"], Float[Array, "instants values scaled"]]:
-        """Return all constraints of one motion at checked instants, and their derivatives."""
-        rows = jnp.asarray(self._rows)[:, instants]
-        coefficients = self.limits.coefficients(x)
-        motion = [part @ coefficients.T for part in rows]
-        # Samples are independent: one pull gives a value's derivatives at all of them.
-        values, pull = jax.vjp(lambda *parts: self._evaluated(Motion(*parts)), *motion)
-        each = jnp.eye(values.shape[1])[:, None, :]
-        by_motion = jax.vmap(lambda one: pull(jnp.broadcast_to(one, values.shape)))(each)
-        scale = np.asarray(self.limits.scale)
-        slopes = sum(
-            jnp.einsum("vtj,tk,jk->tvjk", J, part, scale)
-            for J, part in zip(by_motion, rows, strict=True)
-        )
-        return values, jnp.reshape(slopes, (*values.shape, x.shape[-1]))
+        self, x: Float[np.ndarray, " scaled"], watched: Watched
+    ) -> tuple[Float[np.ndarray, " values"], Float[np.ndarray, "values scaled"]]:
+        """Return watched values of one motion's constraints, and their derivatives."""
+        coefficients, scale = self.limits.coefficients(x), np.asarray(self.limits.scale)
+        excess, derivatives = [np.zeros(0)], [np.zeros((0, x.shape[-1]))]
+        for constraint, (instants, entries) in zip(self.constraints, watched, strict=True):
+            rows = self._rows[:, instants]
+            motion = Motion(*(part @ coefficients.T for part in rows))
+            values, slopes = constraint.linearise(self.robot, motion, entries)
+            parts = zip(slopes, rows, strict=True)
+            by_x = sum(J[:, :, None] * part[:, None] for J, part in parts) * scale
+            excess.append(values)
+            derivatives.append(by_x.reshape(len(values), -1))
+        return np.concatenate(excess), np.concatenate(derivatives)
 
     @property
     def conditions(self) -> int:
-        """Number of values that `evaluate` gives for the constraints of one motion."""
-        entries = sum(len(c.entries(self._robot)) for c in self.constraints)
-        return (len(WATCHED) + PEAKS) * entries
+        """Number of watched values of one motion."""
+        return len(self.constraints) * (len(WATCHED) + PEAKS)
 
-    def watched_instants(self, x: Float[Array, "starts scaled"]) -> Int[Array, "starts instants"]:
-        """Return the instants at which constraints are watched: equidistant, and highest peaks."""
-        if not self.constraints:
-            return jnp.zeros((len(x), 0), int)
+    def watched(self, x: Float[np.ndarray, " scaled"]) -> Watched:
+        """Return the values to be watched near a motion, as instants and places in the entries.
 
-        def one(x: Array) -> Array:
-            values = self._constrained(x).T
-            peak = (values >= jnp.roll(values, 1, 1)) & (values >= jnp.roll(values, -1, 1))
-            highest = jax.lax.top_k(jnp.where(peak, values, -jnp.inf), PEAKS)[1]
-            return jnp.concatenate([jnp.asarray(WATCHED, highest.dtype), highest.reshape(-1)])
+        Of each constraint these are the worst value at equidistant instants, and highest peaks.
+        """
+        found = []
+        for values in self._by_constraint(x, slice(None, None, EVERY)):
+            peak = (values >= np.roll(values, 1, 0)) & (values >= np.roll(values, -1, 0))
+            highest = np.argsort(np.where(peak, values, -np.inf), axis=None)[-PEAKS:]
+            highest = np.resize(highest, PEAKS)
+            time, entry = np.unravel_index(highest, values.shape)
+            at = np.concatenate([WATCHED // EVERY, time])
+            worst = values[WATCHED // EVERY].argmax(axis=1)
+            found.append((EVERY * at, np.concatenate([worst, entry])))
+        return found
 
-        return jax.lax.map(one, x)
-
-    def watched_excess(self, x: Float[Array, "starts scaled"]) -> Float[Array, " starts"]:
+    def watched_excess(self, x: Float[np.ndarray, " scaled"]) -> float:
         """Return the largest excess of the constraints at the equidistant watched instants."""
-        return jax.lax.map(lambda y: jnp.max(self._constrained(y, WATCHED)), x)
+        return max((float(v.max()) for v in self._by_constraint(x, WATCHED)), default=-np.inf)
+
+    def _by_constraint(self, x: AnyArray, instants: Any) -> list[np.ndarray]:
+        coefficients = self.limits.coefficients(np.asarray(x))
+        motion = Motion(*(part[instants] @ coefficients.T for part in self._rows))
+        return [np.asarray(c(self.robot, motion)) for c in self.constraints]
 
     def checked(self, x: Float[AnyArray, " scaled"]) -> Float[np.ndarray, "checked values"]:
         """Return all constraints of one motion at all checked instants."""
-        return np.asarray(self._checked(np.asarray(x)))
+        return np.concatenate(self._by_constraint(x, slice(None)), axis=1)
 
     def information(self, x: Float[AnyArray, " scaled"]) -> Information:
         """Return the information of one run, computed in NumPy."""
-        rows = np.asarray(self.basis.rows(self.basis.times(self.samples))[:3])
-        coefficients = np.asarray(self.limits.coefficients(np.asarray(x)))
-        motion = Motion(*(part @ coefficients.T for part in rows))
+        coefficients = self.limits.coefficients(np.asarray(x))
+        motion = Motion(*(part @ coefficients.T for part in self._sampled(self.samples)))
         weights = 1.0 / self.noise
         return criteria.information(self.base, motion, weights, self.prior, self.sizes)
 
     def excess(self, x: Float[AnyArray, " scaled"]) -> float:
         """Return the largest excess over constraints for all times; minus infinity if none."""
-        return float(_tops(self.checked(x)).max()) if self.constraints else -np.inf
+        if not self.constraints:
+            return -np.inf
+        # What is far from its limits need not be known closely.
+        rough = self._by_constraint(x, slice(None, None, EVERY))
+        coarse = float(_tops(np.concatenate(rough, axis=1)).max())
+        return coarse if not -SURE < coarse < NEAR else float(_tops(self.checked(x)).max())
 
     def findings(self, x: Float[AnyArray, " scaled"]) -> list[Finding]:
         """Return all limited quantities with their largest values."""
         found: list[Finding] = []
         tops = _tops(self.checked(x)) if self.constraints else np.zeros(0)
         for constraint in self.constraints:
-            width, start = len(constraint.entries(self._robot)), len(found)
-            found += constraint.describe(self._robot, tops[start : start + width])
+            width, start = len(constraint.entries(self.robot)), len(found)
+            found += constraint.describe(self.robot, tops[start : start + width])
         return found
 
     def _constrained(
@@ -281,7 +344,7 @@ class ExcitationProblem:
         return self._evaluated(Motion(*(part[instants] @ coefficients.T for part in self._rows)))
 
     def _evaluated(self, motion: Motion) -> Float[Array, "*batch values"]:
-        return jnp.concatenate([c(self._robot, motion) for c in self.constraints], axis=-1)
+        return jnp.concatenate([c(self.robot, motion) for c in self.constraints], axis=-1)
 
 
 def assumed_noise(robot: Robot) -> Float[np.ndarray, " joints"]:
@@ -368,44 +431,38 @@ def evaluate_within_limits(
     Where they almost keep the other constraints, they are made smaller until they do; without
     constraints they fill their limits where that is better.
     """
+    grid = problem.limits.grid()
 
     def mended(y: np.ndarray) -> np.ndarray:
-        if not 0.0 < problem.excess(y) <= 0.1:
+        if not 0.0 < problem.excess(y) <= NEAR:
             return y
         fractions = (0.9995, 0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9)
-        smaller = (np.asarray(_shrink(problem, y, fraction)) for fraction in fractions)
+        smaller = (np.asarray(grid.shrink(y, fraction)) for fraction in fractions)
         return next((z for z in smaller if problem.excess(z) <= 0.0), y)
 
     # A larger motion mostly tells more, but a condition number may well become worse by it.
     growths = (1.0,) if problem.constraints else (1.0, 1.05)
-    scaled = (np.asarray(_scale_into_limits(problem, growth, x)) for growth in growths)
+    scaled = [
+        [np.asarray(grid.scale_into_limits(y, growth=growth)) for y in np.asarray(x)]
+        for growth in growths
+    ]
     found = [evaluate(problem, np.array([mended(y) for y in some])) for some in scaled]
     return functools.reduce(Candidates.improved, found)
 
 
 def shrink_to_constraints(problem: ExcitationProblem, x: Float[AnyArray, " scaled"]) -> Candidates:
     """Return a motion made so small that it keeps all constraints; unchanged if no size does."""
+    x, shrink = np.asarray(x), problem.limits.grid().shrink
 
     def keeps(fraction: float) -> bool:
-        return problem.excess(np.asarray(_shrink(problem, x, fraction))) <= 0.0
+        return problem.excess(shrink(x, fraction)) <= 0.0
 
     step = 0.05
     low = next((s for s in np.arange(1.0 - step, 0.0, -step) if keeps(s)), None)
     if low is None:
-        return evaluate(problem, np.asarray(x)[None])
+        return evaluate(problem, x[None])
     high = low + step
     for _ in range(6):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if keeps(middle) else (low, middle)
-    return evaluate(problem, np.asarray(_shrink(problem, x, low))[None])
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _scale_into_limits(problem: ExcitationProblem, growth: float, x: AnyArray) -> Array:
-    grid = problem.limits.grid()
-    return jax.vmap(lambda y: grid.scale_into_limits(y, growth=growth))(x)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _shrink(problem: ExcitationProblem, x: Array, fraction: Any) -> Array:
-    return problem.limits.grid().shrink(x, fraction)
+    return evaluate(problem, shrink(x, low)[None])

@@ -1,33 +1,29 @@
-"""The search from many starts at once: relaxed limits first, then tight ones; then generations.
+"""The search from many starts: relaxed limits first, then tight ones; then generations.
 
 The children of the motions found are improved in the same way, and of parents and children the best
 survive. In the end limits are kept on a finer grid, so that less of them is left unused, and the
-best motions are polished one by one.
+best motions are polished one by one. Where there are constraints, all starts are small motions that
+keep them, so that there is a result after seconds.
 """
 
-import functools
-import hashlib
-import io
-from contextlib import suppress
-from pathlib import Path
+import time
+from collections.abc import Iterator
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, PRNGKeyArray
-from jaxid.errors import InputError
-from jaxid.io import write_bytes
+from jaxid.arrays import Float, PRNGKeyArray
+from jaxid.dynamics.motion import Motion
 
 from . import interior_point
 from .coefficient_limits import scale_samples
-from .interior_point import Stage, State
+from .interior_point import Evaluation, Stage, State
 from .polish import polish
 from .problem import (
     PENALTY,
     SEARCHED,
+    Candidates,
     ExcitationProblem,
     evaluate,
     evaluate_within_limits,
@@ -53,25 +49,42 @@ SCHEDULE = (
 )
 """Relaxed limits, then the limits (0.998 leaves room for rounding); slightly relaxed once more;
 sharper in the end."""
-SETTLING = tuple(Stage(0.998, 1e-4, 1e-6, n, 20.0, 100.0) for n in (100, 50, 50))
-"""Further stages where there are constraints: their peaks move, and exceeding them is expensive."""
-EVALUATED = frozenset({5, 7, 10, 11, 12, 13, 14})
-"""Stages of both whose results are compared with the best so far."""
+CONSTRAINED = (
+    Stage(1.25, 1e-2, 1e-3, 50),
+    Stage(0.998, 1e-3, 1e-4, 75, 4.0, 30.0),
+    Stage(0.998, 1e-4, 1e-6, 75, 20.0, 100.0),
+    Stage(0.998, 1e-4, 1e-6, 50, 20.0, 100.0),
+    Stage(1.1, 1e-3, 1e-3, 25, 8.0, 30.0),
+    Stage(0.998, 1e-4, 1e-6, 100, 20.0, 100.0),
+    Stage(0.998, 1e-4, 1e-6, 50, 20.0, 100.0),
+)
+"""The same where there are constraints: exceeding them becomes more and more expensive."""
+EVALUATED = frozenset({5, 7, 10, 11})
+"""Stages without constraints whose results are compared with the best so far."""
 GENERATION = Stage(0.998, 1e-3, 1e-6, 150, 20.0, 100.0)
 """Improvement of children."""
 LAST = Stage(0.998, 1e-4, 1e-6, 300, 20.0, 100.0)
 """Last improvement, on the fine grid."""
+BATCH = 8
+"""Starts that are improved together."""
+PART = 25
+"""Iterations after which the peaks of constraints are found anew."""
+POLISHING = 0.35
+"""Fraction of a limited time that is left for the fine grid and for polishing."""
+SIZES = (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
+"""Sizes of first motions that may keep constraints, relative to the limits of the joints."""
+POSES = 1000
+"""Random poses among which the middles of these motions are sought."""
 
 
 class Search:
-    """A search that can be stopped after each step, saved and resumed.
+    """A search that may be stopped after each step.
 
     Attributes:
-        done: Number of steps done.
-        steps: Number of steps: of the starts, of their descendants, the last one, and polishing.
         first: Values of the random motions.
         best: Best motions so far.
         history: Value of the criterion for the best motion, before the first step and after each.
+        steps: Number of steps without a limit of time.
     """
 
     def __init__(
@@ -81,18 +94,24 @@ class Search:
         starts: int,
         generations: int,
         polished: int,
+        begin: Float[np.ndarray, " scaled"] | None = None,
+        seconds: float | None = None,
     ):
-        self._problem, self._key = problem, key
-        self._schedule = SCHEDULE + SETTLING if problem.constraints else SCHEDULE
-        self._generations, self._polished = generations, min(polished, starts)
-        self._searching = len(self._schedule) + generations + 1
-        self.steps = self._searching + self._polished
+        self._problem, self._generations = problem, generations
+        self._random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        self._polished = min(polished, starts)
+        self._began, self._seconds = time.monotonic(), seconds
         x = problem.limits.random(key, starts)
-        self.done, self.best = 0, evaluate(problem, x)
-        self.first = self.best.value
-        self.history = np.full(self.steps + 1, self.best.best_value)
-        self._order = self.best.promising()
-        self._state = _begin(problem, SEARCHED, x)
+        self.first = evaluate(problem, x).value if not problem.constraints else _values(problem, x)
+        if problem.constraints:
+            x = first_motions(problem, self._random, x)
+        if begin is not None:
+            x[0] = begin
+        self.best = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
+        self._x, self.history = x, [self.best.best_value]
+        schedule = len(CONSTRAINED if problem.constraints else SCHEDULE)
+        batches = -(-starts // BATCH)
+        self.steps = batches * (schedule + 1) + generations + self._polished
 
     @property
     def feasible(self) -> bool:
@@ -100,128 +119,178 @@ class Search:
         return bool((self.best.broken == 0).any())
 
     @property
-    def searching(self) -> bool:
-        """Whether the next step is one of the search from many starts, not polishing."""
-        return self.done < self._searching
+    def spent(self) -> float:
+        """Fraction of the time that is spent; that of the steps where time is not limited."""
+        if self._seconds is None:
+            return min((len(self.history) - 1) / self.steps, 1.0)
+        return min((time.monotonic() - self._began) / self._seconds, 1.0)
 
-    def advance(self) -> None:
-        """Do the next step."""
-        problem, number, generation = self._problem, self.done, self.done - len(self._schedule)
-        if generation < 0:
-            if number == len(SCHEDULE) and self.best.broken.any():
-                self._restart_broken()
-            self._state = _improve(problem, SEARCHED, self._state, self._schedule[number])
-            if number in EVALUATED:
-                self.best = self.best.improved(evaluate_within_limits(problem, self._state.y))
-        elif generation < self._generations:
-            key = jax.random.fold_in(self._key, generation)
-            children = crossover(problem, jnp.asarray(self.best.x), key)
-            found = _improve(problem, SEARCHED, _begin(problem, SEARCHED, children), GENERATION)
-            self.best = self.best.survivors(evaluate_within_limits(problem, found.y))
-        elif generation == self._generations:
-            found = _improve(problem, FINE, _begin(problem, FINE, self.best.x), LAST)
-            self.best = self.best.improved(evaluate_within_limits(problem, found.y))
+    def run(self) -> Iterator[str]:
+        """Search, and yield what it does next at the beginning and after each step."""
+        problem = self._problem
+        if problem.constraints:
+            yield from self._start_batches()
         else:
-            place = int(self._order[number - self._searching])
+            yield "searching from many starts"
+        schedule = CONSTRAINED if problem.constraints else SCHEDULE
+        for places in self._batches():
+            yield from self._improve_batch(places, schedule)
+        for _ in range(self._generations):
+            if self._is_late:
+                break
+            children = crossover(problem, np.asarray(self.best.x), self._random)
+            found = [*self.best.x]
+            for start in range(0, len(found), BATCH):
+                states = _begin(problem, SEARCHED, children[start : start + BATCH])
+                for _ in _improve(problem, SEARCHED, states, GENERATION):
+                    if self._is_late:
+                        break
+                    yield "improving descendants"
+                found[start : start + BATCH] = [one.y for one in states]
+            self.best = self.best.survivors(evaluate_within_limits(problem, np.array(found)))
+            yield self._done("improving descendants")
+        yield from self._finish()
+
+    def _batches(self) -> Iterator[np.ndarray]:
+        """Yield the places of starts; with constraints the first batch is one start alone."""
+        every = np.arange(len(self._x))
+        first = 1 if self._problem.constraints else 0
+        for batch in (every[:first], *np.split(every[first:], range(BATCH, len(every), BATCH))):
+            if len(batch) and not self._is_late:
+                yield batch
+
+    def _start_batches(self) -> Iterator[str]:
+        """Look for a first motion that keeps all constraints, then for more."""
+        yield "looking for a first motion that keeps all limits"
+        for x in self._x[1:]:
+            if self.feasible:
+                break
+            self.best = self.best.survivors(shrink_to_constraints(self._problem, x))
+            yield self._done("looking for a first motion that keeps all limits")
+        found, unknown = self.best, np.full(len(self._x), np.inf)
+        self.best = Candidates(self._x, unknown, unknown.copy())
+        for part, one in zip(self.best, found, strict=True):
+            part[0] = one[int(found.order()[0])]
+
+    def _improve_batch(self, places: np.ndarray, schedule: tuple[Stage, ...]) -> Iterator[str]:
+        states, task = (
+            _begin(self._problem, SEARCHED, self._x[places]),
+            "searching from many starts",
+        )
+        for number, stage in enumerate(schedule):
+            for _ in _improve(self._problem, SEARCHED, states, stage):
+                if self._is_late:
+                    return
+                yield task
+            if number in EVALUATED or (self._problem.constraints and stage.bound < 1.0):
+                self._take(states, places)
+            yield self._done(task)
+
+    def _finish(self) -> Iterator[str]:
+        """Keep limits on a finer grid, then polish the best motions."""
+        problem, task = self._problem, "keeping the limits closely"
+        promising = self.best.promising()
+        for start in range(0, len(promising) if self._seconds is None else BATCH, BATCH):
+            places = promising[start : start + BATCH]
+            states = _begin(problem, FINE, self.best.x[places])
+            for _ in _improve(problem, FINE, states, LAST):
+                yield task
+            self._take(states, places)
+            yield self._done(task)
+        order = self.best.promising()
+        for place in order[: self._polished]:
+            yield "polishing the best"
             better = polish(problem, np.asarray(self.best.x[place]))
-            self.best = self.best.improved(better, np.arange(len(self.first)) == place)
-        self.done = number + 1
-        self.history[self.done :] = self.best.best_value
-        if self.done <= self._searching:
-            self._order = self.best.promising()
+            self.best = self.best.improved(better, np.arange(len(order)) == place)
+            yield self._done("polishing the best")
+
+    @property
+    def _is_late(self) -> bool:
+        """Whether only the time for the last steps is left."""
+        return self._seconds is not None and self.spent > 1.0 - POLISHING
+
+    def _take(self, states: list[State], places: np.ndarray) -> None:
+        """Replace the motions at some places by better ones."""
+        x = np.array(self.best.x)
+        x[places] = [one.y for one in states]
+        chosen = np.isin(np.arange(len(x)), places)
+        found = evaluate_within_limits(self._problem, x[places])
+        whole = Candidates(*(np.array(part) for part in self.best))
+        for part, new in zip(whole, found, strict=True):
+            part[places] = new
+        self.best = self.best.improved(whole, chosen)
+
+    def _done(self, task: str) -> str:
+        self.history.append(self.best.best_value)
+        return task
 
     def finish(self) -> None:
         """Make motions smaller where no other keeps all constraints."""
         if self.best.broken.all():
-            for place, x in enumerate(np.asarray(self.best.x)):
+            for place in self.best.order()[:4]:
+                x = np.asarray(self.best.x[place])
                 small = shrink_to_constraints(self._problem, x)
-                self.best = self.best.improved(small, np.arange(len(self.first)) == place)
-
-    def save(self, path: str | Path) -> None:
-        """Write the state of the search."""
-        buffer = io.BytesIO()
-        eqx.tree_serialise_leaves(buffer, (self._digest(), self._content()))
-        write_bytes(path, buffer.getvalue())
-
-    def resume(self, path: str | Path) -> None:
-        """Go on from a state that was saved for the same problem and settings."""
-        digest, content = self._digest(), self._content()
-        saved = np.zeros_like(digest)
-        with Path(path).open("rb") as file, suppress(ValueError, EOFError, RuntimeError, TypeError):
-            saved, content = eqx.tree_deserialise_leaves(file, (digest, content))
-        if (saved != digest).any():
-            raise InputError(
-                f"`{path}` is damaged, or of a design with other settings: remove it to begin anew."
-            )
-        self.done = int(content[0])
-        self.first, self.best, self.history, self._order, self._state = content[1:]
-
-    def _content(self) -> tuple:
-        done, known = np.array(self.done), (self.first, self.best, self.history)
-        return done, *known, self._order, self._state
-
-    def _digest(self) -> np.ndarray:
-        """Return a digest of everything that the result depends on."""
-        p = self._problem
-        settings = len(self.first), self._generations, self._polished, p.samples
-        parts = p.base, p.limits, p.criterion, p.constraints, p.noise, p.prior, settings
-        digest = hashlib.sha256(eqx.tree_pformat(parts, width=10**6).encode())
-        for leaf in jax.tree.leaves((parts, jax.random.key_data(self._key))):
-            digest.update(np.asarray(leaf).tobytes() if eqx.is_array_like(leaf) else b"")
-        return np.frombuffer(digest.digest(), np.uint8)
-
-    def _restart_broken(self) -> None:
-        """Start again where constraints are broken, from small motions that keep them best."""
-        broken = self.best.broken > 0
-        sizes = (0.8, 0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
-        random = self._problem.limits.random
-        many = jnp.concatenate([random(jax.random.key(k), 16, s) for k, s in enumerate(sizes)])
-        best = jnp.argsort(jnp.maximum(_watched_excess(self._problem, many), 0.0))
-        chosen = many[best[np.arange(len(broken)) % len(many)]]
-        self._state = jax.tree.map(
-            lambda a, b: jnp.where(broken.reshape(-1, *(1,) * (a.ndim - 1)), a, b),
-            _begin(self._problem, SEARCHED, chosen),
-            self._state,
-        )
+                self.best = self.best.improved(small, np.arange(len(self.best.x)) == place)
 
 
-def _begin(problem: ExcitationProblem, points: int, x: AnyArray) -> State:
-    return interior_point.begin(problem.limits.grid(points), x, problem.conditions)
+def first_motions(
+    problem: ExcitationProblem, random: np.random.Generator, x: Float[np.ndarray, "starts scaled"]
+) -> Float[np.ndarray, "starts scaled"]:
+    """Return as many small motions that keep the constraints best, the largest of them first.
+
+    They have the shapes of given motions, about poses at which the robot may stand still.
+    """
+    limits, robot = problem.limits.limits, problem.base.model.robot
+    low, high = np.asarray(limits.position_min), np.asarray(limits.position_max)
+    places = random.uniform(0.1, 0.9, (POSES, robot.joints))
+    q = low + places * (high - low)
+    still = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    values = [np.asarray(c(problem.robot, still)).max(axis=1) for c in problem.constraints]
+    good = np.argsort(np.max(values, axis=0))[: len(x)]
+    fill = problem.limits.grid().fill
+    many = [
+        np.asarray(fill(y, place, size))
+        for size in SIZES
+        for y, place in zip(x, places[good], strict=True)
+    ]
+    excess = np.array([problem.watched_excess(y) for y in many])
+    best = np.argsort(np.maximum(excess, 0.0), kind="stable")[: len(x)]
+    return np.array(many)[best]
 
 
-def _improve(problem: ExcitationProblem, points: int, state: State, stage: Stage) -> State:
-    """Run one stage; with constraints in parts, whose peaks are found anew."""
-    whole = int(stage.iterations)
-    part = 25 if problem.constraints else whole
-    for start in range(0, whole, part):
+def _values(problem: ExcitationProblem, x: Float[np.ndarray, "starts scaled"]) -> np.ndarray:
+    """Return the criterion of motions, whether they keep constraints or not."""
+    return problem.value_and_gradient(x, None, problem.samples)[0]
+
+
+def _begin(problem: ExcitationProblem, points: int, x: Any) -> list[State]:
+    return interior_point.begin(problem.limits.grid(points), np.asarray(x), problem.conditions)
+
+
+def _improve(
+    problem: ExcitationProblem, points: int, states: list[State], stage: Stage
+) -> Iterator[None]:
+    """Run one stage in parts, on the list of states; peaks of constraints are found anew."""
+    grid = problem.limits.grid(points)
+    for start in range(0, stage.iterations, PART):
         barrier = max(stage.least, stage.barrier * interior_point.COOLING**start)
-        now = stage._replace(barrier=barrier, iterations=min(part, whole - start))
-        numbers = Stage(*(jnp.asarray(x, float) for x in now))
-        state = _run(problem, points, state, numbers, _watched_instants(problem, state.y))
-    return jax.block_until_ready(state)
+        count = min(PART, stage.iterations - start)
+        watched = [problem.watched(one.y) for one in states]
+
+        def objective(y: np.ndarray, active: Any, watched: Any = watched) -> list[Evaluation]:
+            return problem.evaluate(y, stage.sharpness, [watched[k] for k in active])
+
+        now = stage._replace(barrier=barrier, iterations=count)
+        states[:] = interior_point.run(grid, objective, states, now)
+        yield
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
-def _run(
-    problem: ExcitationProblem, points: int, state: State, stage: Stage, instants: Array
-) -> State:
-    def objective(x: Array) -> Any:
-        return problem.evaluate(x, stage.sharpness, instants)
-
-    return interior_point.run(problem.limits.grid(points), objective, state, stage)
-
-
-_watched_instants = jax.jit(ExcitationProblem.watched_instants, static_argnums=0)
-_watched_excess = jax.jit(ExcitationProblem.watched_excess, static_argnums=0)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 3))
 def crossover(
     problem: ExcitationProblem,
-    x: Float[Array, "starts scaled"],
-    key: PRNGKeyArray,
+    x: Float[np.ndarray, "starts scaled"],
+    random: np.random.Generator,
     tries: int = 16,
-) -> Float[Array, "starts scaled"]:
+) -> Float[np.ndarray, "starts scaled"]:
     """Return one child of each motion with another one: the most promising of several.
 
     Some joints of a child move as in one parent, the others as in another, begun at another time.
@@ -229,35 +298,31 @@ def crossover(
     information of a motion does not depend on when its period begins or which way it runs, so that
     two good motions may fit together at one shift only: many children are tried.
     """
-    retimings = jnp.asarray(problem.basis.retimings())
-
-    def another(best: tuple[Array, Array], key: PRNGKeyArray) -> tuple[tuple, None]:
-        children = _draw_children(problem, retimings, x, key)
-        value = problem.values(children, None, scale_samples(SEARCHED, problem.basis))
+    retimings, count = problem.basis.retimings(), scale_samples(SEARCHED, problem.basis)
+    best, least = np.array(x), np.full(len(x), np.inf)
+    for _ in range(tries):
+        children = _draw_children(problem, retimings, x, random)
+        value = problem.value_and_gradient(children, None, count)[0]
         if problem.constraints:
-            value = value + PENALTY * jnp.maximum(problem.watched_excess(children), 0.0)
-        value = jnp.where(jnp.isnan(value), jnp.inf, value)
-        better = value < best[1]
-        return (jnp.where(better[:, None], children, best[0]), jnp.minimum(value, best[1])), None
-
-    none = x, jnp.full(len(x), jnp.inf)
-    return jax.lax.scan(another, none, jax.random.split(key, tries))[0][0]
+            excess = np.array([problem.watched_excess(y) for y in children])
+            value = value + PENALTY * np.maximum(excess, 0.0)
+        better = value < least
+        best[better], least[better] = children[better], value[better]
+    return best
 
 
 def _draw_children(
-    problem: ExcitationProblem, retimings: Array, x: Array, key: PRNGKeyArray
-) -> Array:
-    mate_key, kind_key, time_key, share_key, joint_key, other_key = jax.random.split(key, 6)
+    problem: ExcitationProblem, retimings: np.ndarray, x: np.ndarray, random: np.random.Generator
+) -> np.ndarray:
     starts, (joints, _) = len(x), problem.limits.shape
-    ahead = jax.random.randint(mate_key, (starts,), 1, max(starts, 2))
+    ahead = random.integers(1, max(starts, 2), starts)
     # Half of the second parents are not retimed: motions of one descent fit together already.
-    which = jax.random.randint(time_key, (starts,), 0, len(retimings))
-    T = retimings[jnp.where(jax.random.uniform(kind_key, (starts,), float) < 0.5, 0, which)]
-    mates = problem.limits.coefficients(x[(jnp.arange(starts) + ahead) % starts])
-    second = jnp.einsum("bvw,bjw->bjv", T, mates) / np.asarray(problem.limits.scale)[None]
+    which = random.integers(0, len(retimings), starts)
+    T = retimings[np.where(random.random(starts) < 0.5, 0, which)]
+    mates = problem.limits.coefficients(x[(np.arange(starts) + ahead) % starts])
+    second = np.einsum("bvw,bjw->bjv", T, mates) / np.asarray(problem.limits.scale)
     # A child has this expected fraction of joints from its second parent, and at least one.
-    share = jax.random.uniform(share_key, (starts, 1), float, 0.1, 0.5)
-    taken = jax.random.uniform(other_key, (starts, joints), float) < share
-    surely = jax.random.randint(joint_key, (starts, 1), 0, joints)
-    taken = (taken | (surely == np.arange(joints)[None]))[:, :, None]
-    return jnp.where(taken, second, x.reshape(second.shape)).reshape(x.shape)
+    share = random.uniform(0.1, 0.5, (starts, 1))
+    taken = random.random((starts, joints)) < share
+    taken[np.arange(starts), random.integers(0, joints, starts)] = True
+    return np.where(taken[:, :, None], second, x.reshape(second.shape)).reshape(x.shape)

@@ -26,7 +26,7 @@ from jaxid.units import Unit, unit
 
 LARGEST = 1e12
 """Largest number of a key, infinity apart, in any unit."""
-RENAMED = {"rows.slow": "min_speed", "rows.every": "step"}
+RENAMED = {"rows.slow": "min_speed", "rows.every": "step", "collision.ground": "floor"}
 """Old keys and their new names."""
 
 

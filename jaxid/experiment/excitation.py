@@ -1,6 +1,6 @@
 """Design of the motion that an experiment file asks for, and the files that a robot can play."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,12 +20,13 @@ from jaxid.report.excitation import write_excitation
 from jaxid.report.result_files import read_fit
 from jaxid.result_table import Remark, Status
 from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
-from jaxid.trajectory.leads import with_leads
-from jaxid.trajectory.trajectory import AbstractTrajectory, PaddedToCycle
+from jaxid.trajectory.fourier import FourierBasis, complete_limits
+from jaxid.trajectory.leads import WithLeads, with_leads
+from jaxid.trajectory.trajectory import AbstractTrajectory, LinearTrajectory, PaddedToCycle
 
-from .collision_check import collision_remarks
 from .decoder import within
 from .experiment import Experiment
+from .motion_check import gravity_fault, motion_checks
 from .robot_tables import named
 
 
@@ -48,29 +49,93 @@ class Nominal(NamedTuple):
         return ForceLimits(base, np.nan_to_num(self.parameters), self.covariance, margin)
 
 
+class Limited(NamedTuple):
+    """Constraints of a motion beside the limits of the joints, and why they leave out forces.
+
+    Attributes:
+        constraints: The constraints.
+        fault: Why forces are no part of them; empty if they are.
+    """
+
+    constraints: tuple[AbstractConstraint, ...]
+    fault: str
+
+
+class Played(NamedTuple):
+    """A motion as a robot can play it.
+
+    Attributes:
+        motion: Motion from standstill to standstill where that is possible.
+        sampled: Motion as it is written in samples: until a sample meets its end.
+        sample_time: Time between those samples [s].
+        window: Times between which it is the designed motion [s].
+        fault: Why it does not start and end at rest; empty if it does, or need not.
+    """
+
+    motion: AbstractTrajectory
+    sampled: AbstractTrajectory
+    sample_time: float
+    window: tuple[float, float]
+    fault: str
+
+
 class Design(NamedTuple):
     """Designed motion as a robot can play it.
 
     Attributes:
         plan: Result of the optimisation.
-        played: Motion from standstill to standstill where that is possible.
+        played: Motion that the robot plays.
         remarks: Remarks beside those of the plan.
-        sampled: Motion as it is written in samples: until a sample meets its end.
-        sample_time: Time between those samples [s].
     """
 
     plan: ExcitationPlan
-    played: AbstractTrajectory
+    played: Played
     remarks: tuple[Remark, ...]
-    sampled: AbstractTrajectory
-    sample_time: float
+
+
+class Preparation(NamedTuple):
+    """Knowledge that a design needs before its search.
+
+    Attributes:
+        nominal: Parameters that are known.
+        limited: Constraints beside the limits of the joints.
+        begin: Motion to go on with; None to begin anew.
+    """
+
+    nominal: Nominal | None
+    limited: Limited
+    begin: LinearTrajectory | None
+
+    def faults(self, experiment: Experiment) -> tuple[str, ...]:
+        """Return what will not be checked, in sentences."""
+        forces = (f"forces: {self.limited.fault}",) if self.limited.fault else ()
+        return (*experiment.surroundings.faults, *forces)
+
+
+def prepare_design(experiment: Experiment, written: Path | None) -> Preparation:
+    """Find the constraints of a design, and the motion of an earlier one to go on with.
+
+    Raises:
+        InputError: If the table does not fit the robot, or the earlier motion does not fit either.
+    """
+    with within("excitation", experiment.path.name):
+        nominal = find_nominal(experiment)
+        limited = find_constraints(experiment, nominal)
+    if written is None:
+        return Preparation(nominal, limited, None)
+    begin = load_trajectory(written)
+    begin = begin.inner if isinstance(begin, WithLeads) else begin
+    basis = experiment.excitation.basis(bool(limited.constraints))
+    if not (isinstance(begin, LinearTrajectory) and str(begin.basis) == str(basis)):
+        raise InputError(f"`{written}` holds a motion of another kind: design anew.")
+    return Preparation(nominal, limited, begin)
 
 
 def design_motion(
     experiment: Experiment,
+    preparation: Preparation,
     progress: Callable[[DesignProgress], None],
-    state: Path,
-    resume: bool,
+    seconds: float | None = None,
 ) -> Design:
     """Design the motion that the experiment file asks for.
 
@@ -79,7 +144,6 @@ def design_motion(
     """
     table = experiment.excitation
     with within("excitation", experiment.path.name):
-        nominal = find_nominal(experiment)
         plan = design_excitation(
             experiment.base,
             criterion=table.objective,
@@ -87,11 +151,12 @@ def design_motion(
             generations=table.generations,
             polish=min(table.polish, table.starts),
             progress=progress,
-            state=state,
-            resume=resume,
-            **_settings(experiment, nominal),
+            begin=preparation.begin,
+            seconds=table.time if seconds is None else seconds,
+            **_settings(experiment, preparation.nominal, preparation.limited),
         )
-        return _add_leads(experiment, plan, nominal)
+    played = play(experiment, plan.trajectory)
+    return Design(plan, played, tuple(_remarks(experiment, plan, played, preparation)))
 
 
 def compare_criteria(
@@ -99,6 +164,8 @@ def compare_criteria(
 ) -> list[ExcitationPlan]:
     """Design by every criterion, from few starts and without polishing, until Ctrl-C."""
     plans, table = [], experiment.excitation
+    nominal = find_nominal(experiment)
+    limited = find_constraints(experiment, nominal)
     for number, criterion in enumerate(CRITERIA, 1):
 
         def tell(step: DesignProgress, number: int = number) -> None:
@@ -115,7 +182,7 @@ def compare_criteria(
                     polish=0,
                     progress=tell,
                     throw=False,
-                    **_settings(experiment, find_nominal(experiment), bool(criterion.weighted)),
+                    **_settings(experiment, nominal, limited, bool(criterion.weighted)),
                 )
         except KeyboardInterrupt:
             break
@@ -125,37 +192,43 @@ def compare_criteria(
     return plans
 
 
+def write_motion(experiment: Experiment, played: Played, output: Path) -> list[Path]:
+    """Write table, trajectory and ROS message of a motion; return the files."""
+    robot, step, table = experiment.robot, played.sample_time, experiment.excitation
+    names = [output.name, f"{output.stem}.ros.{table.ros}", f"{output.stem}.json"]
+    with double_precision(), atomic_folder(output.parent) as folder:
+        write_csv(played.sampled, robot, folder / names[0], sample_time=step)
+        write_ros(played.sampled, robot, folder / names[1], sample_time=step)
+        save_trajectory(jax.tree.map(np.asarray, played.motion), folder / names[2])
+    return [output.parent / name for name in names]
+
+
 def write_design(
     experiment: Experiment, design: Design, output: Path, command: str = ""
 ) -> list[Path]:
-    """Write table, trajectory, ROS message and pictures; return the files."""
-    plan, step, table = design.plan, design.sample_time, experiment.excitation
-    robot = experiment.robot
-    names = [output.name, f"{output.stem}.json", f"{output.stem}.ros.{table.ros}"]
-    seed = (("seed", str(table.seed)),)
+    """Write a motion as `write_motion` does, and its page; return the files."""
+    seed = (("seed", str(experiment.excitation.seed)),)
     settings = {"facts": seed, "experiment_text": experiment.text, "command": command}
-    with double_precision(), atomic_folder(output.parent) as folder:
-        write_csv(design.sampled, robot, folder / names[0], sample_time=step)
-        save_trajectory(jax.tree.map(np.asarray, design.played), folder / names[1])
-        write_ros(design.sampled, robot, folder / names[2], sample_time=step)
-        # Before the others take their places: where there is no room for pictures, nothing changes.
-        place = output.with_suffix("")
-        pictures = write_excitation(place, plan, design.played, design.remarks, settings)
-    return [output.parent / n for n in names] + pictures
+    # First the page: where there is no room for pictures, nothing changes.
+    place, motion = output.with_suffix(""), design.played.motion
+    pictures = write_excitation(place, design.plan, motion, design.remarks, settings)
+    return write_motion(experiment, design.played, output) + pictures
 
 
-def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = True) -> dict:
+def _settings(
+    experiment: Experiment, nominal: Nominal | None, limited: Limited, weighted: bool = True
+) -> dict:
     """Return what all designs of one experiment have in common."""
     table = experiment.excitation
     noise = assumed_noise(experiment.robot) if table.noise is None else np.array(table.noise)
-    constraints, sizes = find_constraints(experiment, nominal), None
+    sizes = None
     if nominal is not None:
         # An estimate of what is not determined means nothing alone.
         open_ones = np.isin(experiment.base.names, nominal.undetermined)
         sizes = np.where(open_ones, np.nan, nominal.parameters)
     return {
-        "basis": table.basis(bool(constraints)),
-        "constraints": constraints,
+        "basis": table.basis(bool(limited.constraints)),
+        "constraints": limited.constraints,
         "key": jax.random.key(table.seed),
         "noise": noise,
         "nominal": sizes,
@@ -164,33 +237,27 @@ def _settings(experiment: Experiment, nominal: Nominal | None, weighted: bool = 
     }
 
 
-def find_constraints(
-    experiment: Experiment, nominal: Nominal | None
-) -> tuple[AbstractConstraint, ...]:
+def find_constraints(experiment: Experiment, nominal: Nominal | None) -> Limited:
     """Return the constraints of the motion beside the limits of the joints.
 
     Raises:
-        InputError: If forces are limited, but no parameters or no largest forces are known.
+        InputError: If `force_margin` is given, but no motion can keep the limits of forces.
     """
-    table = experiment.excitation
-    constraints: list[AbstractConstraint] = []
-    if experiment.clearance is not None:
-        constraints.append(experiment.clearance)
+    table, robot = experiment.excitation, experiment.robot
+    clearance = experiment.surroundings.clearance
+    constraints: list[AbstractConstraint] = [] if clearance is None else [clearance]
     tip = TipLimits(table.tip_speed, table.tip_acceleration, *(table.workspace or ()))
-    if tip.entries(experiment.robot):
+    if tip.entries(robot):
         constraints.append(tip)
-    if table.force_margin is None:
-        return tuple(constraints)
-    if nominal is None:
-        raise InputError(
-            "`force_margin` needs parameters: say in `nominal` where an earlier report is."
-        )
-    forces = nominal.force_limits(experiment.base, table.force_margin)
-    if not forces.entries(experiment.robot):
-        raise InputError(
-            "`force_margin` needs largest forces: give `limits.force` or `drives.max_torques`."
-        )
-    return (*constraints, forces)
+    fault = "not checked: no inertias are known; say in `excitation.nominal` where a report is"
+    if nominal is not None:
+        forces = nominal.force_limits(experiment.base, table.force_margin or 0.0)
+        fault = "not checked: no largest forces are known; give `limits.force`"
+        if forces.entries(robot) and not (fault := gravity_fault(experiment, forces)):
+            constraints.append(forces)
+    if fault and table.force_margin is not None:
+        raise InputError(f"`force_margin`: {fault}.")
+    return Limited(tuple(constraints), fault)
 
 
 def _earlier_information(
@@ -252,28 +319,47 @@ def find_nominal(experiment: Experiment) -> Nominal | None:
     return Nominal(np.asarray(fit.parameters), covariance, names)
 
 
-def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | None) -> Design:
-    """Return the motion from standstill to standstill, in samples of the controller."""
-    motion, table = plan.trajectory, experiment.excitation
-    leads, times = table.chosen_leads, np.asarray(plan.limits.basis.times(plan.samples))
+def play(experiment: Experiment, motion: LinearTrajectory) -> Played:
+    """Return a motion from standstill to standstill, in samples of the controller."""
+    table = experiment.excitation
+    leads, times = table.chosen_leads, np.asarray(motion.basis.times(table.samples))
     begin, end = float(times[0]), float(times[-1] + times[1] - times[0])
-    step = float(times[1] - times[0])
-    remarks = []
+    step, fault, played = float(times[1] - times[0]), "", motion
     # Where there are constraints, leads were designed together with the motion.
-    if leads is not None and leads.time is None and not plan.findings:
-        robot = experiment.robot.replace(limits=plan.limits.limits)
+    if leads is not None and isinstance(motion.basis, FourierBasis):
+        robot = experiment.robot.replace(limits=complete_limits(experiment.robot))
         try:
-            motion = with_leads(motion, robot, periods=leads.periods)
-            begin, end = (float(t) for t in motion.window)
+            played = with_leads(motion, robot, periods=leads.periods)
+            begin, end = (float(t) for t in played.window)
         except InputError as error:
-            text = f"the motion is without leads, and starts and ends at full speed: {error}"
-            remarks.append(Remark(f"{text} `rest = true` designs one at rest there.", Status.BAD))
+            fault = (
+                f"the motion is without leads, and starts and ends at full speed: {error} "
+                "`rest = true` designs one at rest there."
+            )
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
-    rests = not remarks and (leads is not None or table.rest or table.spline is not None)
+    rests = not fault and (leads is not None or table.rest or table.spline is not None)
+    sampled = played
+    if table.sample_time is not None:
+        step = table.sample_time
+        sampled = PaddedToCycle(played, step) if rests else played
+    return Played(played, sampled, step, (begin, end), fault)
+
+
+def _remarks(
+    experiment: Experiment, plan: ExcitationPlan, played: Played, preparation: Preparation
+) -> Iterator[Remark]:
+    """Yield what must be known of a designed motion beside its plan."""
+    table, leads, (begin, end) = (
+        experiment.excitation,
+        experiment.excitation.chosen_leads,
+        played.window,
+    )
+    if played.fault:
+        yield Remark(played.fault, Status.BAD)
     if begin > 0:
-        text = f"from {begin:.3f} to {end:.3f} s of {float(motion.duration):.3f} s"
-        remarks.append(Remark(f"the robot starts at rest and is in the designed motion {text}"))
+        text = f"from {begin:.3f} to {end:.3f} s of {float(played.motion.duration):.3f} s"
+        yield Remark(f"the robot starts at rest and is in the designed motion {text}")
     count = 1 if leads is None else leads.periods
     notes = {
         "the noise is assumed as 1 % of the largest forces: give `noise` if it is known": (
@@ -282,50 +368,21 @@ def _add_leads(experiment: Experiment, plan: ExcitationPlan, nominal: Nominal | 
         f"deviations are those together with {', '.join(table.earlier)}": table.earlier,
         f"the motion runs through {count} periods; the deviations are of one": count > 1,
         "for relative deviations, say in `excitation.nominal` where an earlier result is": (
-            nominal is None
+            preparation.nominal is None
         ),
     }
-    remarks += [Remark(text) for text, holds in notes.items() if holds]
-    remarks += force_remarks(experiment, nominal, motion)
-    remarks += collision_remarks(experiment, motion)
-    sampled = motion
-    if table.sample_time is not None:
-        step = table.sample_time
-        sampled = PaddedToCycle(motion, step) if rests else motion
-    return Design(plan, motion, tuple(remarks), sampled, step)
+    for text, holds in notes.items():
+        if holds:
+            yield Remark(text)
+    yield from motion_checks(experiment, plan, preparation.limited.fault)
+    yield from _force_doubts(experiment, preparation.nominal)
 
 
-def force_remarks(
-    experiment: Experiment, nominal: Nominal | None, played: AbstractTrajectory
-) -> list[Remark]:
-    """Return remarks about the forces of a motion, where any are limited."""
-    if not np.isfinite(experiment.robot.known_max_forces).any():
-        return []
+def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> list[Remark]:
+    """Return what the forces of a motion leave out."""
     if nominal is None:
-        text = (
-            "forces were not checked, although they have limits, for no parameters are known: "
-            "say in `excitation.nominal` where an earlier report is, and give `force_margin`"
-        )
-        return [Remark(text, Status.DOUBTFUL)]
-    remarks = []
-    if experiment.excitation.force_margin is None:
-        with double_precision():
-            motion = played.motion(np.linspace(0.0, float(played.duration), 4000))
-            limits = nominal.force_limits(experiment.base, 0.0)
-            values = np.asarray(limits(experiment.robot, motion))
-        worst = max(limits.describe(experiment.robot, values), key=lambda found: found.value)
-        nearest = f"{worst.name} with {100 * worst.used:.1f} % of {worst.limit:.4g} {worst.unit}"
-        text = (
-            "forces were not part of the design; by the nominal parameters they stay within their "
-            f"limits, the nearest being {nearest} (`force_margin` keeps them with room)"
-        )
-        if worst.value > 0:
-            text = (
-                "by the nominal parameters this motion needs more than robot and motors can give: "
-                f"{nearest}; give `force_margin`, and the design keeps these limits"
-            )
-        remarks.append(Remark(text, Status.BAD if worst.value > 0 else Status.NEUTRAL))
-    names = experiment.base.names
+        return []
+    remarks, names = [], experiment.base.names
     unknown = [n for n, p in zip(names, nominal.parameters, strict=True) if np.isnan(p)]
     if unknown:
         text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"

@@ -4,22 +4,17 @@ import dataclasses
 import math
 import typing
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
 from jaxid.excitation.criteria import CRITERIA, AbstractCriterion
-from jaxid.robot.collision import (
-    GROUND,
-    Box,
-    Capsule,
-    CollisionModel,
-    HalfSpace,
-    fit_capsules,
-)
+from jaxid.robot.capsule_fit import fit_capsules, stand_in_capsules
+from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.library import tx90l_on_rail_collision
+from jaxid.robot.limits_and_drives import owners
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
@@ -27,7 +22,7 @@ from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
 
-from .decoder import Bounds, Count, Positive, Vector
+from .decoder import Bounds, Count, Finite, Positive, Vector
 from .robot_tables import RobotSource, joint_number
 
 Corner = tuple[float, float, float]
@@ -76,9 +71,10 @@ class Collision:
 
     Attributes:
         distance: Distance that must remain [m].
-        fit: Whether to fit capsules around the geometry of the URDF's links.
+        fit: Whether to fit capsules around the geometry of the robot's links.
         packages: Folder of what the URDF file calls `package://`, like `"."`.
-        ground: Height of the floor [m], like `0.0`.
+        floor: Height of the floor [m], "base" for the plane on which the robot stands, or false
+            for none.
         capsules: Capsules on bodies or on the ground, like
             `[{ name = "gun", body = "ground", start = [0, 0, 0], end = [0, 0, 1], radius = 0.1 }]`.
         boxes: Boxes in the world, with angles in degrees, like
@@ -88,49 +84,92 @@ class Collision:
     """
 
     distance: Positive = 0.03
-    fit: bool = False
+    fit: bool = True
     packages: str | None = None
-    ground: float | None = None
+    floor: Finite | Literal["base"] | bool = "base"
     capsules: tuple[Annotated[tuple[str, Capsule], capsule], ...] = ()
     boxes: tuple[Annotated[Box, box], ...] = ()
     pairs: list[tuple[str, str]] | None = None
 
-    def build(self, robot: Robot, source: RobotSource, folder: Path) -> Clearance:
+    def build(self, robot: Robot, source: RobotSource, folder: Path) -> "Surroundings":
         """Return the distance that shapes must keep; the robot's source may know shapes.
 
         Raises:
             InputError: If shapes cannot be made, or a name is unknown.
         """
-        capsules, obstacles, pairs = self._fitted(source, folder) if self.fit else ([], [], None)
+        capsules, obstacles, pairs, faults = [], [], None, []
+        if self.fit and source.builtin == "tx90l_on_rail" and not source.moved:
+            capsules, obstacles, pairs = self._rail(tx90l_on_rail_collision())
+        elif self.fit:
+            capsules, faults = self._fitted(robot, source, folder)
         for body, shape in self.capsules:
             number = GROUND if body == "ground" else joint_number(robot, body)
             capsules.append(dataclasses.replace(shape, body=number))
         obstacles += self.boxes
-        if self.ground is not None:
-            obstacles.append(HalfSpace("ground", height=self.ground))
-        model = CollisionModel(robot, capsules, obstacles, self.pairs or pairs)
-        return Clearance(model, self.distance)
+        if self.floor is not False and not any(isinstance(o, HalfSpace) for o in obstacles):
+            obstacles.append(self._floor(source))
+        if self.fit:
+            # The base may be a frame alone.
+            first = 0 if capsules else GROUND
+            bare = sorted({*range(first, robot.joints)} - {c.body for c in capsules})
+            stout = stand_in_capsules(robot, bare)
+            capsules += stout
+            if names := ", ".join(f"`{c.name}`" for c in stout):
+                faults.append(
+                    f"the shape of {names} is unknown: stout capsules along the lines between the "
+                    "joints stand in for it; give `capsules` in `[collision]`, or a file with "
+                    "collision geometry"
+                )
+        try:
+            model = CollisionModel(robot, capsules, obstacles, self.pairs or pairs)
+        except InputError:
+            if self.capsules or self.boxes or self.pairs:
+                raise
+            return Surroundings(None, tuple(faults))
+        return Surroundings(Clearance(model, self.distance), tuple(faults))
 
-    def _fitted(
-        self, source: RobotSource, folder: Path
+    def _floor(self, source: RobotSource) -> HalfSpace:
+        """Return the floor: horizontal at a height, or the plane on which the robot stands."""
+        if self.floor not in ("base", True):
+            return HalfSpace("floor", height=self.floor)
+        R, r = source.placement.values()
+        normal = np.array([0.0, 0.0, 1.0]) if R is None else R[:, 2]
+        return HalfSpace("floor", normal=normal, height=float(normal @ np.array(r)))
+
+    def _rail(
+        self, model: CollisionModel
     ) -> tuple[list[Capsule], list[HalfSpace | Box], list[tuple[str, str]] | None]:
-        """Return shapes that the robot's source knows, and their pairs if it knows those too."""
-        if source.urdf is not None:
-            packages = None if self.packages is None else folder / self.packages
-            place = {**source.chain, **source.placement}
-            return list(fit_capsules(folder / source.urdf, packages=packages, **place)), [], None
-        moved = source.base_rotation is not None or source.base_position is not None
-        if source.builtin != "tx90l_on_rail" or moved:
-            raise InputError(
-                "`fit` needs `robot.urdf`, or tx90l_on_rail where it stands: give `capsules`."
-            )
-        model = tx90l_on_rail_collision()
-        # New shapes are to be watched too: then all pairs are found anew.
-        alone = not self.capsules and not self.boxes and self.ground is None
-        obstacles = [o for o in model.obstacles if self.ground is None or o.name != "ground"]
+        """Return shapes that are known of a robot, and their pairs if there are no others."""
         names = [s.name for s in (*model.capsules, *model.obstacles)]
         pairs = [(names[i], names[k]) for i, k in model.pairs]
+        alone = not self.capsules and not self.boxes and self.floor in ("base", True)
+        obstacles = list(model.obstacles) if self.floor in ("base", True) else []
         return list(model.capsules), obstacles, pairs if alone else None
+
+    def _fitted(
+        self, robot: Robot, source: RobotSource, folder: Path
+    ) -> tuple[list[Capsule], list[str]]:
+        """Return capsules around the geometry of the robot's file, and what cannot be read."""
+        if source.file is None:
+            return [], []
+        packages, faults = None if self.packages is None else folder / self.packages, {}
+        place = {**source.chain, **source.placement}
+        found = fit_capsules(folder / source.file, packages=packages, faults=faults, **place)
+        why = {text: [n for n, t in faults.items() if t == text] for text in faults.values()}
+        said = (f"{owners('link', n)}: geometry not read ({x.rstrip('.')})" for x, n in why.items())
+        return list(found), list(said)
+
+
+class Surroundings(NamedTuple):
+    """Shapes of robot and surroundings.
+
+    Attributes:
+        clearance: Distance that they must keep; None if there are none.
+        faults: What is not known of them, in sentences.
+    """
+
+    clearance: Clearance | None
+    faults: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,6 +207,7 @@ class Excitation:
         starts: Number of random motions to start from.
         generations: Number of times that the motions found have children.
         polish: Number of the best motions that are polished.
+        time: Time for the search [s], like `60.0`; by default all of its steps are done.
         seed: Seed of the random motions.
         sample_time: Time between two rows of the written table, the controller's cycle [s], like
             `0.004`; by default that of the samples.
@@ -194,6 +234,7 @@ class Excitation:
     starts: Count = 32
     generations: Annotated[int, Bounds(least=0, most=10_000)] = 12
     polish: Annotated[int, Bounds(least=0, most=10_000)] = 4
+    time: Positive | None = None
     seed: Annotated[int, Bounds(least=0, most=2**32 - 1)] = 0
     sample_time: Annotated[float, Bounds(least=1e-5)] | None = None
     ros: Literal["yaml", "json"] = "yaml"

@@ -14,7 +14,6 @@ from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, AbstractTransition, LoadFriction, Tanh
 from jaxid.errors import InputError
-from jaxid.excitation.constraints import Clearance
 from jaxid.identification.consistency import BodyBounds, PhysicallyConsistent
 from jaxid.identification.estimators import NonlinearFriction
 from jaxid.identification.filter_and_parameter_selection import (
@@ -36,7 +35,7 @@ from jaxid.robot.robot import Robot, Tool
 
 from .decoder import call, check_names, within
 from .estimator_table import Estimation, build_estimation, decode_estimator
-from .excitation_tables import Collision, Excitation
+from .excitation_tables import Collision, Excitation, Surroundings
 from .model_and_log_tables import (
     FILTERS,
     Effects,
@@ -76,7 +75,7 @@ class Experiment:
     source: RobotSource  # source of the robot
     robot: Robot  # robot with its limits, drives and known tool
     model: Model  # effects whose parameters are wanted
-    clearance: Clearance | None  # shapes that must keep a distance; None if the file has none
+    collision: Collision  # shapes that must keep a distance, as the file describes them
     columns: Columns | None  # columns of the logs; None if the file does not say
     logs: Logs  # sides, files and parts of the logs
     # known load that is on the robot in some logs only; None if the file does not say
@@ -98,6 +97,12 @@ class Experiment:
     def base(self) -> BaseParameters:
         """Base parameters of the model, found when they are first asked for."""
         return base_parameters(self.model)
+
+    @functools.cached_property
+    def surroundings(self) -> Surroundings:
+        """Shapes of robot and surroundings, found when they are first asked for."""
+        with within("collision", self.path.name):
+            return self.collision.build(self.robot, self.source, self.path.parent)
 
     def fit(self, rows: RegressionProblem, progress: Progress | None = None) -> Fit:
         """Estimate parameters as the table `[estimator]` says."""
@@ -243,9 +248,12 @@ def parse_experiment(text: str, path: Path) -> Experiment:
         said = str(error).rstrip(".")
         raise InputError(f"{path.name}: is no TOML in UTF-8: {said}.") from error
     try:
-        return Experiment(path=path, text=text, **_build(content, path.parent))
+        experiment = Experiment(path=path, text=text, **_build(content, path.parent))
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
+    if "collision" in content:
+        _ = experiment.surroundings  # for its mistakes
+    return experiment
 
 
 def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -280,11 +288,7 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
             raise InputError('`model.load` needs the bodies that `kind = "consistent"` finds.')
     if estimation.nonlinear and model.memory is not None:
         raise InputError("give `coulomb.presliding` or `nonlinear_friction`, but not both.")
-    clearance, tool = None, None
-    if "collision" in content:
-        shapes = call(Collision, content["collision"], "collision")
-        with within("collision"):
-            clearance = shapes.build(robot, source, folder)
+    tool = None
     if "load" in content:
         load = call(known_load, content["load"], "load")
         with within("load"):
@@ -293,7 +297,7 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         "source": source,
         "robot": robot,
         "model": model,
-        "clearance": clearance,
+        "collision": call(Collision, content.get("collision", {}), "collision"),
         "columns": columns,
         "logs": logs,
         "load": tool,

@@ -26,7 +26,6 @@ ELEMENTWISE: dict[Operation, Callable] = {
 HOLDS = jax.__version_info__ >= (0, 12)
 """Whether an optimization barrier stops XLA's CPU backend."""
 CIRCULAR = (Operation.SINE, Operation.COSINE)
-Groups = tuple[tuple[int, ...], ...]
 Entries = Sequence[Array | Sequence[Array]]
 """Entries of each input, in order: arrays of the batch's shape."""
 Values = tuple[list[Array], dict[int, tuple[Array, Array]], Array | None]
@@ -107,22 +106,6 @@ class Lowered(eqx.Module):
         if not jnp.issubdtype(dtype, jnp.floating):
             raise InputError(f"A program computes with real numbers, but got arrays of {dtype}.")
         return self.program.align([jnp.asarray(x, dtype) for x in arrays], jnp)
-
-    def stacked(self, groups: Groups, *arrays: AnyArray) -> list[Array]:
-        """Compute entries of the packed result, stacked, for derivatives.
-
-        The numbers and their derivatives are those of a call, but JAX traces them faster: the rule
-        of a derivative has primitives without the checks of array operators.
-
-        Args:
-            groups: Positions in the packed result; each group becomes one array.
-            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-
-        Returns:
-            For each group an array with its entries along the last axis but one.
-        """
-        stacked: Any = _stacked(self, groups, self.entries(*arrays)[0])
-        return stacked
 
     def dense(self, *arrays: AnyArray) -> Any:
         """Compute the outputs in the structure of the traced function, batch axes last.
@@ -231,72 +214,3 @@ def _circular_jvp(primals, tangents):
     dx, _ = tangents
     sine, cosine = _circular(*primals)
     return (sine, cosine), (cosine * dx, -sine * dx)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _stacked(lowered: Lowered, groups: Groups, entries: list[Array]) -> list[Array]:
-    first = next(x[0] for x in entries if len(x))
-    values = lowered.run(entries, primitives(first))[0]
-    return _in_groups(lowered.program, groups, values, first, is_derivative=False)
-
-
-@_stacked.defjvp
-def _stacked_derivative(lowered: Lowered, groups: Groups, primals: tuple, tangents: tuple) -> tuple:
-    (entries,), (given,) = primals, tangents
-    first = next(x[0] for x in entries if len(x))
-    program, table = lowered.program, primitives(first)
-    values, pairs, anchor = lowered.run(entries, table)
-    multiply, zero = table[Operation.MULTIPLY], jax.lax.full_like(first, 0)
-    changes: list[Array] = []
-    for position, node in enumerate(program.nodes):
-        operation = node.operation
-        if operation is Operation.INPUT:
-            number, entry = node.place
-            changes.append(given[number][entry])
-            continue
-        operands = [values[x] if isinstance(x, int) else x for x in node.operands]
-        own = [changes[x] if isinstance(x, int) else zero for x in node.operands]
-        if operation in CIRCULAR:
-            sine, cosine = pairs[node.uses[0]]
-            slope = cosine if operation is Operation.SINE else table[Operation.NEGATE](sine)
-            change = multiply(own[0], slope)
-        elif operation is Operation.MULTIPLY:
-            pairs_of_one = zip(own, reversed(operands), node.operands, strict=True)
-            parts = [multiply(c, x) for c, x, k in pairs_of_one if isinstance(k, int)]
-            change = functools.reduce(jax.lax.add, parts)
-        elif operation in (Operation.ADD, Operation.SUBTRACT, Operation.NEGATE):
-            change = table[operation](*own)
-        else:
-            real = [jnp.asarray(x, zero.dtype) if isinstance(x, float) else x for x in operands]
-            change = _slope(operation, real, own)
-        fence = anchor if position in lowered.fenced else None
-        changes.append(fenced(change, fence))
-    found = (_in_groups(program, groups, x, first, k) for k, x in enumerate((values, changes)))
-    values, changes = found
-    return values, changes
-
-
-def _slope(operation: Operation, operands: list[Array], changes: list[Array]) -> Array:
-    """Return the derivative of an operation; a condition has none."""
-    if operation is Operation.SELECT:
-        return ELEMENTWISE[operation](operands[0], *changes[1:])
-    return jax.jvp(ELEMENTWISE[operation], operands, changes)[1]
-
-
-def _in_groups(
-    program: Program, groups: Groups, values: list[Array], first: Array, is_derivative: bool | int
-) -> list[Array]:
-    """Stack values of the nodes, or derivatives of them, along the last axis but one."""
-    axis = max(first.ndim - 1, 0)
-    arrays = []
-    for group in groups:
-        own = [program.outputs[k] for k in group]
-        constants = (0.0 if is_derivative else x for x in own)
-        rows = [
-            values[x] if isinstance(x, int) else jax.lax.full_like(first, c)
-            for x, c in zip(own, constants, strict=True)
-        ]
-        rows = [jax.lax.expand_dims(x, (axis,)) for x in rows]
-        empty = jnp.zeros((*first.shape[:axis], 0, *first.shape[axis:]), first.dtype)
-        arrays.append(jax.lax.concatenate(rows, axis) if rows else empty)
-    return arrays

@@ -57,7 +57,7 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
         published and f"Limits that nobody published, assumed: {published}",
         assumed and f"Assumed, because not given: {assumed}",
         vague and f"Deviations above {100 * VAGUE:g} % of the nominal value: {vague}",
-        "The design was stopped: `--resume` goes on where it was" if plan.interrupted else "",
+        "The search was stopped: `--resume` may find a better motion" if plan.interrupted else "",
     )
     found = [Remark(text, Status.DOUBTFUL) for text in doubts if text]
     start, then = plan.limits.basis.times(plan.samples)[:2]
@@ -109,7 +109,7 @@ def write_excitation(
     page = render_page(
         f"{robot.name}: a motion to record",
         [
-            ("Verdict", [_headline(plan, remarks), every]),
+            ("Verdict", [headline(plan, remarks), every]),
             (
                 "The motion",
                 [picture(space, "Links are coloured by the speed of their joint."), *figures],
@@ -126,17 +126,17 @@ def write_excitation(
     return [folder / "report.html"]
 
 
-def _headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
+def headline(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
+    """Return the verdict on a motion in one sentence; `remarks` hold one for each check."""
     if plan.undetermined:
         return Remark("This motion does not determine all base parameters.", Status.BAD)
     if not plan.feasible:
         return Remark("This motion does not keep all limits.", Status.BAD)
-    text = "A motion that keeps all limits, and determines all parameters."
-    status = Status.GOOD
     if any(remark.status is Status.BAD for remark in remarks):
         text = "Do not record this motion yet: what is marked ✗ comes first."
-        status = Status.BAD
-    elif plan.interrupted:
-        text = "The design of this motion was stopped."
-        status = Status.DOUBTFUL
-    return Remark(text, status)
+        return Remark(text, Status.BAD)
+    if left := [r.text.split(":")[0] for r in remarks if ": not checked, as" in r.text]:
+        text = f"This motion keeps all limits that were checked; not checked: {', '.join(left)}."
+        return Remark(text, Status.DOUBTFUL)
+    text = "A motion that can be recorded: it keeps all limits, and determines all parameters."
+    return Remark(text, Status.GOOD)

@@ -53,6 +53,40 @@ def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Lo
     return tree.root, np.zeros(3) if weightless else np.array(model.opt.gravity), tree.loops
 
 
+def mjcf_shapes(path: str | Path) -> dict[str, list[tuple[Float[np.ndarray, "points 3"], float]]]:
+    """Return points and radii [m] of the shapes of all bodies, as `mjcf_as_urdf` names them.
+
+    Shapes that cannot collide count only where a body has no others.
+
+    Raises:
+        ModuleNotFoundError: If MuJoCo is not installed.
+    """
+    mujoco = import_mujoco()
+    model = mujoco.MjModel.from_xml_path(str(path))
+    kinds, found = mujoco.mjtGeom, {}
+    colliding = (model.geom_contype | model.geom_conaffinity) != 0
+    for geom in range(model.ngeom):
+        body, kind = int(model.geom_bodyid[geom]), int(model.geom_type[geom])
+        own = model.geom_bodyid == body
+        if kind in (kinds.mjGEOM_PLANE, kinds.mjGEOM_HFIELD, kinds.mjGEOM_SDF) or (
+            not colliding[geom] and colliding[own].any()
+        ):
+            continue
+        size, radius = model.geom_size[geom], 0.0
+        points = size * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
+            half = 0.0 if kind == kinds.mjGEOM_SPHERE else size[1]
+            points, radius = np.array([[0.0, 0.0, -half], [0.0, 0.0, half]]), float(size[0])
+        elif kind == kinds.mjGEOM_MESH:
+            mesh = model.geom_dataid[geom]
+            first = model.mesh_vertadr[mesh]
+            points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
+        name = "world" if body == 0 else model.body(body).name or f"body{body}"
+        placed = model.geom_pos[geom] + points @ _matrix(model.geom_quat[geom]).T
+        found.setdefault(name, []).append((placed, radius))
+    return found
+
+
 class _Writer:
     """Writer of the links and joints of a compiled model."""
 

@@ -5,12 +5,14 @@ root is rounded near zero, so that a distance comes out at most `ROUNDING` too s
 large. Where the closest points are not unique, the derivative is that at one pair of them.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Numbers
+from jaxid.arrays import AnyArray, Array, Float, Numbers, namespace
 from jaxid.errors import InputError
 
 GROUND = -1
@@ -19,7 +21,7 @@ ROUNDING = 1e-6
 """Largest error of a distance, by which it is smooth at zero [m]."""
 
 Vectors = Float[AnyArray, "*batch 3"]
-Lengths = Float[Array, "*batch"]
+Lengths = Float[AnyArray, "*batch"]
 
 
 class Capsule(eqx.Module):
@@ -88,8 +90,13 @@ class HalfSpace(eqx.Module):
 
     def distance(self, start: Vectors, end: Vectors) -> Lengths:
         """Return the signed distances of segments from the plane [m]: those of the lower ends."""
-        n, start, end = (jnp.asarray(x) for x in (self.normal, start, end))
-        return _smaller(start @ n, end @ n) - self.height
+        return _smaller(start @ self.normal, end @ self.normal) - self.height
+
+    def slopes(self, ends: Float[np.ndarray, "segments 2 3"]) -> Float[np.ndarray, "segments 2 3"]:
+        """Return the derivatives of the distances of segments by their ends, in NumPy."""
+        heights = ends @ self.normal
+        lower = heights[:, 0] < heights[:, 1]
+        return np.stack([lower, ~lower], axis=1)[:, :, None] * self.normal
 
 
 class Box(eqx.Module):
@@ -151,7 +158,14 @@ class Box(eqx.Module):
         before, after = (self._signed(first + place * along) for place in (low, high))
         return share * before + (1.0 - share) * after
 
-    def _signed(self, point: Array) -> Array:
+    def slopes(self, ends: Float[np.ndarray, "segments 2 3"]) -> Float[np.ndarray, "segments 2 3"]:
+        """Return the derivatives of the distances of segments by their ends, in NumPy."""
+        count = -(-len(ends) // 64) * 64  # few sizes, so that little is compiled
+        padded = np.resize(ends, (count, 2, 3))
+        found = _box_slopes(self, jnp.asarray(padded[:, 0]), jnp.asarray(padded[:, 1]))
+        return np.stack([np.asarray(x) for x in found], axis=1)[: len(ends)]
+
+    def _signed(self, point: Array) -> Any:
         beyond = jnp.abs(point) - jnp.broadcast_to(0.5 * self.size, point.shape)
         x, y, z = jnp.unstack(-beyond, axis=-1)
         depth = _smaller(_smaller(x, y), z)
@@ -159,40 +173,55 @@ class Box(eqx.Module):
         return _rounded_norm(outside) - jnp.where(depth > 0, depth, 0.0)
 
 
-def _smaller(x: Array, y: Array) -> Array:
+@eqx.filter_jit
+def _box_slopes(box: Box, start: Array, end: Array) -> tuple[Array, ...]:
+    distance, pull = jax.vjp(box.distance, start, end)
+    return pull(jnp.ones_like(distance))
+
+
+def _smaller(x: AnyArray, y: AnyArray) -> Any:
     """Return the smaller numbers, with the derivatives of one of both.
 
     Derivatives of `jnp.minimum` ask which argument equals the result. None does where a compiler
     rounds the two in different ways.
     """
-    return jnp.where(x < y, x, y)
+    return namespace(x, y).where(x < y, x, y)
 
 
-def _rounded_norm(vector: Vectors) -> Lengths:
+def _rounded_norm(vector: Vectors) -> Any:
     """Return lengths of vectors, smooth at zero and there at most `ROUNDING` too small [m]."""
-    return jnp.sqrt(jnp.sum(vector**2, axis=-1) + ROUNDING**2) - ROUNDING
+    xp = namespace(vector)
+    return xp.sqrt(xp.einsum("...i,...i->...", vector, vector) + ROUNDING**2) - ROUNDING
 
 
 def segment_distance(
     start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
 ) -> Lengths:
     """Return the distance between segments, which may be parallel, touch, or be points [m]."""
-    start, end, other_start, other_end = map(jnp.asarray, (start, end, other_start, other_end))
     u, v = end - start, other_end - other_start
-    # The closest points are found without derivatives: theirs add nothing to that of the distance,
-    # and they have none at parallel axes.
-    a, b = jax.lax.stop_gradient(_closest(u, v, start - other_start))
+    a, b = closest_places(start, end, other_start, other_end)
     return _rounded_norm(start + a * u - other_start - b * v)
 
 
-def _closest(u: Array, v: Array, r: Array) -> tuple[Array, Array]:
-    """Return the places of the closest points along two segments, from 0 to 1."""
+def closest_places(
+    start: Vectors, end: Vectors, other_start: Vectors, other_end: Vectors
+) -> tuple[AnyArray, AnyArray]:
+    """Return the places of the closest points along two segments, from 0 to 1, as constants.
 
-    def dot(x: Array, y: Array) -> Array:
-        return jnp.sum(x * y, axis=-1, keepdims=True)
+    Their derivatives add nothing to that of the distance, and they have none at parallel axes.
+    """
+    xp = namespace(start, end, other_start, other_end)
+    ends = (start, end, other_start, other_end)
+    if xp is jnp:
+        ends = jax.lax.stop_gradient(tuple(map(jnp.asarray, ends)))
+    start, end, other_start, other_end = ends
+    u, v, r = end - start, other_end - other_start, start - other_start
 
-    def share(part: Array, whole: Array, usable: Array) -> Array:
-        return jnp.where(usable, jnp.clip(part / jnp.where(usable, whole, 1.0), 0.0, 1.0), 0.0)
+    def dot(x: AnyArray, y: AnyArray) -> AnyArray:
+        return xp.einsum("...i,...i->...", x, y)[..., None]
+
+    def share(part: AnyArray, whole: AnyArray, usable: AnyArray) -> AnyArray:
+        return xp.where(usable, xp.clip(part / xp.where(usable, whole, 1.0), 0.0, 1.0), 0.0)
 
     uu, vv, uv, ur, vr = dot(u, u), dot(v, v), dot(u, v), dot(u, r), dot(v, r)
     area = uu * vv - uv * uv

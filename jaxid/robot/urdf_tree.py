@@ -40,6 +40,7 @@ class UrdfTree:
         left_out: Elements of joints on moving bodies that lead to no link of the chain.
         loose: Names of links that float and move no joint, which are left out.
         tip: Name of the end-effector's link.
+        compiled: Whether the file is MJCF, whose shapes are no elements of the links.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class UrdfTree:
     ) -> None:
         self.path = str(path)
         self.root, self.gravity, loops = read_description(path)
+        self.compiled = is_mjcf(path)
         element = self.root
         name = element.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
@@ -162,6 +164,20 @@ class UrdfTree:
             raise InputError(
                 f"`{self.path}` has no moving joint {below}: choose another `base` or `tip`."
             )
+
+    def placed_links(self) -> dict[str, tuple[int, np.ndarray, np.ndarray]]:
+        """Return `carriers` with all links below them, whose joints are held where left out."""
+        placed = dict(self.carriers)
+        waiting = list(placed)
+        for link in waiting:
+            body, R, r = placed[link]
+            for joint in self._below[link]:
+                child = link_names(joint)[1]
+                if child not in placed and joint.get("type") in (*TURNING, "prismatic", "fixed"):
+                    rotation, offset = self.held_pose(joint)
+                    placed[child] = body, R @ rotation, r + R @ offset
+                    waiting.append(child)
+        return placed
 
     def _refuse(self, loops: Iterable[Loop]) -> None:
         """Reject constraints that close a loop between bodies of the robot."""

@@ -127,7 +127,8 @@ def write_ros(
 ) -> None:
     """Write a `JointTrajectory` as JSON (if the path ends in `.json`) or YAML.
 
-    `ros2 topic pub --once TOPIC trajectory_msgs/msg/JointTrajectory "$(cat FILE)"` publishes YAML.
+    YAML begins with comments that say units and cycle, and how to bring the robot to the start and
+    publish the file.
     Arguments are those of `joint_trajectory`, and the file's path.
     """
     message = joint_trajectory(trajectory, robot, sample_time=sample_time)
@@ -136,7 +137,14 @@ def write_ros(
         return
     # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
     points = [json.dumps(point, allow_nan=False) for point in message.pop("points")]
-    lines = [f"{key}: {json.dumps(value)}" for key, value in message.items()]
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    lines = [
+        f"# {kind} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
+        f"# at most {sample_time:.6g} s from one point to the next.",
+        "# Move the robot slowly to the first point, then:",
+        f'#   ros2 topic pub --once /joint_trajectory_controller/joint_trajectory {kind} "$(cat FILE)"',
+        *(f"{key}: {json.dumps(value)}" for key, value in message.items()),
+    ]
     lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", f"- {x}") for x in points)]
     write_text(path, "\n".join(lines) + "\n")
 

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from forward_kinematics import body_transforms
+from scipy.spatial.transform import Rotation
 from urdf_text import joint, link, robot
 
-from jaxid.robot.collision import CollisionModel, enclose, fit_capsules
+from jaxid.robot.capsule_fit import enclose, fit_capsules
+from jaxid.robot.collision import CollisionModel
 from jaxid.robot.urdf import load_urdf
 
 
@@ -120,3 +122,44 @@ def test_a_mesh_is_held_whole(tmp_path):
     (meshes / "tool.stl").rename(meshes / "other.stl")
     with pytest.raises(FileNotFoundError, match=r"line 6: the mesh .* `packages`"):
         fit_capsules(path)
+
+
+def test_grippers_that_the_chain_leaves_out_count_as_bodies_that_collide(tmp_path):
+    fingers = "".join(
+        f'<link name="{name}"><collision><geometry><sphere radius="0.01"/></geometry></collision>'
+        f'</link><joint name="j{name}" type="prismatic"><parent link="tool"/><child link="{name}"/>'
+        f'<origin xyz="0 {y} 0.1"/><axis xyz="0 1 0"/><limit lower="0.02" upper="0.04"/></joint>'
+        for name, y in (("left", 0.1), ("right", -0.1))
+    )
+    path = written(tmp_path)
+    path.write_text(path.read_text().replace("</robot>", f"{fingers}</robot>"))
+    arm = load_urdf(path, tip="tool")
+    found = {c.name: c for c in fit_capsules(path, tip="tool")}
+    assert found["left"].body == found["right"].body == found["tool"].body == arm.joints - 1
+    # They are held as near to zero as they can be.
+    shift = np.array(found["left"].start) - found["tool"].start
+    np.testing.assert_allclose(np.linalg.norm(shift), np.hypot(0.12, 0.1), atol=1e-9)
+
+
+def test_shapes_of_mjcf_files_are_held(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text("""<mujoco><worldbody><body name="one" pos="0 0 0.3"><joint axis="0 1 0"/>
+      <geom type="capsule" size="0.05" fromto="0 0 0 0.4 0 0"/>
+      <geom type="box" size="1 1 1" contype="0" conaffinity="0"/>
+      <body name="two" pos="0.5 0 0" euler="0 0 30"><joint axis="0 1 0"/>
+        <geom type="box" size="0.1 0.05 0.02" pos="0.1 0 0" euler="0 20 0"/>
+        <body name="three" pos="0.3 0 0"><geom type="sphere" size="0.03"/></body>
+    </body></body></worldbody></mujoco>""")
+    one, two, three = fit_capsules(path)
+    assert [c.name for c in (one, two, three)] == ["one", "two", "three"]
+    assert [c.body for c in (one, two, three)] == [0, 1, 1]
+    assert float(one.radius) == pytest.approx(0.05)
+    assert np.linalg.norm(one.end - one.start) == pytest.approx(0.4)
+    assert float(two.radius) < 1.01 * np.hypot(0.05, 0.02)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    R = Rotation.from_quat(model.geom_quat[2], scalar_first=True).as_matrix()
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = (signs * [0.1, 0.05, 0.02]) @ R.T + [0.1, 0, 0]
+    assert outside(corners, two.start, two.end, two.radius).max() <= 1e-9
+    np.testing.assert_allclose(three.start, [0.3, 0, 0], atol=1e-9)

@@ -1,0 +1,133 @@
+"""The derivative of a scalar program, as another one: backwards through its operations."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from jaxid.errors import InputError
+
+from .numpy_evaluation import evaluate
+from .program import Program, Reference, assemble
+from .scalar import Graph, Operand, Operation, Scalar, add, apply, divide, multiply, negate, select
+
+_UNARY: dict[Operation, Callable[[Operand, Operand], Operand]] = {
+    Operation.ABSOLUTE: lambda x, y: apply(Operation.SIGN, x),
+    Operation.SIGN: lambda x, y: 0.0,
+    Operation.SINE: lambda x, y: apply(Operation.COSINE, x),
+    Operation.COSINE: lambda x, y: negate(apply(Operation.SINE, x)),
+    Operation.TANGENT: lambda x, y: add(1.0, multiply(y, y)),
+    Operation.ARC_SINE: lambda x, y: divide(1.0, _root_of_one_minus_square(x)),
+    Operation.ARC_COSINE: lambda x, y: divide(-1.0, _root_of_one_minus_square(x)),
+    Operation.ARC_TANGENT: lambda x, y: divide(1.0, add(1.0, multiply(x, x))),
+    Operation.HYPERBOLIC_SINE: lambda x, y: apply(Operation.HYPERBOLIC_COSINE, x),
+    Operation.HYPERBOLIC_COSINE: lambda x, y: apply(Operation.HYPERBOLIC_SINE, x),
+    Operation.HYPERBOLIC_TANGENT: lambda x, y: add(1.0, negate(multiply(y, y))),
+    Operation.SQUARE_ROOT: lambda x, y: divide(0.5, y),
+    Operation.CUBE_ROOT: lambda x, y: divide(1.0, multiply(3.0, multiply(y, y))),
+    Operation.EXPONENTIAL: lambda x, y: y,
+    Operation.LOGARITHM: lambda x, y: divide(1.0, x),
+    Operation.EXPONENTIAL_MINUS_ONE: lambda x, y: add(1.0, y),
+    Operation.LOGARITHM_OF_ONE_PLUS: lambda x, y: divide(1.0, add(1.0, x)),
+}
+"""Derivatives of functions of one argument, by argument and result."""
+
+
+def pull_back(program: Program, weights: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+    """Return the derivative of a weighted sum of a program's results by its inputs, in NumPy.
+
+    Args:
+        program: Program made by `trace`.
+        weights: Weight of each packed result, followed by any batch axes.
+        arrays: Arrays with the shapes of the inputs, each followed by the same batch axes.
+
+    Returns:
+        For each input an array of its shape.
+
+    Raises:
+        InputError: If the arrays do not fit the program's inputs.
+    """
+    return list(evaluate(gradient_program(program), *arrays, weights))
+
+
+@functools.lru_cache(maxsize=64)
+def gradient_program(program: Program) -> Program:
+    """Return the program of the derivative of a weighted sum of results by all inputs.
+
+    Its last input holds the weights, one for each packed result.
+    """
+    graph, number, scalars = Graph(), len(program.input_shapes), []
+    # Inputs are loaded before the first operation, so that they come first.
+    weights = [graph.node(Operation.INPUT, number, k) for k in range(len(program.outputs))]
+
+    def operand(x: Reference) -> Operand:
+        return scalars[x] if isinstance(x, int) else x
+
+    for node in program.nodes:
+        is_input = node.operation is Operation.INPUT
+        operands = node.operands if is_input else tuple(map(operand, node.operands))
+        scalars.append(graph.node(node.operation, *operands))
+    slopes: list[Operand] = [0.0] * len(scalars)
+    for weight, x in zip(weights, program.outputs, strict=True):
+        if isinstance(x, int):
+            slopes[x] = add(slopes[x], weight)
+    found: dict[tuple[int, int], Operand] = {}
+    for k in reversed(range(len(scalars))):
+        node, slope = program.nodes[k], slopes[k]
+        if node.operation is Operation.INPUT:
+            found[node.place] = slope
+        elif slope != 0.0:
+            passed = _slopes(node.operation, tuple(map(operand, node.operands)), scalars[k], slope)
+            for x, more in zip(node.operands, passed, strict=True):
+                if isinstance(x, int):
+                    slopes[x] = add(slopes[x], more)
+    shapes = program.input_shapes
+    outputs = [
+        found.get((i, entry), 0.0)
+        for i, shape in enumerate(shapes)
+        for entry in range(int(np.prod(shape)))
+    ]
+    structure = jax.tree.structure((0,) * len(shapes))
+    return assemble((*shapes, (len(program.outputs),)), outputs, shapes, structure)
+
+
+def _slopes(
+    operation: Operation, x: tuple[Operand, ...], y: Scalar, slope: Operand
+) -> tuple[Operand, ...]:
+    """Return what the derivative by a result adds to those by its operands."""
+    if operation in _UNARY:
+        return (multiply(slope, _UNARY[operation](x[0], y)),)
+    if "truth" in operation.traits:
+        return (0.0,) * len(x)
+    match operation:
+        case Operation.ADD:
+            return slope, slope
+        case Operation.SUBTRACT:
+            return slope, negate(slope)
+        case Operation.NEGATE:
+            return (negate(slope),)
+        case Operation.MULTIPLY:
+            return multiply(slope, x[1]), multiply(slope, x[0])
+        case Operation.DIVIDE:
+            share = divide(slope, x[1])
+            return share, negate(multiply(share, y))
+        case Operation.MAXIMUM | Operation.MINIMUM:
+            first = apply(Operation.EQUAL, x[0], y)
+            return select(first, slope, 0.0), select(first, 0.0, slope)
+        case Operation.SELECT:
+            return 0.0, select(x[0], slope, 0.0), select(x[0], 0.0, slope)
+        case Operation.POWER:
+            lower = apply(Operation.POWER, x[0], add(x[1], -1.0))
+            base = multiply(slope, multiply(x[1], lower))
+            if not isinstance(x[1], Scalar):
+                return base, 0.0
+            return base, multiply(slope, multiply(y, apply(Operation.LOGARITHM, x[0])))
+        case Operation.ARC_TANGENT_2:
+            share = divide(slope, add(multiply(x[0], x[0]), multiply(x[1], x[1])))
+            return multiply(share, x[1]), negate(multiply(share, x[0]))
+    raise InputError(f"the operation `{operation}` has no derivative.")
+
+
+def _root_of_one_minus_square(x: Operand) -> Operand:
+    return apply(Operation.SQUARE_ROOT, add(1.0, negate(multiply(x, x))))
