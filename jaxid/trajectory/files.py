@@ -142,7 +142,8 @@ def write_ros(
         f"# {kind} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
         f"# at most {sample_time:.6g} s from one point to the next.",
         "# Move the robot slowly to the first point, then:",
-        f'#   ros2 topic pub --once /joint_trajectory_controller/joint_trajectory {kind} "$(cat FILE)"',
+        "#   ros2 topic pub --once /joint_trajectory_controller/joint_trajectory \\",
+        f'#     {kind} "$(cat FILE)"',
         *(f"{key}: {json.dumps(value)}" for key, value in message.items()),
     ]
     lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", f"- {x}") for x in points)]
