@@ -1,6 +1,7 @@
 """Public names of `jaxid`, in the order of the pipeline; the package loads them when used."""
 
 from . import (
+    rollout as rollout,
     simulation as simulation,
     trajectory as trajectories,  # noqa: F401
     units as units,
@@ -77,5 +78,6 @@ from .robot.urdf import (
     load_urdf as load_urdf,
     urdf_parameters as urdf_parameters,
 )
+from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot
 from .trajectory import random_fourier_series as random_fourier_series

@@ -1,0 +1,355 @@
+r"""A joint behind a position servo: simulation, and exact sensitivities to its parameters.
+
+Positions alone tell torques only in units of the servo's stiffness $K$, which is divided out:
+
+$J \ddot q + B \dot q + (F + \mu |a L| + F_s e^{-(\dot q/v_s)^2})\, \mathrm{sign}\, \dot q
+= \mathrm{sat}(g c(t - d) + b - q) - a L$
+
+with the command $c$ and the load torque $L$ of the bodies. Dry friction is exact: a soft threshold
+in implicit steps, which holds a joint at rest without creep. The steps are of second order
+and L-stable, so that $J \to 0$ is allowed.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import AnyArray, Array, Float, double_precision, on_cores
+from jaxid.dynamics.dispatch import in_numpy
+from jaxid.dynamics.model import Model
+from jaxid.errors import InputError
+from jaxid.measurement.recording import Recording
+
+GAMMA = 1.0 - math.sqrt(0.5)
+"""Fraction of a step that each of its two implicit stages takes."""
+SETTLING = 0.5
+"""Time at the start of a log that does not count, because the initial speed is not known [s]."""
+PADDED = 500
+"""Samples to a multiple of which motions are padded, so that few lengths are compiled."""
+
+
+class ServoParameter(NamedTuple):
+    """Parameter of a joint: symbol, meaning, unit (`u` is rad or m), start, limits, scale."""
+
+    symbol: str
+    meaning: str
+    unit: str
+    start: float
+    lower: float
+    upper: float
+    scale: float
+
+
+PARAMETERS = (
+    ServoParameter("J", "inertia / stiffness", "s²", 4e-3, 1e-7, 1.0, 2e-3),
+    ServoParameter("B", "damping / stiffness", "s", 0.05, 1e-5, 5.0, 0.03),
+    ServoParameter("d", "delay", "s", 0.01, -0.1, 0.3, 0.01),
+    ServoParameter("b", "bias / stiffness", "u", 0.0, -1.0, 1.0, 0.01),
+    ServoParameter("a", "1 / stiffness", "u/(N m)", 0.0, 0.0, 100.0, 0.05),
+    ServoParameter("F", "dry friction / stiffness", "u", 0.01, 0.0, 1.0, 0.01),
+    ServoParameter("mu", "friction per load", "1", 0.0, 0.0, 2.0, 0.3),
+    ServoParameter("Fs", "Stribeck friction / stiffness", "u", 0.0, 0.0, 1.0, 0.01),
+    ServoParameter("vs", "Stribeck speed", "u/s", 0.05, 3e-3, 2.0, 0.05),
+    ServoParameter("um", "largest torque / stiffness", "u", 1e3, 0.01, 1e4, 0.2),
+    ServoParameter("g", "gain of the command", "1", 1.0, 0.5, 2.0, 0.1),
+)
+"""Parameters of a joint, in the order of the arrays that hold them."""
+INDEX = {parameter.symbol: k for k, parameter in enumerate(PARAMETERS)}
+START, LOWER, UPPER, SCALE = (
+    np.array([getattr(x, key) for x in PARAMETERS]) for key in ("start", "lower", "upper", "scale")
+)
+
+
+class ServoMotion(eqx.Module):
+    """Segments of logs as arrays of one length, padded behind their ends.
+
+    Attributes:
+        commands: Commanded positions [motions, joints, samples].
+        positions: Measured positions.
+        load: Torques of the bodies that the model describes [N m or N].
+        inertia: Inertia of the bodies about each joint [kg m² or kg].
+        rates: Initial velocities [motions, joints].
+        counted: Whether a sample counts in the fit.
+        sample_time: Time between two samples of each motion [s].
+        lengths: Number of samples of each motion.
+        names: Name of the log of each motion.
+    """
+
+    commands: Float[AnyArray, "motions joints samples"]
+    positions: Float[AnyArray, "motions joints samples"]
+    load: Float[AnyArray, "motions joints samples"]
+    inertia: Float[AnyArray, "motions joints samples"]
+    rates: Float[AnyArray, "motions joints"]
+    counted: Float[AnyArray, "motions joints samples"]
+    sample_time: Float[AnyArray, " motions"]
+    lengths: tuple[int, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, logs: Sequence[Recording]) -> "ServoMotion":
+        """Return the segments of logs whose `forces` are the commands.
+
+        Raises:
+            InputError: If logs have different joints, or no segment lasts longer than a second.
+        """
+        if len({log.joints for log in logs}) != 1:
+            raise InputError("`logs` must hold at least one log, and all with the same joints.")
+        parts = [
+            (log, a, b)
+            for log in logs
+            for a, b in log.segments
+            if (b - a) * log.sample_time > 2 * SETTLING
+        ]
+        if not parts:
+            raise InputError("`logs` hold no segment that lasts longer than a second.")
+        lengths = tuple(b - a for _, a, b in parts)
+        padded = PADDED * math.ceil(max(lengths) / PADDED)
+
+        def stacked(channel: str) -> np.ndarray:
+            rows = (np.asarray(getattr(log, channel))[a:b] for log, a, b in parts)
+            filled = [np.pad(x, ((0, padded - len(x)), (0, 0)), "edge").T for x in rows]
+            return np.stack(filled)
+
+        positions, times = stacked("angles"), np.array([log.sample_time for log, _, _ in parts])
+        index = np.arange(padded)
+        settling = np.ceil(SETTLING / times)[:, None]
+        counted = (index >= settling) & (index < np.array(lengths)[:, None])
+        early = np.maximum(2, (0.1 / times).astype(int))
+        rates = [(x[:, k] - x[:, 0]) / (k * dt) for x, k, dt in zip(positions, early, times, strict=True)]
+        return cls(
+            commands=stacked("forces"),
+            positions=positions,
+            load=np.zeros_like(positions),
+            inertia=np.zeros_like(positions),
+            rates=np.array(rates),
+            counted=np.repeat(counted[:, None].astype(float), positions.shape[1], axis=1),
+            sample_time=times,
+            lengths=lengths,
+            names=tuple(log.name for log, _, _ in parts),
+        )
+
+    @property
+    def motions(self) -> int:
+        """Number of motions."""
+        return len(self.lengths)
+
+    def replace(self, **fields: AnyArray) -> "ServoMotion":
+        """Return the motions with other arrays."""
+        return dataclasses.replace(self, **fields)
+
+    def part(self, motion: int) -> "ServoMotion":
+        """Return one motion, without the axis of motions."""
+        return jax.tree.map(lambda x: x[motion], self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Bodies:
+    """Bodies that load the joints: a model with its parameters, often from a URDF file.
+
+    Attributes:
+        model: Model of the robot.
+        parameters: Standard parameters.
+        coupled: Whether inertial torques count, beside those of gravity.
+    """
+
+    model: Model
+    parameters: Float[AnyArray, " standard"]
+    coupled: bool = False
+
+    def loads(self, motion: ServoMotion, q: np.ndarray | None = None) -> ServoMotion:
+        """Return the motions with the loads at positions `q`, by default the measured ones."""
+        q = np.asarray(motion.positions if q is None else q)
+        load, inertia = np.zeros_like(q), np.zeros_like(q)
+        for k, dt in enumerate(motion.sample_time):
+            path, model, p = q[k].T, self.model, np.asarray(self.parameters)
+            still = np.zeros_like(path)
+            if not self.coupled:
+                load[k] = in_numpy(model, model.forces, path, still, still, shared=(p,)).T
+                continue
+            path, qd, qdd = smooth_rates(path, float(dt))
+            M = in_numpy(model, model.inertia, path, shared=(p,))
+            own = np.diagonal(M, axis1=1, axis2=2)
+            forces = in_numpy(model, model.forces, path, qd, qdd, shared=(p,))
+            load[k], inertia[k] = (forces - own * qdd).T, own.T
+        return motion.replace(load=load, inertia=inertia)
+
+
+def smooth_rates(q: np.ndarray, dt: float, cutoff: float = 8.0) -> tuple[np.ndarray, ...]:
+    """Return positions below a frequency [Hz] with their first and second derivatives."""
+    from scipy.signal import butter, sosfiltfilt
+
+    if cutoff < 0.4 / dt:
+        q = sosfiltfilt(butter(2, 2.0 * cutoff * dt, output="sos"), q, axis=0)
+    qd = np.gradient(q, dt, axis=0)
+    return q, qd, np.gradient(qd, dt, axis=0)
+
+
+def shrink(x: Array, threshold: Array) -> Array:
+    """Return what a force leaves beyond a friction that it must overcome: soft threshold."""
+    return x - jnp.clip(x, -threshold, threshold)
+
+
+def delayed_command(c: Array, t: Array, hold: AnyArray) -> Array:
+    """Return the mean command over each step between the instants `t`, in samples.
+
+    Commands are held until the next one, or interpolated; before the first they stand still.
+    """
+    table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
+    held = jnp.clip(t, -1e3, len(c) - 1e-6)
+    k = jnp.clip(jnp.floor(held), 0, len(c) - 1).astype(int)
+    mean = jnp.diff(table[k] + (held - k) * c[k]) / jnp.maximum(jnp.diff(held), 1e-12)
+    middle = jnp.clip(0.5 * (t[1:] + t[:-1]), 0.0, len(c) - 1.0)
+    k = jnp.clip(jnp.floor(middle), 0, len(c) - 2).astype(int)
+    return jnp.where(hold, mean, c[k] + (middle - k) * (c[k + 1] - c[k]))
+
+
+def simulate_joint(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
+    """Simulate one joint from its first measured position (a motion without its other axes).
+
+    Args:
+        theta: Parameters of the joint, as in `PARAMETERS`.
+        motion: One joint of one motion: commands, load, initial state.
+        steps: Steps in each sample time.
+        hold: Whether commands are held until the next one, instead of interpolated.
+    """
+    J, B, d, b, a, F, mu, Fs, vs, um, g = theta
+    c, dt = motion.commands, motion.sample_time
+    samples, h = len(c), dt / steps
+    edges = jnp.arange((samples - 1) * steps + 1) / steps - d / dt
+    command = g * delayed_command(c, edges, hold).reshape(samples - 1, steps) + b
+    load = a * 0.5 * (motion.load[1:] + motion.load[:-1])
+    inertia = J + a * 0.5 * (motion.inertia[1:] + motion.inertia[:-1])
+    hg = GAMMA * h
+
+    def stage(q: Array, v: Array, u: Array, load: Array, inertia: Array) -> Array:
+        """Return the velocity at the end of an implicit Euler step."""
+        error = u - q
+        inside = jnp.where(jnp.abs(error) < um, 1.0, 0.0)
+        friction = F + mu * jnp.abs(load) + Fs * jnp.exp(-((v / vs) ** 2))
+        drive = inertia / hg * v + jnp.clip(error, -um, um) - load
+        return shrink(drive, friction) / (inertia / hg + B + inside * hg)
+
+    def sample(state, inputs):
+        q, v = state
+        commands, load, inertia = inputs
+        for k in range(steps):
+            v1 = stage(q, v, commands[k], load, inertia)
+            # A joint that has stopped in the first stage starts the second one at rest.
+            middle = jnp.where(v1 == 0.0, 0.0, v + (1.0 - GAMMA) / GAMMA * (v1 - v))
+            q = q + (1.0 - GAMMA) * h * v1
+            v = stage(q, middle, commands[k], load, inertia)
+            q = q + hg * v
+        return (q, v), q
+
+    start = motion.positions[0], motion.rates
+    _, path = jax.lax.scan(sample, start, (command, load, inertia))
+    return jnp.concatenate([start[0][None], path])
+
+
+AXES = ServoMotion(0, 0, 0, 0, 0, 0, None, (), ())  # pyright: ignore[reportArgumentType]
+"""Axis of the joints in one motion."""
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _paths(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
+    return _each_joint(lambda x, m: simulate_joint(x, m, steps, hold))(theta, motion)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _costs(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
+    def cost(x, m):
+        r = m.counted * (simulate_joint(x, m, steps, hold) - m.positions)
+        return r @ r
+
+    return _each_joint(cost)(theta, motion)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
+    def moments(x, m):
+        r, S = _sensitivities(x, m, steps, hold)
+        r, S = m.counted * r, m.counted[:, None] * S
+        return r @ r, S.T @ r, S.T @ S
+
+    return _each_joint(moments)(theta, motion)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _residuals(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
+    return _each_joint(lambda x, m: _sensitivities(x, m, steps, hold))(theta, motion)
+
+
+def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
+    def residual(x):
+        r = simulate_joint(x, motion, steps, hold) - motion.positions
+        return r, r
+
+    S, r = jax.jacfwd(residual, has_aux=True)(theta)
+    return r, S
+
+
+def _each_joint(function):
+    """Map a function of a joint's parameters and motion over candidates and joints."""
+    axes = dataclasses.replace(AXES, lengths=(), names=())
+    joints = jax.vmap(lambda x, m: function(x, m), (0, axes))
+    return jax.vmap(joints, (0, None))
+
+
+@dataclasses.dataclass(frozen=True)
+class ServoSimulator:
+    """Motions with the steps in which they are simulated.
+
+    Parameters have the shape [candidates, joints, parameters]; results have the motions first.
+
+    Attributes:
+        motion: Motions.
+        time_step: Longest step, 5 % more if that makes them fewer [s].
+        hold: Whether commands are held until the next one, instead of interpolated.
+    """
+
+    motion: ServoMotion
+    time_step: float
+    hold: bool = False
+
+    @property
+    def steps(self) -> int:
+        """Steps in each sample time."""
+        return math.ceil(float(self.motion.sample_time.max()) / self.time_step - 0.05)
+
+    def _map(self, function, theta: AnyArray, *, each: bool = False):
+        """Apply a compiled function to all motions, on all cores."""
+
+        def one(k: int):
+            own = theta[k] if each else theta
+            with double_precision():
+                part = dataclasses.replace(self.motion.part(k), lengths=(), names=())
+                found = function(jnp.asarray(own), part, self.steps, np.array(self.hold))
+                return jax.tree.map(np.asarray, found)
+
+        # The first call compiles, and the others wait for it.
+        first = one(0)
+        rest = list(on_cores(one, range(1, self.motion.motions)))
+        return jax.tree.map(lambda *x: np.stack(x), first, *rest)
+
+    def paths(self, theta: AnyArray) -> Float[np.ndarray, "motions candidates joints samples"]:
+        """Return the simulated positions."""
+        return self._map(_paths, theta)
+
+    def costs(self, theta: AnyArray, *, each: bool = False) -> np.ndarray:
+        """Return sums of squared errors; with `each`, parameters have the motions first, too."""
+        return self._map(_costs, theta, each=each)
+
+    def moments(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return costs, gradients and Gauss-Newton matrices, each halved cost's derivatives."""
+        return self._map(_moments, theta)
+
+    def residuals(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors and sensitivities of all samples."""
+        return self._map(_residuals, theta)
