@@ -3,7 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, uniform_filter1d
+from scipy.ndimage import (
+    binary_dilation,
+    maximum_filter1d,
+    minimum_filter1d,
+    uniform_filter1d,
+)
 
 from jaxid.arrays import Bool, Float
 
@@ -11,9 +16,9 @@ from .servo import ServoMotion
 
 SUSTAINED = 0.5
 """Time over which errors are averaged: friction and vibration change their sign sooner [s]."""
-SEVERE = 8.0
+SEVERE = 5.0
 """Multiple of a joint's typical averaged error above which it is held by something."""
-LEAST = 0.02
+LEAST = 0.03
 """Averaged error below which nothing is suspected [rad or m]."""
 
 
@@ -22,7 +27,7 @@ class Contact(NamedTuple):
 
     Attributes:
         name: Name of the log.
-        joint: Index of the joint with the largest error.
+        joint: Index of the joint.
         start: Begin, from the start of the segment [s].
         stop: End [s].
         error: Largest averaged error [rad or m].
@@ -38,11 +43,16 @@ class Contact(NamedTuple):
 def sustained_errors(
     motion: ServoMotion, errors: Float[np.ndarray, "motions joints samples"]
 ) -> Float[np.ndarray, "motions joints samples"]:
-    """Return errors averaged over half a second."""
-    mean = np.empty_like(errors)
+    """Return errors averaged over half a second, of joints that do not move.
+
+    A joint that moves over more than the error is not held: there the error counts as zero.
+    """
+    mean, measured = np.empty_like(errors), np.asarray(motion.positions)
     for k, dt in enumerate(motion.sample_time):
         size = max(1, round(SUSTAINED / float(dt)))
         mean[k] = np.abs(uniform_filter1d(errors[k], size, axis=-1, mode="nearest"))
+        high, low = (f(measured[k], 2 * size, axis=-1) for f in (maximum_filter1d, minimum_filter1d))
+        mean[k] *= high - low < np.maximum(mean[k], LEAST)
     return mean * (np.arange(errors.shape[-1]) < np.array(motion.lengths)[:, None, None])
 
 
@@ -50,7 +60,7 @@ def contact_rows(
     motion: ServoMotion,
     errors: Float[np.ndarray, "motions joints samples"],
     typical: Float[np.ndarray, " joints"] | None = None,
-) -> Bool[np.ndarray, "motions samples"]:
+) -> Bool[np.ndarray, "motions joints samples"]:
     """Return the samples of sustained errors that friction cannot explain, with half a second more.
 
     Args:
@@ -61,17 +71,17 @@ def contact_rows(
     mean = sustained_errors(motion, errors)
     typical = typical_errors(motion, mean) if typical is None else typical
     limit = np.maximum(SEVERE * np.asarray(typical), LEAST)[None, :, None]
-    rows = (mean > limit).any(axis=1)
+    rows = mean > limit
     for k, dt in enumerate(motion.sample_time):
         size = 2 * round(SUSTAINED / float(dt)) + 1
-        rows[k] = binary_dilation(rows[k], np.ones(size, bool))
+        rows[k] = binary_dilation(rows[k], np.ones((1, size), bool))
     return rows
 
 
 def typical_errors(motion: ServoMotion, mean: np.ndarray) -> Float[np.ndarray, " joints"]:
-    """Return the median of averaged errors of each joint."""
-    inside = np.arange(mean.shape[-1]) < np.array(motion.lengths)[:, None]
-    return np.array([np.median(mean[:, j][inside]) for j in range(mean.shape[1])])
+    """Return the root mean square of averaged errors of each joint at rest."""
+    still = [mean[:, j][mean[:, j] > 0] for j in range(mean.shape[1])]
+    return np.array([np.sqrt(np.mean(x**2)) if x.size else 0.0 for x in still])
 
 
 def contacts(
@@ -81,10 +91,10 @@ def contacts(
     mean, found = sustained_errors(motion, errors), []
     typical = typical_errors(motion, mean) if typical is None else typical
     rows = contact_rows(motion, errors, typical)
-    for k, dt in enumerate(motion.sample_time):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], rows[k].astype(int), [0]])))
+    for k, j in np.argwhere(rows.any(axis=2)):
+        dt = float(motion.sample_time[k])
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], rows[k, j].astype(int), [0]])))
         for a, b in edges.reshape(-1, 2):
-            peak = mean[k, :, a:b].max(axis=-1)
-            joint = int(np.argmax(peak / np.maximum(typical, 1e-12)))
-            found.append(Contact(motion.names[k], joint, a * float(dt), b * float(dt), float(peak[joint])))
+            peak = float(mean[k, j, a:b].max())
+            found.append(Contact(motion.names[k], int(j), a * dt, b * dt, peak))
     return tuple(found)

@@ -24,7 +24,7 @@ BASIC = ("J", "B", "d", "F", "b")
 LINEAR = ("J", "B", "d", "b", "g")
 """Parameters of the baseline: a linear joint of second order with delay."""
 EFFECTS = (
-    (("b",), ("a",), ("a", "b")),
+    ((), ("a",), ("b",), ("a", "b")),
     ((), ("mu",), ("Fs", "vs"), ("mu", "Fs", "vs")),
     ((), ("um",)),
 )
@@ -35,6 +35,8 @@ FOLDS = 4
 """Smallest number of parts for the choice: fewer logs are divided."""
 RESOLUTION = 1e-4
 """Errors below which no motion counts more [rad or m]."""
+LIGHT = 0.02
+"""Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
 _STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
 """Inertia, damping and delay from which searches may start."""
 
@@ -153,7 +155,7 @@ class _Search:
         self.free = np.tile(mask(BASIC), (joints, 1))
         self.linear = self.x.copy()
 
-    def solve(self, x: np.ndarray, free: np.ndarray, iterations: int = 12) -> Solution:
+    def solve(self, x: np.ndarray, free: np.ndarray, iterations: int = 5) -> Solution:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
 
@@ -193,7 +195,7 @@ class _Search:
         x[3] = x[0]
         x[3, :, INDEX["F"]] = 0.0
         free = np.stack([self.free] * 3 + [np.tile(mask(LINEAR), (len(self.x), 1))])
-        found = self.solve(x, free)
+        found = self.solve(x, free, iterations=8)
         self.linear = found.x[3]
         self._take(found.x[:3], np.argmin(found.cost[:3], axis=0))
         self._weigh(self.x)
@@ -213,7 +215,7 @@ class _Search:
         errors = self.simulator.paths(self.x[None])[:, 0] - np.asarray(motion.positions)
         touched = contact_rows(motion, errors)
         if touched.any():
-            counted = np.asarray(motion.counted) * ~touched[:, None]
+            counted = np.asarray(motion.counted) * ~touched
             self.simulator = dataclasses.replace(self.simulator, motion=motion.replace(counted=counted))
             self._weigh(self.x)
 
@@ -233,16 +235,26 @@ class _Search:
             for symbol in effects:
                 x[k, :, INDEX[symbol]] = self._first_value(symbol)
         # Friction per load needs a load.
+        free[..., INDEX["a"]] &= self._loaded
         free[..., INDEX["mu"]] &= free[..., INDEX["a"]]
+        x[..., INDEX["a"]] *= self._loaded
         found = self.solve(x, free)
         scores = self.held_out(found, free)
         chosen = np.zeros(len(self.x), int)
         for k in range(1, len(group)):
             current = np.take_along_axis(scores, chosen[None], axis=0)[0]
-            chosen = np.where(scores[k] < current - GAIN, k, chosen)
+            # Effects that have been found stay: a known weight is not replaced by a bias.
+            larger = np.array([set(group[c]) <= set(group[k]) for c in chosen])
+            chosen = np.where(larger & (scores[k] < current - GAIN), k, chosen)
         self._take(found.x, chosen)
         self.free = np.take_along_axis(free, chosen[None, :, None], axis=0)[0]
         self._weigh(self.x)
+
+    @property
+    def _loaded(self) -> Bool[np.ndarray, " joints"]:
+        """Joints on which the bodies have a weight worth mentioning."""
+        load = np.abs(self.simulator.motion.load).max(axis=(0, 2))
+        return load > LIGHT * load.max(initial=0.0)
 
     def _first_value(self, symbol: str) -> float | np.ndarray:
         """Return a start at which an effect is active: otherwise it would have no gradient."""
@@ -265,17 +277,16 @@ class _Search:
         original, scores, results = self.simulator, [], []
         for hold in (False, True):
             self.simulator = dataclasses.replace(original, hold=hold)
-            x = np.stack([self.x] * 4)
+            x, free = self.x[None].copy(), self.free[None]
             x[..., INDEX["d"]] -= 0.5 * hold * float(original.motion.sample_time.mean())
-            free = np.stack([self.free] * 4)
-            found = self.solve(x, free)
-            scores.append(self.held_out(found, free)[0].mean())
+            found = self.solve(x, free, iterations=3)
+            scores.append(self.held_out(found, free).mean())
             results.append((self.simulator, found.x[0]))
         self.simulator, self.x = results[int(scores[1] < scores[0])]
         self._weigh(self.x)
 
     def final(self) -> Solution:
         """Return the fit with the chosen effects."""
-        found = self.solve(self.x[None], self.free[None], iterations=20)
+        found = self.solve(self.x[None], self.free[None], iterations=10)
         self.x = found.x[0]
         return found

@@ -96,12 +96,13 @@ class RolloutErrors:
     def rms(self, kind: str = "simulated") -> Float[np.ndarray, "motions joints"]:
         """Return root mean square errors of `simulated`, `command` or `linear`."""
         rows = zip(getattr(self, kind), self.measured, self.counted, strict=True)
-        return np.array([np.sqrt(np.mean((y - q)[:, k] ** 2, axis=1)) for y, q, k in rows])
+        return np.array([np.sqrt(np.mean((y - q) ** 2, axis=1, where=k)) for y, q, k in rows])
 
     def total(self, kind: str = "simulated") -> Float[np.ndarray, " joints"]:
         """Return root mean square errors over all motions together."""
-        sizes = np.array([k.sum() for k in self.counted])[:, None]
-        return np.sqrt((sizes * self.rms(kind) ** 2).sum(axis=0) / sizes.sum())
+        sizes = np.array([k.sum(axis=1) for k in self.counted])
+        squares = np.where(sizes > 0, sizes * self.rms(kind) ** 2, 0.0)
+        return np.sqrt(squares.sum(axis=0) / sizes.sum(axis=0))
 
     def summary(self) -> Table:
         """Return a table of the errors of all motions."""
@@ -178,19 +179,19 @@ class ServoFit:
     ) -> "ServoFit":
         """Return the fit of a solution, with its uncertainty."""
         x, motion = solution.x, simulator.motion
-        r, S = (y[:, 0] for y in simulator.residuals(x))
-        r, S = r * motion.counted, S * np.asarray(motion.counted)[..., None]
+        y, S = (y[:, 0] for y in simulator.sensitivities(x))
+        r, S = (y - motion.positions) * motion.counted, S * np.asarray(motion.counted)[..., None]
         moving = free & (x[0] > LOWER) & (x[0] < UPPER)
         covariance, combinations, notes = np.zeros((*x[0].shape, len(PARAMETERS))), [], []
         for j in range(len(x[0])):
-            rows = _JointRows.of(simulator, weights[:, j], r[:, j], S[:, j])
+            rows = _JointRows.of(simulator, j, weights[:, j], r[:, j], S[:, j])
             own, full = _determined(rows, x[0, j], moving[j], j)
             combinations += own
             covariance[j] = full
             notes += rows.notes(joint_names[j])
         errors = np.where(np.asarray(motion.counted) > 0, r, 0.0)
         count = np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
-        everything = simulator.paths(x)[:, 0] - np.asarray(motion.positions)
+        everything = y - np.asarray(motion.positions)
         typical = typical_errors(motion, sustained_errors(motion, everything))
         return cls(
             joint_names,
@@ -272,7 +273,7 @@ class ServoFit:
             cut(simulated),
             cut(motion.commands),
             cut(linear),
-            cut((np.asarray(motion.counted)[:, 0] > 0) & ~touched),
+            cut((np.asarray(motion.counted) > 0) & ~touched),
             contacts(motion, errors, self.typical),
         )
 
@@ -363,9 +364,9 @@ class _JointRows(NamedTuple):
     resolution: float
 
     @classmethod
-    def of(cls, simulator, weights, r, S) -> "_JointRows":
+    def of(cls, simulator, joint, weights, r, S) -> "_JointRows":
         motion, root = simulator.motion, np.sqrt(weights)[:, None]
-        counted = np.asarray(motion.counted)[:, 0]
+        counted = np.asarray(motion.counted)[:, joint]
         return cls(root * r, root[..., None] * S, r, counted, float(motion.sample_time.mean()), 0.0)
 
     def information(self, own: np.ndarray) -> np.ndarray:

@@ -219,38 +219,60 @@ def simulate_joint(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
         steps: Steps in each sample time.
         hold: Whether commands are held until the next one, instead of interpolated.
     """
-    J, B, d, b, a, F, mu, Fs, vs, um, g = theta
-    c, dt = motion.commands, motion.sample_time
-    samples, h = len(c), dt / steps
-    edges = jnp.arange((samples - 1) * steps + 1) / steps - d / dt
-    command = g * delayed_command(c, edges, hold).reshape(samples - 1, steps) + b
-    load = a * 0.5 * (motion.load[1:] + motion.load[:-1])
-    inertia = J + a * 0.5 * (motion.inertia[1:] + motion.inertia[:-1])
-    hg = GAMMA * h
+    return _states(theta, motion, steps, hold)[0]
 
-    def stage(q: Array, v: Array, u: Array, load: Array, inertia: Array) -> Array:
+
+def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
+    """Return the command of each step, with gain and bias [samples less one, steps]."""
+    count, (_, _, d, b, *_, g) = len(motion.commands) - 1, theta
+    edges = jnp.arange(count * steps + 1) / steps - d / motion.sample_time
+    return g * delayed_command(motion.commands, edges, hold).reshape(count, steps) + b
+
+
+def _loads(motion: ServoMotion) -> tuple[Array, Array]:
+    """Return load and inertia of the bodies between two samples."""
+    load, inertia = (0.5 * (x[1:] + x[:-1]) for x in (motion.load, motion.inertia))
+    return load, inertia
+
+
+def _states(
+    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
+) -> tuple[Array, Array]:
+    """Return positions and velocities at all samples."""
+    h = motion.sample_time / steps
+
+    def sample(state, inputs):
+        state = _advance(*state, theta, *inputs, h)
+        return state, state
+
+    start = motion.positions[0], motion.rates
+    inputs = (_commands(theta, motion, steps, hold), *_loads(motion))
+    _, path = jax.lax.scan(sample, start, inputs)
+    q, v = (jnp.concatenate([x[None], y]) for x, y in zip(start, path, strict=True))
+    return q, v
+
+
+def _advance(q, v, theta, commands, load, inertia, h) -> tuple[Array, Array]:
+    """Return position and velocity one sample later, after a step [s] for each command."""
+    J, B, _, _, a, F, mu, Fs, vs, um, _ = theta
+    load, inertia, hg = a * load, J + a * inertia, GAMMA * h
+
+    def stage(q: Array, v: Array, command: Array) -> Array:
         """Return the velocity at the end of an implicit Euler step."""
-        error = u - q
+        error = command - q
         inside = jnp.where(jnp.abs(error) < um, 1.0, 0.0)
         friction = F + mu * jnp.abs(load) + Fs * jnp.exp(-((v / vs) ** 2))
         drive = inertia / hg * v + jnp.clip(error, -um, um) - load
         return shrink(drive, friction) / (inertia / hg + B + inside * hg)
 
-    def sample(state, inputs):
-        q, v = state
-        commands, load, inertia = inputs
-        for k in range(steps):
-            v1 = stage(q, v, commands[k], load, inertia)
-            # A joint that has stopped in the first stage starts the second one at rest.
-            middle = jnp.where(v1 == 0.0, 0.0, v + (1.0 - GAMMA) / GAMMA * (v1 - v))
-            q = q + (1.0 - GAMMA) * h * v1
-            v = stage(q, middle, commands[k], load, inertia)
-            q = q + hg * v
-        return (q, v), q
-
-    start = motion.positions[0], motion.rates
-    _, path = jax.lax.scan(sample, start, (command, load, inertia))
-    return jnp.concatenate([start[0][None], path])
+    for command in commands:
+        v1 = stage(q, v, command)
+        # A joint that has stopped in the first stage starts the second one at rest.
+        middle = jnp.where(v1 == 0.0, 0.0, v + (1.0 - GAMMA) / GAMMA * (v1 - v))
+        q = q + (1.0 - GAMMA) * h * v1
+        v = stage(q, middle, command)
+        q = q + hg * v
+    return q, v
 
 
 AXES = ServoMotion(0, 0, 0, 0, 0, 0, None, (), ())  # pyright: ignore[reportArgumentType]
@@ -259,47 +281,40 @@ AXES = ServoMotion(0, 0, 0, 0, 0, 0, None, (), ())  # pyright: ignore[reportArgu
 
 @functools.partial(jax.jit, static_argnums=2)
 def _paths(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    return _each_joint(lambda x, m: simulate_joint(x, m, steps, hold))(theta, motion)
+    """Return positions [candidates, joints, samples] of one motion."""
+
+    def one(theta: Array, motion: ServoMotion) -> Array:
+        return simulate_joint(theta, motion, steps, hold)
+
+    return jax.vmap(jax.vmap(one, (0, AXES)), (0, None))(theta, motion)
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def _costs(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    def cost(x, m):
-        r = m.counted * (simulate_joint(x, m, steps, hold) - m.positions)
-        return r @ r
+    r = motion.counted * (_paths(theta, motion, steps, hold) - motion.positions)
+    return jnp.sum(r**2, axis=-1)
 
-    return _each_joint(cost)(theta, motion)
+
+@functools.partial(jax.jit, static_argnums=2)
+def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
+    """Return positions, and their derivatives by the parameters of their own joints, first axis."""
+
+    def along(direction: Array):
+        return jax.jvp(
+            lambda x: _paths(x, motion, steps, hold),
+            (theta,),
+            (jnp.broadcast_to(direction, theta.shape),),
+        )
+
+    return jax.vmap(along, out_axes=(None, 0))(jnp.eye(theta.shape[-1]))
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    def moments(x, m):
-        r, S = _sensitivities(x, m, steps, hold)
-        r, S = m.counted * r, m.counted[:, None] * S
-        return r @ r, S.T @ r, S.T @ S
-
-    return _each_joint(moments)(theta, motion)
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _residuals(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    return _each_joint(lambda x, m: _sensitivities(x, m, steps, hold))(theta, motion)
-
-
-def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    def residual(x):
-        r = simulate_joint(x, motion, steps, hold) - motion.positions
-        return r, r
-
-    S, r = jax.jacfwd(residual, has_aux=True)(theta)
-    return r, S
-
-
-def _each_joint(function):
-    """Map a function of a joint's parameters and motion over candidates and joints."""
-    axes = dataclasses.replace(AXES, lengths=(), names=())
-    joints = jax.vmap(lambda x, m: function(x, m), (0, axes))
-    return jax.vmap(joints, (0, None))
+    y, S = _sensitivities(theta, motion, steps, hold)
+    r, S = motion.counted * (y - motion.positions), motion.counted * S
+    gradient = jnp.einsum("pcjt,cjt->cjp", S, r)
+    return jnp.sum(r**2, axis=-1), gradient, jnp.einsum("pcjt,qcjt->cjpq", S, S)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -350,6 +365,7 @@ class ServoSimulator:
         """Return costs, gradients and Gauss-Newton matrices, each halved cost's derivatives."""
         return self._map(_moments, theta)
 
-    def residuals(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray]:
-        """Return errors and sensitivities of all samples."""
-        return self._map(_residuals, theta)
+    def sensitivities(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the simulated positions and their derivatives by the parameters, last axis."""
+        y, S = self._map(_sensitivities, theta)
+        return y, np.moveaxis(S, 1, -1)
