@@ -16,17 +16,21 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.dispatch import program_of
 from jaxid.errors import InputError
 from jaxid.identification.identify import identify
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.blocks import block_covariance
 from jaxid.measurement.observations import Observations
+from jaxid.program.xla import lower
 from jaxid.result_table import Column, Table, with_deviations
 
 from .least_squares import minimise
 
 MARGIN = 0.05
 """Time before and behind a window for which its torques are known, for delays [s]."""
+SLIDING = 0.05
+"""Speed at which friction by torque has about its full size [rad/s or m/s]."""
 BLOCKS = 40
 """Contiguous parts of the logs whose scatter gives the uncertainty."""
 
@@ -34,25 +38,27 @@ BLOCKS = 40
 class Windows(NamedTuple):
     """Windows of logs, all of one length.
 
+    The windows are the last axis, which makes the loops over them fast.
+
     Attributes:
-        q: Initial positions [windows, joints].
+        q: Initial positions [joints, windows].
         qd: Initial velocities.
-        forces: Torques, with a margin at both ends [windows, samples, joints].
-        measured: Measured positions behind the first sample [windows, steps, joints].
+        forces: Torques, with a margin at both ends [samples, joints, windows].
+        measured: Measured positions behind the first sample [steps, joints, windows].
         blocks: Part of the logs to which each window belongs.
     """
 
-    q: Float[AnyArray, "windows joints"]
-    qd: Float[AnyArray, "windows joints"]
-    forces: Float[AnyArray, "windows samples joints"]
-    measured: Float[AnyArray, "windows steps joints"]
+    q: Float[AnyArray, "joints windows"]
+    qd: Float[AnyArray, "joints windows"]
+    forces: Float[AnyArray, "samples joints windows"]
+    measured: Float[AnyArray, "steps joints windows"]
     blocks: np.ndarray
 
     @classmethod
     def of(cls, logs: Sequence[Observations], horizon: float, spacing: float) -> "Windows":
         """Return windows of a horizon [s], whose starts are `spacing` [s] apart."""
         dt = logs[0].sample_time
-        if any(abs(o.sample_time - dt) > 1e-3 * dt for o in logs):
+        if any(abs(o.sample_time - dt) > 0.01 * dt for o in logs):
             raise InputError("`observations` must have one sample time.")
         steps, margin = max(1, round(horizon / dt)), round(MARGIN / dt)
         parts, count = [], 0
@@ -74,7 +80,7 @@ class Windows(NamedTuple):
                 count += b - a
         if not parts:
             raise InputError(f"`observations` hold no window of {horizon:g} s: shorten `horizon`.")
-        *arrays, place = (np.stack(x) for x in zip(*parts, strict=True))
+        *arrays, place = (np.stack(x, axis=-1) for x in zip(*parts, strict=True))
         return cls(*arrays, place * BLOCKS // max(count, 1))
 
 
@@ -105,22 +111,23 @@ class TorqueRollout:
         n = self.base.model.robot.joints
         return np.concatenate([p, np.zeros(1), np.ones(n), np.zeros(n)])
 
-    def simulate(self, x: Array, q: Array, qd: Array, forces: Array) -> Array:
-        """Simulate one window by the Runge-Kutta method of order four [steps, joints]."""
+    def errors(self, x: Array, windows: Windows) -> Float[Array, "steps joints windows"]:
+        """Return simulated less measured positions, by the Runge-Kutta method of order four."""
         n, h = self.base.model.robot.joints, self.sample_time
         p, delay, gains, load = jnp.split(x, np.cumsum([self.base.size, 1, n]))
-        standard, model = self.base.to_standard(p), self.base.model
-        margin = round(MARGIN / h)
+        p, gains, load = self.base.to_standard(p)[:, None], gains[:, None], load[:, None]
+        forces, margin = jnp.asarray(windows.forces), round(MARGIN / h)
         steps = len(forces) - 2 * margin - 1
         at = jnp.clip(margin + jnp.arange(steps + 1) - delay / h, 0.0, len(forces) - 1.001)
         k = jnp.floor(at).astype(int)
-        late = forces[k] + (at - k)[:, None] * (forces[k + 1] - forces[k])
+        late = forces[k] + (at - k)[:, None, None] * (forces[k + 1] - forces[k])
+        acceleration = self._acceleration
 
         def rate(state, u):
             q, qd = state
             # Gear friction grows with the torque that it carries.
-            u = gains * u - load * jnp.abs(u) * jnp.tanh(qd / 0.05)
-            return qd, model.forward_dynamics(standard, q, qd, u)
+            u = gains * u - load * jnp.abs(u) * jnp.tanh(qd / SLIDING)
+            return qd, jnp.stack(acceleration(p, q, qd, u))
 
         def moved(state, rate, time):
             return jax.tree.map(lambda y, r: y + time * r, state, rate)
@@ -136,12 +143,15 @@ class TorqueRollout:
             state = moved(state, mean, h)
             return state, state[0]
 
-        return jax.lax.scan(step, (q, qd), (late[:-1], late[1:]))[1]
+        start = jnp.asarray(windows.q), jnp.asarray(windows.qd)
+        return jax.lax.scan(step, start, (late[:-1], late[1:]))[1] - windows.measured
 
-    def errors(self, x: AnyArray, windows: Windows) -> Float[Array, "windows steps joints"]:
-        """Return simulated less measured positions of all windows."""
-        simulate = jax.vmap(self.simulate, (None, 0, 0, 0))
-        return simulate(x, windows.q, windows.qd, windows.forces) - windows.measured
+    @functools.cached_property
+    def _acceleration(self) -> Callable:
+        """Accelerations of many samples in scalar operations, which JAX differentiates."""
+        model = self.base.model
+        joints = (model.robot.joints,)
+        return lower(program_of(model, model.acceleration, (model.size,), *[joints] * 3), False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,7 +200,7 @@ class TorqueRolloutFit:
         x = self.unknowns if parameters is None else self.rollout.start(parameters)
         with double_precision():
             errors = jax.jit(self.rollout.errors)(jnp.asarray(x), windows._replace(blocks=None))
-        return np.sqrt(np.mean(np.asarray(errors)[:, -1] ** 2, axis=0))
+        return np.sqrt(np.mean(np.asarray(errors)[-1] ** 2, axis=-1))
 
     def summary(self) -> Table:
         """Return a table of the estimates with 95 % intervals."""
@@ -248,7 +258,7 @@ def identify_torque_rollout(
         [np.ones(base.size + 1), np.full(n, gains), np.full(n, load_friction)]
     ).astype(bool)
     start = rollout.start(first)
-    functions = _compiled(rollout, windows, every)
+    functions = _compiled(rollout, windows, free, every)
     with double_precision():
         limits = _limits(start, base.size)
         found = minimise(*functions[:2], start[None], free[None], limits, 25, 1e-5)
@@ -259,18 +269,21 @@ def identify_torque_rollout(
             "`observations`: the simulation diverges from the fit of torques: shorten `horizon`, "
             "or choose terms of the model that these logs determine."
         )
-    J = J[..., free]
-    blocks = [
-        (J[windows.blocks == k].reshape(-1, J.shape[-1]), r[windows.blocks == k].ravel())
-        for k in np.unique(windows.blocks)
-    ]
-    flat = J.reshape(-1, J.shape[-1])
-    inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
-    covariance, dof = block_covariance(blocks, inverse)
-    naive = inverse * float(np.mean(r**2))
-    uncertainty = Uncertainty(covariance, np.full(len(covariance), dof), naive)
-    rms = np.sqrt(np.mean(r**2, axis=(0, 1)))
+    uncertainty = _uncertainty(r, J[free], windows.blocks)
+    rms = np.sqrt(np.mean(r**2, axis=(0, 2)))
     return TorqueRolloutFit(rollout, x, free, uncertainty, horizon, rms, first)
+
+
+def _uncertainty(r: np.ndarray, J: np.ndarray, part: np.ndarray) -> Uncertainty:
+    """Return the uncertainty from residuals and their derivatives, windows on the last axis."""
+    blocks = [
+        (J[..., part == k].reshape(len(J), -1).T, r[..., part == k].ravel())
+        for k in np.unique(part)
+    ]
+    flat = J.reshape(len(J), -1)
+    inverse = np.linalg.pinv(flat @ flat.T, rcond=1e-12, hermitian=True)
+    covariance, dof = block_covariance(blocks, inverse)
+    return Uncertainty(covariance, np.full(len(J), dof), inverse * float(np.mean(r**2)))
 
 
 def _limits(start: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -283,32 +296,36 @@ def _limits(start: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _compiled(
-    rollout: TorqueRollout, windows: Windows, every: int
+    rollout: TorqueRollout, windows: Windows, free: np.ndarray, every: int
 ) -> tuple[Callable, Callable, Callable]:
-    """Return moments, costs, and residuals with their Jacobian, for a batch of one."""
-    data = windows._replace(blocks=None)
+    """Return moments, costs, and residuals with their derivatives, for a batch of one."""
+    data, index = windows._replace(blocks=None), np.flatnonzero(free)
 
     def residuals(x, data):
-        return rollout.errors(x, data)[:, every - 1 :: every]
+        return rollout.errors(x, data)[every - 1 :: every]
 
     @jax.jit
     def derivatives(x, data):
-        return residuals(x, data), jax.jacfwd(residuals)(x, data)
+        def along(direction):
+            return jax.jvp(lambda x: residuals(x, data), (x,), (direction,))
+
+        return jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(x))[index])
 
     cost = jax.jit(lambda x, data: jnp.sum(residuals(x, data) ** 2))
 
-    @functools.lru_cache(maxsize=2)
-    def cached(key: bytes):
-        found = derivatives(jnp.asarray(np.frombuffer(key)), data)
-        return tuple(np.asarray(y) for y in found)
+    def linearised(x):
+        r, found = (np.asarray(y) for y in derivatives(jnp.asarray(x), data))
+        J = np.zeros((len(x), *r.shape))
+        J[index] = found
+        return r, J
 
     def moments(x):
-        r, J = cached(np.ascontiguousarray(x[0]).tobytes())
-        flat = J.reshape(-1, J.shape[-1])
-        return np.array([np.sum(r**2)]), (flat.T @ r.ravel())[None], (flat.T @ flat)[None]
+        r, J = linearised(x[0])
+        flat = J.reshape(len(J), -1)
+        return np.array([np.sum(r**2)]), (flat @ r.ravel())[None], (flat @ flat.T)[None]
 
     def costs(x):
         found = float(cost(jnp.asarray(x[0]), data))
         return np.array([found if np.isfinite(found) else np.inf])
 
-    return moments, costs, lambda x: cached(np.ascontiguousarray(x).tobytes())
+    return moments, costs, linearised
