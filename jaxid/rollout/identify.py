@@ -62,7 +62,8 @@ def identify_rollout(
     Args:
         logs: One or several recordings of the same robot and controller.
         bodies: Model and parameters of the robot's bodies, often from its URDF file: their weight
-            loads the joints. Without them a joint has a constant bias.
+            loads the joints, and their inertial torques if that lowers the held-out errors (or
+            `coupled` says so). Without them a joint has a constant bias.
         joint_names: Names of the joints; those of the model, or numbers, if None.
         time_step: Longest step of the simulation [s].
         saturation: Whether a largest torque of the servo is tried.
@@ -90,8 +91,11 @@ def identify_rollout(
         if k == 0:
             search.remove_contact()
     search.choose_hold()
+    if bodies is not None and not bodies.coupled:
+        bodies = search.choose_coupling(bodies)
     solution = search.final()
-    return ServoFit.of(search.simulator, search.weights, solution, search.free, search.linear, names, bodies)
+    found = search.simulator, search.weights, solution, search.free, search.linear
+    return ServoFit.of(*found, names, bodies)
 
 
 def _divided(logs: Sequence[Recording]) -> list[Recording]:
@@ -274,16 +278,34 @@ class _Search:
 
     def choose_hold(self) -> None:
         """Decide whether commands are held or interpolated, for all joints alike."""
-        original, scores, results = self.simulator, [], []
-        for hold in (False, True):
-            self.simulator = dataclasses.replace(original, hold=hold)
-            x, free = self.x[None].copy(), self.free[None]
-            x[..., INDEX["d"]] -= 0.5 * hold * float(original.motion.sample_time.mean())
-            found = self.solve(x, free, iterations=3)
-            scores.append(self.held_out(found, free).mean())
-            results.append((self.simulator, found.x[0]))
-        self.simulator, self.x = results[int(scores[1] < scores[0])]
+        held = self.x.copy()
+        held[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
+        other = dataclasses.replace(self.simulator, hold=True)
+        self._choose_simulator((self.simulator, self.x), (other, held))
+
+    def choose_coupling(self, bodies: Bodies) -> Bodies:
+        """Decide whether inertial torques of the bodies act, beside those of gravity."""
+        coupled = dataclasses.replace(bodies, coupled=True)
+        motion = coupled.loads(self.simulator.motion)
+        x, a = self.x.copy(), self.x[:, INDEX["a"]] * self.free[:, INDEX["a"]]
+        own = a * np.asarray(motion.inertia).mean(axis=(0, 2))
+        x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
+        other = dataclasses.replace(self.simulator, motion=motion)
+        better = self._choose_simulator((self.simulator, self.x), (other, x))
+        return coupled if better else bodies
+
+    def _choose_simulator(self, *pairs: tuple[ServoSimulator, np.ndarray]) -> bool:
+        """Take the simulator and start of lower held-out errors; return whether it is the last."""
+        scores, results = [], []
+        for simulator, start in pairs:
+            self.simulator = simulator
+            found = self.solve(start[None], self.free[None], iterations=3)
+            scores.append(self.held_out(found, self.free[None]).mean())
+            results.append((simulator, found.x[0]))
+        last = bool(scores[1] < scores[0])
+        self.simulator, self.x = results[int(last)]
         self._weigh(self.x)
+        return last
 
     def final(self) -> Solution:
         """Return the fit with the chosen effects."""

@@ -34,7 +34,7 @@ AGREED = 1e-4
 """Change of the positions at which they agree [rad or m]."""
 UNDETERMINED = 0.5
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
-SYSTEMATIC = 3.0
+SYSTEMATIC = 1.5
 """Multiple of the encoder's rounding above which errors that are not white show a missing effect."""
 
 
@@ -148,6 +148,7 @@ class ServoFit:
         typical: Typical sustained error of each joint [rad or m].
         contacts: Stretches that were left out, because something held the robot.
         bodies: Bodies whose weight loads the joints; None without.
+        load: Mean absolute load of each joint in the logs [N m or N].
         notes: Doubts about the model, in sentences.
     """
 
@@ -164,6 +165,7 @@ class ServoFit:
     typical: Float[np.ndarray, " joints"]
     contacts: tuple[Contact, ...]
     bodies: Bodies | None
+    load: Float[np.ndarray, " joints"]
     notes: tuple[str, ...] = ()
 
     @classmethod
@@ -207,6 +209,7 @@ class ServoFit:
             typical,
             contacts(motion, everything, typical),
             bodies,
+            np.abs(motion.load).mean(axis=(0, 2)),
             tuple(notes),
         )
 
@@ -276,6 +279,19 @@ class ServoFit:
             cut((np.asarray(motion.counted) > 0) & ~touched),
             contacts(motion, errors, self.typical),
         )
+
+    def window_errors(
+        self, logs: Sequence[Recording] | Recording, horizon: float = 1.0
+    ) -> Float[np.ndarray, " joints"]:
+        """Return root mean square errors of windows that start from measured states [rad or m].
+
+        Args:
+            logs: Recordings whose `forces` are the commands.
+            horizon: Length of the windows [s].
+        """
+        windows = ServoMotion.of([logs] if isinstance(logs, Recording) else logs).windows(horizon)
+        errors = self.paths(windows) - np.asarray(windows.positions)
+        return np.sqrt(np.mean(errors**2, axis=(0, 2)))
 
     def samples(self, count: int, seed: int = 0) -> Float[np.ndarray, "count joints parameters"]:
         """Return parameters drawn from their distribution, within their limits.
@@ -350,8 +366,8 @@ class _JointRows(NamedTuple):
     Attributes:
         residuals: Residuals [motions, samples].
         sensitivities: Sensitivities [motions, samples, parameters].
+        raw: Residuals without weights.
         counted: Whether a sample counts.
-        names: Log of each motion.
         sample_time: Mean sample time [s].
         resolution: Smallest step of the encoder [rad or m].
     """
@@ -367,7 +383,10 @@ class _JointRows(NamedTuple):
     def of(cls, simulator, joint, weights, r, S) -> "_JointRows":
         motion, root = simulator.motion, np.sqrt(weights)[:, None]
         counted = np.asarray(motion.counted)[:, joint]
-        return cls(root * r, root[..., None] * S, r, counted, float(motion.sample_time.mean()), 0.0)
+        step = _resolution(np.asarray(motion.positions)[:, joint])
+        return cls(
+            root * r, root[..., None] * S, r, counted, float(motion.sample_time.mean()), step
+        )
 
     def information(self, own: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton matrix of some parameters."""
@@ -405,7 +424,25 @@ class _JointRows(NamedTuple):
 
     def notes(self, name: str) -> list[str]:
         """Return doubts about the model of the joint, from what its errors look like."""
-        return []
+        kept = self.counted > 0
+        rms = float(np.sqrt(np.mean(self.raw[kept] ** 2)))
+        both = kept[:, 1:] & kept[:, :-1]
+        neighbours = float(np.mean((self.raw[:, 1:] * self.raw[:, :-1])[both])) / rms**2
+        rounding = self.resolution / np.sqrt(12.0)
+        if rms < SYSTEMATIC * rounding or neighbours < 0.5:
+            return []
+        return [
+            f"the errors of {name} are {rms / rounding:.0f} times the rounding of its encoder and "
+            "change slowly: an effect is missing (another friction, play, elasticity, load), and "
+            "the parameters are those that imitate it best"
+        ]
+
+
+def _resolution(q: np.ndarray) -> float:
+    """Return the smallest step of positions."""
+    steps = np.abs(np.diff(q, axis=-1)).ravel()
+    steps = steps[steps > 1e-9]
+    return float(np.quantile(steps, 0.01)) if steps.size else 0.0
 
 
 def _inverse(H: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -140,9 +140,29 @@ class ServoMotion(eqx.Module):
         """Number of motions."""
         return len(self.lengths)
 
-    def replace(self, **fields: AnyArray) -> "ServoMotion":
+    def replace(self, **fields: Any) -> "ServoMotion":
         """Return the motions with other arrays."""
         return dataclasses.replace(self, **fields)
+
+    def windows(self, horizon: float) -> "ServoMotion":
+        """Return consecutive windows of a length [s] as motions of their own."""
+        size = max(3, round(horizon / float(self.sample_time.mean())))
+        places = [(k, a) for k, n in enumerate(self.lengths) for a in range(0, n - size + 1, size)]
+        index = np.array([k for k, _ in places])
+
+        def cut(x: AnyArray) -> np.ndarray:
+            return np.stack([np.asarray(x)[k, :, a : a + size] for k, a in places])
+
+        channels = ("commands", "positions", "load", "inertia", "counted")
+        arrays = {key: cut(getattr(self, key)) for key in channels}
+        q, dt = arrays["positions"], np.asarray(self.sample_time)[index]
+        early = min(2, size - 1)
+        rates = (q[..., early] - q[..., 0]) / (early * dt[:, None])
+        names = tuple(self.names[k] for k in index)
+        lengths = (size,) * len(index)
+        return self.replace(
+            **arrays, rates=rates, sample_time=dt, lengths=lengths, names=names
+        )
 
     def part(self, motion: int) -> "ServoMotion":
         """Return one motion, without the axis of motions."""

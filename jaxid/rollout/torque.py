@@ -241,8 +241,8 @@ def identify_torque_rollout(
         base: Base parameters of the model; dry friction must be smooth.
         observations: Filtered logs with torques.
         horizon: Length of the windows [s].
-        gains: Whether a gain of each joint's torque is estimated: it needs known weights, or
-            gravity that other parameters do not share.
+        gains: Whether the gains of the other joints' torques, relative to the first joint's, are
+            estimated. A gain common to all scales all parameters, and no log tells it.
         load_friction: Whether friction that grows with the torque is estimated.
         every: Number of samples from one that counts to the next.
 
@@ -257,6 +257,8 @@ def identify_torque_rollout(
     free = np.concatenate(
         [np.ones(base.size + 1), np.full(n, gains), np.full(n, load_friction)]
     ).astype(bool)
+    # All torques, masses and friction can be scaled together: the first gain is 1.
+    free[base.size + 1] = False
     start = rollout.start(first)
     functions = _compiled(rollout, windows, free, every)
     with double_precision():
