@@ -35,6 +35,8 @@ FOLDS = 4
 """Smallest number of parts for the choice: fewer logs are divided."""
 RESOLUTION = 1e-4
 """Errors below which no motion counts more [rad or m]."""
+SHORTEST = 5.0
+"""Shortest part into which a log is divided [s]."""
 LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
 _STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
@@ -93,6 +95,9 @@ def identify_rollout(
     search.choose_hold()
     if bodies is not None and not bodies.coupled:
         bodies = search.choose_coupling(bodies)
+        if bodies.coupled:
+            # Inertial torques tell the stiffness of joints on which no weight acts.
+            search.choose(((), ("a",)))
     solution = search.final()
     found = search.simulator, search.weights, solution, search.free, search.linear
     return ServoFit.of(*found, names, bodies)
@@ -100,12 +105,12 @@ def identify_rollout(
 
 def _divided(logs: Sequence[Recording]) -> list[Recording]:
     """Return logs, the long ones divided so that there are enough parts for the choice."""
-    parts = -(-FOLDS // len(logs))
-    if parts == 1:
-        return list(logs)
-    ends = [np.linspace(float(x.time[0]), float(x.time[-1]) + x.sample_time, parts + 1) for x in logs]
-    pairs = [(x, a, b) for x, e in zip(logs, ends, strict=True) for a, b in itertools.pairwise(e)]
-    return [x.crop(float(a), float(b)) for x, a, b in pairs]
+    found = []
+    for log in logs:
+        parts = max(1, min(-(-FOLDS // len(logs)), int(log.duration // SHORTEST)))
+        ends = np.linspace(float(log.time[0]), float(log.time[-1]) + log.sample_time, parts + 1)
+        found += [log.crop(float(a), float(b)) for a, b in itertools.pairwise(ends)]
+    return found
 
 
 def _require_motion(motion: ServoMotion) -> None:

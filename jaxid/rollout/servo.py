@@ -223,11 +223,13 @@ def delayed_command(c: Array, t: Array, hold: AnyArray) -> Array:
     """
     table = jnp.concatenate([jnp.zeros(1), jnp.cumsum(c)])
     held = jnp.clip(t, -1e3, len(c) - 1e-6)
-    k = jnp.clip(jnp.floor(held), 0, len(c) - 1).astype(int)
-    mean = jnp.diff(table[k] + (held - k) * c[k]) / jnp.maximum(jnp.diff(held), 1e-12)
+    whole = jnp.clip(jnp.floor(held), 0.0, len(c) - 1.0)
+    k = whole.astype(int)
+    mean = jnp.diff(table[k] + (held - whole) * c[k]) / jnp.maximum(jnp.diff(held), 1e-12)
     middle = jnp.clip(0.5 * (t[1:] + t[:-1]), 0.0, len(c) - 1.0)
-    k = jnp.clip(jnp.floor(middle), 0, len(c) - 2).astype(int)
-    return jnp.where(hold, mean, c[k] + (middle - k) * (c[k + 1] - c[k]))
+    whole = jnp.clip(jnp.floor(middle), 0.0, len(c) - 2.0)
+    k = whole.astype(int)
+    return jnp.where(hold, mean, c[k] + (middle - whole) * (c[k + 1] - c[k]))
 
 
 def simulate_joint(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
@@ -245,7 +247,7 @@ def simulate_joint(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
 def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
     """Return the command of each step, with gain and bias [samples less one, steps]."""
     count, (_, _, d, b, *_, g) = len(motion.commands) - 1, theta
-    edges = jnp.arange(count * steps + 1) / steps - d / motion.sample_time
+    edges = jnp.asarray(np.arange(count * steps + 1) / steps) - d / motion.sample_time
     return g * delayed_command(motion.commands, edges, hold).reshape(count, steps) + b
 
 
@@ -311,7 +313,8 @@ def _paths(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Arr
 
 @functools.partial(jax.jit, static_argnums=2)
 def _costs(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    r = motion.counted * (_paths(theta, motion, steps, hold) - motion.positions)
+    y, counted = _paths(theta, motion, steps, hold), motion.counted[None]
+    r = counted * (y - motion.positions[None])
     return jnp.sum(r**2, axis=-1)
 
 
@@ -332,7 +335,8 @@ def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
 @functools.partial(jax.jit, static_argnums=2)
 def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
     y, S = _sensitivities(theta, motion, steps, hold)
-    r, S = motion.counted * (y - motion.positions), motion.counted * S
+    r = motion.counted[None] * (y - motion.positions[None])
+    S = motion.counted[None, None] * S
     gradient = jnp.einsum("pcjt,cjt->cjp", S, r)
     return jnp.sum(r**2, axis=-1), gradient, jnp.einsum("pcjt,qcjt->cjpq", S, S)
 

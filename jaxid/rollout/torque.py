@@ -119,8 +119,9 @@ class TorqueRollout:
         forces, margin = jnp.asarray(windows.forces), round(MARGIN / h)
         steps = len(forces) - 2 * margin - 1
         at = jnp.clip(margin + jnp.arange(steps + 1) - delay / h, 0.0, len(forces) - 1.001)
-        k = jnp.floor(at).astype(int)
-        late = forces[k] + (at - k)[:, None, None] * (forces[k + 1] - forces[k])
+        whole = jnp.floor(at)
+        k = whole.astype(int)
+        late = forces[k] + (at - whole)[:, None, None] * (forces[k + 1] - forces[k])
         acceleration = self._acceleration
 
         def rate(state, u):
