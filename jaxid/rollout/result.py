@@ -432,17 +432,18 @@ class _JointRows(NamedTuple):
         if rms < SYSTEMATIC * rounding or neighbours < 0.5:
             return []
         return [
-            f"the errors of {name} are {rms / rounding:.0f} times the rounding of its encoder and "
-            "change slowly: an effect is missing (another friction, play, elasticity, load), and "
-            "the parameters are those that imitate it best"
+            f"the errors of {name} ({1e3 * rms:.2g} mrad or mm RMS) are not the rounding of an "
+            "encoder, and change slowly: an effect is missing (other friction, play, elasticity, "
+            "load), and the parameters are those that imitate it best"
         ]
 
 
 def _resolution(q: np.ndarray) -> float:
     """Return the smallest step of positions."""
     steps = np.abs(np.diff(q, axis=-1)).ravel()
-    steps = steps[steps > 1e-9]
-    return float(np.quantile(steps, 0.01)) if steps.size else 0.0
+    steps = steps[steps > 1e-6]
+    # Most steps of a slow joint are the smallest one; interpolated logs have smaller ones, too.
+    return float(np.quantile(steps, 0.1)) if steps.size else 0.0
 
 
 def _inverse(H: np.ndarray) -> np.ndarray:
