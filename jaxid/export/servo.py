@@ -20,7 +20,9 @@ STICKING = {"solreffriction": "0.004 1", "solimpfriction": "0.99 0.9999 0.001"}
 """Settings with which MuJoCo's dry friction holds a joint almost without creep."""
 
 
-def servo_stiffness(fit: ServoFit, stiffness: Numbers | None = None) -> Float[np.ndarray, " joints"]:
+def servo_stiffness(
+    fit: ServoFit, stiffness: Numbers | None = None
+) -> Float[np.ndarray, " joints"]:
     """Return the stiffness of each servo: given, known by a weight, or that of the other joints.
 
     Args:
@@ -95,12 +97,18 @@ def simulator_table(fit: ServoFit, stiffness: Numbers | None = None) -> Table:
         for (name, value), unit in zip(values.items(), units, strict=True)
     ]
     known = np.isfinite(fit.stiffness)
-    source = ["given" if stiffness is not None else "weight" if k else "other joints" for k in known]
+    source = [
+        "given" if stiffness is not None else "weight" if k else "other joints" for k in known
+    ]
     remarks = []
     if (values["delay"] < 0).any():
-        remarks.append("a negative delay means that positions are stamped later than commands: use 0")
+        remarks.append(
+            "a negative delay means that positions are stamped later than commands: use 0"
+        )
     if not fit.hold:
-        remarks.append("the delay counts for interpolated commands: held ones are later by half a step")
+        remarks.append(
+            "the delay counts for interpolated commands: held ones are later by half a step"
+        )
     return Table(
         "actuators of simulators",
         Column("joint", fit.joint_names),

@@ -141,7 +141,7 @@ def rollout_page(report: RolloutReport, figures: Mapping[str, Figure]) -> str:
 
 
 def write_rollout(folder: Path, report: RolloutReport) -> list[Path]:
-    """Write `rollout.html`, `rollout.json`, `rollout.csv`, figures, and MJCF if bodies are known."""
+    """Write the page, `rollout.json`, `rollout.csv`, figures, and MJCF if bodies are known."""
     fit, count = report.fit, min(SHOWN, len(report.errors.motions))
     figures = {f"motion_{k + 1}": motion_figure(report.errors, k) for k in range(count)}
     rows = [

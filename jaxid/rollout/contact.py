@@ -51,7 +51,9 @@ def sustained_errors(
     for k, dt in enumerate(motion.sample_time):
         size = max(1, round(SUSTAINED / float(dt)))
         mean[k] = np.abs(uniform_filter1d(errors[k], size, axis=-1, mode="nearest"))
-        high, low = (f(measured[k], 2 * size, axis=-1) for f in (maximum_filter1d, minimum_filter1d))
+        high, low = (
+            f(measured[k], 2 * size, axis=-1) for f in (maximum_filter1d, minimum_filter1d)
+        )
         mean[k] *= high - low < np.maximum(mean[k], LEAST)
     return mean * (np.arange(errors.shape[-1]) < np.array(motion.lengths)[:, None, None])
 

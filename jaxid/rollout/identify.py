@@ -81,7 +81,7 @@ def identify_rollout(
     simulator = ServoSimulator(motion if bodies is None else bodies.loads(motion), time_step)
     search = _Search(simulator)
     search.start()
-    groups = list(EFFECTS)
+    groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
     if bodies is None:
         groups[0] = (("b",),)
     if not friction:
@@ -216,7 +216,9 @@ class _Search:
         """Weigh motions by their own errors, so that the worst one does not decide alone."""
         counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
         mean = self.simulator.costs(x[None])[:, 0] / np.maximum(counted, 1.0)
-        self.weights = np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(counted, 1)
+        self.weights = np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(
+            counted, 1
+        )
 
     def remove_contact(self) -> None:
         """Leave out the samples in which a joint is held by something that is not in the model."""
@@ -225,7 +227,9 @@ class _Search:
         touched = contact_rows(motion, errors)
         if touched.any():
             counted = np.asarray(motion.counted) * ~touched
-            self.simulator = dataclasses.replace(self.simulator, motion=motion.replace(counted=counted))
+            self.simulator = dataclasses.replace(
+                self.simulator, motion=motion.replace(counted=counted)
+            )
             self._weigh(self.x)
 
     def choose(self, group: Sequence[tuple[str, ...]]) -> None:

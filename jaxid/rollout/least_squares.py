@@ -21,14 +21,12 @@ class Solution(NamedTuple):
         cost: Sums of squares.
         gradient: Half the gradient of the costs.
         information: Gauss-Newton matrices.
-        iterations: Steps that were taken.
     """
 
     x: Float[np.ndarray, "*batch size"]
     cost: Float[np.ndarray, "*batch"]
     gradient: Float[np.ndarray, "*batch size"]
     information: Float[np.ndarray, "*batch size size"]
-    iterations: int
 
 
 def minimise(
@@ -56,8 +54,7 @@ def minimise(
     x = np.clip(x, *bounds)
     damping = np.full(x.shape[:-1], 1e-2)
     cost, g, H = moments(x)
-    done = 0
-    for done in range(1, iterations + 1):
+    for _ in range(iterations):
         decrease = np.zeros_like(cost)
         for _ in range(5):
             step = bounded_step(g, H, x, free, bounds, damping)
@@ -73,7 +70,7 @@ def minimise(
         cost, g, H = moments(x)
         if (decrease < tolerance).all():
             break
-    return Solution(x, cost, g, H, done)
+    return Solution(x, cost, g, H)
 
 
 def bounded_step(

@@ -14,14 +14,13 @@ from jaxid.measurement.recording import Recording
 from jaxid.result_table import Column, Remark, Status, Table, significant, with_deviations
 
 from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
+from .errors import RolloutErrors
 from .least_squares import Solution
 from .servo import (
     INDEX,
     LOWER,
     PARAMETERS,
     SCALE,
-    SETTLING,
-    START,
     UPPER,
     Bodies,
     ServoMotion,
@@ -35,7 +34,7 @@ AGREED = 1e-4
 UNDETERMINED = 0.5
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
 SYSTEMATIC = 1.5
-"""Multiple of the encoder's rounding above which errors that are not white show a missing effect."""
+"""Multiple of the encoder's rounding above which slow errors show a missing effect."""
 
 
 class Combination(NamedTuple):
@@ -65,69 +64,6 @@ class Combination(NamedTuple):
         """Return the confidence interval."""
         half = self.deviation * float(special.stdtrit(max(self.dof, 1.0), 0.5 + 0.5 * level))
         return self.value - half, self.value + half
-
-
-@dataclasses.dataclass(frozen=True)
-class RolloutErrors:
-    """Errors of free-running simulations, beside those of simple baselines [rad or m].
-
-    Attributes:
-        joint_names: Names of the joints.
-        motions: Name of the log of each motion.
-        time: Instants of the samples of each motion [s].
-        measured: Measured positions of each motion [joints, samples].
-        simulated: Simulated positions.
-        command: Commanded positions.
-        linear: Simulation by the linear baseline.
-        counted: Whether a sample counts: behind the first half second, and without contact.
-        contacts: Stretches in which something outside the model holds the robot.
-    """
-
-    joint_names: tuple[str, ...]
-    motions: tuple[str, ...]
-    time: tuple[np.ndarray, ...]
-    measured: tuple[np.ndarray, ...]
-    simulated: tuple[np.ndarray, ...]
-    command: tuple[np.ndarray, ...]
-    linear: tuple[np.ndarray, ...]
-    counted: tuple[np.ndarray, ...]
-    contacts: tuple[Contact, ...]
-
-    def rms(self, kind: str = "simulated") -> Float[np.ndarray, "motions joints"]:
-        """Return root mean square errors of `simulated`, `command` or `linear`."""
-        rows = zip(getattr(self, kind), self.measured, self.counted, strict=True)
-        return np.array([np.sqrt(np.mean((y - q) ** 2, axis=1, where=k)) for y, q, k in rows])
-
-    def total(self, kind: str = "simulated") -> Float[np.ndarray, " joints"]:
-        """Return root mean square errors over all motions together."""
-        sizes = np.array([k.sum(axis=1) for k in self.counted])
-        squares = np.where(sizes > 0, sizes * self.rms(kind) ** 2, 0.0)
-        return np.sqrt(squares.sum(axis=0) / sizes.sum(axis=0))
-
-    def summary(self) -> Table:
-        """Return a table of the errors of all motions."""
-        columns = [
-            Column(f"{title}\n{name}", 1e3 * self.rms(kind)[:, j], "mrad or mm")
-            for j, name in enumerate(self.joint_names)
-            for title, kind in (("", "simulated"),)
-        ]
-        totals = [("simulation", "simulated"), ("linear joint", "linear"), ("copied command", "command")]
-        facts = [
-            (word, "  ".join(significant(1e3 * x) for x in self.total(kind)) + "  (all motions)")
-            for word, kind in totals
-        ]
-        remarks = [
-            Remark(
-                f"{c.name}: {self.joint_names[c.joint]} is held by something from {c.start:.1f} s "
-                f"to {c.stop:.1f} s (error {1e3 * c.error:.0f} mrad): contact? It does not count",
-                Status.DOUBTFUL,
-            )
-            for c in self.contacts
-        ]
-        return Table("errors of free-running simulations", Column("motion", self.motions), *columns, facts=facts, remarks=remarks)
-
-    def __str__(self) -> str:
-        return self.summary().text()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -324,12 +260,17 @@ class ServoFit:
         )
         facts = [
             ("logs", ", ".join(dict.fromkeys(self.motions))),
-            ("errors", "  ".join(significant(1e3 * x) for x in np.sqrt((self.rms**2).mean(axis=0))) + "  mrad or mm RMS"),
+            (
+                "errors",
+                "  ".join(significant(1e3 * x) for x in np.sqrt((self.rms**2).mean(axis=0)))
+                + "  mrad or mm RMS",
+            ),
             ("commands", "held until the next one" if self.hold else "interpolated"),
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
         remarks: list[Remark | str] = [
-            "positions determine torques, inertias and motor gain only in their ratios to the stiffness",
+            "positions determine inertias, friction, load and motor gain only in their ratios to the "
+            "stiffness",
             *(Remark(note, Status.DOUBTFUL) for note in self.notes),
             *(
                 Remark(
@@ -482,7 +423,16 @@ def _determined(
         value = float(coefficients @ x)
         deviation = float(np.sqrt(reduced[k, k]))
         found.append(
-            Combination(joint, name, meaning, PARAMETERS[i].unit, coefficients, value, deviation, float(dof[k]))
+            Combination(
+                joint,
+                name,
+                meaning,
+                PARAMETERS[i].unit,
+                coefficients,
+                value,
+                deviation,
+                float(dof[k]),
+            )
         )
     return found, full
 

@@ -122,7 +122,9 @@ class ServoMotion(eqx.Module):
         settling = np.ceil(SETTLING / times)[:, None]
         counted = (index >= settling) & (index < np.array(lengths)[:, None])
         early = np.maximum(2, (0.1 / times).astype(int))
-        rates = [(x[:, k] - x[:, 0]) / (k * dt) for x, k, dt in zip(positions, early, times, strict=True)]
+        rates = [
+            (x[:, k] - x[:, 0]) / (k * dt) for x, k, dt in zip(positions, early, times, strict=True)
+        ]
         return cls(
             commands=stacked("forces"),
             positions=positions,
@@ -160,9 +162,7 @@ class ServoMotion(eqx.Module):
         rates = (q[..., early] - q[..., 0]) / (early * dt[:, None])
         names = tuple(self.names[k] for k in index)
         lengths = (size,) * len(index)
-        return self.replace(
-            **arrays, rates=rates, sample_time=dt, lengths=lengths, names=names
-        )
+        return self.replace(**arrays, rates=rates, sample_time=dt, lengths=lengths, names=names)
 
     def part(self, motion: int) -> "ServoMotion":
         """Return one motion, without the axis of motions."""
@@ -216,7 +216,7 @@ def shrink(x: Array, threshold: Array) -> Array:
     return x - jnp.clip(x, -threshold, threshold)
 
 
-def delayed_command(c: Array, t: Array, hold: AnyArray) -> Array:
+def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> Array:
     """Return the mean command over each step between the instants `t`, in samples.
 
     Commands are held until the next one, or interpolated; before the first they stand still.
@@ -251,23 +251,23 @@ def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> 
     return g * delayed_command(motion.commands, edges, hold).reshape(count, steps) + b
 
 
-def _loads(motion: ServoMotion) -> tuple[Array, Array]:
+def _loads(motion: ServoMotion) -> tuple[AnyArray, AnyArray]:
     """Return load and inertia of the bodies between two samples."""
     load, inertia = (0.5 * (x[1:] + x[:-1]) for x in (motion.load, motion.inertia))
     return load, inertia
 
 
-def _states(
-    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
-) -> tuple[Array, Array]:
+def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array, Array]:
     """Return positions and velocities at all samples."""
     h = motion.sample_time / steps
 
     def sample(state, inputs):
-        state = _advance(*state, theta, *inputs, h)
+        q, v = state
+        command, load, inertia = inputs
+        state = _advance(q, v, theta, command, load, inertia, h)
         return state, state
 
-    start = motion.positions[0], motion.rates
+    start: Any = motion.positions[0], motion.rates
     inputs = (_commands(theta, motion, steps, hold), *_loads(motion))
     _, path = jax.lax.scan(sample, start, inputs)
     q, v = (jnp.concatenate([x[None], y]) for x, y in zip(start, path, strict=True))

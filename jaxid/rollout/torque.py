@@ -80,8 +80,8 @@ class Windows(NamedTuple):
                 count += b - a
         if not parts:
             raise InputError(f"`observations` hold no window of {horizon:g} s: shorten `horizon`.")
-        *arrays, place = (np.stack(x, axis=-1) for x in zip(*parts, strict=True))
-        return cls(*arrays, place * BLOCKS // max(count, 1))
+        q0, qd0, u, measured, place = (np.stack(x, axis=-1) for x in zip(*parts, strict=True))
+        return cls(q0, qd0, u, measured, place * BLOCKS // max(count, 1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,7 +163,7 @@ class TorqueRolloutFit:
         rollout: Robot and unknowns.
         unknowns: Estimates, in the order of `rollout.names`.
         free: Unknowns that were estimated.
-        uncertainty: Uncertainty of those that were estimated, from the scatter of parts of the logs.
+        uncertainty: Uncertainty of these, from the scatter of parts of the logs.
         horizon: Horizon of the windows [s].
         rms: Errors of the identification over the windows [rad or m].
         start: Base parameters of the fit of torques from which the search started.
@@ -209,7 +209,9 @@ class TorqueRolloutFit:
         deviations = self.uncertainty.standard_deviations
         values, shown = with_deviations(self.unknowns[self.free], deviations)
         half = self.uncertainty.half_widths()
-        ends = [with_deviations(self.unknowns[self.free] + s * half, deviations)[0] for s in (-1, 1)]
+        ends = [
+            with_deviations(self.unknowns[self.free] + s * half, deviations)[0] for s in (-1, 1)
+        ]
         errors = "  ".join(f"{1e3 * x:.3g}" for x in self.rms)
         return Table(
             "open-loop rollouts",

@@ -23,7 +23,7 @@ def _one_joint(commands, load=0.0, **parameters):
     return ServoSimulator(motion, 0.01), x[None, None]
 
 
-def test_a_linear_joint_moves_as_scipys(rng=np.random.default_rng(0)):
+def test_a_linear_joint_moves_as_scipys():
     from scipy.signal import lsim
 
     t = 0.02 * np.arange(500)
@@ -86,7 +86,9 @@ def test_the_batch_of_least_squares_respects_bounds():
 
     free = np.array([[True, True], [True, False]])
     bounds = np.full(2, -1.0), np.full(2, 1.0)
-    found = minimise(moments, lambda x: moments(x)[0], np.zeros((2, 2)), free, bounds, tolerance=1e-14)
+    found = minimise(
+        moments, lambda x: moments(x)[0], np.zeros((2, 2)), free, bounds, tolerance=1e-14
+    )
     np.testing.assert_allclose(found.x, [[0.5, 1.0], [-1.0, 0.0]], atol=1e-6)
 
 
@@ -176,5 +178,3 @@ def test_contact_needs_a_joint_that_does_not_move():
     errors = np.full_like(motion.positions, 0.1)
     assert contacts(motion.replace(positions=motion.commands), errors, np.array([0.01])) == ()
     assert len(contacts(motion, errors, np.array([0.01]))) == 1
-
-
