@@ -24,6 +24,10 @@ from .excitation.design import design_excitation as design_excitation, minimise 
 from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
 from .export.c_code import export_c as export_c
+from .export.servo import (
+    export_servo_mjcf as export_servo_mjcf,
+    simulator_table as simulator_table,
+)
 from .export.simulators import export_mjcf as export_mjcf, export_urdf as export_urdf
 from .identification import (
     consistency as consistency,

@@ -269,8 +269,8 @@ class ServoFit:
             ("stiffness", K or "not determined: all parameters are ratios to it"),
         ]
         remarks: list[Remark | str] = [
-            "positions determine inertias, friction, load and motor gain only in their ratios to the "
-            "stiffness",
+            "positions determine inertias, friction, load and motor gain only in their ratios to "
+            "the stiffness",
             *(Remark(note, Status.DOUBTFUL) for note in self.notes),
             *(
                 Remark(
