@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special, stats
@@ -27,10 +27,12 @@ from .servo import (
     ServoSimulator,
 )
 
-SWEEPS = 8
+SWEEPS = 15
 """Largest number of simulations in which loads and positions must agree."""
 AGREED = 1e-4
 """Change of the positions at which they agree [rad or m]."""
+DEPTH = 6
+"""Simulations from which the next positions are extrapolated (Anderson's method)."""
 UNDETERMINED = 0.5
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
 SYSTEMATIC = 1.5
@@ -179,13 +181,24 @@ class ServoFit:
     def paths(self, motion: ServoMotion, parameters: AnyArray | None = None) -> np.ndarray:
         """Return simulated positions [motions, joints, samples], with loads at these positions."""
         x = self.parameters if parameters is None else parameters
-        q = np.asarray(motion.commands)
+        if self.bodies is None:
+            return ServoSimulator(motion, self.time_step, self.hold).paths(x[None])[:, 0]
+        states = self._respond(motion, x, np.asarray(motion.commands), None)
+        tried: list[np.ndarray] = []
+        found: list[np.ndarray] = []
         for _ in range(SWEEPS):
-            loaded = motion if self.bodies is None else self.bodies.loads(motion, q)
-            last, q = q, ServoSimulator(loaded, self.time_step, self.hold).paths(x[None])[:, 0]
-            if self.bodies is None or np.abs(q - last).max() < AGREED:
+            tried.append(states)
+            found.append(self._respond(motion, x, *states))
+            last, states = states, _extrapolated(tried[-DEPTH:], found[-DEPTH:])
+            if np.abs(found[-1] - last)[0].max() < AGREED:
                 break
-        return q
+        return found[-1][0]
+
+    def _respond(self, motion: ServoMotion, x: np.ndarray, q: Any, v: Any) -> np.ndarray:
+        """Return positions and velocities under the loads of other positions and velocities."""
+        loaded = motion if self.bodies is None else self.bodies.loads(motion, q, v)
+        simulator = ServoSimulator(loaded, self.time_step, self.hold)
+        return np.stack([y[:, 0] for y in simulator.states(x[None])])
 
     def validate(self, logs: Sequence[Recording] | Recording) -> RolloutErrors:
         """Compare free-running simulations with logs, and with simple baselines.
@@ -299,6 +312,17 @@ class ServoFit:
 
     def __str__(self) -> str:
         return self.summary().text()
+
+
+def _extrapolated(tried: list[np.ndarray], found: list[np.ndarray]) -> np.ndarray:
+    """Return where a fixed-point iteration leads, by Anderson's method."""
+    errors = [(y - x)[0].ravel() for x, y in zip(tried, found, strict=True)]
+    if len(errors) == 1:
+        return found[0]
+    steps = np.stack([e - errors[-1] for e in errors[:-1]], axis=1)
+    weights = np.linalg.lstsq(steps, -errors[-1], rcond=1e-10)[0]
+    changes = (w * (y - found[-1]) for w, y in zip(weights, found[:-1], strict=True))
+    return found[-1] + np.sum(list(changes), axis=0)
 
 
 class _JointRows(NamedTuple):

@@ -73,7 +73,7 @@ class ServoMotion(eqx.Module):
     Attributes:
         commands: Commanded positions [motions, joints, samples].
         positions: Measured positions.
-        load: Torques of the bodies that the model describes [N m or N].
+        load: Torques of the bodies between a sample and the next one [N m or N].
         inertia: Inertia of the bodies about each joint [kg m² or kg].
         rates: Initial velocities [motions, joints].
         counted: Whether a sample counts in the fit.
@@ -183,21 +183,35 @@ class Bodies:
     parameters: Float[AnyArray, " standard"]
     coupled: bool = False
 
-    def loads(self, motion: ServoMotion, q: np.ndarray | None = None) -> ServoMotion:
-        """Return the motions with the loads at positions `q`, by default the measured ones."""
+    def loads(
+        self, motion: ServoMotion, q: np.ndarray | None = None, v: np.ndarray | None = None
+    ) -> ServoMotion:
+        """Return the motions with the loads between two samples.
+
+        Args:
+            motion: Motions.
+            q: Positions; the measured ones if None.
+            v: Velocities of a simulation, whose changes are the mean accelerations; smoothed
+                derivatives of the positions if None.
+        """
         q = np.asarray(motion.positions if q is None else q)
         load, inertia = np.zeros_like(q), np.zeros_like(q)
-        for k, dt in enumerate(motion.sample_time):
-            path, model, p = q[k].T, self.model, np.asarray(self.parameters)
-            still = np.zeros_like(path)
-            if not self.coupled:
-                load[k] = in_numpy(model, model.forces, path, still, still, shared=(p,)).T
-                continue
-            path, qd, qdd = smooth_rates(path, float(dt))
-            M = in_numpy(model, model.inertia, path, shared=(p,))
-            own = np.diagonal(M, axis1=1, axis2=2)
-            forces = in_numpy(model, model.forces, path, qd, qdd, shared=(p,))
-            load[k], inertia[k] = (forces - own * qdd).T, own.T
+        model, p = self.model, np.asarray(self.parameters)
+        for k, dt in enumerate(map(float, motion.sample_time)):
+            if v is None:
+                rates = smooth_rates(q[k].T, dt)
+                path, qd, qdd = (0.5 * (x[1:] + x[:-1]) for x in rates)
+            else:
+                path, qd = (0.5 * (x[k].T[1:] + x[k].T[:-1]) for x in (q, v))
+                qdd = np.diff(v[k].T, axis=0) / dt
+            if self.coupled:
+                M = in_numpy(model, model.inertia, path, shared=(p,))
+                own = np.diagonal(M, axis1=1, axis2=2)
+                forces = in_numpy(model, model.forces, path, qd, qdd, shared=(p,)) - own * qdd
+                inertia[k, :, :-1] = own.T
+            else:
+                forces = in_numpy(model, model.forces, path, 0 * qd, 0 * qd, shared=(p,))
+            load[k, :, :-1] = forces.T
         return motion.replace(load=load, inertia=inertia)
 
 
@@ -232,18 +246,6 @@ def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> Array:
     return jnp.where(hold, mean, c[k] + (middle - whole) * (c[k + 1] - c[k]))
 
 
-def simulate_joint(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    """Simulate one joint from its first measured position (a motion without its other axes).
-
-    Args:
-        theta: Parameters of the joint, as in `PARAMETERS`.
-        motion: One joint of one motion: commands, load, initial state.
-        steps: Steps in each sample time.
-        hold: Whether commands are held until the next one, instead of interpolated.
-    """
-    return _states(theta, motion, steps, hold)[0]
-
-
 def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
     """Return the command of each step, with gain and bias [samples less one, steps]."""
     count, (_, _, d, b, *_, g) = len(motion.commands) - 1, theta
@@ -251,14 +253,15 @@ def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> 
     return g * delayed_command(motion.commands, edges, hold).reshape(count, steps) + b
 
 
-def _loads(motion: ServoMotion) -> tuple[AnyArray, AnyArray]:
-    """Return load and inertia of the bodies between two samples."""
-    load, inertia = (0.5 * (x[1:] + x[:-1]) for x in (motion.load, motion.inertia))
-    return load, inertia
-
-
 def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array, Array]:
-    """Return positions and velocities at all samples."""
+    """Simulate one joint from its first measured position; return positions and velocities.
+
+    Args:
+        theta: Parameters of the joint, as in `PARAMETERS`.
+        motion: One joint of one motion: commands, load, initial state.
+        steps: Steps in each sample time.
+        hold: Whether commands are held until the next one, instead of interpolated.
+    """
     h = motion.sample_time / steps
 
     def sample(state, inputs):
@@ -268,7 +271,7 @@ def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tu
         return state, state
 
     start: Any = motion.positions[0], motion.rates
-    inputs = (_commands(theta, motion, steps, hold), *_loads(motion))
+    inputs = _commands(theta, motion, steps, hold), motion.load[:-1], motion.inertia[:-1]
     _, path = jax.lax.scan(sample, start, inputs)
     q, v = (jnp.concatenate([x[None], y]) for x, y in zip(start, path, strict=True))
     return q, v
@@ -302,13 +305,17 @@ AXES = ServoMotion(0, 0, 0, 0, 0, 0, None, (), ())  # pyright: ignore[reportArgu
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _paths(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    """Return positions [candidates, joints, samples] of one motion."""
+def _all_states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
+    """Return positions and velocities [candidates, joints, samples] of one motion."""
 
-    def one(theta: Array, motion: ServoMotion) -> Array:
-        return simulate_joint(theta, motion, steps, hold)
+    def one(theta: Array, motion: ServoMotion) -> tuple[Array, Array]:
+        return _states(theta, motion, steps, hold)
 
     return jax.vmap(jax.vmap(one, (0, AXES)), (0, None))(theta, motion)
+
+
+def _paths(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
+    return _all_states(theta, motion, steps, hold)[0]
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -379,7 +386,11 @@ class ServoSimulator:
 
     def paths(self, theta: AnyArray) -> Float[np.ndarray, "motions candidates joints samples"]:
         """Return the simulated positions."""
-        return self._map(_paths, theta)
+        return self.states(theta)[0]
+
+    def states(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the simulated positions and velocities."""
+        return self._map(_all_states, theta)
 
     def costs(self, theta: AnyArray, *, each: bool = False) -> np.ndarray:
         """Return sums of squared errors; with `each`, parameters have the motions first, too."""
