@@ -285,9 +285,7 @@ def band(quick: bool) -> None:
     sent = commanded(999, 6, 10.0, 50.0)
     measured = drive(mujoco.MjModel.from_xml_string(text), sent, 50.0)
     with tempfile.TemporaryDirectory() as folder:
-        paths = jid.export_servo_mjcf(
-            fit, Path(folder) / "arm.xml", samples=count, timestep=STEP
-        )
+        paths = jid.export_servo_mjcf(fit, Path(folder) / "arm.xml", samples=count, timestep=STEP)
         models = [mujoco.MjModel.from_xml_path(str(p)) for p in paths[1:]]
     random = np.random.default_rng(0)
     paths = []
