@@ -113,7 +113,7 @@ def authors_rate(y: dict[str, float], x: np.ndarray, u: np.ndarray) -> np.ndarra
 def pendulum(quick: bool) -> None:
     folder = DATA / "double_pendulum"
     robot = jid.load_urdf(folder / "pendubot_model_1.0.urdf")
-    friction = jid.ViscousFriction(), jid.CoulombFriction(Tanh(0.1)), jid.ConstantOffset()
+    friction = jid.ViscousFriction(), jid.CoulombFriction(Tanh(0.1))
     base = jid.base_parameters(jid.Model(robot, (jid.RigidBodies(), jid.RotorInertia(), *friction)))
     smooth = jid.ZeroPhaseButterworth(12.0)
     for kind in ("con",) if quick else ("con", "meas"):

@@ -54,6 +54,16 @@ logs = [
     for name, sent in (("sines", sines), ("steps", steps), ("chirp", chirp))
 ]
 
+figure, panels = plt.subplots(1, 3, figsize=(11, 2.6))
+for axes, log in zip(panels, logs, strict=True):
+    axes.plot(t, log.forces[:, 0], label="commanded")
+    axes.plot(t, log.angles[:, 0], label="measured")
+    axes.set_title(log.name)
+    axes.set_xlabel("time [s]")
+panels[0].set_ylabel("angle [rad]")
+panels[0].legend()
+plt.show()
+
 # %% [markdown]
 # Commands stand in the place of forces: a recording is what acts and what follows.
 #
@@ -127,3 +137,5 @@ print(jid.identify_rollout(log, friction=False, saturation=False, joint_names=["
 # * A known weight tells the stiffness itself.
 # * Parameters that a log tells only together are reported together.
 # * `jid.export_servo_mjcf` writes the robot for MuJoCo, with as many draws from the estimates' distribution as you wish.
+#
+# The guide: [my robot logs no torque](../docs/rollout.md).
