@@ -118,7 +118,9 @@ class TorqueRollout:
         p, gains, load = self.base.to_standard(p)[:, None], gains[:, None], load[:, None]
         forces, margin = jnp.asarray(windows.forces), round(MARGIN / h)
         steps = len(forces) - 2 * margin - 1
-        at = jnp.clip(margin + jnp.asarray(np.arange(steps + 1.0)) - delay / h, 0.0, len(forces) - 1.001)
+        at = jnp.clip(
+            margin + jnp.asarray(np.arange(steps + 1.0)) - delay / h, 0.0, len(forces) - 1.001
+        )
         whole = jnp.floor(at)
         k = whole.astype(int)
         late = forces[k] + (at - whole)[:, None, None] * (forces[k + 1] - forces[k])

@@ -32,7 +32,7 @@ def _observed(pendulum, seed):
     data, random = mujoco.MjData(model), np.random.default_rng(seed)
     t = 0.002 * np.arange(3000)
     phases, rates = random.uniform(0, 6, (5, 2)), random.uniform(1.5, 8.0, (5, 2))
-    sent = np.sum(0.7 * np.sin(t[:, None, None] * rates + phases), axis=1)
+    sent = np.sum(0.25 * np.sin(t[:, None, None] * rates + phases), axis=1)
     q = np.zeros_like(sent)
     for k in range(4 * len(t)):
         if k % 4 == 0:
@@ -45,9 +45,7 @@ def _observed(pendulum, seed):
 
 @pytest.fixture(scope="module")
 def base(pendulum):
-    return jid.base_parameters(
-        jid.Model(pendulum[0], (jid.RigidBodies(), jid.ViscousFriction()))
-    )
+    return jid.base_parameters(jid.Model(pendulum[0], (jid.RigidBodies(), jid.ViscousFriction())))
 
 
 def test_late_torques_are_found_and_the_simulation_is_closer(pendulum, base):
