@@ -16,7 +16,8 @@ XML = """<mujoco><compiler angle="radian"/>
 <joint name="a" axis="0 1 0" damping="0.05"/>
 <body name="b" pos="0 0 -0.3"><inertial pos="0 0 -0.2" mass="0.6" diaginertia="0.008 0.008 0.001"/>
 <joint name="b" axis="0 1 0" damping="0.03"/></body></body></worldbody>
-<actuator><motor joint="a" ctrlrange="-9 9"/><motor joint="b" ctrlrange="-9 9"/></actuator></mujoco>"""
+<actuator><motor joint="a" ctrlrange="-9 9"/><motor joint="b" ctrlrange="-9 9"/></actuator>
+</mujoco>"""
 
 
 @pytest.fixture(scope="module")
