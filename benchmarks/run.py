@@ -67,6 +67,7 @@ METHODS = (
     Script("friction", 60),
     Script("stepwise", 10),
     Script("states", 5),
+    Script("rollout", 40),
     Script("excitation", 60),
     Script("export", 10),
     Script("virtual_robot", 5),

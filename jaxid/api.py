@@ -1,6 +1,7 @@
 """Public names of `jaxid`, in the order of the pipeline; the package loads them when used."""
 
 from . import (
+    rollout as rollout,
     simulation as simulation,
     trajectory as trajectories,  # noqa: F401
     units as units,
@@ -23,6 +24,10 @@ from .excitation.design import design_excitation as design_excitation, minimise 
 from .excitation.design_result import ExcitationPlan as ExcitationPlan
 from .excitation.problem import ExcitationProblem as ExcitationProblem
 from .export.c_code import export_c as export_c
+from .export.servo import (
+    export_servo_mjcf as export_servo_mjcf,
+    simulator_table as simulator_table,
+)
 from .export.simulators import export_mjcf as export_mjcf, export_urdf as export_urdf
 from .identification import (
     consistency as consistency,
@@ -77,5 +82,6 @@ from .robot.urdf import (
     load_urdf as load_urdf,
     urdf_parameters as urdf_parameters,
 )
+from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot
 from .trajectory import random_fourier_series as random_fourier_series

@@ -233,4 +233,4 @@ print("shape of the Hessian:", jax.jit(jax.hessian(problem.value))(x).shape)
 # * `jid.minimise(problem, solver)` turns what a solver finds into a motion that keeps its limits for all times, with tables and files like any other design.
 # * From four starts, SLSQP and BFGS come within some percent of ours; the generations make the rest.
 #
-# Next: [the guide to excitation](../docs/excitation.md).
+# The guide: [excitation](../docs/excitation.md). Next: [no torque in the log](10_no_torque.ipynb).

@@ -358,3 +358,25 @@ def states(
     from . import commands
 
     commands.states(console, experiment, logs, output)
+
+
+@app.command()
+def rollout(
+    experiment: options.ExperimentFile,
+    logs: options.Logs,
+    verify: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="LOG", help="A log that the fit does not see; may be repeated."),
+    ] = None,
+    output: options.OutputFolder = Path("rollout"),
+    force: options.Force = False,
+) -> None:
+    """Identify joints behind position servos from commands and encoders, without torques.
+
+    So that a simulation moves like the robot: a page with measured and simulated motion, numbers
+    for simulators, and MJCF. The experiment file names the columns of the commands.
+    """
+    console = options.start(experiment, *logs, *(verify or []), output=output, force=force)
+    from . import commands
+
+    commands.rollout(console, experiment, logs, verify or [], output)

@@ -46,9 +46,11 @@ from jaxid.report.result_files import (
     write_estimates,
     write_report,
 )
+from jaxid.report.rollout import RolloutReport, write_rollout
 from jaxid.report.verdict import Report, verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
+from jaxid.rollout import identify_rollout
 
 from . import process
 from .options import command_line, open_console
@@ -412,6 +414,43 @@ def states(console: Console, path: Path, logs: list[Path], output: Path) -> None
     show_remarks(console, said)
     show(console, *tables[1:])
     show_files(console, output, [p.name for p in files])
+
+
+def rollout(
+    console: Console, path: Path, logs: list[Path], verify: list[Path], output: Path
+) -> None:
+    """Identify servos from commands and positions, simulate, and write the report."""
+    _check_logs(logs, verify, None)
+    experiment = load_experiment(path)
+    settings = experiment.rollout
+    with identify_logs.stages(open_console(stderr=True)) as stage:
+        seen, unseen = [], []
+        for log, kept in [*((x, seen) for x in logs), *((x, unseen) for x in verify)]:
+            stage(f"reading {log.name}")
+            kept.append(experiment.read_commands(log))
+        stage("identifying")
+        fit = identify_rollout(
+            seen,
+            experiment.bodies(),
+            joint_names=experiment.robot.joint_names,
+            time_step=settings.time_step,
+            friction=settings.friction,
+            saturation=settings.saturation,
+        )
+        stage("simulating")
+        errors = fit.validate(unseen or seen)
+        report = RolloutReport(
+            fit,
+            errors,
+            fit.window_errors(unseen or seen),
+            bool(unseen),
+            settings.stiffness,
+            settings.samples,
+            {"command": command_line(), "experiment_text": experiment.text},
+        )
+        written = write_rollout(output, report)
+    show(console, fit.summary(), *report.tables())
+    show_files(console, output, [p.name for p in written])
 
 
 def _pair(

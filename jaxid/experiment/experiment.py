@@ -12,7 +12,13 @@ import numpy as np
 from jaxid.arrays import Float
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import AbstractTerm, AbstractTransition, LoadFriction, Tanh
+from jaxid.dynamics.terms import (
+    AbstractTerm,
+    AbstractTransition,
+    LoadFriction,
+    RigidBodies,
+    Tanh,
+)
 from jaxid.errors import InputError
 from jaxid.identification.consistency import BodyBounds, PhysicallyConsistent
 from jaxid.identification.estimators import NonlinearFriction
@@ -32,6 +38,8 @@ from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import read_recording, scan_log
 from jaxid.measurement.recording import NeedsMemory, Recording, remove_delay
 from jaxid.robot.robot import Robot, Tool
+from jaxid.rollout import Bodies
+from jaxid.units import NM
 
 from .decoder import call, check_names, within
 from .estimator_table import Estimation, build_estimation, decode_estimator
@@ -40,6 +48,7 @@ from .model_and_log_tables import (
     FILTERS,
     Effects,
     Logs,
+    Rollout,
     build_columns,
     build_filters,
     build_rows,
@@ -58,6 +67,7 @@ TABLES: dict[str, tuple[Callable, ...]] = {
     "filter": tuple(FILTERS.values()),
     "rows": (build_rows,),
     "estimator": (build_estimation, BodyBounds),
+    "rollout": (Rollout,),
     "excitation": (Excitation,),
     "collision": (Collision,),
 }
@@ -90,6 +100,7 @@ class Experiment:
     linear: tuple[AbstractTerm, ...] | None
     # transition of friction by load, which the model leaves out; None without
     load_transition: AbstractTransition | None
+    rollout: Rollout  # settings of the identification without torques
     excitation: Excitation  # settings of the motion to design
     notes: tuple[str, ...]  # assumptions where the file says nothing, in sentences
 
@@ -160,6 +171,39 @@ class Experiment:
             return None
         columns = dataclasses.replace(self._columns_of(log), angles=commands, velocities=None)
         return self.observe(self._read(log, columns))
+
+    def read_commands(self, log: str | Path) -> Recording:
+        """Read a log with the commanded angles in place of forces.
+
+        Raises:
+            InputError: If the file does not name the columns of the commands, or the log is not as
+                it says.
+        """
+        log, commands = Path(log), self.logs.commands
+        columns = self._columns_of(log)
+        if commands is None:
+            raise InputError(
+                f"{self.path.name}: `recording.commands` is missing: it names the columns of the "
+                'commanded angles, like "cmd{}".'
+            )
+        plain = {"forces": commands, "force_unit": NM, "force_signs": None, "force_gains": None}
+        columns = dataclasses.replace(columns, **plain, torque_constants=None, velocities=None)
+        measured = self._read(log, columns)
+        swapped = dataclasses.replace(columns, angles=commands, forces=columns.angles)
+        sent = self._read(log, swapped)
+        return dataclasses.replace(measured, forces=sent.angles)
+
+    def bodies(self) -> Bodies | None:
+        """Return the bodies that the robot's file describes, as loads of its joints."""
+        wanted = self.rollout.bodies
+        found = None if wanted is False else self.source.parameters(self.path.parent)
+        if found is None and wanted:
+            raise InputError(
+                f"{self.path.name}: `rollout.bodies` needs a robot from a URDF or MJCF file."
+            )
+        if found is None or not (found[:, 0] > 0).any():
+            return None
+        return Bodies(Model(self.robot, (RigidBodies(),)), found.ravel())
 
     def _read(self, log: Path, columns: Columns) -> Recording:
         logs = self.logs
@@ -308,6 +352,7 @@ def _build(content: dict[str, Any], folder: Path) -> dict[str, Any]:
         "estimation": estimation,
         "load_transition": load_transition,
         "linear": effects.linear_terms(robot) if estimation.nonlinear else None,
+        "rollout": call(Rollout, content.get("rollout", {}), "rollout"),
         "excitation": call(Excitation, content.get("excitation", {}), "excitation"),
         "notes": (*filter_notes, *estimation.notes),
     }

@@ -195,7 +195,7 @@ class Logs:
             `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
         velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
         commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid inspect` tells a
-            delay in spite of disturbances.
+            delay in spite of disturbances, and `jaxid rollout` needs no `forces`.
         force_delay: Time by which forces stand later in the log than angles [s].
         largest_gap: Longest pause that is bridged, in sample times; a tenth of the period of the
             filter's cut-off frequency is bridged in any case.
@@ -231,6 +231,28 @@ class Logs:
         }
 
 
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """Settings of `jaxid rollout`, which needs commands and positions, but no torques.
+
+    Attributes:
+        bodies: Whether the bodies of the robot's file load the joints; by default if it has some.
+        stiffness: Stiffness of the servos [N m/rad or N/m], like `12.0`, or a list: only where no
+            weight tells it, for simulators.
+        time_step: Longest step of the simulation [s].
+        friction: Whether friction that grows with load or falls with speed is tried.
+        saturation: Whether a largest torque of the servo is tried.
+        samples: Number of MJCF files drawn from the distribution of the estimates.
+    """
+
+    bodies: bool | None = None
+    stiffness: Positive | list[Positive] | None = None
+    time_step: Positive = 0.01
+    friction: bool = True
+    saturation: bool = True
+    samples: Annotated[int, Bounds(least=0, most=10_000)] = 0
+
+
 SIDES = ("angles_on_motor_side", "forces_on_motor_side")
 """Arguments of `Columns` for which the file has `side` and `forces_side`."""
 
@@ -243,6 +265,9 @@ def build_columns(table: dict[str, Any], robot: Robot) -> tuple[Columns, Logs]:
         else value
         for key, value in table.items()
     }
+    if "commands" in table:
+        # A robot that logs no torque.
+        table.setdefault("forces", table["commands"])
     given, reading = decode([Columns, Logs], table, "recording", skip=SIDES)
     with within("recording"):
         logs = Logs(**reading)

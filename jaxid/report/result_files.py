@@ -41,7 +41,7 @@ MODEL = "model.json"
 """File of a report that holds the fit, for `load` and `jaxid export`."""
 SCHEMAS = {
     f"{kind}.json": f"jaxid-{kind}/1"
-    for kind in ("result", "comparison", "payload", "gains", "states", "demo")
+    for kind in ("result", "comparison", "payload", "gains", "states", "demo", "rollout")
 }
 """Files that hold results, and the schemas in them."""
 Estimates = tuple[Sequence[str], Sequence[str], AnyArray, Uncertainty]

@@ -1,0 +1,307 @@
+"""Rollouts: identification from commands and encoders, without torques.
+
+so101: the SO-101's log (needs ../shared/data), identified on four motions, free-running on six
+others, beside the linear joint and the copied command; joints 1 to 5 [mrad]; time with compiling.
+pendulum: the double pendulum's four logs, ends of windows of 0.1 and 0.2 s on two others, beside
+the authors' models with their own friction, cf arctan(100 v), and the same torques.
+coverage: a simulated servo arm of six axes on MuJoCo, 50 Hz, 12 bits; the truth lies in so many of
+the 95 % intervals; with Stribeck friction that the model leaves out, in how many draws it warns.
+gains: the same arm with servos of 1 and 1.6 times the gain.
+quadruped: twelve hung joints on MuJoCo, 30 s at 200 Hz: time, compiled before.
+band: one hundred posterior models on MuJoCo; fraction of a held-out motion within their band.
+
+    python benchmarks/rollout.py so101 pendulum coverage gains quadruped band
+    python benchmarks/rollout.py --quick
+"""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+
+import jaxid as jid
+from jaxid.dynamics.terms import Tanh
+
+jax.config.update("jax_enable_x64", True)
+DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+SEEN = ("multisine", "chirp_sweep", "friction_gravity", "step_response")
+UNSEEN = (
+    "actuator_bandwidth",
+    "center_workspace",
+    "circular_motion",
+    "coupled_joints",
+    "frequency_sweep",
+    "backlash_detection",
+)
+COMMANDS = jid.Columns(time="time", angles="position{}", forces="command{}")
+STEP, ENCODER = 0.001, 2 * np.pi / 4096
+
+
+def so101_file() -> str:
+    found = Path(sys.prefix).glob(
+        "lib/python*/site-packages/cmeel.prefix/share/example-robot-data/robots/"
+        "so_arm_description/urdf/so101.urdf"
+    )
+    return str(next(found))
+
+
+def so101_logs(names) -> list[jid.Recording]:
+    return [jid.read_recording(DATA / "so101" / f"{name}.csv", COMMANDS) for name in names]
+
+
+def so101(quick: bool) -> None:
+    path = so101_file()
+    model = jid.Model(jid.load_urdf(path), (jid.RigidBodies(),))
+    bodies = jid.rollout.Bodies(model, jid.urdf_parameters(path))
+    start = time.time()
+    fit = jid.identify_rollout(so101_logs(SEEN), bodies)
+    elapsed = time.time() - start
+    print(fit)
+    errors = fit.validate(so101_logs(UNSEEN))
+    for kind in ("simulated", "linear", "command"):
+        print(f"{kind:10s}", (1e3 * errors.total(kind)[:5]).round(1), "mrad, joints 1 to 5")
+    print(f"identified in {elapsed:.0f} s; contacts on the six: {len(errors.contacts)}")
+    held = np.full((700, 6), 0.3)
+    held[:100] *= np.linspace(0.0, 1.0, 100)[:, None]
+    (path,) = fit.simulate(jid.Recording.of(0 * held, held, sample_time=0.02))
+    print(f"drift while the command holds for 12 s: {np.ptp(path[-550:], axis=0).max():.1e} rad")
+
+
+def authors(number: str) -> dict[str, float]:
+    lines = (DATA / "double_pendulum" / f"model_{number}.yml").read_text().splitlines()
+    return {k: float(v) for k, v in (line.split(": ") for line in lines if ": " in line)}
+
+
+def authors_errors(y: dict[str, float], logs, horizon: float) -> np.ndarray:
+    """Simulate windows by an authors' model; links hang at zero, and relative angles count."""
+    errors = []
+    for o in logs:
+        dt, steps = o.sample_time, round(horizon / o.sample_time)
+        edge = o.filter.edge(dt) + round(0.05 / dt)
+        starts = np.arange(edge, len(o.motion.q) - edge - steps, round(0.04 / dt))
+        x = np.concatenate([o.motion.q[starts], o.motion.qd[starts]], axis=1).T
+        for k in range(steps):
+            u = [np.asarray(o.forces)[starts + k + i].T for i in (0, 1)]
+            mid = 0.5 * (u[0] + u[1])
+            k1 = authors_rate(y, x, u[0])
+            k2 = authors_rate(y, x + 0.5 * dt * k1, mid)
+            k3 = authors_rate(y, x + 0.5 * dt * k2, mid)
+            x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + authors_rate(y, x + dt * k3, u[1]))
+        errors.append(x[:2].T - o.motion.q[starts + steps])
+    return np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
+
+
+def authors_rate(y: dict[str, float], x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    q1, q2, v1, v2 = x
+    c, s, C = np.cos(q2), np.sin(q2), y["m2"] * y["r2"] * y["l1"]
+    rotor = y["Ir"]
+    m11 = y["I1"] + y["I2"] + y["m2"] * y["l1"] ** 2 + 2 * C * c + rotor * (1 + y["gr"] ** 2)
+    m12, m22 = y["I2"] + C * c - y["gr"] * rotor, y["I2"] + y["gr"] ** 2 * rotor
+    weight2 = y["g"] * y["m2"] * y["r2"] * np.sin(q1 + q2)
+    weight1 = y["g"] * (y["m1"] * y["r1"] + y["m2"] * y["l1"]) * np.sin(q1) + weight2
+    f1, f2 = (y[f"b{k}"] * v + y[f"cf{k}"] * np.arctan(100 * v) for k, v in ((1, v1), (2, v2)))
+    r1 = u[0] - weight1 + C * s * (2 * v1 * v2 + v2**2) - f1
+    r2 = u[1] - weight2 - C * s * v1**2 - f2
+    det = m11 * m22 - m12**2
+    return np.stack([v1, v2, (m22 * r1 - m12 * r2) / det, (m11 * r2 - m12 * r1) / det])
+
+
+def pendulum(quick: bool) -> None:
+    folder = DATA / "double_pendulum"
+    robot = jid.load_urdf(folder / "pendubot_model_1.0.urdf")
+    friction = jid.ViscousFriction(), jid.CoulombFriction(Tanh(0.1))
+    base = jid.base_parameters(jid.Model(robot, (jid.RigidBodies(), jid.RotorInertia(), *friction)))
+    smooth = jid.ZeroPhaseButterworth(12.0)
+    for kind in ("con",) if quick else ("con", "meas"):
+        columns = jid.Columns(time="time", angles="pos_meas{}", forces=f"tau_{kind}{{}}")
+
+        def read(*names, columns=columns):
+            logs = [jid.read_recording(folder / f"{name}.csv", columns) for name in names]
+            return [jid.observe(log, robot, smooth) for log in logs]
+
+        seen, unseen = read("143339", "143524", "143601", "143704"), read("143747", "144003")
+        start = time.time()
+        plain = jid.rollout.identify_torque_rollout(base, seen)
+        rich = jid.rollout.identify_torque_rollout(base, seen, gains=True, load_friction=True)
+        print(f"tau_{kind}: {time.time() - start:.0f} s for both; q1 q2 at 0.1 s, at 0.2 s [rad]")
+        horizons = (0.1, 0.2)
+        rows = {f"authors {n}": [authors_errors(authors(n), unseen, h) for h in horizons]
+                for n in ("1.0", "1.1", "2.0", "3.0")}  # fmt: skip
+        rows["torque fit"] = [plain.errors_at(unseen, h, plain.start) for h in horizons]
+        rows["rollout"] = [plain.errors_at(unseen, h) for h in horizons]
+        rows["rollout, gains, load friction"] = [rich.errors_at(unseen, h) for h in horizons]
+        for name, values in rows.items():
+            print(f"  {name:30s}", np.concatenate(values).round(4))
+
+
+def arm_text(gain: float, stribeck: bool, axes: int = 6) -> str:
+    """Return an arm whose links are in a row, axes by turns upright and level, as MJCF."""
+    text, end = "", ""
+    for j in range(axes):
+        axis = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")[j % 6]
+        loss = 0.0 if stribeck else 0.1 + 0.02 * j
+        text += (
+            f'<body name="b{j}" pos="{0.12 * (j > 0)} 0 0"><inertial pos="0.06 0 0" mass="0.15" '
+            f'diaginertia="2e-4 2e-4 2e-4"/><joint name="j{j}" axis="{axis}" '
+            f'armature="{0.04 + 0.004 * j}" damping="{0.6 + 0.05 * j}" frictionloss="{loss}" '
+            'solreffriction="0.004 1" solimpfriction="0.99 0.9999 0.001"/>'
+        )
+        end += "</body>"
+    servos = "".join(
+        f'<position name="j{j}" joint="j{j}" kp="{gain * (12 - j)}"/>' for j in range(axes)
+    )
+    return (
+        f'<mujoco><compiler angle="radian"/><option timestep="{STEP}" integrator="implicitfast"/>'
+        f"<worldbody>{text}{end}</worldbody><actuator>{servos}</actuator></mujoco>"
+    )
+
+
+def commanded(seed: int, axes: int, duration: float, rate: float) -> np.ndarray:
+    random, t = np.random.default_rng(seed), np.arange(round(duration * rate)) / rate
+    q = np.zeros((len(t), axes))
+    for f in (0.11, 0.29, 0.63, 1.1, 1.9):
+        q += 0.25 / (1 + 2 * f) * np.sin(2 * np.pi * (f * t[:, None] + random.uniform(size=axes)))
+    return np.clip(t, 0.0, 1.0)[:, None] * q
+
+
+def drive(model, sent: np.ndarray, rate: float, stribeck: bool = False, late: float = 0.01):
+    """Return the encoders' positions; with Stribeck friction of a narrow smooth sign."""
+    data, every = mujoco.MjData(model), round(1 / rate / STEP)
+    measured, delay = np.zeros_like(sent), round(late / STEP)
+    for k in range(every * len(sent)):
+        if k % every == 0:
+            measured[k // every] = data.qpos
+        data.ctrl[:] = sent[max(0, (k - delay) // every)]
+        if stribeck:
+            v = data.qvel
+            data.qfrc_applied[:] = -np.tanh(v / 0.005) * (0.1 + 0.15 * np.exp(-((v / 0.1) ** 2)))
+        mujoco.mj_step(model, data)
+    return ENCODER * np.round(measured / ENCODER)
+
+
+def arm_bodies(text: str) -> jid.rollout.Bodies:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "arm.xml"
+        path.write_text(text)
+        model = jid.Model(jid.load_mjcf(path), (jid.RigidBodies(),))
+        return jid.rollout.Bodies(model, jid.urdf_parameters(path), coupled=True)
+
+
+def arm_logs(seed: int, gain: float = 1.0, stribeck: bool = False, duration: float = 20.0):
+    model = mujoco.MjModel.from_xml_string(arm_text(gain, stribeck))
+    sent = [commanded(10 * seed + k, 6, duration, 50.0) for k in range(3)]
+    return [
+        jid.Recording.of(drive(model, x, 50.0, stribeck), x, sample_time=0.02, name=f"log {k}")
+        for k, x in enumerate(sent)
+    ]
+
+
+def truth(gain: float) -> np.ndarray:
+    j = np.arange(6)
+    K = gain * (12.0 - j)
+    symbols = [p.symbol for p in jid.rollout.PARAMETERS]
+    x = np.zeros((6, len(symbols)))
+    values = {"J": (0.04 + 0.004 * j) / K, "B": (0.6 + 0.05 * j) / K, "a": 1 / K}
+    values |= {"F": (0.1 + 0.02 * j) / K, "d": np.full(6, 0.01 - STEP / 2)}
+    for symbol, value in values.items():
+        x[:, symbols.index(symbol)] = value
+    return x
+
+
+def inside(fit, x: np.ndarray) -> list[bool]:
+    ends = [(c.interval(), float(c.coefficients @ x[c.joint])) for c in fit.combinations]
+    return [low <= value <= high for (low, high), value in ends]
+
+
+def coverage(quick: bool) -> None:
+    bodies, draws = arm_bodies(arm_text(1.0, False)), 2 if quick else 25
+    for stribeck in (False, True):
+        hits, warned, start = [], 0, time.time()
+        for seed in range(draws):
+            logs = arm_logs(seed, stribeck=stribeck)
+            fit = jid.identify_rollout(logs, bodies, friction=False, saturation=False)
+            hits += inside(fit, truth(1.0))
+            warned += bool(fit.notes)
+        print(
+            f"{draws} draws, {'with' if stribeck else 'without'} unmodelled Stribeck friction: "
+            f"{100 * np.mean(hits):.1f} % of {len(hits)} intervals hold, {warned} warn "
+            f"({time.time() - start:.0f} s)",
+            flush=True,
+        )
+
+
+def gains(quick: bool) -> None:
+    """Compare armature, damping, friction, delay of two gains, whose ratio is known."""
+    agree, bodies = [], arm_bodies(arm_text(1.0, False))
+    for seed in range(1 if quick else 8):
+        one, other = (
+            jid.identify_rollout(arm_logs(seed, g), bodies, friction=False, saturation=False)
+            for g in (1.0, 1.6)
+        )
+        second = {(c.joint, c.name): c for c in other.combinations}
+        for c in one.combinations:
+            if (d := second.get((c.joint, c.name))) is None:
+                continue
+            ratio = 1.0 if c.name == "d" else 1.6
+            spread = np.hypot(c.deviation, ratio * d.deviation)
+            agree.append(abs(c.value - ratio * d.value) < 2.0 * spread)
+    print(f"two gains: {100 * np.mean(agree):.1f} % of {len(agree)} parameters agree")
+
+
+def quadruped(quick: bool) -> None:
+    leg = (
+        '<body name="h{k}" pos="0 {k} 0"><inertial pos="0 0 0" mass="0.7" diaginertia="2e-3 2e-3 '
+        '2e-3"/><joint name="h{k}" axis="1 0 0" {j}/><body name="t{k}" pos="0 0.08 0"><inertial '
+        'pos="0 0 -0.1" mass="1" diaginertia="5e-3 5e-3 1e-3"/><joint name="t{k}" axis="0 1 0" '
+        '{j}/><body name="s{k}" pos="0 0 -0.2"><inertial pos="0 0 -0.1" mass="0.2" diaginertia='
+        '"2e-3 2e-3 1e-4"/><joint name="s{k}" axis="0 1 0" {j}/></body></body></body>'
+    )
+    joint = 'armature="0.01" damping="1" frictionloss="0.3" solreffriction="0.004 1"'
+    legs = "".join(leg.format(k=k, j=joint) for k in range(4))
+    names = [f"{part}{k}" for k in range(4) for part in "hts"]
+    servos = "".join(f'<position joint="{name}" kp="30"/>' for name in names)
+    text = (
+        f'<mujoco><compiler angle="radian"/><option timestep="{STEP}" integrator="implicitfast"/>'
+        f"<worldbody>{legs}</worldbody><actuator>{servos}</actuator></mujoco>"
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    sent = commanded(0, 12, 30.0, 200.0)
+    log = jid.Recording.of(drive(model, sent, 200.0), sent, sample_time=0.005)
+    for word in ("first", "again"):
+        start = time.time()
+        fit = jid.identify_rollout(log, arm_bodies(text))
+        print(f"12 joints, 30 s at 200 Hz, {word}: {time.time() - start:.0f} s")
+    print(f"errors {1e3 * fit.validate(log).total().max():.2f} mrad at most")
+
+
+def band(quick: bool) -> None:
+    text, count = arm_text(1.0, False), 10 if quick else 100
+    bodies = arm_bodies(text)
+    fit = jid.identify_rollout(arm_logs(0), bodies, friction=False, saturation=False)
+    sent = commanded(999, 6, 10.0, 50.0)
+    measured = drive(mujoco.MjModel.from_xml_string(text), sent, 50.0)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = jid.export_servo_mjcf(fit, Path(folder) / "arm.xml", samples=count, timestep=STEP)
+        models = [mujoco.MjModel.from_xml_path(str(p)) for p in paths[1:]]
+    random = np.random.default_rng(0)
+    paths = []
+    for model in models:
+        late = float(np.mean(model.numeric("delay").data))
+        noise = random.uniform(-0.5, 0.5, sent.shape) * ENCODER
+        paths.append(drive(model, sent, 50.0, late=late + STEP / 2) + noise)
+    low, high = np.quantile(paths, [0.05, 0.95], axis=0)
+    held = (low - ENCODER / 2 <= measured) & (measured <= high + ENCODER / 2)
+    print(f"band of {count} models holds {100 * held[25:].mean():.0f} % of a motion (90 wanted)")
+
+
+BENCHMARKS = (so101, pendulum, coverage, gains, quadruped, band)
+
+if __name__ == "__main__":
+    words = [word for word in sys.argv[1:] if not word.startswith("--")]
+    for benchmark in BENCHMARKS:
+        if not words or benchmark.__name__ in words:
+            benchmark("--quick" in sys.argv)

@@ -1,0 +1,201 @@
+"""Report of an identification without torques: measured and simulated motion, and its numbers."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxid.arrays import Float
+from jaxid.export.servo import export_servo_mjcf, servo_stiffness, simulator_table, simulator_values
+from jaxid.io import atomic_folder
+from jaxid.result_table import Column, Remark, Status, Table, significant
+from jaxid.rollout import PARAMETERS, RolloutErrors, ServoFit
+
+from .page import Section, provenance, render_page
+from .result_files import header, plain, write_csv, write_json
+from .style import (
+    BLUE,
+    GREY,
+    MEASURED,
+    PREDICTED,
+    WIDTH,
+    add_legend,
+    caption,
+    drawing,
+    label_time,
+    write_figures,
+)
+from .torques import decimate
+
+SHOWN = 6
+"""Motions whose figures the page shows."""
+
+
+class RolloutReport(NamedTuple):
+    """Content of the report.
+
+    Attributes:
+        fit: Identified servos.
+        errors: Errors of free-running simulations.
+        windows: Errors of windows of one second that start from measured states [rad or m].
+        unseen: Whether these logs were not used for the fit.
+        stiffness: Stiffness of the servos, if the file gives it [N m/rad or N/m].
+        samples: Number of MJCF files to draw.
+        settings: Facts, command and text of the experiment file.
+    """
+
+    fit: ServoFit
+    errors: RolloutErrors
+    windows: Float[np.ndarray, " joints"]
+    unseen: bool
+    stiffness: Any
+    samples: int
+    settings: Mapping[str, Any]
+
+    @property
+    def has_stiffness(self) -> bool:
+        """Whether simulators can be given absolute numbers."""
+        return self.stiffness is not None or bool(np.isfinite(self.fit.stiffness).any())
+
+    def tables(self) -> list[Table]:
+        """Return errors beside the baselines, errors of each motion, numbers for simulators."""
+        found = [comparison_table(self), self.errors.summary()]
+        return [*found, simulator_table(self.fit, self.stiffness)] if self.has_stiffness else found
+
+
+def comparison_table(report: RolloutReport) -> Table:
+    """Return the errors of the simulation beside those of the baselines."""
+    errors, kinds = report.errors, ("simulated", "linear", "command")
+    free = [1e3 * errors.total(kind) for kind in kinds]
+    worse = free[0] > 0.9 * np.minimum(free[1], free[2])
+    where = "logs that the fit has not seen" if report.unseen else "the logs of the fit"
+    return Table(
+        f"errors of {where} [mrad or mm]",
+        Column("joint", errors.joint_names),
+        Column("simulation,\nfree-running", free[0]),
+        Column("simulation,\nwindows of 1 s", 1e3 * report.windows),
+        Column("linear joint\nwith delay", free[1]),
+        Column("copied\ncommand", free[2]),
+        status=[Status.DOUBTFUL if x else Status.GOOD for x in worse],
+    )
+
+
+def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
+    """Draw measured and simulated positions of all joints in one motion, and the errors."""
+    joints, time = len(errors.joint_names), errors.time[motion]
+    title = f"{errors.motions[motion]}: measured and simulated, free-running"
+    with drawing(title, WIDTH, 1.5 * joints + 0.5) as figure:
+        panels = figure.subplots(joints, 2, sharex=True, squeeze=False)
+        for j, (left, right) in enumerate(panels):
+            measured, simulated = errors.measured[motion][j], errors.simulated[motion][j]
+            lines = ((errors.command[motion][j], GREY, 0.5), (measured, MEASURED, 1.9))
+            for values, colour, width in (*lines, (simulated, PREDICTED, 0.8)):
+                left.plot(*decimate(time, values, bins=700), color=colour, lw=width)
+            right.plot(*decimate(time, 1e3 * (simulated - measured), bins=700), color=BLUE, lw=0.6)
+            rms = 1e3 * float(errors.rms()[motion, j])
+            caption(left, errors.joint_names[j])
+            caption(right, "error [mrad or mm]", f"RMS {significant(rms)}")
+        label_time(panels[-1], time)
+        add_legend(
+            figure,
+            ("commanded", {"color": GREY, "lw": 1.0}),
+            ("measured", {"color": MEASURED, "lw": 1.9}),
+            ("simulated", {"color": PREDICTED, "lw": 1.2}),
+        )
+    return figure
+
+
+def rollout_page(report: RolloutReport, figures: Mapping[str, Figure]) -> str:
+    """Return the page of an identification without torques as HTML."""
+    fit, errors = report.fit, report.errors
+    total, linear = errors.total(), errors.total("linear")
+    better = bool((total < linear).all())
+    text = "moves like the robot more closely than a linear joint" if better else "does not beat"
+    verdict = Remark(
+        f"The simulation {text}: {', '.join(significant(1e3 * x) for x in total)} mrad or mm "
+        f"against {', '.join(significant(1e3 * x) for x in linear)}",
+        Status.GOOD if better else Status.DOUBTFUL,
+    )
+    parameters = fit.summary()
+    simulators: list[Any] = ["No weight tells a stiffness: name it by `rollout.stiffness`."]
+    if report.has_stiffness:
+        simulators = [simulator_table(fit, report.stiffness)]
+    sections: list[Section] = [
+        ("Verdict", [verdict, parameters.remarks]),
+        ("Errors", [comparison_table(report), errors.summary()]),
+        ("Measured and simulated motion", [*figures.values()]),
+        (
+            "What the logs determine",
+            [
+                "Positions tell torques only in units of the servo's stiffness. Parameters that "
+                "the logs tell only together are merged.",
+                Table("", *parameters.columns, facts=parameters.facts, status=parameters.status),
+            ],
+        ),
+        ("For simulators", simulators),
+        provenance(report.settings),
+    ]
+    return render_page("Joints behind position servos", sections)
+
+
+def write_rollout(folder: Path, report: RolloutReport) -> list[Path]:
+    """Write the page, `rollout.json`, `rollout.csv`, figures, and MJCF if bodies are known."""
+    fit, count = report.fit, min(SHOWN, len(report.errors.motions))
+    figures = {f"motion_{k + 1}": motion_figure(report.errors, k) for k in range(count)}
+    rows = [
+        {
+            "joint": fit.joint_names[c.joint],
+            "parameter": c.name,
+            "meaning": c.meaning,
+            "unit": c.unit,
+            "estimate": c.value,
+            "standard_deviation": c.deviation,
+            "low_95": c.interval()[0],
+            "high_95": c.interval()[1],
+        }
+        for c in fit.combinations
+    ]
+    names = ["rollout.html", "rollout.json", "rollout.csv"]
+    with atomic_folder(folder) as staging:
+        names += write_figures(staging, figures)
+        if report.has_stiffness and fit.bodies is not None:
+            options = {"stiffness": report.stiffness, "samples": report.samples}
+            made = export_servo_mjcf(fit, staging / "robot.xml", **options)
+            names += [p.name for p in made]
+        write_json(staging / "rollout.json", {**_record(report, rows), "files": names})
+        write_csv(staging / "rollout.csv", rows)
+        page = rollout_page(report, figures)
+        (staging / "rollout.html").write_text(page, encoding="utf-8")
+    return [folder / name for name in names]
+
+
+def _record(report: RolloutReport, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the content of `rollout.json`."""
+    fit, errors = report.fit, report.errors
+    simulators = None
+    if report.has_stiffness:
+        values = simulator_values(fit, servo_stiffness(fit, report.stiffness))
+        limits = values.pop("effort_limit")
+        simulators = {**values, "effort_limit": np.where(np.isfinite(limits), limits, -1.0)}
+    return plain(
+        {
+            **header("rollout.json"),
+            "joints": fit.joint_names,
+            "combinations": rows,
+            "symbols": [x.symbol for x in PARAMETERS],
+            "parameters": fit.parameters,
+            "covariance": fit.covariance,
+            "hold": fit.hold,
+            "errors": {
+                "motions": errors.motions,
+                "unseen": report.unseen,
+                **{kind: errors.rms(kind) for kind in ("simulated", "linear", "command")},
+                "windows": report.windows,
+            },
+            "contacts": [c._asdict() for c in (*fit.contacts, *errors.contacts)],
+            "simulators": simulators,
+            "notes": fit.notes,
+        }
+    )

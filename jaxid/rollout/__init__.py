@@ -1,0 +1,11 @@
+"""Identification from rollouts: a simulation that moves like the robot, without torques."""
+
+from .contact import Contact as Contact
+from .errors import RolloutErrors as RolloutErrors
+from .identify import identify_rollout as identify_rollout
+from .result import Combination as Combination, ServoFit as ServoFit
+from .servo import PARAMETERS as PARAMETERS, Bodies as Bodies
+from .torque import (
+    TorqueRolloutFit as TorqueRolloutFit,
+    identify_torque_rollout as identify_torque_rollout,
+)

@@ -1,0 +1,66 @@
+"""Errors of free-running simulations, beside those of simple baselines."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxid.arrays import Float
+from jaxid.result_table import Column, Remark, Status, Table
+
+from .contact import Contact
+
+
+@dataclasses.dataclass(frozen=True)
+class RolloutErrors:
+    """Errors of free-running simulations, beside those of simple baselines [rad or m].
+
+    Attributes:
+        joint_names: Names of the joints.
+        motions: Name of the log of each motion.
+        time: Instants of the samples of each motion [s].
+        measured: Measured positions of each motion [joints, samples].
+        simulated: Simulated positions.
+        command: Commanded positions.
+        linear: Simulation by the linear baseline.
+        counted: Whether a sample counts: behind the first half second, and without contact.
+        contacts: Stretches in which something outside the model holds the robot.
+    """
+
+    joint_names: tuple[str, ...]
+    motions: tuple[str, ...]
+    time: tuple[np.ndarray, ...]
+    measured: tuple[np.ndarray, ...]
+    simulated: tuple[np.ndarray, ...]
+    command: tuple[np.ndarray, ...]
+    linear: tuple[np.ndarray, ...]
+    counted: tuple[np.ndarray, ...]
+    contacts: tuple[Contact, ...]
+
+    def rms(self, kind: str = "simulated") -> Float[np.ndarray, "motions joints"]:
+        """Return root mean square errors of `simulated`, `command` or `linear`."""
+        rows = zip(getattr(self, kind), self.measured, self.counted, strict=True)
+        return np.array([np.sqrt(np.mean((y - q) ** 2, axis=1, where=k)) for y, q, k in rows])
+
+    def total(self, kind: str = "simulated") -> Float[np.ndarray, " joints"]:
+        """Return root mean square errors over all motions together."""
+        sizes = np.array([k.sum(axis=1) for k in self.counted])
+        squares = np.where(sizes > 0, sizes * self.rms(kind) ** 2, 0.0)
+        return np.sqrt(squares.sum(axis=0) / sizes.sum(axis=0))
+
+    def summary(self) -> Table:
+        """Return a table of the errors of all motions."""
+        rms = 1e3 * self.rms()
+        columns = [Column(name, rms[:, j]) for j, name in enumerate(self.joint_names)]
+        remarks = [
+            Remark(
+                f"{c.name}: {self.joint_names[c.joint]} is held by something from {c.start:.1f} s "
+                f"to {c.stop:.1f} s (error {1e3 * c.error:.0f} mrad): contact? It does not count",
+                Status.DOUBTFUL,
+            )
+            for c in self.contacts
+        ]
+        title = "errors of free-running simulations [mrad or mm]"
+        return Table(title, Column("motion", self.motions), *columns, remarks=remarks)
+
+    def __str__(self) -> str:
+        return self.summary().text()

@@ -1,0 +1,323 @@
+"""Identification of joints behind position servos, from commands and positions alone.
+
+Each choice (gravity, friction by load, Stribeck friction, saturation, commands held or
+interpolated) is made by motions that the fit has not seen: leave one out among those given.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxid.arrays import Bool, Float
+from jaxid.errors import InputError
+from jaxid.measurement.recording import Recording
+
+from .contact import contact_rows
+from .least_squares import Solution, bounded_step, minimise
+from .result import ServoFit
+from .servo import INDEX, LOWER, START, UPPER, Bodies, ServoMotion, ServoSimulator
+
+BASIC = ("J", "B", "d", "F", "b")
+"""Parameters of every joint, before the choice."""
+LINEAR = ("J", "B", "d", "b", "g")
+"""Parameters of the baseline: a linear joint of second order with delay."""
+EFFECTS = (
+    ((), ("a",), ("b",), ("a", "b")),
+    ((), ("mu",), ("Fs", "vs"), ("mu", "Fs", "vs")),
+    ((), ("um",)),
+)
+"""Groups of effects, from which one each is chosen: bias or load; friction; saturation."""
+GAIN = 0.04
+"""Fall of the logarithm of the held-out mean square for which a larger model is chosen."""
+FOLDS = 4
+"""Smallest number of parts for the choice: fewer logs are divided."""
+RESOLUTION = 1e-4
+"""Errors below which no motion counts more [rad or m]."""
+SHORTEST = 5.0
+"""Shortest part into which a log is divided [s]."""
+LIGHT = 0.02
+"""Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
+_STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
+"""Inertia, damping and delay from which searches may start."""
+
+
+def identify_rollout(
+    logs: Sequence[Recording] | Recording,
+    bodies: Bodies | None = None,
+    *,
+    joint_names: Sequence[str] | None = None,
+    time_step: float = 0.01,
+    saturation: bool = True,
+    friction: bool = True,
+) -> ServoFit:
+    """Identify position-controlled joints so that a simulation moves like the robot.
+
+    No torque is needed. The logs are recordings whose `forces` are the commanded positions:
+    `jid.Recording.of(positions, commands, sample_time=…)`, or
+    `jid.Columns(angles="position{}", forces="command{}")`.
+
+    Positions tell torques in units of the servo's stiffness: the parameters are ratios to it. With
+    bodies of known weight the stiffness itself follows where gravity acts on the joint.
+
+    Args:
+        logs: One or several recordings of the same robot and controller.
+        bodies: Model and parameters of the robot's bodies, often from its URDF file: their weight
+            loads the joints, and their inertial torques if that lowers the held-out errors (or
+            `coupled` says so). Without them a joint has a constant bias.
+        joint_names: Names of the joints; those of the model, or numbers, if None.
+        time_step: Longest step of the simulation [s].
+        saturation: Whether a largest torque of the servo is tried.
+        friction: Whether friction that grows with load or falls with speed is tried.
+
+    Raises:
+        InputError: If logs differ in their joints, are too short, or do not move.
+    """
+    logs = [logs] if isinstance(logs, Recording) else list(logs)
+    motion = ServoMotion.of(_divided(logs))
+    _require_motion(motion)
+    names = _joint_names(motion, bodies, joint_names)
+    simulator = ServoSimulator(motion if bodies is None else bodies.loads(motion), time_step)
+    search = _Search(simulator)
+    search.start()
+    groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
+    if bodies is None:
+        groups[0] = (("b",),)
+    if not friction:
+        groups[1] = ((),)
+    if not saturation:
+        groups[2] = ((),)
+    for k, group in enumerate(groups):
+        search.choose(group)
+        if k == 0:
+            search.remove_contact()
+    search.choose_hold()
+    if bodies is not None and not bodies.coupled:
+        bodies = search.choose_coupling(bodies)
+        if bodies.coupled:
+            # Inertial torques tell the stiffness of joints on which no weight acts.
+            search.choose(((), ("a",)))
+    solution = search.final()
+    found = search.simulator, search.weights, solution, search.free, search.linear
+    return ServoFit.of(*found, names, bodies)
+
+
+def _divided(logs: Sequence[Recording]) -> list[Recording]:
+    """Return logs, the long ones divided so that there are enough parts for the choice."""
+    found = []
+    for log in logs:
+        parts = max(1, min(-(-FOLDS // len(logs)), int(log.duration // SHORTEST)))
+        ends = np.linspace(float(log.time[0]), float(log.time[-1]) + log.sample_time, parts + 1)
+        found += [log.crop(float(a), float(b)) for a, b in itertools.pairwise(ends)]
+    return found
+
+
+def _require_motion(motion: ServoMotion) -> None:
+    for channel in ("positions", "commands"):
+        still = np.ptp(getattr(motion, channel), axis=-1).max(axis=0) < 10 * RESOLUTION
+        if still.any():
+            joint = int(np.argmax(still)) + 1
+            raise InputError(
+                f"`logs`: the {channel} of joint {joint} never change: nothing can be identified. "
+                "Leave the joint out, or give logs in which it moves."
+            )
+
+
+def _joint_names(
+    motion: ServoMotion, bodies: Bodies | None, names: Sequence[str] | None
+) -> tuple[str, ...]:
+    count = motion.positions.shape[1]
+    if bodies is not None:
+        names = names or bodies.model.robot.joint_names
+    names = tuple(names or (f"joint {k + 1}" for k in range(count)))
+    if len(names) != count:
+        raise InputError(
+            f"`logs` have {count} joints, but the robot has {len(names)}: choose the columns of "
+            "its joints, or the `tip` of the robot."
+        )
+    return names
+
+
+def mask(symbols: Sequence[str]) -> Bool[np.ndarray, " parameters"]:
+    """Return which parameters are among these."""
+    return np.isin(list(INDEX), list(symbols))
+
+
+class _Search:
+    """Fits of all joints, candidate models and folds, in batches.
+
+    Attributes:
+        simulator: Motions and steps.
+        weights: Weight of each motion's squared errors [motions, joints].
+        x: Parameters so far [joints, parameters].
+        free: Parameters that are estimated.
+        linear: Parameters of the linear baseline.
+    """
+
+    def __init__(self, simulator: ServoSimulator):
+        self.simulator = simulator
+        counted = np.asarray(simulator.motion.counted).sum(axis=-1)
+        self.weights = 1.0 / np.maximum(counted, 1.0)
+        joints = counted.shape[1]
+        self.x = np.tile(START, (joints, 1))
+        self.free = np.tile(mask(BASIC), (joints, 1))
+        self.linear = self.x.copy()
+
+    def solve(self, x: np.ndarray, free: np.ndarray, iterations: int = 5) -> Solution:
+        """Fit candidates [candidates, joints, parameters] to all motions."""
+        w = self.weights[:, None, :]
+
+        def moments(x):
+            cost, g, H = self.simulator.moments(x)
+            totals = ((w[(...,) + (None,) * k] * y).sum(axis=0) for k, y in enumerate((cost, g, H)))
+            return tuple(totals)
+
+        def costs(x):
+            return (w * self.simulator.costs(x)).sum(axis=0)
+
+        return minimise(moments, costs, x, free, (LOWER, UPPER), iterations)
+
+    def held_out(self, found: Solution, free: np.ndarray) -> Float[np.ndarray, "candidates joints"]:
+        """Return mean logarithms of the mean square errors of motions left out, one at a time.
+
+        Without a motion the fit moves by a Gauss-Newton step; its error is simulated.
+        """
+        w = self.weights[:, None, :]
+        _, g, H = self.simulator.moments(found.x)
+        left = found.gradient - w[..., None] * g, found.information - w[..., None, None] * H
+        x = np.broadcast_to(found.x, g.shape)
+        step = bounded_step(*left, x, np.broadcast_to(free, x.shape), (LOWER, UPPER), 1e-3)
+        errors = self.simulator.costs(np.clip(x + step, LOWER, UPPER), each=True)
+        counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
+        mean = errors / np.maximum(counted, 1.0)[:, None]
+        share = (counted > 0)[:, None] + 0.0
+        return (share * np.log(mean + RESOLUTION**2)).sum(axis=0) / share.sum(axis=0)
+
+    def start(self) -> None:
+        """Fit the basic model from the best of many starts, and the linear baseline."""
+        grid = np.tile(self.x, (len(_STARTS), 1, 1))
+        grid[..., [INDEX[k] for k in ("J", "B", "d")]] = np.array(_STARTS)[:, None]
+        costs = (self.weights[:, None] * self.simulator.costs(grid)).sum(axis=0)
+        best = np.argsort(costs, axis=0)[:3]
+        x = np.concatenate([np.take_along_axis(grid, best[..., None], axis=0), self.linear[None]])
+        x[3] = x[0]
+        x[3, :, INDEX["F"]] = 0.0
+        free = np.stack([self.free] * 3 + [np.tile(mask(LINEAR), (len(self.x), 1))])
+        found = self.solve(x, free, iterations=8)
+        self.linear = found.x[3]
+        self._take(found.x[:3], np.argmin(found.cost[:3], axis=0))
+        self._weigh(self.x)
+
+    def _take(self, x: np.ndarray, chosen: np.ndarray) -> None:
+        self.x = np.take_along_axis(x, chosen[None, :, None], axis=0)[0]
+
+    def _weigh(self, x: np.ndarray) -> None:
+        """Weigh motions by their own errors, so that the worst one does not decide alone."""
+        counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
+        mean = self.simulator.costs(x[None])[:, 0] / np.maximum(counted, 1.0)
+        self.weights = np.where(counted > 0, 1.0 / (mean + RESOLUTION**2), 0.0) / np.maximum(
+            counted, 1
+        )
+
+    def remove_contact(self) -> None:
+        """Leave out the samples in which a joint is held by something that is not in the model."""
+        motion = self.simulator.motion
+        errors = self.simulator.paths(self.x[None])[:, 0] - np.asarray(motion.positions)
+        touched = contact_rows(motion, errors)
+        if touched.any():
+            counted = np.asarray(motion.counted) * ~touched
+            self.simulator = dataclasses.replace(
+                self.simulator, motion=motion.replace(counted=counted)
+            )
+            self._weigh(self.x)
+
+    def choose(self, group: Sequence[tuple[str, ...]]) -> None:
+        """Take the effects of a group that lower the held-out errors, joint by joint."""
+        if len(group) == 1:
+            return
+        every = {symbol for effects in group for symbol in effects}
+        # Always four candidates: one compilation.
+        filled = [*group, *[group[-1]] * (4 - len(group))]
+        x, free = np.stack([self.x] * 4), np.stack([self.free] * 4)
+        for k, effects in enumerate(filled):
+            free[k, :, mask(tuple(every))] = False
+            free[k, :, mask(effects)] = True
+            for symbol in every - set(effects):
+                x[k, :, INDEX[symbol]] = START[INDEX[symbol]]
+            for symbol in effects:
+                x[k, :, INDEX[symbol]] = self._first_value(symbol)
+        # Friction per load needs a load.
+        free[..., INDEX["a"]] &= self._loaded
+        free[..., INDEX["mu"]] &= free[..., INDEX["a"]]
+        x[..., INDEX["a"]] *= self._loaded
+        found = self.solve(x, free)
+        scores = self.held_out(found, free)
+        chosen = np.zeros(len(self.x), int)
+        for k in range(1, len(group)):
+            current = np.take_along_axis(scores, chosen[None], axis=0)[0]
+            # Effects that have been found stay: a known weight is not replaced by a bias.
+            larger = np.array([set(group[c]) <= set(group[k]) for c in chosen])
+            chosen = np.where(larger & (scores[k] < current - GAIN), k, chosen)
+        self._take(found.x, chosen)
+        self.free = np.take_along_axis(free, chosen[None, :, None], axis=0)[0]
+        self._weigh(self.x)
+
+    @property
+    def _loaded(self) -> Bool[np.ndarray, " joints"]:
+        """Joints on which the bodies have a weight worth mentioning."""
+        load = np.abs(self.simulator.motion.load).max(axis=(0, 2))
+        return load > LIGHT * load.max(initial=0.0)
+
+    def _first_value(self, symbol: str) -> float | np.ndarray:
+        """Return a start at which an effect is active: otherwise it would have no gradient."""
+        motion = self.simulator.motion
+        lag = np.abs(np.asarray(motion.commands) - motion.positions).max(axis=(0, 2))
+        load = np.abs(motion.load).max(axis=(0, 2))
+        own = self.x[:, INDEX["F"]]
+        values = {
+            "a": 0.02 / np.maximum(load, 1e-6),
+            "b": self.x[:, INDEX["b"]],
+            "mu": 0.2,
+            "Fs": 0.3 * own + 1e-3,
+            "vs": START[INDEX["vs"]],
+            "um": 0.6 * lag,
+        }
+        return values[symbol]
+
+    def choose_hold(self) -> None:
+        """Decide whether commands are held or interpolated, for all joints alike."""
+        held = self.x.copy()
+        held[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
+        other = dataclasses.replace(self.simulator, hold=True)
+        self._choose_simulator((self.simulator, self.x), (other, held))
+
+    def choose_coupling(self, bodies: Bodies) -> Bodies:
+        """Decide whether inertial torques of the bodies act, beside those of gravity."""
+        coupled = dataclasses.replace(bodies, coupled=True)
+        motion = coupled.loads(self.simulator.motion)
+        x, a = self.x.copy(), self.x[:, INDEX["a"]] * self.free[:, INDEX["a"]]
+        own = a * np.asarray(motion.inertia).mean(axis=(0, 2))
+        x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
+        other = dataclasses.replace(self.simulator, motion=motion)
+        better = self._choose_simulator((self.simulator, self.x), (other, x))
+        return coupled if better else bodies
+
+    def _choose_simulator(self, *pairs: tuple[ServoSimulator, np.ndarray]) -> bool:
+        """Take the simulator and start of lower held-out errors; return whether it is the last."""
+        scores, results = [], []
+        for simulator, start in pairs:
+            self.simulator = simulator
+            found = self.solve(start[None], self.free[None], iterations=3)
+            scores.append(self.held_out(found, self.free[None]).mean())
+            results.append((simulator, found.x[0]))
+        last = bool(scores[1] < scores[0])
+        self.simulator, self.x = results[int(last)]
+        self._weigh(self.x)
+        return last
+
+    def final(self) -> Solution:
+        """Return the fit with the chosen effects."""
+        found = self.solve(self.x[None], self.free[None], iterations=10)
+        self.x = found.x[0]
+        return found

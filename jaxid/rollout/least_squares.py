@@ -1,0 +1,96 @@
+"""Levenberg-Marquardt within bounds, for many independent problems in one batch."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Bool, Float
+
+Moments = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""Function that returns costs, gradients and Gauss-Newton matrices for parameters [..., size]."""
+Costs = Callable[[np.ndarray], np.ndarray]
+"""Function that returns the costs alone."""
+
+
+class Solution(NamedTuple):
+    """Minima of many problems.
+
+    Attributes:
+        x: Parameters.
+        cost: Sums of squares.
+        gradient: Half the gradient of the costs.
+        information: Gauss-Newton matrices.
+    """
+
+    x: Float[np.ndarray, "*batch size"]
+    cost: Float[np.ndarray, "*batch"]
+    gradient: Float[np.ndarray, "*batch size"]
+    information: Float[np.ndarray, "*batch size size"]
+
+
+def minimise(
+    moments: Moments,
+    costs: Costs,
+    x: Float[np.ndarray, "*batch size"],
+    free: Bool[np.ndarray, "*batch size"],
+    bounds: tuple[np.ndarray, np.ndarray],
+    iterations: int = 30,
+    tolerance: float = 1e-4,
+) -> Solution:
+    """Minimise sums of squares over the free parameters, each problem with its own damping.
+
+    A parameter at a bound that its gradient would leave is held there for one step.
+
+    Args:
+        moments: Costs and their derivatives at parameters of all problems.
+        costs: Costs alone.
+        x: Start of each problem.
+        free: Parameters that may change.
+        bounds: Lower and upper limits of the parameters.
+        iterations: Largest number of steps.
+        tolerance: Relative decrease of the cost below which a problem has converged.
+    """
+    x = np.clip(x, *bounds)
+    damping = np.full(x.shape[:-1], 1e-2)
+    cost, g, H = moments(x)
+    for _ in range(iterations):
+        decrease = np.zeros_like(cost)
+        for _ in range(5):
+            step = bounded_step(g, H, x, free, bounds, damping)
+            trial = np.clip(x + step, *bounds)
+            found = costs(trial)
+            better = (found < cost) & (decrease == 0.0)
+            decrease = np.where(better, (cost - found) / np.maximum(cost, 1e-300), decrease)
+            x = np.where(better[..., None], trial, x)
+            factor = np.where(better, 0.2, np.where(decrease > 0.0, 1.0, 8.0))
+            damping = np.clip(damping * factor, 1e-9, 1e6)
+            if (decrease > 0.0).mean() > 0.7:
+                break
+        cost, g, H = moments(x)
+        if (decrease < tolerance).all():
+            break
+    return Solution(x, cost, g, H)
+
+
+def bounded_step(
+    gradient: np.ndarray,
+    information: np.ndarray,
+    x: np.ndarray,
+    free: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    damping: np.ndarray | float,
+) -> np.ndarray:
+    """Return damped Gauss-Newton steps of the free parameters that no bound holds."""
+    low, high = bounds
+    held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
+    moving = (free & ~held).astype(float)
+    size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))
+    moving = moving * (size > 1e-140)
+    scaled = information / size[..., None] / size[..., None, :]
+    scaled = scaled * moving[..., None] * moving[..., None, :]
+    identity = np.eye(x.shape[-1])
+    more = np.asarray(damping)[..., None, None] + 1e-12
+    A = scaled + identity * (more + (1.0 - moving)[..., None])
+    step = np.linalg.solve(A, (-gradient / size * moving)[..., None])[..., 0]
+    return step / size

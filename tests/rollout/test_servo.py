@@ -1,0 +1,180 @@
+"""Identification of position-controlled joints against MuJoCo, differences and scipy."""
+
+import mujoco
+import numpy as np
+import pytest
+import servo_arm
+
+import jaxid as jid
+from jaxid.export.servo import export_servo_mjcf, simulator_table, simulator_values
+from jaxid.rollout.contact import contacts
+from jaxid.rollout.least_squares import minimise
+from jaxid.rollout.servo import INDEX, START, ServoMotion, ServoSimulator
+
+
+def _one_joint(commands, load=0.0, **parameters):
+    """Return a simulator of one joint and its parameters [1, 1, parameters]."""
+    sent = np.asarray(commands, float)[:, None]
+    motion = ServoMotion.of([jid.Recording.of(0 * sent + sent[0], sent, sample_time=0.02)])
+    motion = motion.replace(load=np.full_like(motion.load, load))
+    x = START.copy()
+    for symbol, value in parameters.items():
+        x[INDEX[symbol]] = value
+    return ServoSimulator(motion, 0.01), x[None, None]
+
+
+def test_a_linear_joint_moves_as_scipys():
+    from scipy.signal import lsim
+
+    t = 0.02 * np.arange(500)
+    sent = np.sin(3.0 * t) * (1.0 - np.exp(-t))
+    simulator, x = _one_joint(sent, J=4e-3, B=0.08, d=0.0, F=0.0)
+    path = simulator.paths(x)[0, 0, 0]
+    fine = np.linspace(0.0, t[-1], 20 * 499 + 1)
+    _, exact, _ = lsim(([1.0], [4e-3, 0.08, 1.0]), np.interp(fine, t, sent), fine)
+    assert np.abs(path - exact[::20]).max() < 1e-4
+
+
+def test_a_joint_within_its_friction_does_not_creep():
+    sent = np.concatenate([np.linspace(0.0, 0.5, 100), np.full(600, 0.5)])
+    simulator, x = _one_joint(sent, J=4e-3, B=0.08, F=0.02, a=0.1, load=0.1)
+    path = simulator.paths(x)[0, 0, 0]
+    at_rest = path[200:]
+    assert np.ptp(at_rest) == 0.0
+    # It stops where the friction and the load hold it, short of the command.
+    assert 0.0 < 0.5 - at_rest[0] < 0.02 + 0.01
+
+
+def test_no_inertia_is_allowed():
+    simulator, x = _one_joint(np.linspace(0.0, 1.0, 200), J=1e-7, B=0.05, d=0.0, F=0.0)
+    path = simulator.paths(x)[0, 0, 0]
+    speed = 1.0 / (199 * 0.02)
+    assert path[150] == pytest.approx(150 * 0.02 * speed - 0.05 * speed, abs=1e-3)
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_sensitivities_and_moments_agree_with_differences(hold):
+    t = 0.02 * np.arange(300)
+    sent = 0.4 * np.sin(2.0 * t) + 0.1 * np.sin(9.0 * t + 1.0)
+    values = {"J": 5e-3, "B": 0.06, "d": 0.013, "b": 0.01, "a": 0.08, "F": 0.015, "mu": 0.3}
+    values |= {"Fs": 0.004, "vs": 0.07, "um": 0.15}
+    simulator, x = _one_joint(sent, load=0.2, **values)
+    simulator = ServoSimulator(simulator.motion, 0.01, hold)
+    y, S = simulator.sensitivities(x)
+    r = (y - simulator.motion.positions)[0, 0] * simulator.motion.counted[0]
+    _, g, H = (z[0, 0, 0] for z in simulator.moments(x))
+    own = S[0, 0, 0] * simulator.motion.counted[0, 0][:, None]
+    np.testing.assert_allclose(g, own.T @ r[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(H, own.T @ own, rtol=1e-9, atol=1e-12)
+    for k in range(len(START)):
+        step = np.zeros_like(x)
+        step[..., k] = 1e-6 * x[..., k]
+        difference = simulator.paths(x + step) - simulator.paths(x - step)
+        difference = difference[0, 0, 0] / (2 * step[0, 0, k])
+        scale = np.abs(difference).max()
+        # A kink that lies within a step shifts single samples.
+        error = np.sort(np.abs(S[0, 0, 0, :, k] - difference))
+        assert error[int(0.95 * len(error))] < 1e-6 * scale, k
+
+
+def test_the_batch_of_least_squares_respects_bounds():
+    targets = np.array([[0.5, 2.0], [-3.0, 0.2]])
+
+    def moments(x):
+        r = x - targets
+        return (r**2).sum(-1), r, np.broadcast_to(np.eye(2), (2, 2, 2))
+
+    free = np.array([[True, True], [True, False]])
+    bounds = np.full(2, -1.0), np.full(2, 1.0)
+    found = minimise(
+        moments, lambda x: moments(x)[0], np.zeros((2, 2)), free, bounds, tolerance=1e-14
+    )
+    np.testing.assert_allclose(found.x, [[0.5, 1.0], [-1.0, 0.0]], atol=1e-6)
+
+
+def test_the_arms_parameters_are_found(fit):
+    K = np.array(servo_arm.KP)
+    truth = {"B": servo_arm.DAMPING / K, "F": servo_arm.FRICTION / K}
+    for symbol, values in truth.items():
+        np.testing.assert_allclose(fit.of_parameter(symbol), values, rtol=0.02)
+    assert fit.hold
+    assert fit.bodies.coupled
+    np.testing.assert_allclose(fit.of_parameter("J")[1], servo_arm.ARMATURE[1] / K[1], rtol=0.02)
+    assert fit.stiffness[1] == pytest.approx(K[1], rel=0.01)
+    assert fit.notes == ()
+
+
+def test_the_simulation_follows_another_motion_and_names_contact(fit):
+    free = fit.validate(servo_arm.log(9, duration=30.0))
+    assert free.total().max() < 0.7e-3
+    assert (free.total("linear") > 3 * free.total()).all()
+    assert free.contacts == ()
+    blocked = fit.validate(servo_arm.log(9, duration=30.0, block=0.05))
+    assert {c.joint for c in blocked.contacts} == {1}
+    assert str(blocked.summary()).count("contact") >= 1
+
+
+def test_windows_and_segments(fit):
+    log = servo_arm.log(9, duration=20.0)
+    (path,) = fit.simulate(log)
+    assert path.shape == log.angles.shape
+    assert fit.window_errors(log, 1.0).max() < 1e-2
+
+
+def test_mujoco_moves_like_the_simulation(fit, tmp_path):
+    paths = export_servo_mjcf(fit, tmp_path / "arm.xml", samples=2, timestep=0.001)
+    assert len({p.read_text() for p in paths}) == 3
+    model = mujoco.MjModel.from_xml_path(str(paths[0]))
+    data, log = mujoco.MjData(model), servo_arm.log(9, duration=20.0)
+    delay = model.numeric("delay").data
+    measured, sent = np.asarray(log.angles), np.asarray(log.forces)
+    path = np.zeros_like(measured)
+    for k in range(20 * len(sent)):
+        if k % 20 == 0:
+            path[k // 20] = data.qpos
+        at = np.maximum(0, np.floor((k * 0.001 - delay) / 0.02).astype(int))
+        data.ctrl[:] = sent[at, [0, 1]]
+        mujoco.mj_step(model, data)
+    assert np.sqrt(np.mean((path - measured) ** 2, axis=0)).max() < 1.5e-3
+    values = simulator_values(fit)
+    np.testing.assert_allclose(values["armature"][1], servo_arm.ARMATURE[1], rtol=0.02)
+    assert "other joints" in str(simulator_table(fit)) or np.isfinite(fit.stiffness).all()
+
+
+def test_stiffness_and_delay_of_a_slow_ramp_are_merged():
+    """Without acceleration only the lag is seen: damping over stiffness plus delay."""
+    t = 0.02 * np.arange(1500)
+    sent = 0.8 * np.abs((0.05 * t) % 1.0 - 0.5)
+    simulator, x = _one_joint(sent, J=1e-4, B=0.06, d=0.02, F=0.01)
+    path = simulator.paths(x)[0, 0, 0][: len(sent)]
+    step = servo_arm.ENCODER
+    random = np.random.default_rng(0)
+    measured = step * np.round((path + random.uniform(-step, step, len(path))) / step)
+    log = jid.Recording.of(measured[:, None], sent[:, None], sample_time=0.02)
+    found = jid.identify_rollout(log, friction=False, saturation=False)
+    (lag,) = [c for c in found.combinations if "B" in c.name.split()[0]]
+    assert " d" in lag.name
+    low, high = lag.interval(0.999)
+    truth = float(lag.coefficients[INDEX["B"]] * 0.06 + lag.coefficients[INDEX["d"]] * 0.02)
+    assert low < truth < high
+
+
+def test_logs_that_cannot_be_used_are_rejected():
+    still = jid.Recording.of(np.zeros((200, 1)), np.zeros((200, 1)), sample_time=0.02)
+    with pytest.raises(jid.InputError, match="`logs`"):
+        jid.identify_rollout(still)
+    short = jid.Recording.of(np.zeros((20, 1)), np.zeros((20, 1)), sample_time=0.02)
+    with pytest.raises(jid.InputError, match="`logs`"):
+        jid.identify_rollout(short)
+    moving = servo_arm.log(0, duration=10.0)
+    with pytest.raises(jid.InputError, match="`logs`"):
+        jid.identify_rollout(moving, joint_names=["one"])
+
+
+def test_contact_needs_a_joint_that_does_not_move():
+    sent = np.sin(np.linspace(0.0, 20.0, 1000))
+    simulator, _ = _one_joint(sent)
+    motion = simulator.motion
+    errors = np.full_like(motion.positions, 0.1)
+    assert contacts(motion.replace(positions=motion.commands), errors, np.array([0.01])) == ()
+    assert len(contacts(motion, errors, np.array([0.01]))) == 1
