@@ -50,7 +50,7 @@ def identification_page(report: Report, figures: Mapping[str, Figure]) -> str:
         ),
         *_physics(report, figures),
         ("Measured and predicted forces", _torques(figures, robot)),
-        ("Parameters in words", _parameters(fit)),
+        ("Parameters in words", _parameters(fit, figures["parameters"])),
         ("Details", [folded(name, *blocks) for name, blocks in _details(report, figures)]),
     ]
     logs = f"{len(fit.recordings)} log{'' if len(fit.recordings) == 1 else 's'}"
@@ -153,24 +153,18 @@ def _torques(figures: Mapping[str, Figure], robot: Robot) -> list[Any]:
     return blocks
 
 
-def _parameters(fit: Fit) -> list[Any]:
-    """Return the estimates with their meanings, and the meanings of all symbols."""
+def _parameters(fit: Fit, figure: Figure) -> list[Any]:
+    """Return the meanings of all symbols, and the estimates with theirs."""
     base = fit.base
-    values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
-    columns = [
-        Column("parameter", base.names),
-        *word_columns(base),
-        Column("estimate", values, kind="number"),
-        Column("±", deviations, kind="number"),
-        Column("unit", base.units),
-        Column("±", fit.relative_standard_deviations, "%", percent),
-    ]
     text = (
-        "* together with what forces cannot tell apart from it: see the combinations below. A "
-        "parameter near zero is never known to a few percent, and that is no fault."
+        "* together with what forces cannot tell apart from it: see its combination. A parameter "
+        "near zero is never known to a few percent, and that is no fault."
     )
-    table = Table("", *columns, status=fit.trust)
-    return [glossary(base), folded(f"All {base.size} estimates, in words", table, text)]
+    lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
+    said = [text, *([f"In the combinations: {lengths} (m; m/s² for g)."] if lengths else [])]
+    doubts = [fit.determination] if fit.undetermined else []
+    summary = f"All {base.size} estimates with 95 % intervals and combinations"
+    return [*doubts, glossary(base), folded(summary, parameter_table(fit), *said, figure)]
 
 
 def words_of(x: Any) -> str:
@@ -181,7 +175,6 @@ def words_of(x: Any) -> str:
 def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
     """Return what experts ask for."""
     fit, settings, robot = report.fit, report.settings, report.fit.base.model.robot
-    base, errors = fit.base, report.every_error
     task = [
         ("experiment", settings.get("experiment")),
         *((key, settings.get(key)) for key in ("split", "filter", "decimation")),
@@ -192,7 +185,6 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
     gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
     assumed = ", ".join(robot.limits.assumed) or "nothing"
     facts = [*about.facts, ("gravity [m/s²]", gravity), ("assumed", assumed)]
-    lengths = ", ".join(f"{name} = {value:.4g}" for name, value in base.lengths.items())
     notes = [Remark(note) for note in report.every_note]
     sections: list[Section] = [
         ("Task and notes", [Table("", facts=[f for f in task if f[1] is not None]), notes]),
@@ -204,16 +196,7 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
                 "Fig. 10 of the paper); points: their RMS. The offset is the mean error, which a "
                 "constant of the log explains; RMS values at rest and in motion are about it.",
                 figures["errors"],
-                tuple(error_table(e, robot) for e in errors),
-            ],
-        ),
-        (
-            f"{base.size} base parameters: intervals and combinations",
-            [
-                *([fit.determination] if fit.undetermined else []),
-                figures["parameters"],
-                parameter_table(fit),
-                *([f"In the combinations: {lengths} (m; m/s² for g)."] if lengths else []),
+                tuple(error_table(e, robot) for e in report.every_error),
             ],
         ),
     ]
@@ -233,7 +216,7 @@ def _details(report: Report, figures: Mapping[str, Figure]) -> list[Section]:
 
 
 def parameter_table(fit: Fit) -> Table:
-    """Return the base parameters with their 95 % intervals."""
+    """Return the base parameters in words, with their 95 % intervals."""
     base, (low, high) = fit.base, fit.intervals().T
     values, deviations = with_deviations(fit.parameters, fit.standard_deviations)
     low, high = (with_deviations(ends, fit.standard_deviations)[0] for ends in (low, high))
@@ -241,6 +224,7 @@ def parameter_table(fit: Fit) -> Table:
         "",
         Column("#", list(range(1, base.size + 1))),
         Column("parameter", base.names),
+        *word_columns(base),
         Column("estimate", values, kind="number"),
         Column("±", deviations, kind="number"),
         Column("unit", base.units),

@@ -65,7 +65,10 @@ def word_columns(base: BaseParameters) -> list[Column]:
     """Return columns with what each base parameter is, and of which body or joint."""
     meanings, places = zip(*(in_words(name, base.model.robot) for name in base.names), strict=True)
     mixed = np.any(np.asarray(base.kappa) != 0.0, axis=1)
-    shown = [f"{text} *" if more else text for text, more in zip(meanings, mixed, strict=True)]
+    shown = [
+        f"{text}\N{NO-BREAK SPACE}*" if more else text
+        for text, more in zip(meanings, mixed, strict=True)
+    ]
     return [Column("in words", shown), Column("of", places)]
 
 

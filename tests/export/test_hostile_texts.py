@@ -90,7 +90,9 @@ def test_html():
     expected = [x.tag for x in read("x").iter()]
     for text in hostile(1000, lambda x: printable(x).split()):
         page = read(text)
-        assert [x.tag for x in page.iter()] == expected, text
+        # Names between backticks stand in an element without anything else.
+        found = [x for x in page.iter() if dict(x.attrib) != {"class": "key"}]
+        assert [x.tag for x in found] == expected, text
         assert "".join(printable(text).split()) in "".join(page.text_content().split())
 
 
