@@ -1,11 +1,10 @@
 """Report of an identification without torques: measured and simulated motion, and its numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxid.arrays import Float
 from jaxid.export.servo import export_servo_mjcf, servo_stiffness, simulator_table, simulator_values
@@ -13,21 +12,9 @@ from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
 from jaxid.rollout import PARAMETERS, RolloutErrors, ServoFit
 
+from .figure import ERROR, GREY, MEASURED, PREDICTED, Curve, Figure, Panel
 from .page import Section, provenance, render_page
 from .result_files import header, plain, write_csv, write_json
-from .style import (
-    BLUE,
-    GREY,
-    MEASURED,
-    PREDICTED,
-    WIDTH,
-    add_legend,
-    caption,
-    drawing,
-    label_time,
-    write_figures,
-)
-from .torques import decimate
 
 SHOWN = 6
 """Motions whose figures the page shows."""
@@ -83,31 +70,26 @@ def comparison_table(report: RolloutReport) -> Table:
 
 
 def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
-    """Draw measured and simulated positions of all joints in one motion, and the errors."""
-    joints, time = len(errors.joint_names), errors.time[motion]
+    """Return measured and simulated positions of all joints in one motion, and the errors."""
+    time, panels = np.asarray(errors.time[motion]), []
+    channels = [np.asarray(x[motion]) for x in (errors.command, errors.measured, errors.simulated)]
+    for name, *rows in zip(errors.joint_names, *channels, strict=True):
+        command, measured, simulated = rows
+        wrong = 1e3 * (simulated - measured)
+        curves = [
+            Curve(time, command, "commanded", GREY, width=0.6),
+            Curve(time, measured, "measured", MEASURED, width=1.9),
+            Curve(time, simulated, "simulated", PREDICTED, width=0.9),
+        ]
+        error = Curve(time, wrong, "error", ERROR, width=0.7)
+        below = [Panel([error], y="error", unit="mrad or mm", share=0.6)]
+        rms = f"RMS {significant(float(np.sqrt(np.mean(wrong**2))))} mrad or mm"
+        panels.append(Panel(curves, name, rms, y="position", unit="rad or m", below=below))
     title = f"{errors.motions[motion]}: measured and simulated, free-running"
-    with drawing(title, WIDTH, 1.5 * joints + 0.5) as figure:
-        panels = figure.subplots(joints, 2, sharex=True, squeeze=False)
-        for j, (left, right) in enumerate(panels):
-            measured, simulated = errors.measured[motion][j], errors.simulated[motion][j]
-            lines = ((errors.command[motion][j], GREY, 0.5), (measured, MEASURED, 1.9))
-            for values, colour, width in (*lines, (simulated, PREDICTED, 0.8)):
-                left.plot(*decimate(time, values, bins=700), color=colour, lw=width)
-            right.plot(*decimate(time, 1e3 * (simulated - measured), bins=700), color=BLUE, lw=0.6)
-            rms = 1e3 * float(errors.rms()[motion, j])
-            caption(left, errors.joint_names[j])
-            caption(right, "error [mrad or mm]", f"RMS {significant(rms)}")
-        label_time(panels[-1], time)
-        add_legend(
-            figure,
-            ("commanded", {"color": GREY, "lw": 1.0}),
-            ("measured", {"color": MEASURED, "lw": 1.9}),
-            ("simulated", {"color": PREDICTED, "lw": 1.2}),
-        )
-    return figure
+    return Figure(title, panels, columns=2, height=2.6)
 
 
-def rollout_page(report: RolloutReport, figures: Mapping[str, Figure]) -> str:
+def rollout_page(report: RolloutReport, figures: Sequence[Figure]) -> str:
     """Return the page of an identification without torques as HTML."""
     fit, errors = report.fit, report.errors
     total, linear = errors.total(), errors.total("linear")
@@ -125,7 +107,7 @@ def rollout_page(report: RolloutReport, figures: Mapping[str, Figure]) -> str:
     sections: list[Section] = [
         ("Verdict", [verdict, parameters.remarks]),
         ("Errors", [comparison_table(report), errors.summary()]),
-        ("Measured and simulated motion", [*figures.values()]),
+        ("Measured and simulated motion", figures),
         (
             "What the logs determine",
             [
@@ -141,9 +123,9 @@ def rollout_page(report: RolloutReport, figures: Mapping[str, Figure]) -> str:
 
 
 def write_rollout(folder: Path, report: RolloutReport) -> list[Path]:
-    """Write the page, `rollout.json`, `rollout.csv`, figures, and MJCF if bodies are known."""
+    """Write the page, `rollout.json`, `rollout.csv`, and MJCF if bodies are known."""
     fit, count = report.fit, min(SHOWN, len(report.errors.motions))
-    figures = {f"motion_{k + 1}": motion_figure(report.errors, k) for k in range(count)}
+    figures = [motion_figure(report.errors, k) for k in range(count)]
     rows = [
         {
             "joint": fit.joint_names[c.joint],
@@ -159,7 +141,6 @@ def write_rollout(folder: Path, report: RolloutReport) -> list[Path]:
     ]
     names = ["rollout.html", "rollout.json", "rollout.csv"]
     with atomic_folder(folder) as staging:
-        names += write_figures(staging, figures)
         if report.has_stiffness and fit.bodies is not None:
             options = {"stiffness": report.stiffness, "samples": report.samples}
             made = export_servo_mjcf(fit, staging / "robot.xml", **options)
