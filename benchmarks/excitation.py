@@ -248,7 +248,7 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="the first key")
     parser.add_argument("--starts", type=int, default=32)
     parser.add_argument("--generations", type=int, default=12)
-    parser.add_argument("--polish", type=int, nargs="+", default=[0, 4], help="0: JAX alone")
+    parser.add_argument("--polish", type=int, nargs="+", default=[0, 4], help="0: no polishing")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jid.keep_compiled()
