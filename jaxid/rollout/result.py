@@ -180,7 +180,7 @@ class ServoFit:
 
     def paths(self, motion: ServoMotion, parameters: AnyArray | None = None) -> np.ndarray:
         """Return simulated positions [motions, joints, samples], with loads at these positions."""
-        x = self.parameters if parameters is None else parameters
+        x = np.asarray(self.parameters if parameters is None else parameters)
         if self.bodies is None:
             return ServoSimulator(motion, self.time_step, self.hold).paths(x[None])[:, 0]
         states = self._respond(motion, x, np.asarray(motion.commands), None)
