@@ -67,8 +67,9 @@ class JointRegressor(eqx.Module):
 
     def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
         """Return the columns of each joint, evaluated in NumPy."""
-        rows, program = evaluate_rows(self.program, *arrays), self.program
-        found = [np.empty((len(own), rows.shape[1])) for own in self.columns]
+        batch, program = np.shape(arrays[0])[1:], self.program
+        rows = evaluate_rows(program, *arrays).reshape(-1, *batch)
+        found = [np.empty((len(own), *batch)) for own in self.columns]
         for joint, own in enumerate(self.columns):
             for row, k in zip(found[joint], own, strict=True):
                 entry = joint * self.size + k

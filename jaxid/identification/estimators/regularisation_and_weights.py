@@ -226,7 +226,7 @@ class ResidualVariances(AbstractWeights):
     def _reciprocals(self, factors: Factors, squares: np.ndarray) -> np.ndarray:
         deviations = np.sqrt(squares / np.maximum(factors.rows, 1))
         # Finite also for a joint without any force or residual.
-        floor = max(1e-9 * float(deviations.max()), np.finfo(float).tiny)
+        floor = max(1e-9 * float(deviations.max()), 1e-100)
         return 1.0 / np.maximum(deviations, floor)
 
 
