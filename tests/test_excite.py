@@ -238,6 +238,7 @@ def test_floor_self_collision_and_forces_are_kept_by_default(tmp_path, run):
     said = " ".join(out.split())
     for words in ("floor: 3 quantities", "self-collision: 1 quant", "forces by the nominal"):
         assert f"✓ {words}" in said
+    assert "less a margin of 30 %" in said
     assert said.index("✓ A motion that can be recorded: it keeps all limits") > said.index("floor:")
     experiment = load_experiment(tmp_path / "arm.toml")
     q = table(tmp_path / "motion.csv")[:, 1:4]

@@ -181,10 +181,7 @@ def inspect(
 def identify(
     experiment: options.ExperimentFile,
     logs: options.Logs,
-    verify: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="LOG", help="A log that the fit does not see; may be repeated."),
-    ] = None,
+    verify: options.Verified = None,
     split: Annotated[
         float | None,
         typer.Option(
@@ -364,10 +361,7 @@ def states(
 def rollout(
     experiment: options.ExperimentFile,
     logs: options.Logs,
-    verify: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="LOG", help="A log that the fit does not see; may be repeated."),
-    ] = None,
+    verify: options.Verified = None,
     output: options.OutputFolder = Path("rollout"),
     force: options.Force = False,
 ) -> None:

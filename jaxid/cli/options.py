@@ -42,6 +42,12 @@ Logs = Annotated[
         metavar="LOG",
     ),
 ]
+Verified = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--verify", metavar="LOG", help="A log that the fit does not see; may be repeated."
+    ),
+]
 Loaded = Annotated[
     list[Path],
     typer.Option(metavar="LOG", help="A log with the load, or a report; may be repeated."),

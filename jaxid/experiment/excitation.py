@@ -29,6 +29,9 @@ from .experiment import Experiment
 from .motion_check import gravity_fault, motion_checks
 from .robot_tables import named
 
+UNKNOWN = 0.3
+"""Fraction of the largest forces that is kept free where friction, or anything else, is unknown."""
+
 
 class Nominal(NamedTuple):
     """Base parameters as far as they are known before the experiment.
@@ -44,8 +47,10 @@ class Nominal(NamedTuple):
     covariance: Float[np.ndarray, "base base"] | None
     undetermined: tuple[str, ...] = ()
 
-    def force_limits(self, base: BaseParameters, margin: float) -> ForceLimits:
-        """Return the limits of forces that these parameters need."""
+    def force_limits(self, base: BaseParameters, margin: float | None) -> ForceLimits:
+        """Return the limits of forces, with a margin for what is unknown if none is given."""
+        if margin is None:
+            margin = UNKNOWN if np.isnan(self.parameters).any() else 0.0
         return ForceLimits(base, np.nan_to_num(self.parameters), self.covariance, margin)
 
 
@@ -251,7 +256,7 @@ def find_constraints(experiment: Experiment, nominal: Nominal | None) -> Limited
         constraints.append(tip)
     fault = "not checked: no inertias are known; say in `excitation.nominal` where a report is"
     if nominal is not None:
-        forces = nominal.force_limits(experiment.base, table.force_margin or 0.0)
+        forces = nominal.force_limits(experiment.base, table.force_margin)
         fault = "not checked: no largest forces are known; give `limits.force`"
         if forces.entries(robot) and not (fault := gravity_fault(experiment, forces)):
             constraints.append(forces)
@@ -386,6 +391,8 @@ def _force_doubts(experiment: Experiment, nominal: Nominal | None) -> list[Remar
     unknown = [n for n, p in zip(names, nominal.parameters, strict=True) if np.isnan(p)]
     if unknown:
         text = f"not known, and counted as zero in the forces: {', '.join(unknown)}"
+        if experiment.excitation.force_margin is None:
+            text += f"; so {100 * UNKNOWN:g} % of the largest forces are kept free (`force_margin`)"
         remarks.append(Remark(text, Status.DOUBTFUL))
     if nominal.undetermined:
         text = (

@@ -216,7 +216,7 @@ class Excitation:
         earlier: Motions whose logs will be used together with this one's, like
             `["trajectory.json"]`.
         force_margin: Fraction of the largest forces to keep free, by nominal parameters, like
-            `0.1`.
+            `0.1`; by default 0.3 if friction or others are unknown, else 0.
         tip_speed: Largest speed of the end-effector [m/s], like `1.5`.
         tip_acceleration: Largest acceleration of the end-effector [m/s²], like `10.0`.
         workspace: Box for the end-effector: two corners [m], like

@@ -9,7 +9,7 @@ import numpy as np
 from jaxid.errors import InputError
 
 from .numpy_evaluation import evaluate
-from .program import Program, Reference, assemble
+from .program import Program, Reference, assemble, record
 from .scalar import Graph, Operand, Operation, Scalar, add, apply, divide, multiply, negate, select
 
 _UNARY: dict[Operation, Callable[[Operand, Operand], Operand]] = {
@@ -57,17 +57,14 @@ def gradient_program(program: Program) -> Program:
 
     Its last input holds the weights, one for each packed result.
     """
-    graph, number, scalars = Graph(), len(program.input_shapes), []
+    graph, number = Graph(), len(program.input_shapes)
     # Inputs are loaded before the first operation, so that they come first.
     weights = [graph.node(Operation.INPUT, number, k) for k in range(len(program.outputs))]
+    scalars = record(program, graph)
 
     def operand(x: Reference) -> Operand:
         return scalars[x] if isinstance(x, int) else x
 
-    for node in program.nodes:
-        is_input = node.operation is Operation.INPUT
-        operands = node.operands if is_input else tuple(map(operand, node.operands))
-        scalars.append(graph.node(node.operation, *operands))
     slopes: list[Operand] = [0.0] * len(scalars)
     for weight, x in zip(weights, program.outputs, strict=True):
         if isinstance(x, int):

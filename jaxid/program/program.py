@@ -171,17 +171,19 @@ def assemble(
     return Program(input_shapes, nodes, tuple(map(reference, outputs)), output_shapes, structure)
 
 
-def select_outputs(program: Program, entries: np.ndarray) -> Program:
-    """Return a program that computes only some results of a program."""
-    graph = Graph()
+def record(program: Program, graph: Graph) -> list[Scalar]:
+    """Write the nodes of a program into a graph; return the scalar of each."""
     scalars: list[Scalar] = []
-
-    def operand(x: Reference) -> Operand:
-        return scalars[x] if isinstance(x, int) else x
-
     for node in program.nodes:
         is_input = node.operation is Operation.INPUT
-        operands = node.operands if is_input else tuple(map(operand, node.operands))
-        scalars.append(graph.node(node.operation, *operands))
-    outputs = [operand(program.outputs[k]) for k in entries.ravel()]
+        known = (scalars[x] if isinstance(x, int) and not is_input else x for x in node.operands)
+        scalars.append(graph.node(node.operation, *known))
+    return scalars
+
+
+def select_outputs(program: Program, entries: np.ndarray) -> Program:
+    """Return a program that computes only some results of a program."""
+    scalars = record(program, Graph())
+    chosen = (program.outputs[k] for k in entries.ravel())
+    outputs = [scalars[x] if isinstance(x, int) else x for x in chosen]
     return assemble(program.input_shapes, outputs, (entries.shape,), jax.tree.structure(0))
