@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import equinox as eqx
+import mujoco
 import numpy as np
 import pytest
 
@@ -250,6 +251,15 @@ def test_floor_self_collision_and_forces_are_kept_by_default(tmp_path, run):
     assert np.ptp(q, axis=0).min() > 0.1
     gaps = np.asarray(experiment.surroundings.clearance.model.clearance(experiment.robot, q))
     assert gaps.min() >= 0.029
+    # MuJoCo finds no contact between the cylinders of the file, but one where the arm is folded.
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.urdf"))
+    data, contacts = mujoco.MjData(model), []
+    for pose in (*q, [0.0, 2.3, 2.3]):
+        data.qpos[:] = pose
+        mujoco.mj_fwdPosition(model, data)
+        contacts.append(data.ncon)
+    assert not any(contacts[:-1])
+    assert contacts[-1]
 
 
 def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
