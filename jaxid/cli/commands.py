@@ -46,7 +46,7 @@ from jaxid.report.result_files import (
     write_estimates,
     write_report,
 )
-from jaxid.report.rollout import RolloutReport, write_rollout
+from jaxid.report.rollout import RolloutReport, rollout_verdict, write_rollout
 from jaxid.report.verdict import Report, verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
@@ -450,6 +450,7 @@ def rollout(
         )
         written = write_rollout(output, report)
     show(console, fit.summary(), *report.tables())
+    show_remarks(console, [rollout_verdict(errors)])
     show_files(console, output, [p.name for p in written])
 
 

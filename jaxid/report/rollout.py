@@ -89,23 +89,29 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
     return Figure(title, panels, columns=2, height=2.6)
 
 
+def rollout_verdict(errors: RolloutErrors) -> Remark:
+    """Return in words whether the simulation is closer to the robot than a linear joint."""
+    total, linear = errors.total(), errors.total("linear")
+    worse = [n for n, x, y in zip(errors.joint_names, total, linear, strict=True) if x >= y]
+    text = "The simulation moves more like the robot than a linear joint does"
+    if worse:
+        text = f"The simulation is no better than a linear joint ({', '.join(worse)})"
+    sizes = (", ".join(significant(1e3 * x) for x in values) for values in (total, linear))
+    return Remark(
+        f"{text}: errors of {' instead of '.join(sizes)} mrad or mm",
+        Status.DOUBTFUL if worse else Status.GOOD,
+    )
+
+
 def rollout_page(report: RolloutReport, figures: Sequence[Figure]) -> str:
     """Return the page of an identification without torques as HTML."""
     fit, errors = report.fit, report.errors
-    total, linear = errors.total(), errors.total("linear")
-    better = bool((total < linear).all())
-    text = "moves like the robot more closely than a linear joint" if better else "does not beat"
-    verdict = Remark(
-        f"The simulation {text}: {', '.join(significant(1e3 * x) for x in total)} mrad or mm "
-        f"against {', '.join(significant(1e3 * x) for x in linear)}",
-        Status.GOOD if better else Status.DOUBTFUL,
-    )
     parameters = fit.summary()
     simulators: list[Any] = ["No weight tells a stiffness: name it by `rollout.stiffness`."]
     if report.has_stiffness:
         simulators = [simulator_table(fit, report.stiffness)]
     sections: list[Section] = [
-        ("Verdict", [verdict, parameters.remarks]),
+        ("Verdict", [rollout_verdict(errors), parameters.remarks]),
         ("Errors", [comparison_table(report), errors.summary()]),
         ("Measured and simulated motion", figures),
         (

@@ -192,7 +192,8 @@ class _Search:
         counted = np.asarray(self.simulator.motion.counted).sum(axis=-1)
         mean = errors / np.maximum(counted, 1.0)[:, None]
         share = (counted > 0)[:, None] + 0.0
-        return (share * np.log(mean + RESOLUTION**2)).sum(axis=0) / share.sum(axis=0)
+        scores = (share * np.log(mean + RESOLUTION**2)).sum(axis=0) / share.sum(axis=0)
+        return np.where(np.isfinite(scores), scores, np.inf)
 
     def start(self) -> None:
         """Fit the basic model from the best of many starts, and the linear baseline."""

@@ -81,8 +81,14 @@ def bounded_step(
     bounds: tuple[np.ndarray, np.ndarray],
     damping: np.ndarray | float,
 ) -> np.ndarray:
-    """Return damped Gauss-Newton steps of the free parameters that no bound holds."""
+    """Return damped Gauss-Newton steps of the free parameters that no bound holds.
+
+    Where derivatives have overflowed, the step is zero.
+    """
     low, high = bounds
+    known = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(axis=-1)
+    information = np.where(known[..., None, None], information, 0.0)
+    gradient = np.where(known[..., None], gradient, 0.0)
     held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))
     moving = (free & ~held).astype(float)
     size = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 1e-300))

@@ -122,13 +122,19 @@ class ServoFit:
         y, S = (y[:, 0] for y in simulator.sensitivities(x))
         r, S = (y - motion.positions) * motion.counted, S * np.asarray(motion.counted)[..., None]
         moving = free & (x[0] > LOWER) & (x[0] < UPPER)
-        covariance, combinations, notes = np.zeros((*x[0].shape, len(PARAMETERS))), [], []
+        covariance, combinations, lacking = np.zeros((*x[0].shape, len(PARAMETERS))), [], []
         for j in range(len(x[0])):
             rows = _JointRows.of(simulator, j, weights[:, j], r[:, j], S[:, j])
             own, full = _determined(rows, x[0, j], moving[j], j)
             combinations += own
             covariance[j] = full
-            notes += rows.notes(joint_names[j])
+            if (rms := rows.systematic_error()) > 0:
+                lacking.append(f"{joint_names[j]} {1e3 * rms:.2g}")
+        notes = (
+            f"errors are larger than an encoder's rounding and change slowly "
+            f"({', '.join(lacking)} mrad or mm RMS): an effect is missing, such as other friction, "
+            "play, elasticity or load, and the parameters are those that imitate it best",
+        )
         errors = np.where(np.asarray(motion.counted) > 0, r, 0.0)
         count = np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
         everything = y - np.asarray(motion.positions)
@@ -148,7 +154,7 @@ class ServoFit:
             contacts(motion, everything, typical),
             bodies,
             np.abs(motion.load).mean(axis=(0, 2)),
-            tuple(notes),
+            notes if lacking else (),
         )
 
     @cached_property
@@ -387,20 +393,14 @@ class _JointRows(NamedTuple):
         deviation = np.sqrt(np.where(differ, scatter, variance))
         return correlation * np.outer(deviation, deviation), dof
 
-    def notes(self, name: str) -> list[str]:
-        """Return doubts about the model of the joint, from what its errors look like."""
+    def systematic_error(self) -> float:
+        """Return the RMS error [rad or m] if it looks like a missing effect; otherwise 0."""
         kept = self.counted > 0
         rms = float(np.sqrt(np.mean(self.raw[kept] ** 2)))
         both = kept[:, 1:] & kept[:, :-1]
         neighbours = float(np.mean((self.raw[:, 1:] * self.raw[:, :-1])[both])) / rms**2
         rounding = self.resolution / np.sqrt(12.0)
-        if rms < SYSTEMATIC * rounding or neighbours < 0.5:
-            return []
-        return [
-            f"the errors of {name} ({1e3 * rms:.2g} mrad or mm RMS) are not the rounding of an "
-            "encoder, and change slowly: an effect is missing (other friction, play, elasticity, "
-            "load), and the parameters are those that imitate it best"
-        ]
+        return 0.0 if rms < SYSTEMATIC * rounding or neighbours < 0.5 else rms
 
 
 def _resolution(q: np.ndarray) -> float:

@@ -49,7 +49,8 @@ class ServoParameter(NamedTuple):
 
 PARAMETERS = (
     ServoParameter("J", "inertia / stiffness", "s²", 4e-3, 1e-7, 1.0, 2e-3),
-    ServoParameter("B", "damping / stiffness", "s", 0.05, 1e-5, 5.0, 0.03),
+    # With less damping than 6 % of a step, a step may overshoot where friction then holds.
+    ServoParameter("B", "damping / stiffness", "s", 0.05, 1e-3, 5.0, 0.03),
     ServoParameter("d", "delay", "s", 0.01, -0.1, 0.3, 0.01),
     ServoParameter("b", "bias / stiffness", "u", 0.0, -1.0, 1.0, 0.01),
     ServoParameter("a", "1 / stiffness", "u/(N m)", 0.0, 0.0, 100.0, 0.05),

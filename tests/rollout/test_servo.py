@@ -8,7 +8,7 @@ import servo_arm
 import jaxid as jid
 from jaxid.export.servo import export_servo_mjcf, simulator_table, simulator_values
 from jaxid.rollout.contact import contacts
-from jaxid.rollout.least_squares import minimise
+from jaxid.rollout.least_squares import bounded_step, minimise
 from jaxid.rollout.servo import INDEX, START, ServoMotion, ServoSimulator
 
 
@@ -75,6 +75,15 @@ def test_sensitivities_and_moments_agree_with_differences(hold):
         # A kink that lies within a step shifts single samples.
         error = np.sort(np.abs(S[0, 0, 0, :, k] - difference))
         assert error[int(0.95 * len(error))] < 1e-6 * scale, k
+
+
+def test_a_step_is_zero_where_derivatives_have_overflowed():
+    gradient = np.array([[1.0, 2.0], [np.nan, 1.0]])
+    information = np.array([np.eye(2), np.full((2, 2), np.inf)])
+    bounds = (np.full(2, -9.0), np.full(2, 9.0))
+    free = np.ones((2, 2), bool)
+    step = bounded_step(gradient, information, np.zeros((2, 2)), free, bounds, 0.0)
+    assert np.allclose(step, [[-1.0, -2.0], [0.0, 0.0]])
 
 
 def test_the_batch_of_least_squares_respects_bounds():
