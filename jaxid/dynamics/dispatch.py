@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, Joints, Numbers, as_array, content, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Program, dense_rows, evaluate, evaluate_rows, trace
+from jaxid.program import Program, evaluate, evaluate_rows, packed_entries, trace
 from jaxid.program.blocks import BLOCK, on_rows
 from jaxid.program.rules import with_derivatives_of
 
@@ -202,7 +202,12 @@ def _in_numpy(program: Program, arrays: list, batch: tuple[int, ...]) -> np.ndar
     given = [np.moveaxis(np.asarray(x, np.float64), -1, 0) for x in arrays]
     rank = len(batch) + 1
     given = [x.reshape(len(x), *(1,) * (rank - x.ndim), *x.shape[1:]) for x in given]
-    return dense_rows(program, evaluate_rows(program, *given), dtype)
+    rows, entries = evaluate_rows(program, *given), np.arange(len(program.outputs))
+    out = np.empty((rows.shape[1], len(entries)), dtype)
+    for start in range(0, len(out), BLOCK):
+        part = slice(start, start + BLOCK)
+        out[part] = packed_entries(program, rows[:, part], entries).T
+    return out
 
 
 def _over_batches(run: Callable, batch: tuple[int, ...], arrays: list[Array], shared: int) -> Array:

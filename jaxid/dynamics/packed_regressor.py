@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
 from jaxid.errors import InputError
-from jaxid.program import Lowered, Program, evaluate_rows, lower, on_any_platform
+from jaxid.program import Lowered, Program, evaluate_rows, lower, on_any_platform, packed_entries
 from jaxid.program.blocks import row_products
 
 from .dispatch import FEW, KEPT, program_of
@@ -67,14 +67,11 @@ class JointRegressor(eqx.Module):
 
     def in_numpy(self, *arrays: AnyArray) -> list[Float[np.ndarray, "columns samples"]]:
         """Return the columns of each joint, evaluated in NumPy."""
-        batch, program = np.shape(arrays[0])[1:], self.program
-        rows = evaluate_rows(program, *arrays).reshape(-1, *batch)
-        found = [np.empty((len(own), *batch)) for own in self.columns]
+        batch, program, found = np.shape(arrays[0])[1:], self.program, []
+        rows = evaluate_rows(program, *arrays)
         for joint, own in enumerate(self.columns):
-            for row, k in zip(found[joint], own, strict=True):
-                entry = joint * self.size + k
-                number = program.distinct[1][entry]
-                row[:] = rows[number] if number >= 0 else program.outputs[entry]
+            entries = joint * self.size + np.array(own, int)
+            found.append(packed_entries(program, rows, entries).reshape(len(own), *batch))
         return found
 
 

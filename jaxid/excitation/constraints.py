@@ -77,6 +77,10 @@ class Finding(NamedTuple):
         return f"{self.name} exceeds its limit by {amount} ({100 * self.value:.3g} %){bound}"
 
 
+BLOCK = 96
+"""Samples for which derivatives are compiled: those that the search watches of one motion."""
+
+
 class AbstractConstraint(eqx.Module):
     """Limits on a motion that are not linear in the joints' motion.
 
@@ -105,14 +109,20 @@ class AbstractConstraint(eqx.Module):
     ) -> tuple[Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]]:
         """Return one value of each sample, and its derivatives by q, qd, qdd, in NumPy.
 
+        Derivatives by qd and qdd may be left out where values depend on q only.
+
         Args:
             robot: Robot that moves.
             motion: Joint motion in NumPy, with one axis of samples.
             chosen: Place of each sample's value in `entries`.
         """
-        parts = (motion.q, motion.qd, motion.qdd)
-        values, slopes = _compiled(_Same(self, robot))(jnp.asarray(chosen), *parts)
-        return np.asarray(values), [np.asarray(x) for x in slopes]
+        run, samples = _compiled(_Same(self, robot)), len(chosen)
+        # Another number of samples would compile anew.
+        padded = np.resize(np.arange(samples), BLOCK * -(-samples // BLOCK)).reshape(-1, BLOCK)
+        parts = (chosen, motion.q, motion.qd, motion.qdd)
+        found = [run(*(x[block] for x in parts)) for block in padded]
+        values, *slopes = (np.concatenate(x)[:samples] for x in zip(*found, strict=True))
+        return values, slopes
 
     def describe(self, robot: Robot, values: Float[AnyArray, "*batch values"]) -> list[Finding]:
         """Return the limited quantities with the largest of their values."""
@@ -139,13 +149,13 @@ def _compiled(key: _Same) -> Callable:
     constraint, robot = key.parts
 
     @jax.jit
-    def linearised(chosen: Array, *parts: Array) -> tuple[Array, tuple[Array, ...]]:
+    def linearised(chosen: Array, *parts: Array) -> tuple[Array, ...]:
         def value(*parts: Array) -> Array:
             values = constraint(robot, Motion(*parts))
             return jnp.take_along_axis(values, chosen[:, None], axis=1)[:, 0]
 
         values, pull = jax.vjp(value, *parts)
-        return values, pull(jnp.ones_like(values))
+        return values, *pull(jnp.ones_like(values))
 
     return linearised
 
@@ -222,8 +232,7 @@ class Clearance(AbstractConstraint):
         gaps, slopes = self.model.slopes(np.asarray(self._axes(robot, motion.q)), chosen)
         ends = eqx.Partial(self.model.ends, robot)
         (by_q,) = _pull(ends, ends.__call__, slopes / -0.1, np.asarray(motion.q))
-        none = np.zeros(by_q.shape)
-        return (self.distances[chosen] - gaps) / 0.1, [by_q, none, none]
+        return (self.distances[chosen] - gaps) / 0.1, [by_q]
 
     def entries(self, robot: Robot) -> tuple[Finding, ...]:
         """Return the pairs."""

@@ -72,7 +72,8 @@ def _minimise(
 
         @functools.lru_cache(maxsize=1)
         def linearised(z: bytes) -> tuple[np.ndarray, np.ndarray]:
-            return problem.linearise(np.frombuffer(z), watched)
+            values, slopes = problem.linearise(np.frombuffer(z)[None], [watched])
+            return values[0], slopes[0]
 
         fun, jac = (lambda z, k=k: -linearised(z.tobytes())[k] for k in (0, 1))
         conditions.append({"type": "ineq", "fun": lambda z: fun(z) - MARGIN, "jac": jac})

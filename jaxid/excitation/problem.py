@@ -112,6 +112,7 @@ class ExcitationProblem:
                 f"`noise` must hold one positive number for each joint, but is {self.noise}."
             )
         self.robot = robot.replace(limits=self.limits.limits)
+        self._regressor = base.joint_regressor
         self._rows = np.asarray(self.basis.rows(self.basis.instants(CHECKED))[:3])
         self._samples: dict[int, tuple[np.ndarray, ...]] = {}
         self._judged = jax.jit(jax.value_and_grad(self._criterion, argnums=(0, 1)))
@@ -209,7 +210,7 @@ class ExcitationProblem:
         rows = self._sampled(samples)
         coefficients = self.limits.coefficients(x)
         arrays = [np.einsum("sk,bjk->jbs", part, coefficients) for part in rows]
-        regressor = self.base.joint_regressor
+        regressor = self._regressor
         columns = [np.swapaxes(y, 0, 1) for y in regressor.in_numpy(*arrays)]
         plain, weighted = np.zeros((2, len(x), self.base.size, self.base.size))
         scale, w = self.samples / samples, 1.0 / self.noise
@@ -256,27 +257,28 @@ class ExcitationProblem:
         """Return the criterion, and the watched values of constraints, of several motions."""
         count = scale_samples(SEARCHED, self.basis)
         values, gradients = self.value_and_gradient(x, sharpness, count)
-        found = []
-        for y, value, gradient, now in zip(x, values, gradients, watched, strict=True):
-            excess, slopes = self.linearise(y, now)
-            found.append(Evaluation(float(value), gradient, excess + MARGIN, slopes))
-        return found
+        excess, slopes = self.linearise(x, watched)
+        parts = zip(values.tolist(), gradients, excess + MARGIN, slopes, strict=True)
+        return [Evaluation(*one) for one in parts]
 
     def linearise(
-        self, x: Float[np.ndarray, " scaled"], watched: Watched
-    ) -> tuple[Float[np.ndarray, " values"], Float[np.ndarray, "values scaled"]]:
-        """Return watched values of one motion's constraints, and their derivatives."""
+        self, x: Float[np.ndarray, "starts scaled"], watched: Sequence[Watched]
+    ) -> tuple[Float[np.ndarray, "starts values"], Float[np.ndarray, "starts values scaled"]]:
+        """Return watched values of the constraints of several motions, and their derivatives."""
         coefficients, scale = self.limits.coefficients(x), np.asarray(self.limits.scale)
-        excess, derivatives = [np.zeros(0)], [np.zeros((0, x.shape[-1]))]
-        for constraint, (instants, entries) in zip(self.constraints, watched, strict=True):
+        excess, derivatives = [np.zeros((len(x), 0))], [np.zeros((len(x), 0, x.shape[-1]))]
+        for constraint, places in zip(self.constraints, zip(*watched, strict=True), strict=True):
+            instants, entries = (np.array(part) for part in zip(*places, strict=True))
             rows = self._rows[:, instants]
-            motion = Motion(*(part @ coefficients.T for part in rows))
-            values, slopes = constraint.linearise(self.robot, motion, entries)
-            parts = zip(slopes, rows, strict=True)
-            by_x = sum(J[:, :, None] * part[:, None] for J, part in parts) * scale
-            excess.append(values)
-            derivatives.append(by_x.reshape(len(values), -1))
-        return np.concatenate(excess), np.concatenate(derivatives)
+            q, qd, qdd = np.einsum("obwk,bjk->obwj", rows, coefficients, optimize=True)
+            motion = Motion(*(part.reshape(instants.size, -1) for part in (q, qd, qdd)))
+            values, slopes = constraint.linearise(self.robot, motion, entries.ravel())
+            by_x = np.zeros((*instants.shape, *scale.shape))
+            for J, part in zip(slopes, rows, strict=False):
+                by_x += J.reshape(*instants.shape, -1, 1) * part[:, :, None]
+            excess.append(values.reshape(instants.shape))
+            derivatives.append((by_x * scale).reshape(*instants.shape, -1))
+        return np.concatenate(excess, axis=1), np.concatenate(derivatives, axis=1)
 
     @property
     def conditions(self) -> int:

@@ -7,9 +7,9 @@ JAX, `evaluate` in NumPy, `to_python` on single floats; `c.CWriter` writes it in
 
 from .jax_sincos import sine_cosine as sine_cosine
 from .numpy_evaluation import (
-    dense_rows as dense_rows,
     evaluate as evaluate,
     evaluate_rows as evaluate_rows,
+    packed_entries as packed_entries,
     to_python as to_python,
 )
 from .program import (

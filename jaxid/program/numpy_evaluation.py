@@ -29,10 +29,9 @@ operations on the cells; number of cells. Those of the results come first, other
 
 def evaluate(program: Program, *arrays: AnyArray) -> Any:
     """Compute the outputs of a program, in the structure of the traced function, in NumPy."""
-    table, batch = _evaluate(program, arrays)
-    rows = [row.reshape(batch) for row in table]
-    pairs = zip(program.distinct[1], program.outputs, strict=True)
-    return program.unpack([rows[k] if k >= 0 else x for k, x in pairs], batch, np)
+    rows, batch = _evaluate(program, arrays)
+    entries = packed_entries(program, rows, np.arange(len(program.outputs)))
+    return program.unpack(entries.reshape(len(entries), *batch))
 
 
 def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
@@ -40,17 +39,14 @@ def evaluate_rows(program: Program, *arrays: AnyArray) -> np.ndarray:
     return _evaluate(program, arrays)[0]
 
 
-def dense_rows(program: Program, rows: np.ndarray, dtype: Any) -> np.ndarray:
-    """Return the packed result of each sample [samples, results] from its distinct values."""
-    (_, entries), samples = program.distinct, rows.shape[1]
-    out = np.zeros((samples, len(entries)), dtype)
-    varying, constants = np.flatnonzero(entries >= 0), np.flatnonzero(entries < 0)
-    out[:, constants] = [program.outputs[k] for k in constants]
-    source = entries[varying]
-    for start in range(0, samples, _BLOCK // 4):
-        part = slice(start, start + _BLOCK // 4)
-        out[part, varying] = rows[source, part].T
-    return out
+def packed_entries(program: Program, rows: np.ndarray, entries: np.ndarray) -> np.ndarray:
+    """Return some entries of the packed result [entries, samples] from its distinct values."""
+    found, number = np.empty((len(entries), rows.shape[1])), program.distinct[1][entries]
+    varies = number >= 0
+    found[varies] = rows[number[varies]]
+    constants = [program.outputs[k] for k in entries[~varies]]
+    found[~varies] = np.array(constants, float)[:, None]
+    return found
 
 
 @functools.lru_cache(maxsize=64)

@@ -108,11 +108,11 @@ class Program:
         entries = [-1 if x is None else numbers.setdefault(x, len(numbers)) for x in nodes]
         return tuple(numbers), np.array(entries, int)
 
-    @property
+    @functools.cached_property
     def nonzeros(self) -> Any:
         """Boolean arrays in the structure of the outputs, False where an entry is always 0."""
-        varies = [not (isinstance(x, float) and x == 0) for x in self.outputs]
-        return self.unpack(varies, (), np)
+        varies = np.array([not (isinstance(x, float) and x == 0) for x in self.outputs], bool)
+        return self.unpack(varies)
 
     def split(self, packed: Sequence) -> list[Sequence]:
         """Split values of the packed entries into those of each output."""
@@ -138,13 +138,10 @@ class Program:
             entries.append(xp.broadcast_to(x.reshape(size, *missing, *own), (size, *batch)))
         return entries, batch
 
-    def unpack(self, packed: Sequence[Any], batch: tuple[int, ...], xp: ModuleType) -> Any:
-        """Return a packed result in the structure of the traced function, batch axes last."""
-        full = [xp.broadcast_to(x, batch) for x in packed]
-        leaves = []
-        for entries, shape in zip(self.split(full), self.output_shapes, strict=True):
-            stacked = xp.stack(entries) if entries else xp.zeros((0, *batch))
-            leaves.append(stacked.reshape((*shape, *batch)))
+    def unpack(self, packed: Any) -> Any:
+        """Return an array [entries, *batch] in the structure of the traced function's result."""
+        parts = zip(self.split(packed), self.output_shapes, strict=True)
+        leaves = [entries.reshape((*shape, *packed.shape[1:])) for entries, shape in parts]
         return jax.tree.unflatten(self.structure, leaves)
 
 

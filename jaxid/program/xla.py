@@ -112,9 +112,9 @@ class Lowered(eqx.Module):
 
         Constants cost memory and time here; prefer the packed result.
         """
-        dtype = jnp.result_type(*arrays, float)
-        packed = [jnp.asarray(x, dtype) for x in self(*arrays)]
-        return self.program.unpack(packed, self.entries(*arrays)[1], jnp)
+        dtype, batch = jnp.result_type(*arrays, float), self.entries(*arrays)[1]
+        full = [jnp.broadcast_to(jnp.asarray(x, dtype), batch) for x in self(*arrays)]
+        return self.program.unpack(jnp.stack(full) if full else jnp.zeros((0, *batch), dtype))
 
     def run(self, entries: Entries, operations: dict[Operation, Callable]) -> Values:
         """Compute all nodes.

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from sample_functions import SIZE, chain, random_functions, reference, samples
 
 from jaxid.errors import InputError
-from jaxid.program import dense_rows, evaluate, evaluate_rows, to_python, trace
+from jaxid.program import evaluate, evaluate_rows, packed_entries, to_python, trace
 
 
 def flat(program, *x):
@@ -38,7 +38,7 @@ def test_distinct_results_are_computed_once_and_constants_not_at_all():
     rows = evaluate_rows(program, np.arange(3.0))
     np.testing.assert_array_equal(rows, [np.arange(3.0)])
     expected = [[x, 0.0, x, 2.5] for x in range(3)]
-    np.testing.assert_array_equal(dense_rows(program, rows, np.float64), expected)
+    np.testing.assert_array_equal(packed_entries(program, rows, np.arange(4)).T, expected)
 
 
 def test_inputs_are_not_changed():
