@@ -269,11 +269,9 @@ class SpectralTable:
         self._rest = xp.maximum(rest, xp.maximum(least, 1e-300))
         # Channel by channel: fewer numbers at once.
         pairs = [(energy[:, c], self._rest[c]) for c in range(len(self._rest))]
-        C = xp.stack([half * transposed_sums(x / rest[None]) for x, rest in pairs], axis=1)
-        self._map = C.reshape((len(C), -1))
+        self._maps = [half * transposed_sums(x / rest[None]) for x, rest in pairs]
         # From a line's power to the scatter of its mean over the stretches.
-        scatter = xp.sqrt(2.0 / (half * (1.0 + xp.maximum(exposure, 1.0))))
-        self._scatter = scatter.reshape((1, -1))
+        self._scatter = xp.sqrt(2.0 / (half * (1.0 + xp.maximum(exposure, 1.0))))
 
     @classmethod
     def of(cls, lines: Sequence[Lines]) -> "SpectralTable":
@@ -282,7 +280,8 @@ class SpectralTable:
         arrays = [[getattr(x, name) for x in lines] for name in names]
         arrays.append([x.exposure[:, None] + 0 * x.leverage for x in lines])
         longest = max(x.length * x.row_time for x in lines)
-        return cls(np, *(np.concatenate(parts, -1) for parts in arrays), longest=longest)
+        joined = (np.concatenate(x, -1) if len(x) > 1 else x[0] for x in arrays)
+        return cls(np, *joined, longest=longest)
 
     def density(self, power: np.ndarray) -> np.ndarray:
         """Return the spectrum of the errors at each line, from the periodogram of residuals."""
@@ -290,9 +289,10 @@ class SpectralTable:
 
     def __call__(self, power: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return variances and degrees of freedom for periodograms [draws, channels, lines]."""
-        xp, flat = self._xp, power.reshape((len(power), -1))
-        variance = flat @ self._map.T
-        squares = (flat * self._scatter) ** 2 @ (self._map**2).T
+        xp, variance, squares = self._xp, 0.0, 0.0
+        for c, C in enumerate(self._maps):
+            variance = variance + power[:, c] @ C.T
+            squares = squares + (power[:, c] * self._scatter[c]) ** 2 @ (C**2).T
         positive = squares > 0
         dof = xp.where(positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf)
         return variance, dof
