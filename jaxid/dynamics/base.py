@@ -20,13 +20,7 @@ from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion
 from .packed_regressor import JointRegressor, PackedRegressor
-from .rank import (
-    Dependence,
-    gram_schmidt,
-    random_regressor,
-    regrouping,
-    singular_values,
-)
+from .rank import Dependence, gram_schmidt, random_regressor, regrouping, singular_values
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 

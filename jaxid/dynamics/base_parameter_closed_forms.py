@@ -26,13 +26,7 @@ from jaxid.units import Dimension, dimension
 
 from .base_parameter_expressions import Coefficient, Expression, Monomial
 from .model import Model
-from .rank import (
-    characteristic_length,
-    column_units,
-    random_motion,
-    regrouping,
-    row_units,
-)
+from .rank import characteristic_length, column_units, random_motion, regrouping, row_units
 
 _POWERS = np.arange(-2, 3)
 """Exponents of a length that are tried."""

@@ -11,14 +11,7 @@ from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot
 
-from .factors import (
-    Blocks,
-    Columns,
-    Factors,
-    RowChunk,
-    empty_factors,
-    row_chunks,
-)
+from .factors import Blocks, Columns, Factors, RowChunk, empty_factors, row_chunks
 
 Span = tuple[int, int, int]
 """Index of a recording, and the half-open range of some of its rows."""

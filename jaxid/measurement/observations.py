@@ -18,19 +18,8 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
-from .filters import (
-    AbstractDecimation,
-    AbstractFilter,
-    Subsample,
-    ZeroPhaseButterworth,
-)
-from .recording import (
-    Recording,
-    TimeGrid,
-    consecutive,
-    finite_channel,
-    positive_time,
-)
+from .filters import AbstractDecimation, AbstractFilter, Subsample, ZeroPhaseButterworth
+from .recording import Recording, TimeGrid, consecutive, finite_channel, positive_time
 
 FEWEST_ROWS = 4
 """Smallest number of rows for which a segment is used."""

@@ -26,13 +26,7 @@ from .friction_and_disturbances import (
     FrictionTemperature,
     SmoothFriction,
 )
-from .mechanics import (
-    DriveTrain,
-    RigidGear,
-    Servo,
-    SimulatedPlant,
-    follow,
-)
+from .mechanics import DriveTrain, RigidGear, Servo, SimulatedPlant, follow
 
 
 def random_bodies(

@@ -12,13 +12,7 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
-from .trajectory import (
-    AbstractBasis,
-    Envelope,
-    LinearTrajectory,
-    as_scalar,
-    stand_outside,
-)
+from .trajectory import AbstractBasis, Envelope, LinearTrajectory, as_scalar, stand_outside
 
 
 class FourierBasis(AbstractBasis):

@@ -22,13 +22,7 @@ from jaxid.arrays import (
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 
-from ..estimators import (
-    AbstractEstimator,
-    AbstractWeights,
-    Complete,
-    Estimate,
-    MaximumForces,
-)
+from ..estimators import AbstractEstimator, AbstractWeights, Complete, Estimate, MaximumForces
 from . import solver
 from .bounds_and_priors import BodyBounds, EntropicPull, ParameterPrior
 from .program import (

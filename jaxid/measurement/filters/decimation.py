@@ -13,11 +13,7 @@ from scipy import signal
 from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 
-from .filter import (
-    LowPass,
-    integer,
-    unit_gain_sections,
-)
+from .filter import LowPass, integer, unit_gain_sections
 
 
 class AbstractDecimation(eqx.Module):
