@@ -73,7 +73,6 @@ from .robot import (
     collision as collision,
     library as robots,  # noqa: F401
 )
-from .robot.forward_and_inverse_kinematics import inverse_kinematics as inverse_kinematics
 from .robot.library import from_dh as from_dh
 from .robot.limits_and_drives import Drives as Drives, Limits as Limits
 from .robot.robot import Robot as Robot, Tool as Tool

@@ -1,7 +1,6 @@
 """Trajectories: bases, splines, leads, paths of the end-effector, and their files."""
 
 from .files import (
-    joint_trajectory as joint_trajectory,
     load_trajectory as load_trajectory,
     save_trajectory as save_trajectory,
     write_csv as write_csv,
