@@ -32,8 +32,6 @@ SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
 EXAMINED = 2**17
 """Largest number of samples of a long log that are examined."""
-APART = 5.0
-"""Ratio of a force's departure from the model to all others from which it is an event."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,7 +265,7 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
         others = error[np.abs(o.instants - o.instants[k]) > length]
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = _deviation(fit, row)
-        if error[k] > max(0.5 * size[j], APART * (deviation + others.max(initial=0.0))):
+        if error[k] > max(0.5 * size[j], 5.0 * (deviation + others.max(initial=0.0))):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "

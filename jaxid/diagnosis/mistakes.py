@@ -43,12 +43,8 @@ FAR = 0.15
 """Fraction (0 to 1) of the forces that no model misses whose description is right."""
 MOST = 0.5
 """Fraction (0 to 1) of what a model misses that may be left by the correction of a mistake."""
-PROMISING = 0.9
-"""Fraction (0 to 1) of what a model misses that a correction may leave at first sight."""
 MANY = 12
 """Number of joints above which no two joints, and no axes, are examined: they would be too many."""
-CLEAR = 1.5
-"""Ratio of what two corrections leave from which one of them is not likely."""
 
 
 class Correction(NamedTuple):
@@ -114,7 +110,7 @@ def likely_mistakes(
             candidates += _of_kinds(robot, motion, forces) if left > FAR else ()
         tried = sorted(((samples.missed(c, part), k) for k, c in enumerate(candidates)))
         best = tried[0][0]
-        likely = [candidates[k] for value, k in tried if value < CLEAR * best]
+        likely = [candidates[k] for value, k in tried if value < 1.5 * best]
         unseen = samples.missed(likely[0], part, FOLDS)
         # With more than three candidates nothing is known.
         known = len(likely) <= 3 and best <= min(MOST * left, FAR)
@@ -165,7 +161,7 @@ class _Samples:
         step, now = 0.1 * mistake.small, self.given**2
         below, above = left(-step) ** 2, left(step) ** 2
         bend, slope = below + above - 2 * now, above - below
-        if bend > 0 and slope**2 < 8 * bend * now * (1 - PROMISING**2):
+        if bend > 0 and slope**2 < 8 * bend * now * (1 - 0.9**2):
             return mistake.correction(-np.sign(slope) * step, part)
         bounds, options = (-mistake.largest, mistake.largest), {"maxiter": 10}
         found = optimize.minimize_scalar(left, bounds=bounds, options=options).x

@@ -26,8 +26,6 @@ from .torque_program import body_parameters
 
 _COMMENT = " Inertias and friction: model of "
 """Beginning of the comment in a URDF file that names the model."""
-_UNLIMITED = "1e9"
-"""Effort or velocity in a URDF file where none is known."""
 
 
 def joint_dynamics(
@@ -175,7 +173,7 @@ def export_urdf(
             _child(joints[name], "limit").set("effort", _text(efforts[i]))
     for limit, key in itertools.product(root.iterfind("joint/limit"), ("effort", "velocity")):
         # A URDF must have both; MJCF has no speeds.
-        limit.set(key, limit.get(key, _UNLIMITED))
+        limit.set(key, limit.get(key, "1e9"))
     write_bytes(
         path, etree.tostring(root.getroottree(), xml_declaration=True, encoding="utf-8") + b"\n"
     )

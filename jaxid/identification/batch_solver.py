@@ -25,10 +25,6 @@ AT_ONCE, AT_ONCE_ON_GPU = 2048, 2**17
 WELL_CONDITIONED = 1e4
 """Condition number, with columns of length one, up to which products of rows are accurate enough;
 beyond it a data set is solved again by orthogonal factors."""
-ACCURATE = 1e3
-"""Bound of the condition number up to which the products' solution needs no refinement."""
-SMALL = 1e-6
-"""Fraction of the forces' squares below which the residuals' are summed themselves."""
 RIDGE = 64 * np.finfo(float).eps
 
 
@@ -163,7 +159,7 @@ def _solve_one(
         return p + step, squares - 2 * along(step, products)
 
     # Residuals themselves are only needed where differences of large numbers would lose digits.
-    lost = (condition > ACCURATE) | jnp.any(squares < SMALL * forces)
+    lost = (condition > 1e3) | jnp.any(squares < 1e-6 * forces)
     if on_cpu:
         p, squares = jax.lax.cond(lost, refine, lambda: (p, squares))
     else:

@@ -29,9 +29,6 @@ from .fit_result import Fit
 from .identify import identify
 from .uncertainty import IndependentRows
 
-GEOMETRY = ("axis", "rotation", "offset", "gravity")
-"""Numbers in which the robots of a batch may differ."""
-
 
 def identify_batch(
     base: BaseParameters,
@@ -184,6 +181,7 @@ def _of_each(base: BaseParameters, robots: Sequence[Robot]) -> list[BaseParamete
             raise InputError(
                 f"`{robot.name}` of `robots` must have the topology of `{own.name}`, and no tool."
             )
-        placed = own.replace(**{name: getattr(robot, name) for name in GEOMETRY})
+        geometry = {x: getattr(robot, x) for x in ("axis", "rotation", "offset", "gravity")}
+        placed = own.replace(**geometry)
         each.append(eqx.tree_at(lambda b: b.model.robot, base, placed))
     return each

@@ -20,8 +20,6 @@ from .fit_result import Fit, interval_table
 from .operating_states import state_maps, varying_parameters
 from .uncertainty import Uncertainty
 
-SCALE = 1e-3
-"""Relative standard deviation of a mass that a scale has told."""
 CENTRAL_NAMES = ("m", "x", "y", "z", "A_c", "B_c", "C_c", "D_c", "E_c", "F_c")
 CENTRAL_UNITS = ("kg", "m", "m", "m", *("kg m²",) * 6)
 
@@ -144,7 +142,7 @@ def identify_payload(
     dof = np.full(10, np.min(both.dof[-10:]))
     estimate = x[-10:]
     if mass is not None:
-        gain = covariance[:, 0] / (covariance[0, 0] + (SCALE * mass) ** 2)
+        gain = covariance[:, 0] / (covariance[0, 0] + (1e-3 * mass) ** 2)
         estimate = estimate + gain * (mass - estimate[0])
         covariance = covariance - np.outer(gain, covariance[0])
     uncertainty = Uncertainty(covariance, dof, covariance)

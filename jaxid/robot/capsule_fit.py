@@ -20,8 +20,6 @@ from .urdf_tree import UrdfTree
 
 _SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _ZERO = (0.0, 0.0, 0.0)
-_STOUT = 0.07
-"""Radius of a body of unknown shape, relative to the length of the robot."""
 
 
 class Shape(NamedTuple):
@@ -113,7 +111,7 @@ def stand_in_capsules(robot: Robot, bodies: list[int]) -> list[Capsule]:
     """
     offsets = [np.asarray(x) for x in (*robot.offset, robot.tip_offset)]
     carriers = (*robot.parent, robot.tip_body)
-    stout = _STOUT * sum(float(np.linalg.norm(x)) for x in offsets)
+    stout = 0.07 * sum(float(np.linalg.norm(x)) for x in offsets)
     found = []
     for body in bodies:
         name = "base" if body == GROUND else f"link of {robot.joint_names[body]}"

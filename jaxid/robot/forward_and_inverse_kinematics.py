@@ -23,10 +23,6 @@ from .rotations import rotation_about
 
 _REACHED = 1e-9
 """Distance at which a pose is reached [m, and rad], and slack of a range relative to its half."""
-_LARGEST_STEP = 0.2
-"""Largest step of a joint, relative to half its range."""
-_SINGULAR = 1e-11
-"""Regularisation of directions that no joint moves."""
 
 
 def placement_in_parent(
@@ -202,7 +198,7 @@ def _descend(
     """
     n = q.shape[1]
     K = np.zeros((len(q), n + 6, n + 6))
-    K[:, n:, n:] = -_SINGULAR * np.eye(6)
+    K[:, n:, n:] = -1e-11 * np.eye(6)
     for k in range(gauss + newton):
         e, J, shift, turn = _linearise(task, positions, q)
         K[:, :n, :n], K[:, :n, n:], K[:, n:, :n] = np.eye(n), np.swapaxes(J, 1, 2), J
@@ -211,7 +207,8 @@ def _descend(
             K[:, :n, :n] += H * (task.half[:, None] * task.half)
         slope = (q - task.posture) / task.half + np.einsum("pij,pi->pj", J, multipliers)
         step = np.linalg.solve(K, np.concatenate([slope, e], axis=1)[..., None])[..., 0]
-        step /= np.maximum(1.0, np.abs(step[:, :n]).max(axis=1, keepdims=True) / _LARGEST_STEP)
+        # At most a tenth of a joint's range.
+        step /= np.maximum(1.0, np.abs(step[:, :n]).max(axis=1, keepdims=True) / 0.2)
         q = q - task.half * step[:, :n]
         multipliers = multipliers - step[:, n:]
     return q, multipliers
