@@ -74,9 +74,7 @@ class Diagnosis(Summarised):
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
 
-        Args:
-            fit: Fit to this log.
-            commanded: The log with commanded angles in place of the measured ones, filtered alike.
+        The log with `commanded` angles in place of the measured ones is filtered alike.
         """
         found, more = _mistakes([self], fit)
         if not found and not self.faulty and self.observations is not None:

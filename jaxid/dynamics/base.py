@@ -146,7 +146,6 @@ class BaseParameters(Summarised, Hashable):
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
         r"""Return the base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
-        self.model.check(motion.q)
         return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
@@ -156,7 +155,6 @@ class BaseParameters(Summarised, Hashable):
             InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 robot's geometry.
         """
-        self.model.check(motion.q)
         return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 
     def from_standard(
@@ -188,7 +186,6 @@ class BaseParameters(Summarised, Hashable):
         motion: Motion,
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
-        self.model.check(motion.q)
         return on_samples(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
     def mass_matrix(

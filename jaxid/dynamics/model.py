@@ -130,6 +130,7 @@ class Model(Hashable):
 
         Where a motion does not have the state, its samples are a path in the order of time.
         """
+        self.check(motion.q)
         law, qd, s = self.memory, motion.qd, motion.state
         if law is None:
             return motion.q, qd, motion.qdd
@@ -185,7 +186,6 @@ class Model(Hashable):
         Args:
             motion: Joint motion at any number of instants.
         """
-        self.check(motion.q)
         return on_samples(self, self.columns, *self.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
@@ -200,7 +200,6 @@ class Model(Hashable):
             InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 robot's geometry.
         """
-        self.check(motion.q)
         return PackedRegressor(self, self.columns, *self.arguments(motion))
 
     def gram(
@@ -227,7 +226,6 @@ class Model(Hashable):
             p: Standard parameters.
             motion: Joint motion at any number of instants.
         """
-        self.check(motion.q)
         return on_samples(self, self.forces, *self.arguments(motion), shared=(p,))
 
     def mass_matrix(

@@ -54,7 +54,7 @@ def shards(folder: str | Path) -> tuple[Path, ...]:
 def factorise_across_processes(
     base: BaseParameters,
     recordings: Sequence[Observations],
-    patience: float | int = 600.0,
+    patience: float = 600.0,
     progress: Progress | None = None,
 ) -> RegressionProblem:
     """Return the regression problem of the recordings of all processes: their joined factors.
