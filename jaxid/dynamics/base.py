@@ -180,19 +180,11 @@ class BaseParameters(Summarised, Hashable):
             return full
         return jnp.zeros(shape, p.dtype).at[..., places].set(p)
 
-    def inverse_dynamics(
-        self,
-        p: Parameters,
-        motion: Motion,
-    ) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
         return on_samples(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
-    def mass_matrix(
-        self,
-        p: Parameters,
-        q: Coordinates,
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
         """Return the mass matrix, which base parameters determine completely (Eq. 38)."""
         return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
 

@@ -189,10 +189,7 @@ def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
 
 
 def on_samples(
-    owner: eqx.Module,
-    definition: Callable,
-    *samples: AnyArray,
-    shared: tuple[Numbers, ...] = (),
+    owner: eqx.Module, definition: Callable, *samples: AnyArray, shared: tuple[Numbers, ...] = ()
 ) -> AnyArray:
     """Apply a method for one sample to arrays with any leading batch axes.
 
@@ -266,10 +263,7 @@ def _over_batches(run: Callable, batch: tuple[int, ...], arrays: list[Array], sh
 
 
 def in_numpy(
-    owner: eqx.Module,
-    definition: Callable,
-    *samples: AnyArray,
-    shared: tuple[AnyArray, ...] = (),
+    owner: eqx.Module, definition: Callable, *samples: AnyArray, shared: tuple[AnyArray, ...] = ()
 ) -> np.ndarray:
     """Apply a method for one sample to rows of samples in NumPy: float64, never compiled."""
     arguments = [np.asarray(x, np.float64) for x in shared]

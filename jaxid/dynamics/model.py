@@ -215,11 +215,7 @@ class Model(Hashable):
         """
         return gram(self, self.columns, weights, *self.arguments(motion))
 
-    def inverse_dynamics(
-        self,
-        p: Parameters,
-        motion: Motion,
-    ) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
@@ -228,11 +224,7 @@ class Model(Hashable):
         """
         return on_samples(self, self.forces, *self.arguments(motion), shared=(p,))
 
-    def mass_matrix(
-        self,
-        p: Parameters,
-        q: Coordinates,
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
         r"""Return the mass matrix $M(q)$, rotors included (Eq. 38).
 
         Args:
@@ -242,10 +234,7 @@ class Model(Hashable):
         return on_samples(self, self.inertia, self.check(q), shared=(p,))
 
     def bias_forces(
-        self,
-        p: Parameters,
-        q: Coordinates,
-        qd: Coordinates,
+        self, p: Parameters, q: Coordinates, qd: Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the forces $h(q, \dot q)$ at zero acceleration [N m or N] (Eq. 38).
 
@@ -271,10 +260,7 @@ class Model(Hashable):
         return on_samples(self, self.acceleration, *samples, shared=(p,))
 
     def kinetic_energy(
-        self,
-        p: Parameters,
-        q: Coordinates,
-        qd: Coordinates,
+        self, p: Parameters, q: Coordinates, qd: Coordinates
     ) -> Float[AnyArray, "*batch"]:
         r"""Return the kinetic energy $\frac12 \dot q^T M \dot q$ [J]."""
         M, qd = self.mass_matrix(p, q), self.check(qd)

@@ -58,11 +58,7 @@ def resolution_bias(
 
     def estimate(angles: np.ndarray) -> np.ndarray:
         log = dataclasses.replace(
-            recording,
-            angles=angles,
-            velocities=None,
-            forces=forces,
-            forces_on_motor_side=False,
+            recording, angles=angles, velocities=None, forces=forces, forces_on_motor_side=False
         )
         o = observe(log, robot, observations.filter, observations.decimation)
         o = o.replace(mask=observations.mask)

@@ -146,12 +146,7 @@ def identify_nonlinear(
     )
 
 
-def _held_out_errors(
-    blocks,
-    search: ShapeSearch,
-    weights,
-    progress,
-) -> HeldOutErrors:
+def _held_out_errors(blocks, search: ShapeSearch, weights, progress) -> HeldOutErrors:
     """Test both models on blocks that neither has seen, nor the search for shapes."""
     squares, errors, every = weights**2, [], np.arange(len(blocks.parts))
     folds = np.array_split(every, min(5, len(every)))

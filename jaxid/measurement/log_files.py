@@ -69,12 +69,7 @@ class LogTable:
             raise InputError(f"`{self.source}` has no rows: is the log cut?")
         return rows
 
-    def read(
-        self,
-        channels: Iterable[str],
-        start: int = 0,
-        stop: int | None = None,
-    ) -> "LogTable":
+    def read(self, channels: Iterable[str], start: int = 0, stop: int | None = None) -> "LogTable":
         """Return some rows of some channels, in memory."""
         kept = {channel: self.channels[channel] for channel in channels}
         names = list(itertools.chain(*kept.values()))

@@ -90,11 +90,7 @@ load_mjcf = load_urdf
 
 
 def urdf_parameters(
-    path: str | Path,
-    *,
-    tip: str | None = None,
-    base: str | None = None,
-    check: bool = True,
+    path: str | Path, *, tip: str | None = None, base: str | None = None, check: bool = True
 ) -> Float[AnyArray, " inertial"]:
     """Return the inertial parameters that a URDF or MJCF file claims, often from CAD (Eq. 9).
 

@@ -158,12 +158,7 @@ def fourier_series(
 
 
 def random_fourier_series(
-    robot: Robot,
-    *,
-    omega: float,
-    harmonics: int = 5,
-    reach: float = 0.95,
-    seed: int = 0,
+    robot: Robot, *, omega: float, harmonics: int = 5, reach: float = 0.95, seed: int = 0
 ) -> LinearTrajectory:
     """Draw a Fourier series that uses the limits of every joint: a start for designs and tests.
 

@@ -193,9 +193,7 @@ class ShapeSearch(eqx.Module):
         return cls(shapes, start, logs, fixed, forces * counted, counted, blocks, tuple(entries))
 
     def __call__(
-        self,
-        weights: Float[AnyArray, " joints"],
-        kept: Float[AnyArray, " blocks"] | None = None,
+        self, weights: Float[AnyArray, " joints"], kept: Float[AnyArray, " blocks"] | None = None
     ) -> tuple[Float[Array, " shapes"], Array]:
         """Search by Levenberg-Marquardt over logarithms; return shapes, and whether it converged.
 
