@@ -21,6 +21,8 @@ from .recording import NeedsMemory, Recording, TimeGrid, consecutive, find_grid
 
 AT_ONCE = 65536
 """Samples that are read at once."""
+BAD_ROWS = 1e-3
+"""Fraction of the rows of a log that may be bad."""
 NAMED = 20
 """Bad rows that are named."""
 
@@ -34,7 +36,7 @@ def read_recording(
     velocities_path: str | Path | None = None,
     largest_gap: float | int = 1.75,
     bridged: float = 0.0,
-    bad_rows: float = 1e-3,
+    bad_rows: float = BAD_ROWS,
 ) -> Recording:
     """Read a log from CSV (any separator), Parquet, NPZ, MAT, HDF5, or a bag of ROS 1 or 2.
 
