@@ -10,7 +10,6 @@ what `demo.json` says, the median over the seeds and the worst of them:
   by the true parameters, whose errors are what disturbs;
 * share of 2000 random poses in which the mass matrix has an eigenvalue that is not positive;
 * six base parameters cold and warm (Sec. 6), less the paper's, in percent of the paper's;
-* distance of the end-effector from the path of ISO 9283, three feed-forwards;
 * speed and acceleration of the end-effector along the designed motion.
 
     python benchmarks/demo.py [--seeds 0 1 2] [--quick]
@@ -68,11 +67,6 @@ def figures(record):
             found[f"p_B({one['number']}) {state}, off the paper's [%]"] = (
                 100 * (one["estimates"][k] - paper) / paper
             )
-    for one in record["following"]:
-        found[f"end-effector off the path, RMS, {one['fed_forward']} [mm]"] = 1e3 * one["tip_rms"]
-        found[f"end-effector off the path, largest, {one['fed_forward']} [mm]"] = (
-            1e3 * one["tip_largest"]
-        )
     excitation = record["excitation"]
     found["end-effector, speed up to [m/s]"] = excitation["tip_speed"]
     found["end-effector, acceleration up to [m/s²]"] = excitation["tip_acceleration"]

@@ -38,7 +38,6 @@ from .identification import (
 from .identification.combination import update as update
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from .identification.delay import estimate_delay as estimate_delay
-from .identification.drive_gains import identify_drive_gains as identify_drive_gains
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
 from .identification.filter_and_parameter_selection import (
     choose_filter as choose_filter,
@@ -50,12 +49,15 @@ from .identification.many_data_sets import identify_batch as identify_batch
 from .identification.model_selection import Candidate as Candidate, choose_model as choose_model
 from .identification.nonlinear_friction import (
     identify_nonlinear as identify_nonlinear,
+    identify_presliding as identify_presliding,
     temperature_law as temperature_law,
 )
 from .identification.operating_states import identify_states as identify_states
 from .identification.parameter_changes import compare as compare
-from .identification.payload import identify_payload as identify_payload
-from .identification.presliding import identify_presliding as identify_presliding
+from .identification.payload import (
+    identify_drive_gains as identify_drive_gains,
+    identify_payload as identify_payload,
+)
 from .identification.problem import RegressionProblem as RegressionProblem
 from .measurement import filters as filters
 from .measurement.columns import Columns as Columns
@@ -73,7 +75,6 @@ from .robot import (
     collision as collision,
     library as robots,  # noqa: F401
 )
-from .robot.forward_and_inverse_kinematics import inverse_kinematics as inverse_kinematics
 from .robot.library import from_dh as from_dh
 from .robot.limits_and_drives import Drives as Drives, Limits as Limits
 from .robot.robot import Robot as Robot, Tool as Tool

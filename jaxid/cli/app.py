@@ -62,8 +62,8 @@ def demo(
 ) -> None:
     """Do the whole paper on a virtual TX90L on its rail.
 
-    Base parameters, optimal excitation, measurement cold and warm, identification, verification on
-    the path of ISO 9283, and how well the path is followed with and without the model.
+    Base parameters, optimal excitation, measurement cold and warm, identification, and verification
+    on the path of ISO 9283.
     """
     from jaxid.demo.results import remarks, tables, write_study
     from jaxid.demo.study import run_study

@@ -49,7 +49,6 @@ def tables(study: Study) -> list[Table]:
         error_table(study, 0),
         error_table(study, 1),
         study.temperature.group_summary(),
-        following_table(study),
     ]
 
 
@@ -57,7 +56,6 @@ def remarks(study: Study) -> list[Remark]:
     """Return the findings of the paper, as far as they come out here."""
     worst, true = ([max(m.mean_errors(k)) for k in (0, 1)] for m in (study.weighted, study.true))
     plain, weighted = (m.mean_errors(0)[-1] for m in (study.unweighted, study.weighted))
-    none, cad, identified = (1e3 * run.rms for run in study.followed)
     return [
         Remark(
             f"The identified model predicts the torques of every axis to {worst[0]:.2g} % of the "
@@ -70,12 +68,6 @@ def remarks(study: Study) -> list[Remark]:
             f"Without weights the last axis errs by {plain:.2g} %, with weights by {weighted:.2g} "
             "% of its largest torque.",
             Status.GOOD if weighted < plain else Status.BAD,
-        ),
-        Remark(
-            "With the identified model fed forward the end-effector keeps its path to "
-            f"{identified:.2g} mm (RMS), with CAD values to {cad:.2g} mm, without a model to "
-            f"{none:.2g} mm.",
-            Status.GOOD if identified < cad < none else Status.DOUBTFUL,
         ),
     ]
 
@@ -129,17 +121,6 @@ def error_table(study: Study, recording: int) -> Table:
         *(column(m.name.replace(" ", "\n"), m.mean_errors(recording)) for m in study.models),
         column("weighted,\nmoving", study.moving_errors(study.weighted, recording)),
         rules=[len(names)],
-    )
-
-
-def following_table(study: Study) -> Table:
-    """Return how well the path of ISO 9283 is followed with each model."""
-    runs = study.followed
-    return Table(
-        "following the path of ISO 9283 by computed torque",
-        Column("fed forward", [run.name for run in runs]),
-        Column("end-effector\nRMS", [1e3 * run.rms for run in runs], "mm"),
-        Column("end-effector\nmax", [1e3 * float(run.distance.max()) for run in runs], "mm"),
     )
 
 
@@ -226,7 +207,7 @@ def _verification(study: Study) -> Section:
     times = np.linspace(0.0, float(path.duration), 5 * POINTS)
     motion = path.motion(times)
     first, second = study.weighted.validation.errors
-    return "Verification and application on another path", [
+    return "Verification on another path", [
         f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its corners, up "
         f"to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of the redundant joint "
         "angles the nearest to a posture are taken.",
@@ -239,9 +220,6 @@ def _verification(study: Study) -> Section:
         (error_table(study, 0), error_table(study, 1)),
         f"“Moving”: rows of each axis above {settings.AT_REST:g} rad/s or m/s. The torque of an "
         "axis at rest may be anything up to stiction, which no model of speeds predicts.",
-        "The same path with three torques fed forward: none, those of a CAD model without friction "
-        "whose bodies are 10 to 18 % off, and those of the identified model.",
-        following_table(study),
     ]
 
 
@@ -288,9 +266,5 @@ def _record(study: Study) -> dict[str, Any]:
                 "estimates": [fit.parameters[k - 1] for fit in fits],
             }
             for k in COLD
-        ],
-        "following": [
-            {"fed_forward": run.name, "tip_rms": run.rms, "tip_largest": run.distance.max()}
-            for run in study.followed
         ],
     }

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,6 @@ from jaxid.arrays import Float, on_cores
 from jaxid.excitation.design import DesignProgress
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.model_validation import Validation
-from jaxid.simulation.virtual import Tracking
 
 HARMONICS, OMEGA, SAMPLES = 5, 0.8, 800
 """Fourier series of the paper: order, fundamental frequency [rad/s], samples of a period."""
@@ -40,19 +39,6 @@ class Model(NamedTuple):
         return [float(x) for x in self.validation.errors[recording].mean_percent]
 
 
-class PathRun(NamedTuple):
-    """Run with a model fed forward, and the distance of the end-effector from its path [m]."""
-
-    name: str
-    run: Tracking
-    distance: Float[np.ndarray, " samples"]
-
-    @property
-    def rms(self) -> float:
-        """RMS distance of the end-effector [m]."""
-        return float(np.sqrt(np.mean(self.distance**2)))
-
-
 class Study(NamedTuple):
     """Results of the demo, with and without the weights of the joints (Eq. 30)."""
 
@@ -72,8 +58,6 @@ class Study(NamedTuple):
     true: Model  # parameters of the robot itself: their errors are all due to disturbances
     warm: jid.Fit  # fit of the warm robot
     temperature: Comparison  # comparison of the cold with the warm robot
-    # runs along the path with no model, CAD values, and the identified model
-    followed: tuple[PathRun, ...]
 
     @property
     def models(self) -> tuple[Model, ...]:
@@ -150,21 +134,8 @@ def run_study(
     models = [Model(name, fit, jid.validate(fit, recordings)) for name, fit in fits.items()]
     progress("comparing cold and warm", 0.0)
     warm = jid.identify(base, observations[1], jid.WeightedLeastSquares())
-    progress("following the path with three controllers", 0.0)
-    followed = _follow(cold, path, joints, fits["consistent"], seed)
-    return Study(
-        seed,
-        base,
-        truth,
-        plans,
-        played,
-        joints,
-        tuple(observations),
-        *models,
-        warm=warm,
-        temperature=jid.compare(fits["weighted"], warm),
-        followed=followed,
-    )
+    found: Any = (*models, warm, jid.compare(fits["weighted"], warm))
+    return Study(seed, base, truth, plans, played, joints, tuple(observations), *found)
 
 
 def _design(
@@ -205,27 +176,3 @@ def _design(
 
     # Most of the time is that of the compiler, which works on one core at a time.
     return tuple(on_cores(design, (jid.criteria.ConditionNumber(), jid.criteria.DOptimal())))
-
-
-def _follow(
-    virtual: jid.VirtualRobot,
-    path: jid.trajectories.TipPath,
-    joints: jid.trajectories.AbstractTrajectory,
-    fit: jid.Fit,
-    seed: int,
-) -> tuple[PathRun, ...]:
-    """Run the path by the servo alone, and with two models fed forward."""
-    cad = jid.simulation.cad_tx90l_on_rail()
-    controllers = {
-        "no model": None,
-        "CAD values": lambda motion: np.asarray(virtual.model.inverse_dynamics(cad, motion)),
-        "identified model": fit.predict,
-    }
-    runs = []
-    for k, (name, feed_forward) in enumerate(controllers.items()):
-        number = 100 + 10 * seed + k
-        run = virtual.track(joints, feed_forward=feed_forward, seed=number, name=name)
-        tip = np.asarray(jid.constraints.tip_motion(virtual.robot, run.actual)[0])
-        distance = np.linalg.norm(tip - path.positions(np.asarray(run.time)), axis=1)
-        runs.append(PathRun(name, run, distance))
-    return tuple(runs)

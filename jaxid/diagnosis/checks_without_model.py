@@ -380,11 +380,7 @@ def _held(value: float, start: float, stop: float) -> str:
     )
 
 
-def stuck_findings(
-    robot: Robot,
-    recording: Recording,
-    faulty: Collection[int] = (),
-) -> list[str]:
+def stuck_findings(robot: Robot, recording: Recording, faulty: Collection[int] = ()) -> list[str]:
     """Look for forces that are constant, or cut off at their largest value.
 
     Forces are cut off if many samples lie on the largest value, and few on the values beside it.

@@ -32,8 +32,6 @@ SURE = 3.0
 """Standard deviations beyond which a sign is certain."""
 EXAMINED = 2**17
 """Largest number of samples of a long log that are examined."""
-APART = 5.0
-"""Ratio of a force's departure from the model to all others from which it is an event."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,9 +74,7 @@ class Diagnosis(Summarised):
     def with_fit(self, fit: Fit, commanded: Observations | None = None) -> "Diagnosis":
         """Return the diagnosis with what a fit to this log alone reveals, including delays.
 
-        Args:
-            fit: Fit to this log.
-            commanded: The log with commanded angles in place of the measured ones, filtered alike.
+        The log with `commanded` angles in place of the measured ones is filtered alike.
         """
         found, more = _mistakes([self], fit)
         if not found and not self.faulty and self.observations is not None:
@@ -267,7 +263,7 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
         others = error[np.abs(o.instants - o.instants[k]) > length]
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = _deviation(fit, row)
-        if error[k] > max(0.5 * size[j], APART * (deviation + others.max(initial=0.0))):
+        if error[k] > max(0.5 * size[j], 5.0 * (deviation + others.max(initial=0.0))):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "

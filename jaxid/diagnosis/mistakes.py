@@ -43,28 +43,17 @@ FAR = 0.15
 """Fraction (0 to 1) of the forces that no model misses whose description is right."""
 MOST = 0.5
 """Fraction (0 to 1) of what a model misses that may be left by the correction of a mistake."""
-PROMISING = 0.9
-"""Fraction (0 to 1) of what a model misses that a correction may leave at first sight."""
 MANY = 12
 """Number of joints above which no two joints, and no axes, are examined: they would be too many."""
-CLEAR = 1.5
-"""Ratio of what two corrections leave from which one of them is not likely."""
 
 
 class Correction(NamedTuple):
-    """Correction of a possible mistake.
+    """Correction of a possible mistake."""
 
-    Attributes:
-        text: The mistake, as a clause.
-        robot: The robot without the mistake.
-        motion: Motion of the log without it.
-        forces: Forces of the log without it [N m or N].
-    """
-
-    text: str
-    robot: Robot
-    motion: Motion
-    forces: np.ndarray
+    text: str  # the mistake, as a clause
+    robot: Robot  # robot without the mistake
+    motion: Motion  # motion of the log without it
+    forces: np.ndarray  # forces of the log without it [N m or N]
 
 
 class _Amount(NamedTuple):
@@ -86,13 +75,8 @@ def likely_mistakes(
     """Return a sentence about the mistake that explains most of what a model misses, and notes.
 
     A mistake is looked for in all logs alike, then in the columns of each. The notes say which
-    mistakes would not show.
-
-    Args:
-        fit: Fit of the robot's model.
-        logs: Logs of one experiment.
-        motor_sides: Whether angles and forces of the logs are taken for the motors'.
-        events: Sentences about moments, which are returned if no mistake explains them.
+    mistakes would not show; `events`, sentences about moments, are returned if no mistake explains
+    them. Whether angles and forces are taken for the motors' is in `motor_sides`.
     """
     samples = _Samples(fit.base.model, logs)
     robot, motion, forces = fit.base.model.robot, samples.motion, samples.forces
@@ -114,7 +98,7 @@ def likely_mistakes(
             candidates += _of_kinds(robot, motion, forces) if left > FAR else ()
         tried = sorted(((samples.missed(c, part), k) for k, c in enumerate(candidates)))
         best = tried[0][0]
-        likely = [candidates[k] for value, k in tried if value < CLEAR * best]
+        likely = [candidates[k] for value, k in tried if value < 1.5 * best]
         unseen = samples.missed(likely[0], part, FOLDS)
         # With more than three candidates nothing is known.
         known = len(likely) <= 3 and best <= min(MOST * left, FAR)
@@ -165,7 +149,7 @@ class _Samples:
         step, now = 0.1 * mistake.small, self.given**2
         below, above = left(-step) ** 2, left(step) ** 2
         bend, slope = below + above - 2 * now, above - below
-        if bend > 0 and slope**2 < 8 * bend * now * (1 - PROMISING**2):
+        if bend > 0 and slope**2 < 8 * bend * now * (1 - 0.9**2):
             return mistake.correction(-np.sign(slope) * step, part)
         bounds, options = (-mistake.largest, mistake.largest), {"maxiter": 10}
         found = optimize.minimize_scalar(left, bounds=bounds, options=options).x
@@ -388,13 +372,9 @@ class _AnyGeometry(eqx.Module):
 def _missed(rows: np.ndarray, braking: np.ndarray, folds: int = 1) -> float:
     """Return the fraction (0 to 1) of the forces that least squares miss.
 
-    All joints count equally. Friction that would come out negative is left out. With several
-    `folds`, each of these parts of the time is left out of the fit that it is compared with.
-
-    Args:
-        rows: Regressor with the forces as last column [instants, joints, columns].
-        braking: Whether each column is friction.
-        folds: Number of parts, each of several stretches.
+    The rows are a regressor with the forces as last column [instants, joints, columns]. All joints
+    count equally. Friction, the `braking` columns, is left out where it would come out negative.
+    Each of several `folds`, of several stretches each, is left out of the fit for it.
     """
     size = np.sqrt(np.mean(rows[..., -1] ** 2, axis=0))
     theta = rows / np.where(size > 0, size, np.inf)[:, None]

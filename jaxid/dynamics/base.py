@@ -20,13 +20,7 @@ from .dispatch import in_numpy, on_samples, program_of
 from .model import Coordinates, Model
 from .motion import Motion
 from .packed_regressor import JointRegressor, PackedRegressor
-from .rank import (
-    Dependence,
-    gram_schmidt,
-    random_regressor,
-    regrouping,
-    singular_values,
-)
+from .rank import Dependence, gram_schmidt, random_regressor, regrouping, singular_values
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 
@@ -152,7 +146,6 @@ class BaseParameters(Summarised, Hashable):
 
     def regressor(self, motion: Motion) -> Float[AnyArray, "*batch joints base"]:
         r"""Return the base regressor $\Theta_B = \hat\Theta_1$ (Eq. 23)."""
-        self.model.check(motion.q)
         return on_samples(self, self.columns, *self.model.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
@@ -162,7 +155,6 @@ class BaseParameters(Summarised, Hashable):
             InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 robot's geometry.
         """
-        self.model.check(motion.q)
         return PackedRegressor(self, self.columns, *self.model.arguments(motion))
 
     def from_standard(
@@ -188,20 +180,11 @@ class BaseParameters(Summarised, Hashable):
             return full
         return jnp.zeros(shape, p.dtype).at[..., places].set(p)
 
-    def inverse_dynamics(
-        self,
-        p: Parameters,
-        motion: Motion,
-    ) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta_B p_B$ [N m or N] (Eq. 39)."""
-        self.model.check(motion.q)
         return on_samples(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
-    def mass_matrix(
-        self,
-        p: Parameters,
-        q: Coordinates,
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
         """Return the mass matrix, which base parameters determine completely (Eq. 38)."""
         return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
 

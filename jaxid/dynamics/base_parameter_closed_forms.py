@@ -26,13 +26,7 @@ from jaxid.units import Dimension, dimension
 
 from .base_parameter_expressions import Coefficient, Expression, Monomial
 from .model import Model
-from .rank import (
-    characteristic_length,
-    column_units,
-    random_motion,
-    regrouping,
-    row_units,
-)
+from .rank import characteristic_length, column_units, random_motion, regrouping, row_units
 
 _POWERS = np.arange(-2, 3)
 """Exponents of a length that are tried."""
@@ -40,8 +34,6 @@ _SCALES = np.array([0.55, 0.75, 1.3, 1.7])
 """Factors of a length that is varied alone."""
 _FITTED, _CHECKED = 40, 8
 """Numbers of random geometries for fits and for checks."""
-_AT_ONCE = 32
-"""Number of geometries that are evaluated together."""
 _FITS = 1e-9
 """Relative error up to which a closed form fits."""
 _SMALL = 1e-7
@@ -233,7 +225,7 @@ class Regrouping:
                 geometries[:, entry] = factor * values[:, column]
         found, right = [], True
         joints, samples = self._motion[0].shape
-        for block in np.split(geometries, range(_AT_ONCE, len(geometries), _AT_ONCE)):
+        for block in np.split(geometries, range(32, len(geometries), 32)):
             motion = [np.tile(x, len(block)) for x in self._motion]
             theta = evaluate(self._program, *motion, np.repeat(block.T, samples, axis=1))
             theta = theta * self._rows[:, None, None] * self.units[:, None]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 Number = Fraction | float
-Powers = tuple[tuple[str, int], ...]
 
 
 @dataclass(frozen=True)
@@ -17,7 +16,8 @@ class Monomial:
     """A number times powers of lengths, such as `2*l2x/l3z`."""
 
     number: Number
-    powers: Powers = ()  # names of the lengths and their exponents, which are not zero
+    # names of the lengths and their exponents, which are not zero
+    powers: tuple[tuple[str, int], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Methods for one sample applied to many: in NumPy for few samples, in compiled blocks for many.
 
 A method of a model is traced once into a scalar program, with numbers of the model that JAX is
-tracing as inputs; the programs of the models that were used last are kept. Derivatives take the
-model's spatial form, which is a short program on whole arrays.
+tracing, or in which models differ, as inputs; the programs of the models that were used last are
+kept. Derivatives take the model's spatial form, which is a short program on whole arrays.
 """
 
 import functools
@@ -24,7 +24,56 @@ from jaxid.program import Program, evaluate, evaluate_rows, packed_entries, trac
 from jaxid.program.blocks import BLOCK, on_rows
 from jaxid.program.rules import with_derivatives_of
 
-from .open_model import opened
+
+class OpenModel(eqx.Module):
+    """A method of a model for one sample, whose first argument are numbers of the model."""
+
+    model: eqx.Module  # model; in the place of these numbers it has any others
+    method: str = eqx.field(static=True)  # name of the method
+    # leaves of the model that have such numbers, and their positions in each
+    places: tuple[tuple[int, tuple[int, ...]], ...] = eqx.field(static=True)
+
+    def call(self, numbers: Float[AnyArray, " numbers"], *arguments: AnyArray) -> Array:
+        """Call the method of the model with these numbers."""
+        leaves, structure = jax.tree.flatten(self.model)
+        begun = 0
+        for leaf, positions in self.places:
+            fixed = leaves[leaf]
+            order = np.arange(fixed.size)
+            order[list(positions)] = fixed.size + np.arange(len(positions))
+            own = numbers[begun : begun + len(positions)]
+            leaves[leaf] = jnp.concatenate([fixed.ravel(), own])[order].reshape(fixed.shape)
+            begun += len(positions)
+        return getattr(jax.tree.unflatten(structure, leaves), self.method)(*arguments)
+
+
+def opened(
+    method: str, model: eqx.Module, *others: eqx.Module
+) -> tuple[OpenModel, Float[AnyArray, "models numbers"]]:
+    """Return a method whose inputs are the numbers that JAX is tracing, or in which models differ.
+
+    All other numbers stay constants of a program. The numbers are those of each model.
+    """
+    leaves, structure = jax.tree.flatten(model)
+    each = [leaves, *map(jax.tree.leaves, others)]
+    places, numbers = [], []
+    for k, values in enumerate(zip(*each, strict=True)):
+        traced = is_traced(values)
+        if traced:
+            leaves[k] = np.zeros(np.shape(values[0]), values[0].dtype)
+            positions = np.arange(leaves[k].size)
+        else:
+            rows = np.array([np.ravel(x) for x in values])
+            positions = np.flatnonzero((rows != rows[0]).any(axis=0))
+        if len(positions):
+            stack = jnp.stack if traced else np.stack
+            numbers.append(stack([x.ravel()[positions] for x in values]))
+            places.append((k, tuple(positions.tolist())))
+    closed = jax.tree.unflatten(structure, leaves)
+    join = jnp.concatenate if is_traced(numbers) else np.concatenate
+    together = join([np.zeros((len(each), 0)), *numbers], axis=1)
+    return OpenModel(closed, method, tuple(places)), together
+
 
 FEW = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
@@ -49,16 +98,11 @@ class SampleMethod:
 
     An owner may have a method `derived_program(name, *shapes)`, which returns the program of its
     method of that name if it follows from the program of another model, or None.
-
-    Attributes:
-        owner: Model, whose numbers become constants of the program.
-        definition: Method of the model for one sample.
-        shapes: Shapes of the method's arguments.
     """
 
-    owner: Any
-    definition: Callable
-    shapes: tuple[tuple[int, ...], ...]
+    owner: Any  # model, whose numbers become constants of the program
+    definition: Callable  # method of the model for one sample
+    shapes: tuple[tuple[int, ...], ...]  # shapes of the method's arguments
 
     @functools.cached_property
     def program(self) -> Program:
@@ -129,13 +173,7 @@ _lock = threading.Lock()
 
 
 def method_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]) -> SampleMethod:
-    """Return a method of a model for one sample; those that were used last are kept.
-
-    Args:
-        owner: Model whose geometry is known.
-        definition: Method of the model for one sample.
-        shapes: Shapes of the method's arguments.
-    """
+    """Return a method of a model of known geometry; those that were used last are kept."""
     key = (definition.__name__, shapes, *content(owner))
     with _lock:
         method = _methods.setdefault(key, SampleMethod(owner, definition, shapes))
@@ -151,10 +189,7 @@ def program_of(owner: eqx.Module, definition: Callable, *shapes: tuple[int, ...]
 
 
 def on_samples(
-    owner: eqx.Module,
-    definition: Callable,
-    *samples: AnyArray,
-    shared: tuple[Numbers, ...] = (),
+    owner: eqx.Module, definition: Callable, *samples: AnyArray, shared: tuple[Numbers, ...] = ()
 ) -> AnyArray:
     """Apply a method for one sample to arrays with any leading batch axes.
 
@@ -233,10 +268,7 @@ def _over_batches(run: Callable, batch: tuple[int, ...], arrays: list[Array], sh
 
 
 def in_numpy(
-    owner: eqx.Module,
-    definition: Callable,
-    *samples: AnyArray,
-    shared: tuple[AnyArray, ...] = (),
+    owner: eqx.Module, definition: Callable, *samples: AnyArray, shared: tuple[AnyArray, ...] = ()
 ) -> np.ndarray:
     """Apply a method for one sample to rows of samples in NumPy: float64, never compiled."""
     arguments = [np.asarray(x, np.float64) for x in shared]
@@ -249,11 +281,7 @@ def in_numpy(
 def solve_symmetric(A: Float[AnyArray, "joints joints"], b: Joints) -> Joints:
     r"""Solve $A x = b$ by $A = L D L^T$, without square roots or pivoting, entry by entry.
 
-    Only the lower triangle is read. A program has no loops, and a robot has few joints.
-
-    Args:
-        A: Symmetric, positive definite matrix.
-        b: Right-hand side.
+    Only the lower triangle of A, which is definite, is read. A program has no loops.
     """
     n = b.shape[0]
     scaled = [[A[i, j] for j in range(i + 1)] for i in range(n)]

@@ -130,6 +130,7 @@ class Model(Hashable):
 
         Where a motion does not have the state, its samples are a path in the order of time.
         """
+        self.check(motion.q)
         law, qd, s = self.memory, motion.qd, motion.state
         if law is None:
             return motion.q, qd, motion.qdd
@@ -185,7 +186,6 @@ class Model(Hashable):
         Args:
             motion: Joint motion at any number of instants.
         """
-        self.check(motion.q)
         return on_samples(self, self.columns, *self.arguments(motion))
 
     def packed_regressor(self, motion: Motion) -> PackedRegressor:
@@ -200,7 +200,6 @@ class Model(Hashable):
             InputError: If the motion does not have one axis of samples, or JAX is tracing the
                 robot's geometry.
         """
-        self.check(motion.q)
         return PackedRegressor(self, self.columns, *self.arguments(motion))
 
     def gram(
@@ -216,25 +215,16 @@ class Model(Hashable):
         """
         return gram(self, self.columns, weights, *self.arguments(motion))
 
-    def inverse_dynamics(
-        self,
-        p: Parameters,
-        motion: Motion,
-    ) -> Float[AnyArray, "*batch joints"]:
+    def inverse_dynamics(self, p: Parameters, motion: Motion) -> Float[AnyArray, "*batch joints"]:
         r"""Return the generalised forces $\Theta p$ [N m or N], without forming $\Theta$ (Eq. 16).
 
         Args:
             p: Standard parameters.
             motion: Joint motion at any number of instants.
         """
-        self.check(motion.q)
         return on_samples(self, self.forces, *self.arguments(motion), shared=(p,))
 
-    def mass_matrix(
-        self,
-        p: Parameters,
-        q: Coordinates,
-    ) -> Float[AnyArray, "*batch joints joints"]:
+    def mass_matrix(self, p: Parameters, q: Coordinates) -> Float[AnyArray, "*batch joints joints"]:
         r"""Return the mass matrix $M(q)$, rotors included (Eq. 38).
 
         Args:
@@ -244,10 +234,7 @@ class Model(Hashable):
         return on_samples(self, self.inertia, self.check(q), shared=(p,))
 
     def bias_forces(
-        self,
-        p: Parameters,
-        q: Coordinates,
-        qd: Coordinates,
+        self, p: Parameters, q: Coordinates, qd: Coordinates
     ) -> Float[AnyArray, "*batch joints"]:
         r"""Return the forces $h(q, \dot q)$ at zero acceleration [N m or N] (Eq. 38).
 
@@ -273,10 +260,7 @@ class Model(Hashable):
         return on_samples(self, self.acceleration, *samples, shared=(p,))
 
     def kinetic_energy(
-        self,
-        p: Parameters,
-        q: Coordinates,
-        qd: Coordinates,
+        self, p: Parameters, q: Coordinates, qd: Coordinates
     ) -> Float[AnyArray, "*batch"]:
         r"""Return the kinetic energy $\frac12 \dot q^T M \dot q$ [J]."""
         M, qd = self.mass_matrix(p, q), self.check(qd)

@@ -36,12 +36,7 @@ class JointRegressor(eqx.Module):
     def __call__(
         self, *arrays: AnyArray, fence: bool | None = None
     ) -> list[Float[Array, "*batch columns samples"]]:
-        """Return the columns of each joint.
-
-        Args:
-            arrays: Arguments of the definition, batch and samples last.
-            fence: Whether shared values get fences; by default on a CPU, see `lower`.
-        """
+        """Return the columns of each joint, from arguments whose batch and samples stand last."""
         packed = lower(self.program, fence)(*arrays)
         like = jnp.zeros(jnp.shape(arrays[0])[1:], jnp.result_type(*arrays, float))
 

@@ -11,7 +11,7 @@ import tomlkit
 
 from jaxid.errors import InputError
 from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
-from jaxid.identification.presliding import identify_presliding
+from jaxid.identification.nonlinear_friction import identify_presliding
 from jaxid.measurement.observations import Observations, Progress
 
 from .experiment import Experiment, parse_experiment

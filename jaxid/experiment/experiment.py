@@ -28,8 +28,11 @@ from jaxid.identification.filter_and_parameter_selection import (
 )
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.identify import fit_problem
-from jaxid.identification.nonlinear_friction import identify_nonlinear
-from jaxid.identification.presliding import identify_presliding, presliding_note
+from jaxid.identification.nonlinear_friction import (
+    identify_nonlinear,
+    identify_presliding,
+    presliding_note,
+)
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import AbstractDecimation, AbstractFilter

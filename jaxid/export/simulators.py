@@ -17,6 +17,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.io import json_text, write_bytes, write_text
 from jaxid.result_table import printable
 from jaxid.robot.inertia import Inertia
+from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_angles
 from jaxid.robot.urdf import load_urdf
@@ -26,8 +27,6 @@ from .torque_program import body_parameters
 
 _COMMENT = " Inertias and friction: model of "
 """Beginning of the comment in a URDF file that names the model."""
-_UNLIMITED = "1e9"
-"""Effort or velocity in a URDF file where none is known."""
 
 
 def joint_dynamics(
@@ -115,11 +114,6 @@ def _origin(fit: Fit, left_out: tuple[str, ...]) -> str:
     return re.sub("-(?=-)", "- ", printable(text))
 
 
-def _text(values: AnyArray | tuple | float) -> str:
-    """Write numbers with all their digits."""
-    return " ".join(map(repr, np.ravel(np.asarray(values, np.float64)).tolist()))
-
-
 def export_urdf(
     fit: Fit,
     source: str | Path,
@@ -170,12 +164,12 @@ def export_urdf(
     for i, name in enumerate(robot.joint_names):
         element = _child(joints[name], "dynamics")
         for quantity in ("damping", "friction"):
-            element.set(quantity, _text(dynamics[quantity][i]))
+            element.set(quantity, exact_text(dynamics[quantity][i]))
         if np.isfinite(efforts[i]):
-            _child(joints[name], "limit").set("effort", _text(efforts[i]))
+            _child(joints[name], "limit").set("effort", exact_text(efforts[i]))
     for limit, key in itertools.product(root.iterfind("joint/limit"), ("effort", "velocity")):
         # A URDF must have both; MJCF has no speeds.
-        limit.set(key, limit.get(key, _UNLIMITED))
+        limit.set(key, limit.get(key, "1e9"))
     write_bytes(
         path, etree.tostring(root.getroottree(), xml_declaration=True, encoding="utf-8") + b"\n"
     )
@@ -193,8 +187,8 @@ def _hold_joints(tree: UrdfTree) -> list[str]:
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
         origin = _child(joint, "origin")
-        origin.set("xyz", _text(r))
-        origin.set("rpy", _text(rpy_angles(R)))
+        origin.set("xyz", exact_text(r))
+        origin.set("rpy", exact_text(rpy_angles(R)))
     return [joint.find("child").get("link") for joint in branches]
 
 
@@ -225,10 +219,10 @@ def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
 
 def _inertial(p: Float[np.ndarray, "10"]) -> etree._Element:
     inertia, element = Inertia.from_parameters(p), etree.Element("inertial")
-    etree.SubElement(element, "origin", xyz=_text(inertia.centre), rpy="0 0 0")
-    etree.SubElement(element, "mass", value=_text(inertia.mass))
+    etree.SubElement(element, "origin", xyz=exact_text(inertia.centre), rpy="0 0 0")
+    etree.SubElement(element, "mass", value=exact_text(inertia.mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = zip(names, map(_text, inertia.moments), strict=True)
+    moments = zip(names, map(exact_text, inertia.moments), strict=True)
     etree.SubElement(element, "inertia", dict(moments))
     return element
 
@@ -274,7 +268,9 @@ def mjcf_text(
     if comment:
         root.append(etree.Comment(comment))
     etree.SubElement(root, "compiler", angle="radian", autolimits="true")
-    etree.SubElement(root, "option", gravity=_text(robot.gravity), timestep=_text(timestep))
+    etree.SubElement(
+        root, "option", gravity=exact_text(robot.gravity), timestep=exact_text(timestep)
+    )
     world = etree.SubElement(root, "worldbody")
     actuators = etree.SubElement(root, "actuator")
     attributes = {"armature": "armature", "damping": "damping", "frictionloss": "friction"}
@@ -294,23 +290,23 @@ def mjcf_text(
         etree.SubElement(
             body,
             "inertial",
-            pos=_text(inertia.centre),
-            mass=_text(inertia.mass),
-            fullinertia=_text(inertia.tensor[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]),
+            pos=exact_text(inertia.centre),
+            mass=exact_text(inertia.mass),
+            fullinertia=exact_text(inertia.tensor[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]),
         )
         joint = etree.SubElement(
             body,
             "joint",
             name=name,
             type="hinge" if robot.revolute[i] else "slide",
-            axis=_text(robot.axis[i]),
-            **{key: _text(values[i]) for key, values in at_joints.items() if values[i]},
+            axis=exact_text(robot.axis[i]),
+            **{key: exact_text(values[i]) for key, values in at_joints.items() if values[i]},
         )
         if np.isfinite(ranges[i]).all():
-            joint.set("range", _text(ranges[i]))
+            joint.set("range", exact_text(ranges[i]))
         motor = etree.SubElement(actuators, "motor", name=f"{name}_motor", joint=name)
         if np.isfinite(efforts[i]):
-            motor.set("ctrlrange", _text((-efforts[i], efforts[i])))
+            motor.set("ctrlrange", exact_text((-efforts[i], efforts[i])))
     tip = _placement(robot.tip_offset, robot.tip_rotation)
     etree.SubElement(elements[robot.tip_body], "site", name="tip", **tip)
     return etree.tostring(root, pretty_print=True, encoding="unicode")
@@ -319,7 +315,7 @@ def mjcf_text(
 def _placement(offset: AnyArray, rotation: AnyArray) -> dict[str, str]:
     """Return the attributes of a placement; MuJoCo's quaternions are (w, x, y, z)."""
     quaternion = Rotation.from_matrix(np.asarray(rotation)).as_quat(canonical=True)
-    return {"pos": _text(offset), "quat": _text(np.roll(quaternion, 1))}
+    return {"pos": exact_text(offset), "quat": exact_text(np.roll(quaternion, 1))}
 
 
 def pinocchio_parameters(fit: Fit) -> Float[np.ndarray, "joints 10"]:

@@ -55,10 +55,7 @@ def as_least_squares(fit: Fit) -> Fit:
 
 
 def without_bounds(fit: Fit) -> Fit:
-    """Return the least squares behind a physically consistent fit, to which its deviations belong.
-
-    Other fits are returned as they are.
-    """
+    """Return the least squares behind a consistent fit, with its deviations; other fits as is."""
     return fit if fit.consistency is None else as_least_squares(fit)
 
 

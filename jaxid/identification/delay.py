@@ -22,10 +22,6 @@ from .problem import RegressionProblem
 
 BLOCKS = 20
 """Blocks of time of all recordings together, from which the uncertainty is computed."""
-PASSES = 12
-"""Largest number of passes over the data."""
-SENSITIVITY = 2.0
-"""Largest factor by which a sensible control loop amplifies disturbances."""
 
 
 class Delay(eqx.Module):
@@ -104,8 +100,10 @@ def estimate_delay(
     w = (MaximumForces() if weights is None else weights)(base.model.robot, problem.factors)
     together = linalg.block_diag(np.eye(base.size), np.ones((n, 1)))
     p, seconds, step, damping = np.zeros(base.size), 0.0, 0.0, 1.0
-    p = _equations(base, recordings, recordings, w, p).select(base.size).solve()
-    for _ in range(PASSES):
+    # Without a delay at first.
+    start = np.eye(base.size + n)[:, : base.size]
+    p = _equations(base, recordings, recordings, w, p).combined(start).solve()
+    for _ in range(12):
         moved = ([without_delay(o, seconds) for o in logs] for logs in (recordings, instruments))
         each = _equations(base, *moved, w, p)
         common = each.combined(together)
@@ -143,10 +141,6 @@ class _Equations(NamedTuple):
         squares, rates = (whole.T @ x @ whole for x in (self.squares, self.rates))
         return _Equations(columns.T @ self.products @ whole, squares, rates)
 
-    def select(self, count: int) -> "_Equations":
-        """Return the equations without the parameters behind the first ones."""
-        return self.combined(np.eye(len(self.squares) - 1)[:, :count])
-
     def solve(self, without: int | None = None) -> np.ndarray:
         """Return the parameters, from all blocks or without one of them."""
         total = self.products.sum(axis=0)
@@ -170,7 +164,8 @@ class _Equations(NamedTuple):
         G = self.squares[:-1, :-1]
         others = np.linalg.lstsq(G[:-1, :-1], G[:-1, -1], rcond=1e-14)[0]
         left = float(G[-1, -1] - G[:-1, -1] @ others)
-        return SENSITIVITY * size * rate / left if left > 0 else np.inf
+        # A sensible control loop amplifies disturbances twice at most.
+        return 2.0 * size * rate / left if left > 0 else np.inf
 
 
 def _equations(

@@ -15,12 +15,6 @@ from .uncertainty import IndependentRows
 
 FEWEST = 100
 """Changes of an angle from which its steps are looked for."""
-LARGE = 0.5
-"""Bias, in standard deviations, from which an interval of 95 % holds clearly less often."""
-NEGLIGIBLE = 1e-5
-"""Step relative to the motion that cannot matter: biases grow with its square."""
-SMALL_STEPS = 20.0
-"""Steps in a change of an angle up to which rounded text still tells that their number is whole."""
 
 
 def encoder_steps(recording: Recording) -> Float[np.ndarray, " joints"]:
@@ -36,7 +30,8 @@ def _step(changes: np.ndarray) -> float:
     if len(real) < FEWEST:
         return 0.0
     counts = real / real[0]
-    counts = counts[counts < SMALL_STEPS]
+    # Of more steps rounded text does not tell that their number is whole.
+    counts = counts[counts < 20.0]
     whole = np.abs(counts - np.round(counts)) < 0.1
     if len(counts) < FEWEST or whole.mean() < 0.99:
         return 0.0
@@ -63,11 +58,7 @@ def resolution_bias(
 
     def estimate(angles: np.ndarray) -> np.ndarray:
         log = dataclasses.replace(
-            recording,
-            angles=angles,
-            velocities=None,
-            forces=forces,
-            forces_on_motor_side=False,
+            recording, angles=angles, velocities=None, forces=forces, forces_on_motor_side=False
         )
         o = observe(log, robot, observations.filter, observations.decimation)
         o = o.replace(mask=observations.mask)
@@ -81,12 +72,14 @@ def resolution_bias(
 
 def resolution_note(fit: Fit, recording: Recording, observations: Observations) -> tuple[str, ...]:
     """Return a sentence about parameters whose intervals the resolution makes wrong, or nothing."""
-    matters = encoder_steps(recording) > NEGLIGIBLE * np.std(np.asarray(recording.angles), axis=0)
+    # Biases grow with the square of the steps: small ones cannot matter.
+    matters = encoder_steps(recording) > 1e-5 * np.std(np.asarray(recording.angles), axis=0)
     if recording.velocities is not None or not matters.any():
         return ()
     bias = np.abs(resolution_bias(fit, recording, observations))
     ratio = bias / np.where(fit.standard_deviations > 0, fit.standard_deviations, np.inf)
-    worst = np.argsort(-ratio)[: np.count_nonzero(ratio > LARGE)]
+    # From half a deviation on an interval of 95 % holds clearly less often.
+    worst = np.argsort(-ratio)[: np.count_nonzero(ratio > 0.5)]
     if not len(worst):
         return ()
     names = ", ".join(f"{fit.base.names[k]} by {ratio[k]:.1f}" for k in worst[:4])

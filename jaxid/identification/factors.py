@@ -63,12 +63,7 @@ class RowChunk(NamedTuple):
         return [np.column_stack([theta, force])[kept] for theta, force, kept in joints]
 
 
-def row_chunks(
-    base,
-    observations: Observations,
-    samples: int,
-    wanted=None,
-) -> Iterator[RowChunk]:
+def row_chunks(base, observations: Observations, samples: int, wanted=None) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of so many samples, not yet divided (Eq. 26).
 
     Only the `wanted` ranges of rows are made, or all.

@@ -384,14 +384,7 @@ def _check(fit: Fit) -> None:
             raise InputError(f"the text {text!r:.40} must be printable")
 
 
-def interval_table(
-    title: str,
-    names,
-    units,
-    values,
-    uncertainty: Uncertainty,
-    remarks=(),
-) -> Table:
+def interval_table(title: str, names, units, values, uncertainty: Uncertainty, remarks=()) -> Table:
     """Return a table of estimates with their 95 % intervals."""
     estimates, half_widths = with_deviations(values, uncertainty.half_widths())
     return Table(

@@ -225,13 +225,7 @@ class _Stream:
         self._add([total] * (len(self._edges) - 1), pieces, [np.eye(w) for w in self._widths])
         return total
 
-    def _add(
-        self,
-        blocks: list[Grams],
-        pieces: list[Piece],
-        mixing: Grams,
-        progress=None,
-    ) -> None:
+    def _add(self, blocks: list[Grams], pieces: list[Piece], mixing: Grams, progress=None) -> None:
         """Add the Gram matrices of some pieces, and of the ends, to those of their blocks."""
         for done, ((block, _, _), grams) in enumerate(self._run(pieces, mixing), 1):
             for total, G in zip(blocks[block], grams, strict=True):
@@ -274,12 +268,7 @@ def _filled_up(x: np.ndarray, length: int) -> np.ndarray:
     return np.pad(x, ((0, missing), (0, 0))) if missing else np.ascontiguousarray(x[:length])
 
 
-def _similar(
-    total: np.ndarray,
-    first: np.ndarray,
-    mixing: np.ndarray,
-    ratio: float = 1e4,
-) -> bool:
+def _similar(total: np.ndarray, first: np.ndarray, mixing: np.ndarray, ratio: float = 1e4) -> bool:
     """Return whether the first look has shown the size of every direction that it has shown."""
     values, directions = np.linalg.eigh(mixing.T @ first @ mixing)
     shown = directions[:, values > 0.5]
@@ -302,11 +291,7 @@ def _root(G: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(
-    program: Program,
-    acting: tuple[tuple[int, ...], ...],
-    shape: LoopShape,
-) -> Callable:
+def _compiled(program: Program, acting: tuple[tuple[int, ...], ...], shape: LoopShape) -> Callable:
     """Return the loop, which is compiled when it is first called."""
     joints = len(acting)
     size = len(program.outputs) // joints

@@ -24,8 +24,6 @@ from jaxid.measurement.observations import Observations, Progress
 from .factors import Blocks
 from .problem import RegressionProblem
 
-MOST = 64
-"""Largest number of blocks of time of all processes, unless there are more processes."""
 _calls = itertools.count()
 
 
@@ -56,7 +54,7 @@ def shards(folder: str | Path) -> tuple[Path, ...]:
 def factorise_across_processes(
     base: BaseParameters,
     recordings: Sequence[Observations],
-    patience: float | int = 600.0,
+    patience: float = 600.0,
     progress: Progress | None = None,
 ) -> RegressionProblem:
     """Return the regression problem of the recordings of all processes: their joined factors.
@@ -87,7 +85,7 @@ def factorise_across_processes(
     content = repr((names, base.indices, np.round(base.kappa, 9).tolist())).encode()
     try:
         _wait(patience)
-        own = own.condense(max(1, MOST // processes))
+        own = own.condense(max(1, 64 // processes))
         # JSON is exact, and reading it runs no code.
         packed = np.frombuffer(json.dumps(to_json(own)).encode(), np.uint8)
         head = np.array([zlib.crc32(content), len(packed)])

@@ -17,11 +17,6 @@ from .estimators import AbstractEstimator, WeightedLeastSquares
 from .factors import Blocks
 from .problem import RegressionProblem
 
-FOLDS = 5
-"""Parts of time that are left out in turn."""
-ENOUGH_LOGS = 4
-"""Logs from which on whole logs are left out in turn."""
-
 
 class Candidate(NamedTuple):
     """A model and an estimator.
@@ -118,7 +113,7 @@ def choose_model(
     if not candidates:
         raise InputError("`candidates` must hold at least one model, but is empty.")
     logs = (observations,) if isinstance(observations, Observations) else tuple(observations)
-    first, by_log = candidates[0], len(logs) >= ENOUGH_LOGS
+    first, by_log = candidates[0], len(logs) >= 4
     folds = _folds(first.base, logs, by_log)
     # All candidates are judged with the weights of the first.
     weights = first.estimator(RegressionProblem(first.base, blocks=_joined(folds))).weights
@@ -156,7 +151,7 @@ def _folds(base: BaseParameters, logs: Sequence[Observations], by_log: bool) -> 
     count = len(blocks.parts)
     if count < 3:
         raise InputError("a choice of models needs at least three blocks of rows: record longer.")
-    return [blocks.select(part) for part in np.array_split(np.arange(count), min(FOLDS, count))]
+    return [blocks.select(part) for part in np.array_split(np.arange(count), min(5, count))]
 
 
 def _joined(folds: Sequence[Blocks]) -> Blocks:

@@ -12,12 +12,7 @@ from jaxid.dynamics.dispatch import in_numpy
 from jaxid.errors import InputError
 from jaxid.result_table import Summarised, Table
 
-from .combination import (
-    as_least_squares,
-    combine,
-    replace_estimates,
-    require_same_base,
-)
+from .combination import as_least_squares, combine, replace_estimates, require_same_base
 from .fit_result import Fit, interval_table
 from .parameter_changes import LEVEL, Comparison, compare_some, joint_test
 from .uncertainty import Uncertainty

@@ -11,14 +11,7 @@ from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.robot.robot import Robot
 
-from .factors import (
-    Blocks,
-    Columns,
-    Factors,
-    RowChunk,
-    empty_factors,
-    row_chunks,
-)
+from .factors import Blocks, Columns, Factors, RowChunk, empty_factors, row_chunks
 
 Span = tuple[int, int, int]
 """Index of a recording, and the half-open range of some of its rows."""
@@ -127,7 +120,6 @@ class RegressionProblem:
         self,
         equations: Equations,
         columns: Columns | None = None,
-        size: int | None = None,
         chunks: Iterable[RowChunk] | None = None,
     ) -> Blocks:
         """Return the factors of transformed rows, by blocks of time.
@@ -135,15 +127,14 @@ class RegressionProblem:
         Args:
             equations: Function from a chunk to the rows `[columns, force]` of each joint.
             columns: Parameters to which these columns belong; by default those of the rows.
-            size: Number of all parameters; by default that of the base parameters.
             chunks: Rows; by default all.
 
         Raises:
             InputError: If only factors are known.
         """
         columns = self.base.acting_columns if columns is None else columns
-        size = self.base.size if size is None else size
-        parts = [empty_factors(columns, size)] * self._first_block(len(self.recordings))
+        empty = empty_factors(columns, self.base.size)
+        parts = [empty] * self._first_block(len(self.recordings))
         for chunk in self.chunks() if chunks is None else chunks:
             parts[chunk.block] = parts[chunk.block].append(equations(chunk))
         return Blocks(tuple(parts))

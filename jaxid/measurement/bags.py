@@ -18,10 +18,6 @@ from .array_files import library, readable
 
 BAGS = (".mcap", ".bag", ".db3")
 """Suffixes of files that are bags."""
-WIDEST = 1000
-"""Most numbers of an array that are columns: images are none."""
-LONGEST_PAUSE = 3.0
-"""Longest pause between two values that are interpolated, in their usual distance."""
 STAMP, RECORDED = ".header.stamp", ".log_time"
 """Fields of each topic with the times of measurement and of recording."""
 CLOCK = "time"
@@ -102,7 +98,7 @@ def _fields(
             yield field, ("",), (value.sec + 1e-9 * value.nanosec,)
         elif dataclasses.is_dataclass(value):
             yield from _fields(value, f"{field}.", names)
-        elif isinstance(value, np.ndarray | list) and 0 < len(value) <= WIDEST:
+        elif isinstance(value, np.ndarray | list) and 0 < len(value) <= 1000:
             elements = names.get(len(value)) or tuple(f"[{k}]" for k in range(len(value)))
             if isinstance(value, np.ndarray):
                 yield field, elements, value.tolist()
@@ -153,5 +149,6 @@ def _interpolated(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> 
     found = np.interp(new, own, values[order], left=np.nan, right=np.nan)
     steps = np.diff(own, prepend=own[0])
     after = np.minimum(np.searchsorted(own, new), len(own) - 1)
-    pausing = (steps[after] > LONGEST_PAUSE * np.median(steps)) & (own[after] != new)
+    # Where usual distances are exceeded threefold nothing is interpolated.
+    pausing = (steps[after] > 3.0 * np.median(steps)) & (own[after] != new)
     return np.where(pausing, np.nan, found)

@@ -34,8 +34,6 @@ HEAD = 65536
 """Bytes from which a format is detected."""
 BLOCK = 2**26
 """Bytes of a text file that are read at once."""
-EPISODE_PAUSE = 10.0
-"""Pause between two episodes of a LeRobot file, whose clock begins anew [s]."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,12 +69,7 @@ class LogTable:
             raise InputError(f"`{self.source}` has no rows: is the log cut?")
         return rows
 
-    def read(
-        self,
-        channels: Iterable[str],
-        start: int = 0,
-        stop: int | None = None,
-    ) -> "LogTable":
+    def read(self, channels: Iterable[str], start: int = 0, stop: int | None = None) -> "LogTable":
         """Return some rows of some channels, in memory."""
         kept = {channel: self.channels[channel] for channel in channels}
         names = list(itertools.chain(*kept.values()))
@@ -212,7 +205,7 @@ def _open_columns(path: Path, on_disk: bool, topics: Collection[str] = ()) -> tu
 
 
 def _with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
-    """Add the elements of lists, named like `action[0]`, and join the clocks of episodes."""
+    """Add the elements of lists, named like `action[0]`; episodes follow each other after 10 s."""
     schema, columns = frame.collect_schema(), []
     kinds = {x: kind for x, kind in schema.items() if isinstance(kind, pl.List | pl.Array)}
     for name, values in (
@@ -224,7 +217,7 @@ def _with_elements(frame: pl.LazyFrame) -> pl.LazyFrame:
     if {"timestamp", "episode_index"} <= {*schema}:
         stamps = pl.col("timestamp").cast(pl.Float64)
         begins = (pl.col("episode_index").diff() != 0).fill_null(False)
-        pauses = pl.when(begins).then(EPISODE_PAUSE - stamps.diff()).otherwise(0.0)
+        pauses = pl.when(begins).then(10.0 - stamps.diff()).otherwise(0.0)
         columns.append((stamps + pauses.cum_sum()).alias("timestamp"))
     return frame.with_columns(columns).drop(list(kinds))
 

@@ -18,28 +18,11 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
-from .filters import (
-    AbstractDecimation,
-    AbstractFilter,
-    Subsample,
-    ZeroPhaseButterworth,
-)
-from .recording import (
-    Recording,
-    TimeGrid,
-    consecutive,
-    finite_channel,
-    positive_time,
-)
+from .filters import AbstractDecimation, AbstractFilter, Subsample, ZeroPhaseButterworth
+from .recording import Recording, TimeGrid, consecutive, finite_channel, positive_time
 
 FEWEST_ROWS = 4
 """Smallest number of rows for which a segment is used."""
-WAY_TIME = 0.2
-"""Time in which measured velocities must make the way of the angles [s]."""
-UNLIKE = 0.2
-"""Relative error of this way from which on velocities are not used."""
-WELL_ABOVE = 10.0
-"""Ratio of the way to the angles' second differences from which on velocities are judged."""
 
 Progress = Callable[[float], None]
 """Callback, called with the completed fraction (0 to 1)."""
@@ -390,7 +373,7 @@ def unlike_derivatives(recording: Recording) -> dict[int, float]:
     factor by which its velocities are too large.
     """
     r, squares, products = recording, np.zeros((3, recording.joints)), np.zeros(recording.joints)
-    steps = max(1, round(WAY_TIME / r.sample_time))
+    steps = max(1, round(0.2 / r.sample_time))
     for a, b in r.grid.ranges:
         q, qd = np.asarray(r.angles)[a:b], np.asarray(r.velocities)[a:b]
         way = r.sample_time * np.cumsum(0.5 * (qd[1:] + qd[:-1]), axis=0)
@@ -400,7 +383,7 @@ def unlike_derivatives(recording: Recording) -> dict[int, float]:
         products += np.sum(moved * expected, axis=0)
         squares += [np.sum(x**2, axis=0) for x in (moved - expected, moved, noise)]
     wrong, way, noise = squares
-    unlike = np.flatnonzero((wrong > UNLIKE**2 * way) & (way > WELL_ABOVE**2 * noise)).tolist()
+    unlike = np.flatnonzero((wrong > 0.2**2 * way) & (way > 10.0**2 * noise)).tolist()
     return {k: float(products[k] / way[k]) for k in unlike}
 
 

@@ -16,21 +16,8 @@ from jaxid.robot.robot import Robot
 from .columns import Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
 from .log_files import LogTable
-from .observations import (
-    AbstractSamples,
-    Observations,
-    Progress,
-    joined,
-    joint_side,
-    prepare,
-)
-from .recording import (
-    NeedsMemory,
-    Recording,
-    TimeGrid,
-    consecutive,
-    find_grid,
-)
+from .observations import AbstractSamples, Observations, Progress, joined, joint_side, prepare
+from .recording import NeedsMemory, Recording, TimeGrid, consecutive, find_grid
 
 AT_ONCE = 65536
 """Samples that are read at once."""

@@ -77,11 +77,7 @@ def _horner(coefficients: tuple[float, ...], z: Array) -> Array:
 
 @jax.custom_jvp
 def sine_cosine(x: Array) -> tuple[Array, Array]:
-    """Compute (sin x, cos x) of an array in float64 or float32.
-
-    Args:
-        x: Angles [rad]; |x| up to 3e9 in float64, up to 1e5 in float32, NaN beyond.
-    """
+    """Compute (sin x, cos x) of angles [rad]: up to 3e9 in float64, 1e5 in float32, else NaN."""
     precision = DOUBLE if x.dtype == np.float64 else SINGLE
     turns = jnp.round(x * float(1 / _HALF_PI))
     *leading, middle, last = precision.pieces

@@ -57,11 +57,8 @@ def with_derivatives_of(plain: Callable, run: Callable) -> Callable:
 def divided(function: Callable) -> Callable:
     """Return a function of arrays with one leading axis, which devices divide among themselves.
 
-    Each device computes what belongs to its part of the axis, and nothing moves between them.
-
-    Args:
-        function: Function whose arguments and results have the same leading axis, in which they
-            belong to each other.
+    Each device computes what belongs to its part of the axis, and nothing moves between them: the
+    results have the same axis.
     """
 
     @custom_vmap

@@ -37,10 +37,7 @@ def hidden_one(reference: Array) -> Array:
 
     XLA does not copy divisions, since they are expensive, and x / 1 is exact, also for NaN and
     infinities: division by a one that XLA cannot recognise is a fence. From JAX 0.12 on an
-    optimization barrier does the same at no cost.
-
-    Args:
-        reference: Number known only at run time, in the precision of the program.
+    optimization barrier does the same at no cost. The number is known only at run time.
     """
     width = 8 * reference.dtype.itemsize
     bits = jax.lax.stop_gradient(reference).view(f"uint{width}")
@@ -77,25 +74,16 @@ class Lowered(eqx.Module):
 
     Works under `jit`, `grad`, `jvp` and `vmap`, in the precision of the arrays. Call it inside
     `jax.jit`: otherwise each operation is dispatched by itself.
-
-    Attributes:
-        program: Program made by `trace`.
-        fence: Whether fences stand behind shared values.
-        fenced: Positions of these nodes.
     """
 
     program: Program = eqx.field(static=True)
-    fence: bool = eqx.field(static=True)
-    fenced: frozenset[int] = eqx.field(static=True)
+    fence: bool = eqx.field(static=True)  # whether fences stand behind shared values
+    fenced: frozenset[int] = eqx.field(static=True)  # positions of these nodes
 
     def __call__(self, *arrays: AnyArray) -> list[Array | float]:
-        """Compute the packed result.
+        """Compute the packed result, from arrays of the inputs' shapes and then any batch axes.
 
-        Args:
-            arrays: Arrays with the shapes of the inputs, each followed by any batch axes.
-
-        Returns:
-            For each entry of each output, in order, an array of the batch's shape, or a constant.
+        For each entry of each output, in order, it is an array of the batch's shape or a constant.
         """
         values = self.run(self.entries(*arrays)[0], ELEMENTWISE)[0]
         return [values[x] if isinstance(x, int) else x for x in self.program.outputs]
@@ -117,12 +105,7 @@ class Lowered(eqx.Module):
         return self.program.unpack(jnp.stack(full) if full else jnp.zeros((0, *batch), dtype))
 
     def run(self, entries: Entries, operations: dict[Operation, Callable]) -> Values:
-        """Compute all nodes.
-
-        Args:
-            entries: Entries of each input, in order.
-            operations: Function for each kind of operation.
-        """
+        """Compute all nodes from the entries of each input, with a function for each operation."""
         nodes = self.program.nodes
         # The last input: XLA folds what depends on constants, such as parameters often are.
         firsts = [x[0] for x in reversed(entries) if len(x)]
@@ -159,10 +142,8 @@ def primitives(like: Array) -> dict[Operation, Callable]:
     """Return the operations with JAX's own primitives for the arithmetic.
 
     They skip the checks of types and shapes in array operators, so that a program is traced in a
-    fraction of the time. JAX differentiates operators faster: do not differentiate these.
-
-    Args:
-        like: Array of the batch's shape.
+    fraction of the time. JAX differentiates operators faster: do not differentiate these. All have
+    the shape of one array.
     """
 
     @functools.cache
@@ -186,12 +167,9 @@ def primitives(like: Array) -> dict[Operation, Callable]:
 
 @functools.lru_cache(maxsize=64)
 def lower(program: Program, fence: bool = True) -> Lowered:
-    """Prepare a program for JAX arrays.
+    """Prepare a program for JAX arrays, with fences behind shared values or without.
 
-    Args:
-        program: Program made by `trace`.
-        fence: Whether fences stand behind shared values. On a GPU they would break the program into
-            many kernels, and float64 divisions are slow.
+    On a GPU fences would break it into many kernels, and float64 divisions are slow.
     """
     return Lowered(program, fence, fenced_nodes(program) if fence else frozenset())
 

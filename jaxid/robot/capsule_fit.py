@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -20,26 +20,10 @@ from .urdf_tree import UrdfTree
 
 _SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _ZERO = (0.0, 0.0, 0.0)
-_STOUT = 0.07
-"""Radius of a body of unknown shape, relative to the length of the robot."""
 
 
-class Shape(NamedTuple):
-    """All points within a radius of some points' convex hull, in the frame of a link.
-
-    Attributes:
-        points: Points; the ends of an axis if the radius is positive [m].
-        radius: Radius [m].
-    """
-
-    points: Float[np.ndarray, "points 3"]
-    radius: float = 0.0
-
-    def capsule(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return ends [m] and radius [m] of a small capsule that holds the shape."""
-        if self.radius > 0.0:
-            return self.points[0], self.points[-1], self.radius
-        return enclose(self.points)
+Shape = tuple[Float[np.ndarray, "points 3"], float]
+"""Points and a radius: all that is within it of their convex hull, in the frame of a link [m]."""
 
 
 def fit_capsules(
@@ -89,13 +73,16 @@ def fit_capsules(
             if compiled is None:
                 shapes = list(_read_shapes(tree, packages, name))
             else:
-                shapes = [Shape(*shape) for shape in compiled.get(name, ())]
+                shapes = compiled.get(name, [])
         except (ImportError, OSError, InputError) as error:
             if faults is None:
                 raise
             faults[name] = str(error)
             continue
-        for number, (start, end, radius) in enumerate((x.capsule() for x in shapes), 1):
+        for number, (points, radius) in enumerate(shapes, 1):
+            start, end = points[[0, -1]]
+            if radius == 0.0:
+                start, end, radius = enclose(points)
             label = name if number == 1 else f"{name} {number}"
             ends = {"start": r + R @ start, "end": r + R @ end}
             found.append(Capsule(label, body, **ends, radius=radius))
@@ -105,15 +92,10 @@ def fit_capsules(
 
 
 def stand_in_capsules(robot: Robot, bodies: list[int]) -> list[Capsule]:
-    """Return stout capsules for bodies of unknown shape, about the lines between their joints.
-
-    Args:
-        robot: Robot.
-        bodies: Indices of the bodies; -1 is the ground. One without any length gets no capsule.
-    """
+    """Return stout capsules for bodies of unknown shape, about the lines between their joints."""
     offsets = [np.asarray(x) for x in (*robot.offset, robot.tip_offset)]
     carriers = (*robot.parent, robot.tip_body)
-    stout = _STOUT * sum(float(np.linalg.norm(x)) for x in offsets)
+    stout = 0.07 * sum(float(np.linalg.norm(x)) for x in offsets)
     found = []
     for body in bodies:
         name = "base" if body == GROUND else f"link of {robot.joint_names[body]}"
@@ -181,23 +163,23 @@ def _read_shapes(tree: UrdfTree, packages: str | Path | None, name: str) -> Iter
         inner = None if geometry is None else geometry.find("*")
         points, radius = _read_shape(tree, packages, element if inner is None else inner)
         R = rpy_rotation(tree.numbers(origin, "rpy", _ZERO))
-        yield Shape(tree.numbers(origin, "xyz", _ZERO) + points @ R.T, radius)
+        yield tree.numbers(origin, "xyz", _ZERO) + points @ R.T, radius
 
 
 def _read_shape(tree: UrdfTree, packages: str | Path | None, shape: Any) -> Shape:
     """Return one shape in its own frame."""
     if shape.tag == "box":
-        return Shape(_SIGNS * tree.numbers(shape, "size", _ZERO))
+        return _SIGNS * tree.numbers(shape, "size", _ZERO), 0.0
     if shape.tag == "mesh":
         scale = tree.numbers(shape, "scale", (1.0, 1.0, 1.0))
-        return Shape(_vertices(tree, packages, shape) * scale)
+        return _vertices(tree, packages, shape) * scale, 0.0
     if shape.tag not in ("sphere", "cylinder", "capsule"):
         raise InputError(
             f"{tree.place(shape)}: `{shape.tag}` is no box, cylinder, sphere, capsule or mesh."
         )
     length = 0.0 if shape.tag == "sphere" else tree.numbers(shape, "length", (0.0,))[0]
     half = np.array([0.0, 0.0, 0.5 * length])
-    return Shape(np.array([-half, half]), float(tree.numbers(shape, "radius", (0.0,))[0]))
+    return np.array([-half, half]), float(tree.numbers(shape, "radius", (0.0,))[0])
 
 
 def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndarray:

@@ -70,11 +70,7 @@ class Inertia(eqx.Module):
         """Entries xx, xy, xz, yy, yz, zz of the tensor, the order of URDF [kg m²]."""
         return self.tensor[..., (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
 
-    def moved(
-        self,
-        rotation: Float[AnyArray, "3 3"],
-        position: Float[AnyArray, "3"],
-    ) -> "Inertia":
+    def moved(self, rotation: Float[AnyArray, "3 3"], position: Float[AnyArray, "3"]) -> "Inertia":
         """Return the same body in the frame in which its present frame is placed."""
         R = rotation
         return Inertia(self.mass, position + self.centre @ R.T, R @ self.tensor @ R.T)

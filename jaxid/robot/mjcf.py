@@ -57,9 +57,6 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[tuple[Float[np.ndarray, "poi
     """Return points and radii [m] of the shapes of all bodies, as `mjcf_as_urdf` names them.
 
     Shapes that cannot collide count only where a body has no others.
-
-    Raises:
-        ModuleNotFoundError: If MuJoCo is not installed.
     """
     mujoco = import_mujoco()
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -137,9 +134,9 @@ class _Writer:
             link, R, r = moved, np.eye(3), -model.jnt_pos[i]
         element: Any = E.link(name=name)
         if model.body_mass[body] or model.body_inertia[body].any():
-            xx, yy, zz = map(_text, model.body_inertia[body])
+            xx, yy, zz = map(exact_text, model.body_inertia[body])
             place = _origin(_matrix(model.body_iquat[body]), model.body_ipos[body])
-            mass = E.mass(value=_text(model.body_mass[body]))
+            mass = E.mass(value=exact_text(model.body_mass[body]))
             products = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
             moments = E.inertia(ixx=xx, iyy=yy, izz=zz, **products)
             element.append(E.inertial(place, mass, moments))
@@ -152,16 +149,16 @@ class _Writer:
         model = self._model
         limit: dict[str, str] = {}
         if model.jnt_limited[joint]:
-            limit["lower"], limit["upper"] = map(_text, model.jnt_range[joint])
+            limit["lower"], limit["upper"] = map(exact_text, model.jnt_range[joint])
         if np.isfinite(self._efforts[joint]):
-            limit["effort"] = _text(self._efforts[joint])
+            limit["effort"] = exact_text(self._efforts[joint])
         dof = model.jnt_dofadr[joint]
         dynamics = E.dynamics(
-            damping=_text(model.dof_damping[dof]),
-            friction=_text(model.dof_frictionloss[dof]),
-            armature=_text(model.dof_armature[dof]),
+            damping=exact_text(model.dof_damping[dof]),
+            friction=exact_text(model.dof_frictionloss[dof]),
+            armature=exact_text(model.dof_armature[dof]),
         )
-        return [E.axis(xyz=_text(model.jnt_axis[joint])), E.limit(**limit), dynamics]
+        return [E.axis(xyz=exact_text(model.jnt_axis[joint])), E.limit(**limit), dynamics]
 
     def add_site(self, site: int) -> None:
         """Write a site as a link; one without a name, or with that of a body, is left out."""
@@ -197,7 +194,7 @@ class _Writer:
             slope = polynomial[1]
             value += np.polyval(polynomial[::-1], shift) - polynomial[0] - slope * held
             mimicked = {"joint": self._joints[other].get("name")}
-        mimic = E.mimic(**mimicked, multiplier=_text(slope), offset=_text(value))
+        mimic = E.mimic(**mimicked, multiplier=exact_text(slope), offset=exact_text(value))
         self._joints[joint].append(mimic)
 
 
@@ -226,9 +223,9 @@ def _matrix(quaternion: np.ndarray) -> Float[np.ndarray, "3 3"]:
 
 
 def _origin(R: Float[np.ndarray, "3 3"], r: Float[np.ndarray, "3"]) -> Any:
-    return E.origin(xyz=_text(r), rpy=_text(rpy_angles(R)))
+    return E.origin(xyz=exact_text(r), rpy=exact_text(rpy_angles(R)))
 
 
-def _text(values: Numbers | float) -> str:
+def exact_text(values: Numbers | float) -> str:
     """Write numbers with all their digits."""
     return " ".join(map(repr, np.ravel(np.asarray(values, np.float64)).tolist()))

@@ -221,8 +221,7 @@ class Robot(Summarised, eqx.Module):
             InputError: If the tolerance is no small angle.
         """
         return self.replace(
-            axis=snapped(self.axis, tolerance),
-            rotation=snapped_rotations(self.rotation, tolerance),
+            axis=snapped(self.axis, tolerance), rotation=snapped_rotations(self.rotation, tolerance)
         )
 
     def mounted(

@@ -45,13 +45,7 @@ class Capsule(eqx.Module):
     radius: Float[AnyArray, ""]
 
     def __init__(
-        self,
-        name: str,
-        body: int,
-        *,
-        start: Numbers,
-        end: Numbers | None = None,
-        radius: Numbers,
+        self, name: str, body: int, *, start: Numbers, end: Numbers | None = None, radius: Numbers
     ):
         self.name, self.body = name, body
         self.start = _point(f"`start` of capsule `{name}`", start)

@@ -15,12 +15,6 @@ from .robot import Robot
 from .urdf_tree import TURNING, UrdfTree
 
 _ZERO = (0.0, 0.0, 0.0)
-_ENDLESS = 2e4
-"""Range from which a joint turns without end [rad]."""
-_POSES = 64
-"""Number of random poses in which the weight of the bodies is computed."""
-_WEAK = 0.25
-"""Fraction of the largest torque of gravity below which a largest force is suspicious."""
 
 
 def load_urdf(
@@ -96,11 +90,7 @@ load_mjcf = load_urdf
 
 
 def urdf_parameters(
-    path: str | Path,
-    *,
-    tip: str | None = None,
-    base: str | None = None,
-    check: bool = True,
+    path: str | Path, *, tip: str | None = None, base: str | None = None, check: bool = True
 ) -> Float[AnyArray, " inertial"]:
     """Return the inertial parameters that a URDF or MJCF file claims, often from CAD (Eq. 9).
 
@@ -147,7 +137,7 @@ def _limits(tree: UrdfTree) -> tuple[Limits, list[str]]:
         low, high = tree.range(joint)
         if low == high == 0.0:
             unknown.setdefault("a range from 0 to 0", []).append(name)
-        elif not (turns and high - low >= _ENDLESS):
+        elif not (turns and high - low >= 2e4):  # such a joint turns without end
             if fault := range_fault(low, high, turns):
                 unit = "radians, not degrees" if turns else "metres"
                 raise tree.error(joint, f"{fault}: its limits must be in {unit}")
@@ -205,7 +195,7 @@ def _weight_notes(robot: Robot, bodies: Float[np.ndarray, "joints 10"]) -> Itera
     low, high = (np.asarray(x) for x in (robot.limits.position_min, robot.limits.position_max))
     ends = np.where(robot.revolute, np.pi, 0.0)
     low, high = np.where(np.isfinite(low), low, -ends), np.where(np.isfinite(high), high, ends)
-    q = np.random.default_rng(0).uniform(low, high, (_POSES, robot.joints))
+    q = np.random.default_rng(0).uniform(low, high, (64, robot.joints))
     forces = np.zeros(q.shape)
     for body, inertia in enumerate(map(Inertia.from_parameters, bodies)):
         if inertia.mass > 0.0 and np.abs(inertia.centre).max() < FAR:
@@ -213,7 +203,7 @@ def _weight_notes(robot: Robot, bodies: Float[np.ndarray, "joints 10"]) -> Itera
             forces -= inertia.mass * (tip_jacobian(carried, q)[2] @ robot.gravity)
     needed = np.abs(forces).max(axis=0)
     for j, (name, most) in enumerate(zip(robot.joint_names, robot.limits.force, strict=True)):
-        if most < _WEAK * needed[j]:
+        if most < 0.25 * needed[j]:
             unit = robot.force_unit(j)
             yield (
                 f"joint `{name}`: an effort of {most:.3g} {unit} is far below the {needed[j]:.3g} "

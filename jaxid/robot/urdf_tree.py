@@ -44,11 +44,7 @@ class UrdfTree:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        base: str | None = None,
-        tip: str | None = None,
+        self, path: str | Path, *, base: str | None = None, tip: str | None = None
     ) -> None:
         self.path = str(path)
         self.root, self.gravity, loops = read_description(path)
@@ -113,8 +109,7 @@ class UrdfTree:
             reached += [link_names(joint)[1] for joint in self._below[link]]
         if link := next((link for link in self.links if link not in reached), None):
             raise self.error(
-                self._above[link],
-                "is part of a closed loop: remove one joint of the loop",
+                self._above[link], "is part of a closed loop: remove one joint of the loop"
             )
         if len(roots) != 1:
             raise InputError(

@@ -62,12 +62,7 @@ def virtual_panda(seed: int = 0) -> VirtualRobot:
     )
 
 
-def virtual_log(
-    robot: VirtualRobot,
-    name: str,
-    periods: int,
-    seed: tuple[int, int],
-) -> Recording:
+def virtual_log(robot: VirtualRobot, name: str, periods: int, seed: tuple[int, int]) -> Recording:
     """Return a log of a random motion within the limits, with a period of 8 s, at 500 Hz."""
     first, second = np.random.SeedSequence(seed).generate_state(2, np.uint32).tolist()
     motion = random_fourier_series(robot.robot, omega=2 * math.pi / 8.0, reach=0.9, seed=first)

@@ -177,8 +177,7 @@ class FrictionTemperature(eqx.Module):
         dry_rate: $a$ of the dry friction [1/K].
         resistance: Thermal resistance $R$ from each gear to the air [K/W].
         time: Time constant $t_h$ [s].
-        reference: Temperature $T_0$ at which the friction is known [°C].
-        ambient: Temperature $T_a$ of the air [°C].
+        reference: Temperature $T_0$ at which the friction is known, and $T_a$ of the air [°C].
     """
 
     viscous_rate: Joints
@@ -186,7 +185,6 @@ class FrictionTemperature(eqx.Module):
     resistance: Joints
     time: float = 600.0
     reference: float = 20.0
-    ambient: float = 20.0
 
     def factors(self, temperature: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Return the factors of viscous and dry friction at a temperature [°C]."""
@@ -195,7 +193,7 @@ class FrictionTemperature(eqx.Module):
 
     def warm_up(self, temperature: Joints, power: Joints, duration: float) -> np.ndarray:
         """Return temperatures [°C] after some time [s] with constant power of friction [W]."""
-        final = self.ambient + np.asarray(self.resistance) * np.asarray(power)
+        final = self.reference + np.asarray(self.resistance) * np.asarray(power)
         return final + (np.asarray(temperature) - final) * np.exp(-duration / self.time)
 
 

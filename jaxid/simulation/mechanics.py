@@ -198,10 +198,6 @@ class Servo(eqx.Module):
     sample_time: float = 1e-3
 
 
-SMOOTHING = 2e-3
-"""Time constant of the low-pass in a servo [s]."""
-
-
 def follow(
     plant: Any,
     servo: Servo,
@@ -218,7 +214,7 @@ def follow(
         np.asarray(x, np.float64).tolist()
         for x in (servo.proportional, servo.derivative, limits, resolution)
     )
-    keep = float(np.exp(-servo.sample_time / SMOOTHING))
+    keep = float(np.exp(-servo.sample_time / 2e-3))
     gain = (1.0 - keep) / servo.sample_time
     joints = range(n)
     plant.start(*(np.asarray(x)[0] for x in (desired.q, desired.qd, desired.qdd)))

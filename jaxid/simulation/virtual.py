@@ -26,13 +26,7 @@ from .friction_and_disturbances import (
     FrictionTemperature,
     SmoothFriction,
 )
-from .mechanics import (
-    DriveTrain,
-    RigidGear,
-    Servo,
-    SimulatedPlant,
-    follow,
-)
+from .mechanics import DriveTrain, RigidGear, Servo, SimulatedPlant, follow
 
 
 def random_bodies(
@@ -233,17 +227,16 @@ class VirtualRobot(Hashable):
         return self.replace(temperature=np.full(self.robot.joints, temperature, np.float64))
 
     def warming(
-        self, trajectory: AbstractTrajectory, *, duration: float, interval: float = 30.0
+        self, trajectory: AbstractTrajectory, *, duration: float
     ) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times joints"]]:
         """Return temperatures while a motion is repeated: friction heats the gears (Sec. 6).
 
         Args:
             trajectory: Repeated motion.
             duration: Duration [s].
-            interval: Time between two temperatures, in which friction is constant [s].
 
         Returns:
-            Times from now on [s], and temperatures [°C].
+            Times from now on [s], about every 30 s, and temperatures [°C].
 
         Raises:
             InputError: If friction does not depend on temperature.
@@ -255,7 +248,7 @@ class VirtualRobot(Hashable):
             raise InputError("friction does not depend on temperature: give the robot `heating`.")
         # The power of friction is averaged over 2000 instants of the motion.
         _, motion = trajectory.sample(float(trajectory.duration) / 2000)
-        steps = max(1, round(duration / interval))
+        steps = max(1, round(duration / 30.0))
         parts = [
             self.friction.scaled(*x) for x in np.eye(2)[:, :, None] * np.ones(motion.qd[0].shape)
         ]

@@ -1,7 +1,6 @@
 """Trajectories: bases, splines, leads, paths of the end-effector, and their files."""
 
 from .files import (
-    joint_trajectory as joint_trajectory,
     load_trajectory as load_trajectory,
     save_trajectory as save_trajectory,
     write_csv as write_csv,
@@ -13,11 +12,7 @@ from .fourier import (
     fourier_series as fourier_series,
     random_fourier_series as random_fourier_series,
 )
-from .leads import (
-    LeadsBasis as LeadsBasis,
-    WithLeads as WithLeads,
-    with_leads as with_leads,
-)
+from .leads import LeadsBasis as LeadsBasis, WithLeads as WithLeads, with_leads as with_leads
 from .prescribed_tip_path import (
     Circle as Circle,
     Line as Line,

@@ -3,7 +3,6 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -88,55 +87,22 @@ def write_csv(
     write_text(path, pl.DataFrame(columns).write_csv())
 
 
-def joint_trajectory(
-    trajectory: AbstractTrajectory, robot: Robot, *, sample_time: float
-) -> dict[str, Any]:
-    """Return the ROS 2 message `trajectory_msgs/JointTrajectory` as dictionaries and lists.
-
-    ROS 1 calls the parts of a time `secs` and `nsecs`.
-
-    Args:
-        trajectory: Trajectory, sampled from its start to its end.
-        robot: Robot whose joint names the message carries.
-        sample_time: Largest time between two points [s].
-
-    Raises:
-        InputError: If the trajectory does not move the robot's joints, or `sample_time` is not
-            positive.
-    """
-    times, motion = _sample(trajectory, robot, sample_time)
-    rows = (np.asarray(x).tolist() for x in (motion.q, motion.qd, motion.qdd))
-    return {
-        "header": {"stamp": _ros_time(0.0), "frame_id": ""},
-        "joint_names": list(robot.joint_names),
-        "points": [
-            {
-                "positions": q,
-                "velocities": qd,
-                "accelerations": qdd,
-                "effort": [],
-                "time_from_start": _ros_time(t),
-            }
-            for t, q, qd, qdd in zip(times.tolist(), *rows, strict=True)
-        ],
-    }
-
-
 def write_ros(
     trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
 ) -> None:
-    """Write a `JointTrajectory` as JSON (if the path ends in `.json`) or YAML.
+    """Write the ROS 2 message `trajectory_msgs/JointTrajectory` as YAML.
 
-    YAML begins with comments that say units and cycle, and how to bring the robot to the start and
-    publish the file.
-    Arguments are those of `joint_trajectory`, and the file's path.
+    It begins with comments that say units and cycle, and how to bring the robot to the start and
+    publish the file. Arguments are those of `write_csv`, and so are the errors.
     """
-    message = joint_trajectory(trajectory, robot, sample_time=sample_time)
-    if Path(path).suffix == ".json":
-        write_text(path, json.dumps(message, allow_nan=False) + "\n")
-        return
-    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
-    points = [json.dumps(point, allow_nan=False) for point in message.pop("points")]
+    times, motion = _sample(trajectory, robot, sample_time)
+    rows = (np.asarray(x).tolist() for x in (motion.q, motion.qd, motion.qdd))
+    header = {"header": {"stamp": _ros_time(0.0), "frame_id": ""}, "joint_names": robot.joint_names}
+    keys = ("positions", "velocities", "accelerations", "effort", "time_from_start")
+    points = [
+        json.dumps(dict(zip(keys, (*row, [], _ros_time(t)), strict=True)), allow_nan=False)
+        for t, *row in zip(times.tolist(), *rows, strict=True)
+    ]
     kind = "trajectory_msgs/msg/JointTrajectory"
     lines = [
         f"# {kind} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
@@ -144,8 +110,9 @@ def write_ros(
         "# Move the robot slowly to the first point, then:",
         "#   ros2 topic pub --once /joint_trajectory_controller/joint_trajectory \\",
         f'#     {kind} "$(cat FILE)"',
-        *(f"{key}: {json.dumps(value)}" for key, value in message.items()),
+        *(f"{key}: {json.dumps(value)}" for key, value in header.items()),
     ]
+    # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
     lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", f"- {x}") for x in points)]
     write_text(path, "\n".join(lines) + "\n")
 

@@ -12,13 +12,7 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
-from .trajectory import (
-    AbstractBasis,
-    Envelope,
-    LinearTrajectory,
-    as_scalar,
-    stand_outside,
-)
+from .trajectory import AbstractBasis, Envelope, LinearTrajectory, as_scalar, stand_outside
 
 
 class FourierBasis(AbstractBasis):
@@ -164,12 +158,7 @@ def fourier_series(
 
 
 def random_fourier_series(
-    robot: Robot,
-    *,
-    omega: float,
-    harmonics: int = 5,
-    reach: float = 0.95,
-    seed: int = 0,
+    robot: Robot, *, omega: float, harmonics: int = 5, reach: float = 0.95, seed: int = 0
 ) -> LinearTrajectory:
     """Draw a Fourier series that uses the limits of every joint: a start for designs and tests.
 

@@ -13,13 +13,7 @@ from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
 from .fourier import PeriodsBasis, complete_limits
-from .trajectory import (
-    AbstractTrajectory,
-    Envelope,
-    States,
-    as_scalar,
-    stand_outside,
-)
+from .trajectory import AbstractTrajectory, Envelope, States, as_scalar, stand_outside
 
 
 def _lead(state: Any, duration: Any, x: Any, sign: int = 1) -> tuple:

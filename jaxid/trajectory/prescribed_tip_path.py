@@ -176,9 +176,9 @@ def iso9283_path(
     rising = np.eye(3)[leans_along] + np.eye(3)[2]
     level = np.eye(3)[1 - leans_along]
     # The corners lie a tenth of the diagonal inside, so that 80 % of the half edges are left.
-    u, v = 0.8 * edge / 2 * rising, 0.8 * edge / 2 * level
-    p2, p3, p4, p5 = c + u + v, c - u + v, c - u - v, c + u - v
     large, small = 0.8 * edge / 2, 0.08 * edge / 2
+    u, v = large * rising, large * level
+    p2, p3, p4, p5 = c + u + v, c - u + v, c - u - v, c + u - v
     up = rising / np.sqrt(2.0)
     corners = (c, p2, p3, p4, p5, p2, p4, c, c + large * up)
     pieces = (
@@ -192,30 +192,23 @@ def iso9283_path(
 
 
 def joint_path(
-    robot: Robot,
-    path: TipPath,
-    *,
-    posture: Numbers | None = None,
-    spacing: float = 0.01,
+    robot: Robot, path: TipPath, *, posture: Numbers | None = None
 ) -> PiecewisePolynomial:
     """Return the joints' motion that takes the end-effector along a path.
 
-    Inverse kinematics at close instants; between them quintic splines that stand still where pieces
-    of the path meet.
+    Inverse kinematics every 0.01 s; between them quintic splines that stand still where pieces of
+    the path meet.
 
     Args:
         robot: Robot whose end-effector moves.
         path: Path of the end-effector.
         posture: Preferred coordinates [rad or m]; the middle of the ranges if None.
-        spacing: Largest time between two instants [s].
 
     Raises:
-        InputError: If a part of the path is out of reach, a joint would have to move faster than it
-            can, or `spacing` is not positive.
+        InputError: If the path cannot be followed, or a joint would have to move faster than it
+            can.
     """
-    if not 0 < spacing < np.inf:
-        raise InputError(f"`spacing` must be positive [s], but is {spacing:g}.")
-    counts = [max(12, int(np.ceil(time / spacing))) for time in path.durations]
+    counts = [max(12, int(np.ceil(time / 0.01))) for time in path.durations]
     ends = np.concatenate([[0.0], np.cumsum(path.durations)])
     pairs = zip(itertools.pairwise(ends), counts, strict=True)
     instants = [np.linspace(a, b, count + 1) for (a, b), count in pairs]

@@ -253,9 +253,7 @@ class LinearTrajectory(AbstractTrajectory):
 
 
 def stand_outside(
-    rows: Callable[[AnyArray], AnyArray],
-    t: Float[AnyArray, " samples"],
-    duration: AnyArray | float,
+    rows: Callable[[AnyArray], AnyArray], t: Float[AnyArray, " samples"], duration: AnyArray | float
 ) -> Float[AnyArray, "4 samples variables"]:
     """Return rows of a motion that stands still before zero and after its duration [s]."""
     xp = namespace(t, as_scalar(duration))

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import jaxid as jid
 from jaxid.dynamics.terms import CoulombFriction, Presliding, SquareRootFriction, Tanh
 from jaxid.errors import InputError
-from jaxid.identification.presliding import LENGTHS as LENGTHS_TRIED
+from jaxid.identification.nonlinear_friction import LENGTHS as LENGTHS_TRIED
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import PART, SamplesWithMemory, with_memory
 from jaxid.simulation.friction_and_disturbances import LuGreFriction

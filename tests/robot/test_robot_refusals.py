@@ -8,7 +8,7 @@ from urdf_text import arm, inertial, joint, link, robot
 
 from jaxid.errors import InputError
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace, fit_capsules
-from jaxid.robot.forward_and_inverse_kinematics import inverse_kinematics
+from jaxid.robot.forward_and_inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.library import from_dh, panda, planar_arm
 from jaxid.robot.limits_and_drives import Drives, Limits
 from jaxid.robot.robot import Robot, Tool
@@ -63,9 +63,8 @@ CALLS = [
     (lambda: from_dh([(0.0, 1.0)], **STANDARD), "`rows`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD, revolute=(True,)), "`axis`"),
     (lambda: from_dh(np.zeros((2, 4)), **STANDARD).snapped(1.0), "`snap_tolerance`"),
-    (lambda: inverse_kinematics(panda(), [1.0, 0.0]), "position"),
-    (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], 2 * np.eye(3)), "rotation"),
-    (lambda: inverse_kinematics(panda(), [0.4, 0.0, 0.4], posture=[0.0]), "`posture`"),
+    (lambda: inverse_kinematics_along(panda(), np.ones((1, 3)), 2 * np.eye(3)), "rotation"),
+    (lambda: inverse_kinematics_along(panda(), np.ones((1, 3)), np.eye(3), [0.0]), "`posture`"),
 ]
 
 

@@ -44,11 +44,7 @@ class RigidBodies(AbstractTerm):
         theta = projection_equation.rigid_body_regressor(robot, q, qd, qdd)
         return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
 
-    def all_ten(
-        self,
-        robot: Robot,
-        p: Float[AnyArray, " columns"],
-    ) -> Float[AnyArray, "joints 10"]:
+    def all_ten(self, robot: Robot, p: Float[AnyArray, " columns"]) -> Float[AnyArray, "joints 10"]:
         """Return ten parameters of all bodies, with zeros for those that are left out."""
         bodies = p.reshape(robot.joints, self.body_parameters)
         if not self.principal_axes:

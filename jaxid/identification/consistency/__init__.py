@@ -13,8 +13,8 @@ from .estimator import (
     consistent_batch as consistent_batch,
     consistent_body as consistent_body,
 )
-from .log_cholesky import LogCholesky as LogCholesky
 from .pseudo_inertia import (
+    LogCholesky as LogCholesky,
     consistency_margin as consistency_margin,
     pseudo_inertia as pseudo_inertia,
 )

@@ -22,13 +22,7 @@ from jaxid.arrays import (
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 
-from ..estimators import (
-    AbstractEstimator,
-    AbstractWeights,
-    Complete,
-    Estimate,
-    MaximumForces,
-)
+from ..estimators import AbstractEstimator, AbstractWeights, Complete, Estimate, MaximumForces
 from . import solver
 from .bounds_and_priors import BodyBounds, EntropicPull, ParameterPrior
 from .program import (
@@ -47,9 +41,6 @@ UNPROVED = (
     f"{2 * solver.TOLERANCE:.0e} is a proof of the optimum."
 )
 """Message where the optimum was not proved."""
-
-ACTIVE = 0.01
-"""Fall of the objective without a bound above which it is active [half squared deviations]."""
 
 
 class Consistency(eqx.Module):
@@ -136,14 +127,7 @@ class PhysicallyConsistent(AbstractEstimator):
         R, z = rows.factors.weighted(weights)
         feasible = self.feasible_set(base)
         data, program = self.program(np, base, feasible, R, z, int(rows.factors.rows.sum()))
-        program.require_interior()
-        optimum = solver.solve_in_numpy(program)
-        error_bound = float(optimum.error / max(optimum.value, program.scale))
-        if self.throw and not optimum.certified:
-            raise RuntimeError(
-                f"no physically consistent estimate with a proof: {UNPROVED.format(error_bound)} "
-                "Widen the bounds, or accept it with `throw=False`."
-            )
+        optimum, error_bound = _solve(program, self.throw)
         p = feasible.standard_parameters(np, data, optimum.y)
         parameters = np.asarray(base.from_standard(p))
         bodies = p[np.array(feasible.bodies)]
@@ -214,6 +198,19 @@ class PhysicallyConsistent(AbstractEstimator):
         return data, cone_program(xp, feasible, data, self.pull.strength, prior)
 
 
+def _solve(program: ConeProgram, throw: bool) -> tuple[solver.Optimum, float]:
+    """Return the optimum, and a bound of its objective's relative distance to the true one."""
+    program.require_interior()
+    optimum = solver.solve_in_numpy(program)
+    error_bound = float(optimum.error / max(optimum.value, program.scale))
+    if throw and not optimum.certified:
+        raise RuntimeError(
+            f"no physically consistent estimate with a proof: {UNPROVED.format(error_bound)} "
+            "Widen the bounds, or accept it with `throw=False`."
+        )
+    return optimum, error_bound
+
+
 def _active_bounds(base, feasible, program, optimum: solver.Optimum, bodies) -> tuple[str, ...]:
     """Name the bounds that keep the estimate from a better one."""
 
@@ -221,7 +218,8 @@ def _active_bounds(base, feasible, program, optimum: solver.Optimum, bodies) -> 
         return ", ".join(str(k + 1) for k in np.flatnonzero(chosen))
 
     labels, n = feasible.linear_bounds()[0], program.drives
-    tight = solver.prices(program, optimum) > ACTIVE
+    # Active bounds cost more than a hundredth of half a squared deviation.
+    tight = solver.prices(program, optimum) > 0.01
     linear, drives = np.split(tight, [program.bodies * len(labels)])
     pairs = zip(labels, linear.reshape(program.bodies, -1).T, strict=True)
     found = [f"{label} of body {numbers(active)}" for label, active in pairs if active.any()]
@@ -270,17 +268,9 @@ def consistent_body(
     b = A @ estimate
     feasible = FeasibleSet((tuple(range(10)),), (), (), bounds, np.zeros((1, 4, 4)), ())
     data = ScaledRows(A, b, np.float64(len(b)))
-    program = cone_program(np, feasible, data)
-    program.require_interior()
-    optimum = solver.solve_in_numpy(program)
-    if throw and not optimum.certified:
-        raise RuntimeError(
-            "no consistent body with a proof: "
-            f"{UNPROVED.format(float(optimum.error / max(optimum.value, program.scale)))}"
-        )
+    optimum, _ = _solve(cone_program(np, feasible, data), throw)
     parameters = feasible.standard_parameters(np, data, optimum.y)
-    distance = float(np.sqrt(2.0 * optimum.value))
-    return parameters, distance, float(optimum.error)
+    return parameters, float(np.sqrt(2.0 * optimum.value)), float(optimum.error)
 
 
 class ConsistentBatch(eqx.Module):

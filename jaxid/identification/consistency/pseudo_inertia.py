@@ -5,16 +5,19 @@ moment and mass. Ten numbers belong to some distribution of positive masses if a
 positive semidefinite (Wensing, Kim, Slotine, 2018), which includes the triangle inequality of the
 principal moments of inertia.
 
-The second half of the file is arithmetic on stacks of such matrices, for NumPy and JAX alike. The
+The last part of the file is arithmetic on stacks of such matrices, for NumPy and JAX alike. The
 loops over four rows are unrolled: a stack takes a few dozen array operations and no call of LAPACK.
 """
 
 from types import ModuleType
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, as_array, namespace
+from jaxid.arrays import AnyArray, Float, Numbers, as_array, is_traced, namespace
+from jaxid.errors import InputError
 
 Values = Any
 """Arrays of NumPy or JAX, and NumPy scalars."""
@@ -28,6 +31,7 @@ for _k, (_i, _j) in enumerate(((1, 2), (0, 2), (0, 1))):
     BASIS[4 + _k, range(3), range(3)] = 0.5
     BASIS[4 + _k, _k, _k] = -0.5
     BASIS[7 + _k, _i, _j] = BASIS[7 + _k, _j, _i] = 1.0
+_ROWS, _COLUMNS = np.triu_indices(4, 1)
 
 
 def pseudo_inertia(bodies: Float[AnyArray, "*batch 10"]) -> Float[AnyArray, "*batch 4 4"]:
@@ -71,6 +75,59 @@ def consistency_margin(bodies: Float[AnyArray, "*batch 10"]) -> Float[np.ndarray
     size = np.sqrt(np.abs(np.diagonal(P, axis1=-2, axis2=-1)))
     scale = 1.0 / np.where(size > 0, size, 1.0)
     return np.linalg.eigvalsh(P * scale[..., :, None] * scale[..., None, :])[..., 0]
+
+
+class LogCholesky(eqx.Module):
+    r"""Log-Cholesky coordinates of bodies: any ten numbers are a body that can exist.
+
+    The pseudo-inertia of a body is $U U^T$ with an upper triangle $U$ whose diagonal is positive
+    (Rucker, Wensing, Smooth Parameterization of Rigid-Body Inertia, 2022). Its logarithms and its
+    other entries are free: an optimiser of any kind stays within the possible bodies.
+
+    Attributes:
+        coordinates: For each body the logarithms of the diagonal of $U$, then the entries above it
+            row by row; any real numbers.
+    """
+
+    coordinates: Float[AnyArray, "*batch 10"]
+
+    @classmethod
+    def of(cls, bodies: Numbers) -> "LogCholesky":
+        """Return the coordinates of bodies that can exist, with $(m, m r_c, A, ..., F)$ each.
+
+        Args:
+            bodies: Parameters of each body along the last axis, or of all bodies in a row.
+
+        Raises:
+            InputError: If there are not ten numbers for each body, or a body cannot exist, or is
+                flat: points and plates lie at infinity.
+        """
+        p = as_array("bodies", bodies)
+        if p.shape[-1:] != (10,):
+            if p.ndim != 1 or p.size % 10:
+                raise InputError(f"`bodies` must hold ten numbers each, but has shape {p.shape}.")
+            p = p.reshape(-1, 10)
+        if not is_traced(p) and not np.all(np.asarray(consistency_margin(np.asarray(p))) > 0):
+            raise InputError(
+                "`bodies` must be able to exist, with a volume: use `PhysicallyConsistent`, or the "
+                "bodies of a URDF file."
+            )
+        # The upper triangle is a lower one with the axes in reverse order.
+        reverse = (Ellipsis, slice(None, None, -1), slice(None, None, -1))
+        U = jnp.linalg.cholesky(jnp.asarray(pseudo_inertia(p))[reverse])[reverse]
+        diagonal = jnp.diagonal(U, axis1=-2, axis2=-1)
+        above = U[..., _ROWS, _COLUMNS]
+        return cls(jnp.concatenate([jnp.log(diagonal), above], axis=-1))
+
+    @property
+    def parameters(self) -> Float[AnyArray, "*batch 10"]:
+        """Parameters $(m, m r_c, A, B, C, D, E, F)$ of each body."""
+        x = jnp.asarray(self.coordinates)
+        U = jnp.exp(x[..., :4, None]) * jnp.eye(4, dtype=x.dtype).reshape(
+            (1,) * (x.ndim - 1) + (4, 4)
+        )
+        U = U.at[..., _ROWS, _COLUMNS].set(x[..., 4:])
+        return inertial_parameters(U @ jnp.swapaxes(U, -1, -2))
 
 
 def _cholesky(xp: ModuleType, P: Values) -> list[list[Values]]:

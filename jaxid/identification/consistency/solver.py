@@ -25,14 +25,7 @@ import scipy.linalg
 from jaxid.arrays import AnyArray, Bool, Float, Int
 
 from .program import ConeProgram, Number, indicators
-from .pseudo_inertia import (
-    BASIS,
-    Values,
-    are_definite,
-    inverse,
-    log_determinant,
-    symmetric_part,
-)
+from .pseudo_inertia import BASIS, Values, are_definite, inverse, log_determinant, symmetric_part
 
 TOLERANCE = 2.5e-7
 """Error bound of a certified optimum, relative to objective and scale together."""

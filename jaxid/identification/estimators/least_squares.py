@@ -17,13 +17,7 @@ from jaxid.measurement.observations import Observations, SamplesInMemory
 
 from ..factors import Blocks, JointFactor, RowChunk
 from ..problem import RegressionProblem, Span
-from .estimate import (
-    AbstractEstimator,
-    Channel,
-    Estimate,
-    Influence,
-    weighted_joints,
-)
+from .estimate import AbstractEstimator, Channel, Estimate, Influence, weighted_joints
 from .regularisation_and_weights import (
     NUMERICAL,
     AbstractSolution,

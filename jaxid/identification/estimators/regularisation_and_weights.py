@@ -54,11 +54,7 @@ class Decomposition(eqx.Module):
         return np.sum(null**2, axis=0) > 1e-8
 
     def solve(self, inverse: np.ndarray | None = None) -> np.ndarray:
-        """Return the parameters for an inverse of the information along each direction.
-
-        Args:
-            inverse: Substitute of 1 / value² for each direction; by default that of `Complete`.
-        """
+        """Return the parameters, by a substitute of 1 / value² for each direction (`Complete`)."""
         inverse = Complete().inverse(self.values) if inverse is None else inverse
         along = inverse * self.values * self.forces
         return self.directions.T @ along / self.scale

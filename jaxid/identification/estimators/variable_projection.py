@@ -27,8 +27,6 @@ from .least_squares import WeightedLeastSquares
 
 RIDGE = 64 * np.finfo(float).eps
 """Ridge of the products of columns of length one, which may depend on each other."""
-PULL = np.log(10.0)
-"""Change of a shape's logarithm that costs as much as one row that is wrong by its deviation."""
 STEPS = 60
 """Largest number of steps of a search."""
 
@@ -195,9 +193,7 @@ class ShapeSearch(eqx.Module):
         return cls(shapes, start, logs, fixed, forces * counted, counted, blocks, tuple(entries))
 
     def __call__(
-        self,
-        weights: Float[AnyArray, " joints"],
-        kept: Float[AnyArray, " blocks"] | None = None,
+        self, weights: Float[AnyArray, " joints"], kept: Float[AnyArray, " blocks"] | None = None
     ) -> tuple[Float[Array, " shapes"], Array]:
         """Search by Levenberg-Marquardt over logarithms; return shapes, and whether it converged.
 
@@ -223,7 +219,7 @@ class ShapeSearch(eqx.Module):
             return rows * self.fit(start * jnp.exp(u), rows, information)[1]
 
         def left(u: Array, scale: Array) -> Array:
-            return jnp.append(weighted(u) / scale, u / PULL)
+            return jnp.append(weighted(u) / scale, u / np.log(10.0))
 
         def search(u: Array, _) -> tuple[Array, Array]:
             deviation = jnp.sqrt(jnp.sum(weighted(u) ** 2) / jnp.maximum(count, 1.0))

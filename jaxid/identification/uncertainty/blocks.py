@@ -108,7 +108,7 @@ def bootstrap(
         InputError: If there are fewer than two blocks, or draws do not determine all parameters.
         RuntimeError: If JAX's 64-bit mode is off.
     """
-    from ..batch_solver import RIDGE, inverse_information
+    from ..many_data_sets import RIDGE, inverse_information
 
     require_float64("a bootstrap")
     count = len(blocks.parts)

@@ -99,10 +99,7 @@ class AbstractUncertainty(eqx.Module):
 
     @abstractmethod
     def __call__(
-        self,
-        problem: RegressionProblem,
-        estimate: Estimate,
-        naive: Float[np.ndarray, "base base"],
+        self, problem: RegressionProblem, estimate: Estimate, naive: Float[np.ndarray, "base base"]
     ) -> tuple[Uncertainty, ResidualSpectra | None]:
         """Return the uncertainty, and spectra of the residuals if the method computes them.
 

@@ -1,11 +1,12 @@
 """Filters: motion from measured angles, one low-pass for forces and columns, and decimation."""
 
-from .decimation import (
+from .filter import (
     AbstractDecimation as AbstractDecimation,
+    AbstractFilter as AbstractFilter,
     Decimation as Decimation,
+    LowPass as LowPass,
     Subsample as Subsample,
 )
-from .filter import AbstractFilter as AbstractFilter, LowPass as LowPass
 from .motion_filters import (
     PaperFilter as PaperFilter,
     PeriodicFourier as PeriodicFourier,
