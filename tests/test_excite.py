@@ -33,6 +33,7 @@ from jaxid.experiment.excitation import (
 from jaxid.experiment.excitation_tables import Excitation, Leads
 from jaxid.experiment.experiment import load_experiment
 from jaxid.report.excitation import plan_remarks
+from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.files import load_trajectory, save_trajectory
 from jaxid.trajectory.fourier import FourierBasis, fourier_series
 from jaxid.trajectory.leads import LeadsBasis
@@ -366,6 +367,19 @@ def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pict
     assert np.abs([qd[-1], qdd[-1]]).max() < 1e-9
     assert files[1].name == "motion.ros.json"
     assert len(json.loads(files[1].read_text())["points"]) == len(t)
+    # Files of a controller come and go with the key.
+    one = CONTROLLERS["universal_robots"]._replace(joints=1)
+    monkeypatch.setitem(CONTROLLERS, "universal_robots", one)
+    keys = ('controller = "universal_robots"', 'ros = "mcap"')
+    played = load_experiment(with_keys(written, "script.toml", *keys, text=FREE))
+    files = write_design(played, designed_by(played), written / "cycles" / "motion.csv")
+    names = ["motion.csv", "motion.json", "motion.ros.mcap", "motion.script"]
+    assert listing(written / "cycles") == names
+    t = table(files[0])[:, 0]
+    np.testing.assert_allclose(t, 0.008 * np.arange(len(t)), atol=1e-12)
+    assert files[-1].read_text().count("  servoj(") == len(t)
+    write_design(experiment, found, written / "cycles" / "motion.csv")
+    assert listing(written / "cycles") == ["motion.csv", "motion.json", "motion.ros.json"]
     said = [remark.text for remark in found.remarks]
     assert "the motion runs through 2 periods; the deviations are of one." in said
 
@@ -441,6 +455,7 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
     [
         ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
         ("leads = false\nsample_time = 0.01", "choose `omega` = 0.79"),
+        ('controller = "franka"', "`controller` moves robots of 7 revolute joints, but `pendulum`"),
         ("rest = true", "`harmonics` must be at least"),
         ("rest = true\nspline = {}", "a `spline` rests at its ends"),
         ("spline = { point = 9 }", "`excitation.spline.point` is no known key: did you mean `po"),

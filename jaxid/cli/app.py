@@ -35,11 +35,9 @@ def main() -> None:
     try:
         options.require_one_log_per_option()
         app()
-    except (ImportError, InputError, OSError, RuntimeError) as error:
+    except (InputError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
             raise  # of JAX, not a failed search
-        if isinstance(error, ImportError) and "pip install" not in str(error):
-            raise  # a damaged installation, not a missing extra
         said = Text(f"jaxid: {options.describe_error(error)}")
         options.open_console(stderr=True).print(said, soft_wrap=True)
         raise SystemExit(2) from None
@@ -149,8 +147,8 @@ def excite(
 
     Floor, self-collision and forces count as far as the robot's file describes them. A first motion
     is written after seconds, and every better one replaces it: the table, the trajectory itself
-    (.json) and the same for ROS (.ros.yaml); at the end also a page with pictures. Ctrl-C keeps
-    the best motion so far. The exit code is 3 if something was not checked.
+    (.json) and the same for ROS (.ros.yaml) or other controllers; at the end also a page with
+    pictures. Ctrl-C keeps the best motion so far. The exit code is 3 if something was not checked.
     """
     console = options.start(experiment)
     from . import commands

@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxid.arrays import Float, Numbers
 from jaxid.errors import InputError
+from jaxid.io import import_extra
 
 from .mjcf import mjcf_shapes
 from .robot import Robot
@@ -74,8 +75,8 @@ def fit_capsules(
 
     Raises:
         FileNotFoundError: If the file or a mesh does not exist.
-        ImportError: If there are meshes and trimesh is not installed.
-        InputError: If the file cannot be loaded, or its geometry cannot be read.
+        InputError: If the file cannot be loaded, its geometry cannot be read, or there are meshes
+            and trimesh is not installed.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
@@ -90,7 +91,7 @@ def fit_capsules(
                 shapes = list(_read_shapes(tree, packages, name))
             else:
                 shapes = [Shape(*shape) for shape in compiled.get(name, ())]
-        except (ImportError, OSError, InputError) as error:
+        except (OSError, InputError) as error:
             if faults is None:
                 raise
             faults[name] = str(error)
@@ -201,13 +202,7 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, shape: Any) -> Shap
 
 
 def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndarray:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError(
-            f"`{tree.path}` has collision meshes, which trimesh reads: "
-            'install it (`pip install "jaxid-robotics[meshes]"`).'
-        ) from error
+    trimesh = import_extra("trimesh", "meshes", f"meshes of `{tree.path}` are read by")
     path, name = Path(tree.path), mesh.get("filename") or ""
     scheme, _, rest = name.rpartition("://")
     files, folders = [Path(rest)], [path.parent]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,25 @@ import polars as pl
 
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.io import from_json, json_text, read_json, to_json, write_text
+from jaxid.io import (
+    atomic_folder,
+    from_json,
+    import_extra,
+    json_text,
+    read_json,
+    to_json,
+    write_text,
+)
 from jaxid.robot.robot import Robot
 
 from .trajectory import AbstractTrajectory
 
 FORMAT, VERSION = "jaxid trajectory", 2
+MESSAGE, TOPIC = (
+    "trajectory_msgs/msg/JointTrajectory",
+    "/joint_trajectory_controller/joint_trajectory",
+)
+"""Type of the message for ROS 2, and the topic of the controller that plays it."""
 
 
 def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
@@ -125,29 +139,64 @@ def joint_trajectory(
 def write_ros(
     trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
 ) -> None:
-    """Write a `JointTrajectory` as JSON (if the path ends in `.json`) or YAML.
+    """Write a `JointTrajectory` as JSON (`.json`), as a bag of ROS 2 (`.mcap`), or as YAML.
 
-    YAML begins with comments that say units and cycle, and how to bring the robot to the start and
-    publish the file.
+    The bag holds one message on the topic of a `joint_trajectory_controller`, and needs the extra
+    `logs`. YAML begins with comments that say units and cycle, and how to bring the robot to the
+    start and publish the file.
     Arguments are those of `joint_trajectory`, and the file's path.
     """
     message = joint_trajectory(trajectory, robot, sample_time=sample_time)
     if Path(path).suffix == ".json":
         write_text(path, json.dumps(message, allow_nan=False) + "\n")
         return
+    if Path(path).suffix == ".mcap":
+        _write_bag(message, Path(path))
+        return
     # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
     points = [json.dumps(point, allow_nan=False) for point in message.pop("points")]
-    kind = "trajectory_msgs/msg/JointTrajectory"
     lines = [
-        f"# {kind} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
+        f"# {MESSAGE} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
         f"# at most {sample_time:.6g} s from one point to the next.",
         "# Move the robot slowly to the first point, then:",
-        "#   ros2 topic pub --once /joint_trajectory_controller/joint_trajectory \\",
-        f'#     {kind} "$(cat FILE)"',
+        f"#   ros2 topic pub --once {TOPIC} \\",
+        f'#     {MESSAGE} "$(cat FILE)"',
         *(f"{key}: {json.dumps(value)}" for key, value in message.items()),
     ]
     lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", f"- {x}") for x in points)]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _write_bag(message: dict[str, Any], path: Path) -> None:
+    """Write the message of `joint_trajectory` as a bag of ROS 2 in one file (MCAP)."""
+    typesys, rosbag2 = (
+        import_extra(f"rosbags.{name}", "logs", f"`{path.name}` is written by")
+        for name in ("typesys", "rosbag2")
+    )
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+    def typed(name: str, **values: Any) -> Any:
+        return store.types[name](**values)
+
+    header = typed(
+        "std_msgs/msg/Header",
+        stamp=typed("builtin_interfaces/msg/Time", **message["header"]["stamp"]),
+        frame_id=message["header"]["frame_id"],
+    )
+    points = []
+    for point in message["points"]:
+        time = typed("builtin_interfaces/msg/Duration", **point["time_from_start"])
+        arrays = {k: np.array(x, np.float64) for k, x in point.items() if k != "time_from_start"}
+        name = "trajectory_msgs/msg/JointTrajectoryPoint"
+        points.append(typed(name, **arrays, time_from_start=time))
+    whole = typed(MESSAGE, header=header, joint_names=message["joint_names"], points=points)
+    with atomic_folder(path.parent) as folder:
+        bag, plugin = folder / "bag", rosbag2.StoragePlugin.MCAP
+        with rosbag2.Writer(bag, version=9, storage_plugin=plugin) as writer:
+            connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
+            writer.write(connection, 0, store.serialize_cdr(whole, MESSAGE))
+        next(bag.glob("*.mcap")).rename(folder / path.name)
+        shutil.rmtree(bag)
 
 
 def _ros_time(time: float) -> dict[str, int]:
