@@ -142,6 +142,9 @@ def excite(
     all_criteria: Annotated[
         bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
     ] = False,
+    play: Annotated[
+        bool, typer.Option("--play", help="Show the motion that was written in MuJoCo, no more.")
+    ] = False,
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
@@ -153,6 +156,9 @@ def excite(
     console = options.start(experiment)
     from . import commands
 
+    if play:
+        commands.show_motion(experiment, output)
+        return
     options.refuse_foreign_table(output)
     commands.excite(console, experiment, output, resume, time, all_criteria)
 

@@ -115,7 +115,7 @@ def _origin(fit: Fit, left_out: tuple[str, ...]) -> str:
     return re.sub("-(?=-)", "- ", printable(text))
 
 
-def _text(values: AnyArray | tuple | float) -> str:
+def numbers_text(values: AnyArray | tuple | float) -> str:
     """Write numbers with all their digits."""
     return " ".join(map(repr, np.ravel(np.asarray(values, np.float64)).tolist()))
 
@@ -170,9 +170,9 @@ def export_urdf(
     for i, name in enumerate(robot.joint_names):
         element = _child(joints[name], "dynamics")
         for quantity in ("damping", "friction"):
-            element.set(quantity, _text(dynamics[quantity][i]))
+            element.set(quantity, numbers_text(dynamics[quantity][i]))
         if np.isfinite(efforts[i]):
-            _child(joints[name], "limit").set("effort", _text(efforts[i]))
+            _child(joints[name], "limit").set("effort", numbers_text(efforts[i]))
     for limit, key in itertools.product(root.iterfind("joint/limit"), ("effort", "velocity")):
         # A URDF must have both; MJCF has no speeds.
         limit.set(key, limit.get(key, _UNLIMITED))
@@ -193,8 +193,8 @@ def _hold_joints(tree: UrdfTree) -> list[str]:
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
         origin = _child(joint, "origin")
-        origin.set("xyz", _text(r))
-        origin.set("rpy", _text(rpy_angles(R)))
+        origin.set("xyz", numbers_text(r))
+        origin.set("rpy", numbers_text(rpy_angles(R)))
     return [joint.find("child").get("link") for joint in branches]
 
 
@@ -225,10 +225,10 @@ def _require_same(robot: Robot, described: Robot, source: str | Path) -> None:
 
 def _inertial(p: Float[np.ndarray, "10"]) -> etree._Element:
     inertia, element = Inertia.from_parameters(p), etree.Element("inertial")
-    etree.SubElement(element, "origin", xyz=_text(inertia.centre), rpy="0 0 0")
-    etree.SubElement(element, "mass", value=_text(inertia.mass))
+    etree.SubElement(element, "origin", xyz=numbers_text(inertia.centre), rpy="0 0 0")
+    etree.SubElement(element, "mass", value=numbers_text(inertia.mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = zip(names, map(_text, inertia.moments), strict=True)
+    moments = zip(names, map(numbers_text, inertia.moments), strict=True)
     etree.SubElement(element, "inertia", dict(moments))
     return element
 
@@ -268,17 +268,20 @@ def mjcf_text(
 ) -> str:
     """Return a robot, its bodies and the `joint_dynamics` as MJCF.
 
-    Each body has ten parameters in the paper's order, and is named after its joint.
+    Each body has ten parameters in the paper's order, and is named after its joint. Quantities that
+    `dynamics` does not hold are zero.
     """
     root = etree.Element("mujoco", model=robot.name)
     if comment:
         root.append(etree.Comment(comment))
     etree.SubElement(root, "compiler", angle="radian", autolimits="true")
-    etree.SubElement(root, "option", gravity=_text(robot.gravity), timestep=_text(timestep))
+    etree.SubElement(
+        root, "option", gravity=numbers_text(robot.gravity), timestep=numbers_text(timestep)
+    )
     world = etree.SubElement(root, "worldbody")
     actuators = etree.SubElement(root, "actuator")
     attributes = {"armature": "armature", "damping": "damping", "frictionloss": "friction"}
-    at_joints = {key: dynamics[quantity] for key, quantity in attributes.items()}
+    at_joints = {key: dynamics[name] for key, name in attributes.items() if name in dynamics}
     ranges = np.stack([robot.limits.position_min, robot.limits.position_max], axis=1)
     efforts = np.asarray(robot.known_max_forces)
     elements: list[etree._Element] = []
@@ -287,39 +290,39 @@ def mjcf_text(
             elements[parent] if parent >= 0 else world,
             "body",
             name=f"{name}_body",
-            **_placement(robot.offset[i], robot.rotation[i]),
+            **placement_attributes(robot.offset[i], robot.rotation[i]),
         )
         elements.append(body)
         inertia = Inertia.from_parameters(np.asarray(bodies)[i])
         etree.SubElement(
             body,
             "inertial",
-            pos=_text(inertia.centre),
-            mass=_text(inertia.mass),
-            fullinertia=_text(inertia.tensor[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]),
+            pos=numbers_text(inertia.centre),
+            mass=numbers_text(inertia.mass),
+            fullinertia=numbers_text(inertia.tensor[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]),
         )
         joint = etree.SubElement(
             body,
             "joint",
             name=name,
             type="hinge" if robot.revolute[i] else "slide",
-            axis=_text(robot.axis[i]),
-            **{key: _text(values[i]) for key, values in at_joints.items() if values[i]},
+            axis=numbers_text(robot.axis[i]),
+            **{key: numbers_text(values[i]) for key, values in at_joints.items() if values[i]},
         )
         if np.isfinite(ranges[i]).all():
-            joint.set("range", _text(ranges[i]))
+            joint.set("range", numbers_text(ranges[i]))
         motor = etree.SubElement(actuators, "motor", name=f"{name}_motor", joint=name)
         if np.isfinite(efforts[i]):
-            motor.set("ctrlrange", _text((-efforts[i], efforts[i])))
-    tip = _placement(robot.tip_offset, robot.tip_rotation)
+            motor.set("ctrlrange", numbers_text((-efforts[i], efforts[i])))
+    tip = placement_attributes(robot.tip_offset, robot.tip_rotation)
     etree.SubElement(elements[robot.tip_body], "site", name="tip", **tip)
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
-def _placement(offset: AnyArray, rotation: AnyArray) -> dict[str, str]:
+def placement_attributes(offset: AnyArray, rotation: AnyArray) -> dict[str, str]:
     """Return the attributes of a placement; MuJoCo's quaternions are (w, x, y, z)."""
     quaternion = Rotation.from_matrix(np.asarray(rotation)).as_quat(canonical=True)
-    return {"pos": _text(offset), "quat": _text(np.roll(quaternion, 1))}
+    return {"pos": numbers_text(offset), "quat": numbers_text(np.roll(quaternion, 1))}
 
 
 def pinocchio_parameters(fit: Fit) -> Float[np.ndarray, "joints 10"]:
