@@ -11,7 +11,6 @@ from scipy.spatial import ConvexHull, QhullError
 
 from jaxid.arrays import Float, Numbers
 from jaxid.errors import InputError
-from jaxid.io import import_extra
 
 from .mjcf import mjcf_shapes
 from .robot import Robot
@@ -60,7 +59,7 @@ def fit_capsules(
     named after its link, with a number from the second on. Bodies are those of `load_urdf` with the
     same arguments; a capsule of a link that stands on the ground belongs to the ground. Grippers
     count even where `tip` leaves their joints out: held, like joints that mimic others, as near to
-    zero as they can be. Meshes of a URDF file are read by the package trimesh (extra `meshes`).
+    zero as they can be.
 
     Args:
         path: URDF or MJCF file.
@@ -75,8 +74,7 @@ def fit_capsules(
 
     Raises:
         FileNotFoundError: If the file or a mesh does not exist.
-        InputError: If the file cannot be loaded, its geometry cannot be read, or there are meshes
-            and trimesh is not installed.
+        InputError: If the file cannot be loaded, or its geometry cannot be read.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
@@ -202,7 +200,8 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, shape: Any) -> Shap
 
 
 def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndarray:
-    trimesh = import_extra("trimesh", "meshes", f"meshes of `{tree.path}` are read by")
+    import trimesh  # loaded where there are meshes
+
     path, name = Path(tree.path), mesh.get("filename") or ""
     scheme, _, rest = name.rpartition("://")
     files, folders = [Path(rest)], [path.parent]
