@@ -9,6 +9,7 @@ own subclass is found once its module is imported.
 import contextlib
 import dataclasses
 import enum
+import importlib
 import json
 import math
 import os
@@ -136,6 +137,23 @@ def fill_template(path: Path, **values: Any) -> str:
         keep_trailing_newline=True,
     )
     return environment.from_string(path.read_text(encoding="utf-8")).render(values)
+
+
+def import_extra(module: str, extra: str, use: str) -> Any:
+    """Return a module of an extra; say how to install it where it is missing.
+
+    Args:
+        module: Full name of the module.
+        extra: Name of the extra that holds its package.
+        use: Beginning of the sentence, like "`log.mcap` is read by".
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as missing:
+        package = module.partition(".")[0]
+        raise InputError(
+            f'{use} the package `{package}`: install it (`pip install "jaxid-robotics[{extra}]"`).'
+        ) from missing
 
 
 def to_json(value: Any, refused: tuple[type, ...] = ()) -> Any:

@@ -304,7 +304,7 @@ def test_a_missing_extra_is_one_sentence_with_the_command(folder, run, monkeypat
     code, out, err = run("init", "arm.xml")
     assert (code, out) == (2, "")
     assert len(err.strip().splitlines()) == 1
-    assert "`pip install 'jaxid-robotics[mujoco]'`" in err
+    assert '`pip install "jaxid-robotics[mujoco]"`' in err
 
 
 def test_what_has_changed_between_two_runs_is_told(folder, first, run):

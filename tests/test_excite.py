@@ -2,7 +2,6 @@
 
 import dataclasses
 import html
-import json
 import os
 import re
 import signal
@@ -33,6 +32,7 @@ from jaxid.experiment.excitation import (
 from jaxid.experiment.excitation_tables import Excitation, Leads
 from jaxid.experiment.experiment import load_experiment
 from jaxid.report.excitation import plan_remarks
+from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.files import load_trajectory, save_trajectory
 from jaxid.trajectory.fourier import FourierBasis, fourier_series
 from jaxid.trajectory.leads import LeadsBasis
@@ -353,7 +353,7 @@ def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pict
     monkeypatch.setattr(
         "jaxid.experiment.excitation.design_excitation", lambda *_, **__: excited.plan
     )
-    keys = ("sample_time = 0.03", "leads = { periods = 2 }", 'ros = "json"')
+    keys = ("sample_time = 0.03", "leads = { periods = 2 }")
     experiment = load_experiment(with_keys(written, "cycles.toml", *keys, text=FREE))
     found = designed_by(experiment)
     begin, end = found.played.motion.window
@@ -364,8 +364,21 @@ def test_tables_are_sampled_as_a_controller_wants_them(written, excited, no_pict
     assert 0.0 <= t[-1] - float(found.played.motion.duration) < 0.03
     np.testing.assert_allclose(q[-1], found.played.motion.motion(found.played.motion.duration).q[0])
     assert np.abs([qd[-1], qdd[-1]]).max() < 1e-9
-    assert files[1].name == "motion.ros.json"
-    assert len(json.loads(files[1].read_text())["points"]) == len(t)
+    assert files[1].name == "motion.ros.yaml"
+    assert files[1].read_text().count("time_from_start") == len(t)
+    # Files of a controller come and go with the key.
+    one = CONTROLLERS["universal_robots"]._replace(joints=1)
+    monkeypatch.setitem(CONTROLLERS, "universal_robots", one)
+    keys = ('controller = "universal_robots"', 'ros = "mcap"')
+    played = load_experiment(with_keys(written, "script.toml", *keys, text=FREE))
+    files = write_design(played, designed_by(played), written / "cycles" / "motion.csv")
+    names = ["motion.csv", "motion.json", "motion.ros.mcap", "motion.script"]
+    assert listing(written / "cycles") == names
+    t = table(files[0])[:, 0]
+    np.testing.assert_allclose(t, 0.008 * np.arange(len(t)), atol=1e-12)
+    assert files[-1].read_text().count("  servoj(") == len(t)
+    write_design(experiment, found, written / "cycles" / "motion.csv")
+    assert listing(written / "cycles") == ["motion.csv", "motion.json", "motion.ros.yaml"]
     said = [remark.text for remark in found.remarks]
     assert "the motion runs through 2 periods; the deviations are of one." in said
 
@@ -423,6 +436,23 @@ def test_ctrl_c_among_the_criteria_shows_those_that_are_done(
     assert "stopped after 1 of 6 criteria" in out
 
 
+def test_play_shows_the_written_motion_among_its_shapes(tmp_path, run, monkeypatch):
+    arm(tmp_path)
+    command = ["excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv", "--play"]
+    code, out, err = run(*command)
+    assert (code, out) == (2, "")
+    assert "motion.json` is not there: `--play` shows a motion that was designed" in err
+    rest = fourier_series(np.zeros(3), np.zeros((3, 1)), np.ones((3, 1)), 1.0)
+    save_trajectory(rest, tmp_path / "motion.json")
+    shown = []
+    monkeypatch.setattr("jaxid.simulation.preview.play", lambda *x: shown.append(x))
+    assert run(*command)[0] == 0
+    ((robot, shapes, motion),) = shown
+    assert robot.joints == 3
+    assert {"l1", "floor"} <= {s.name for s in (*shapes.capsules, *shapes.obstacles)}
+    assert eqx.tree_equal(motion, load_trajectory(tmp_path / "motion.json"))
+
+
 def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
@@ -441,6 +471,7 @@ def test_ctrl_c_before_a_motion_keeps_all_limits(written, run, monkeypatch):
     [
         ("rests = true", "`excitation.rests` is no known key: did you mean `rest`"),
         ("leads = false\nsample_time = 0.01", "choose `omega` = 0.79"),
+        ('controller = "franka"', "`controller` moves robots of 7 revolute joints, but `pendulum`"),
         ("rest = true", "`harmonics` must be at least"),
         ("rest = true\nspline = {}", "a `spline` rests at its ends"),
         ("spline = { point = 9 }", "`excitation.spline.point` is no known key: did you mean `po"),

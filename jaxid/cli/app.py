@@ -35,11 +35,9 @@ def main() -> None:
     try:
         options.require_one_log_per_option()
         app()
-    except (ImportError, InputError, OSError, RuntimeError) as error:
+    except (InputError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
             raise  # of JAX, not a failed search
-        if isinstance(error, ImportError) and "pip install" not in str(error):
-            raise  # a damaged installation, not a missing extra
         said = Text(f"jaxid: {options.describe_error(error)}")
         options.open_console(stderr=True).print(said, soft_wrap=True)
         raise SystemExit(2) from None
@@ -60,7 +58,7 @@ def demo(
     seed: options.Seed = 0,
     force: options.Force = False,
 ) -> None:
-    """Do the whole paper on a virtual TX90L on its rail.
+    """Run the whole method on a virtual seven-axis robot.
 
     Base parameters, optimal excitation, measurement cold and warm, identification, and verification
     on the path of ISO 9283.
@@ -144,17 +142,23 @@ def excite(
     all_criteria: Annotated[
         bool, typer.Option("--all-criteria", help="Show what each of the criteria buys.")
     ] = False,
+    play: Annotated[
+        bool, typer.Option("--play", help="Show the motion that was written in MuJoCo's viewer.")
+    ] = False,
 ) -> None:
     """Design the motion to record, within the limits of the joints.
 
     Floor, self-collision and forces count as far as the robot's file describes them. A first motion
     is written after seconds, and every better one replaces it: the table, the trajectory itself
-    (.json) and the same for ROS (.ros.yaml); at the end also a page with pictures. Ctrl-C keeps
-    the best motion so far. The exit code is 3 if something was not checked.
+    (.json) and the same for ROS (.ros.yaml) or other controllers; at the end also a page with
+    pictures. Ctrl-C keeps the best motion so far. The exit code is 3 if something was not checked.
     """
     console = options.start(experiment)
     from . import commands
 
+    if play:
+        commands.show_motion(experiment, output)
+        return
     options.refuse_foreign_table(output)
     commands.excite(console, experiment, output, resume, time, all_criteria)
 
@@ -166,7 +170,7 @@ def inspect(
         list[Path] | None, typer.Argument(help="Logs to examine.", metavar="LOG")
     ] = None,
 ) -> None:
-    """Show what can be identified, and if logs are sane.
+    """Show what can be identified, and check logs for mistakes.
 
     Joints, motors and limits; base parameters and what becomes of each standard parameter; ranges,
     speeds and forces of each log beside the limits, and what the log does not determine.
@@ -214,7 +218,7 @@ def choose(
     ] = Path("chosen.toml"),
     force: options.Force = False,
 ) -> None:
-    """Choose friction and estimator by errors on unseen parts of logs.
+    """Choose friction and estimator by errors on unseen data.
 
     A table of all models, and an experiment file with the simplest that is about as good as any.
     """
@@ -249,7 +253,7 @@ def export(
     ] = False,
     force: options.Force = False,
 ) -> None:
-    """Write an identified model as C, URDF, MJCF, JSON, vectors, or a JAX function.
+    """Write a model as C, URDF, MJCF, JSON, vectors or JAX.
 
     C is a feed-forward for controllers: one file and its header, named like the output.
     """
@@ -329,7 +333,7 @@ def gains(
     output: options.OutputFolder = Path("gains"),
     force: options.Force = False,
 ) -> None:
-    """Find the drives' true forces, like torque constants, with a load that is known.
+    """Find the drives' true forces with a load that is known.
 
     From logs without it and logs with it; the table `[load]` of the experiment file describes it.
     """
@@ -346,7 +350,7 @@ def states(
     output: options.OutputFolder = Path("states"),
     force: options.Force = False,
 ) -> None:
-    """Fit several states of a robot at once: one inertia, friction for each.
+    """Fit several states at once: one inertia, friction for each.
 
     One log or report for each, like cold and warm. Friction and offsets are each state's own,
     all else is shared.
@@ -365,7 +369,7 @@ def rollout(
     output: options.OutputFolder = Path("rollout"),
     force: options.Force = False,
 ) -> None:
-    """Identify joints behind position servos from commands and encoders, without torques.
+    """Identify joints behind position servos, without torques.
 
     So that a simulation moves like the robot: a page with measured and simulated motion, numbers
     for simulators, and MJCF. The experiment file names the columns of the commands.

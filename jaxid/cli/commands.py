@@ -55,6 +55,8 @@ from jaxid.report.verdict import Report, verdict
 from jaxid.result_table import Remark, Status, Table, significant
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.rollout import identify_rollout
+from jaxid.simulation import preview
+from jaxid.trajectory.files import load_trajectory
 
 from . import process
 from .options import command_line, open_console
@@ -216,6 +218,16 @@ def excite(
         raise typer.Exit(STOPPED)
     if verdict.status is Status.BAD:
         raise typer.Exit(UNUSABLE)
+
+
+def show_motion(path: Path, output: Path) -> None:
+    """Show a motion that was written in MuJoCo's viewer, among the shapes that were checked."""
+    experiment, written = load_experiment(path), output.with_suffix(".json")
+    if not written.is_file():
+        raise InputError(f"`{written}` is not there: `--play` shows a motion that was designed.")
+    clearance = experiment.surroundings.clearance
+    shapes = None if clearance is None else clearance.model
+    preview.play(experiment.robot, shapes, load_trajectory(written))
 
 
 class _BestMotion:

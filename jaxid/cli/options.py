@@ -130,6 +130,7 @@ def command_line() -> str:
 def refuse_foreign_table(target: Path) -> None:
     """Reject a table of a motion in whose place are other files than an earlier motion."""
     from jaxid.io import require_writable
+    from jaxid.trajectory.controllers import BESIDE
     from jaxid.trajectory.files import load_trajectory
 
     if target.suffix.lower() != ".csv":
@@ -138,9 +139,9 @@ def refuse_foreign_table(target: Path) -> None:
     try:
         load_trajectory(beside)
     except (OSError, ValueError):
-        ros = (target.with_suffix(f".ros.{kind}") for kind in ("yaml", "json"))
+        others = (target.with_suffix(suffix) for suffix in BESIDE)
         drawn = sorted(pictures.iterdir()) if pictures.is_dir() else []
-        foreign = next((path for path in (target, beside, *ros, *drawn) if path.exists()), None)
+        foreign = next((path for path in (target, beside, *others, *drawn) if path.exists()), None)
         if foreign is not None:
             raise InputError(
                 f"`{foreign}` is there already, and no motion of `jaxid excite`: choose another -o."

@@ -175,7 +175,7 @@ class _Samples:
             f"{what} ({'any joint' if len(names) == self.motion.joints > 1 else ', '.join(names)})"
             for what, names in unseen.items()
         ]
-        return (f"these logs would not show {' or '.join(texts)}",) if texts else ()
+        return (f"mistakes that these logs cannot reveal: {', '.join(texts)}",) if texts else ()
 
     def amounts(self) -> Iterator[_Amount]:
         """Yield mistakes of any amount: a delay, zeros of angles, gains of forces."""

@@ -204,6 +204,11 @@ class ExcitationPlan(Summarised, eqx.Module):
     def remarks(self) -> list[Remark]:
         """Gain of the design, limits that are not kept, and parameters that are not determined."""
         gain = f"Standard deviations are {self.mean_gain:.3g} times smaller than a random motion's"
+        if self.mean_gain < 1.0:
+            gain = (
+                f"Standard deviations are {1.0 / self.mean_gain:.3g} times those of a random "
+                "motion, which keeps the limits of the joints alone: search longer (`--resume`)"
+            )
         remarks = [Remark(gain), *(Remark(text, Status.BAD) for text in self.diagnosis)]
         if self.undetermined:
             text = f"This motion does not determine: {', '.join(self.undetermined)}"

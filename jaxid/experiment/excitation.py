@@ -15,10 +15,11 @@ from jaxid.excitation.criteria import CRITERIA, information
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.excitation.problem import assumed_noise
-from jaxid.io import atomic_folder
+from jaxid.io import atomic_folder, import_extra
 from jaxid.report.excitation import write_excitation
 from jaxid.report.result_files import read_fit
 from jaxid.result_table import Remark, Status
+from jaxid.trajectory.controllers import BESIDE, CONTROLLERS
 from jaxid.trajectory.files import load_trajectory, save_trajectory, write_csv, write_ros
 from jaxid.trajectory.fourier import FourierBasis, complete_limits
 from jaxid.trajectory.leads import WithLeads, with_leads
@@ -123,7 +124,12 @@ def prepare_design(experiment: Experiment, written: Path | None) -> Preparation:
     Raises:
         InputError: If the table does not fit the robot, or the earlier motion does not fit either.
     """
+    controller = experiment.excitation.controller
+    if experiment.excitation.ros == "mcap":
+        import_extra("rosbags.rosbag2", "logs", "a bag of ROS 2 is written by")
     with within("excitation", experiment.path.name):
+        if controller is not None:
+            CONTROLLERS[controller].require(experiment.robot)
         nominal = find_nominal(experiment)
         limited = find_constraints(experiment, nominal)
     if written is None:
@@ -201,9 +207,15 @@ def write_motion(experiment: Experiment, played: Played, output: Path) -> list[P
     """Write table, trajectory and ROS message of a motion; return the files."""
     robot, step, table = experiment.robot, played.sample_time, experiment.excitation
     names = [output.name, f"{output.stem}.ros.{table.ros}", f"{output.stem}.json"]
-    with double_precision(), atomic_folder(output.parent) as folder:
+    every = {f"{output.stem}{suffix}" for suffix in BESIDE}
+    with double_precision(), atomic_folder(output.parent, lambda _: every) as folder:
         write_csv(played.sampled, robot, folder / names[0], sample_time=step)
         write_ros(played.sampled, robot, folder / names[1], sample_time=step)
+        if table.controller is not None:
+            own = CONTROLLERS[table.controller]
+            if own.write is not None:
+                names.append(f"{output.stem}{own.suffix}")
+                own.write(played.sampled, robot, folder / names[-1], step)
         save_trajectory(jax.tree.map(np.asarray, played.motion), folder / names[2])
     return [output.parent / name for name in names]
 
@@ -216,7 +228,9 @@ def write_design(
     settings = {"facts": seed, "experiment_text": experiment.text, "command": command}
     # First the page: where there is no room for pictures, nothing changes.
     place, motion = output.with_suffix(""), design.played.motion
-    pictures = write_excitation(place, design.plan, motion, design.remarks, settings)
+    clearance = experiment.surroundings.clearance
+    shapes = None if clearance is None else clearance.model
+    pictures = write_excitation(place, design.plan, motion, design.remarks, settings, shapes)
     return write_motion(experiment, design.played, output) + pictures
 
 
@@ -345,8 +359,8 @@ def play(experiment: Experiment, motion: LinearTrajectory) -> Played:
         end = begin + leads.periods * (end - begin)
     rests = not fault and (leads is not None or table.rest or table.spline is not None)
     sampled = played
-    if table.sample_time is not None:
-        step = table.sample_time
+    if table.cycle is not None:
+        step = table.cycle
         sampled = PaddedToCycle(played, step) if rests else played
     return Played(played, sampled, step, (begin, end), fault)
 

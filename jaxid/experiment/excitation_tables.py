@@ -17,6 +17,7 @@ from jaxid.robot.library import tx90l_on_rail_collision
 from jaxid.robot.limits_and_drives import owners
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
+from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.leads import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
@@ -35,6 +36,7 @@ CriterionName = Literal[
     "e_optimal",
 ]
 """Names of all criteria, in their order."""
+ControllerName = Literal["franka", "kuka_fri", "kuka_rsi", "universal_robots"]
 
 
 def capsule(
@@ -210,8 +212,10 @@ class Excitation:
         time: Time for the search [s], like `60.0`; by default all of its steps are done.
         seed: Seed of the random motions.
         sample_time: Time between two rows of the written table, the controller's cycle [s], like
-            `0.004`; by default that of the samples.
-        ros: Language of the file for ROS: "yaml" or "json".
+            `0.004`; by default that of the controller, or of the samples.
+        controller: Controller that plays the motion, for its cycle and its file, like
+            "universal_robots"; or franka, kuka_fri, kuka_rsi.
+        ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
         nominal: Folder of an earlier result of `jaxid identify`, to compare with, like `"report"`.
         earlier: Motions whose logs will be used together with this one's, like
             `["trajectory.json"]`.
@@ -237,7 +241,8 @@ class Excitation:
     time: Positive | None = None
     seed: Annotated[int, Bounds(least=0, most=2**32 - 1)] = 0
     sample_time: Annotated[float, Bounds(least=1e-5)] | None = None
-    ros: Literal["yaml", "json"] = "yaml"
+    controller: ControllerName | None = None
+    ros: Literal["yaml", "mcap"] = "yaml"
     nominal: str | None = None
     earlier: tuple[str, ...] = ()
     force_margin: Annotated[float, Bounds(least=0.0, below=1.0)] | None = None
@@ -249,6 +254,13 @@ class Excitation:
     def objective(self) -> AbstractCriterion:
         """Criterion of that name."""
         return CRITERIA[typing.get_args(CriterionName).index(self.criterion)]
+
+    @property
+    def cycle(self) -> float | None:
+        """Time between two rows of the table [s]; None for that of the samples."""
+        if self.sample_time is None and self.controller is not None:
+            return CONTROLLERS[self.controller].sample_time
+        return self.sample_time
 
     @property
     def chosen_leads(self) -> Leads | None:
@@ -272,9 +284,9 @@ class Excitation:
         leads, series = self.chosen_leads, (self.harmonics, self.omega)
         if self.rest:
             return RestToRestBasis(*series)
-        if leads is None and self.sample_time is not None:
+        if leads is None and self.cycle is not None:
             # Samples at full speed must not end before the period or go on after it.
-            period, step = 2 * np.pi / self.omega, self.sample_time
+            period, step = 2 * np.pi / self.omega, self.cycle
             count = count_cycles(period, step)
             if abs(count * step - period) > 1e-6 * step:
                 raise InputError(

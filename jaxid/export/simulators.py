@@ -262,7 +262,8 @@ def mjcf_text(
 ) -> str:
     """Return a robot, its bodies and the `joint_dynamics` as MJCF.
 
-    Each body has ten parameters in the paper's order, and is named after its joint.
+    Each body has ten parameters in the paper's order, and is named after its joint. Quantities that
+    `dynamics` does not hold are zero.
     """
     root = etree.Element("mujoco", model=robot.name)
     if comment:
@@ -274,7 +275,7 @@ def mjcf_text(
     world = etree.SubElement(root, "worldbody")
     actuators = etree.SubElement(root, "actuator")
     attributes = {"armature": "armature", "damping": "damping", "frictionloss": "friction"}
-    at_joints = {key: dynamics[quantity] for key, quantity in attributes.items()}
+    at_joints = {key: dynamics[name] for key, name in attributes.items() if name in dynamics}
     ranges = np.stack([robot.limits.position_min, robot.limits.position_max], axis=1)
     efforts = np.asarray(robot.known_max_forces)
     elements: list[etree._Element] = []
@@ -283,7 +284,7 @@ def mjcf_text(
             elements[parent] if parent >= 0 else world,
             "body",
             name=f"{name}_body",
-            **_placement(robot.offset[i], robot.rotation[i]),
+            **placement_attributes(robot.offset[i], robot.rotation[i]),
         )
         elements.append(body)
         inertia = Inertia.from_parameters(np.asarray(bodies)[i])
@@ -307,12 +308,12 @@ def mjcf_text(
         motor = etree.SubElement(actuators, "motor", name=f"{name}_motor", joint=name)
         if np.isfinite(efforts[i]):
             motor.set("ctrlrange", exact_text((-efforts[i], efforts[i])))
-    tip = _placement(robot.tip_offset, robot.tip_rotation)
+    tip = placement_attributes(robot.tip_offset, robot.tip_rotation)
     etree.SubElement(elements[robot.tip_body], "site", name="tip", **tip)
     return etree.tostring(root, pretty_print=True, encoding="unicode")
 
 
-def _placement(offset: AnyArray, rotation: AnyArray) -> dict[str, str]:
+def placement_attributes(offset: AnyArray, rotation: AnyArray) -> dict[str, str]:
     """Return the attributes of a placement; MuJoCo's quaternions are (w, x, y, z)."""
     quaternion = Rotation.from_matrix(np.asarray(rotation)).as_quat(canonical=True)
     return {"pos": exact_text(offset), "quat": exact_text(np.roll(quaternion, 1))}

@@ -1,7 +1,6 @@
 """Files of arrays: NPZ, MAT of any version, and HDF5."""
 
 import contextlib
-import importlib
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,17 +10,7 @@ import numpy as np
 import polars as pl
 
 from jaxid.errors import InputError
-
-
-def library(module: str, source: str) -> Any:
-    """Return a module of the extra `logs`; refuse what needs it if it is not installed."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(
-            f"`{source}` is read by the package `{module.partition('.')[0]}`: install it "
-            '(`pip install "jaxid-robotics[logs]"`).'
-        ) from error
+from jaxid.io import import_extra
 
 
 @contextlib.contextmanager
@@ -52,7 +41,7 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
 
 def read_hdf5(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of an HDF5 file but its images; those in a group are named like `log.q`."""
-    h5py = library("h5py", path.name)
+    h5py = import_extra("h5py", "logs", f"`{path.name}` is read by")
     with readable(path.name, "HDF5 file"), h5py.File(path, "r") as file:
         return _named_arrays(file)
 

@@ -13,8 +13,9 @@ import numpy as np
 import polars as pl
 
 from jaxid.errors import InputError
+from jaxid.io import import_extra
 
-from .array_files import library, readable
+from .array_files import readable
 
 BAGS = (".mcap", ".bag", ".db3")
 """Suffixes of files that are bags."""
@@ -39,7 +40,10 @@ class Topic(NamedTuple):
 
 def read_bag(path: Path, selected: Collection[str]) -> list[Topic]:
     """Read the messages of selected topics, and one message of each other topic."""
-    types, highlevel = (library(f"rosbags.{x}", path.name) for x in ("typesys", "highlevel"))
+    types, highlevel = (
+        import_extra(f"rosbags.{x}", "logs", f"`{path.name}` is read by")
+        for x in ("typesys", "highlevel")
+    )
     latest, topics = types.get_typestore(types.Stores.LATEST), []
     kind = "bag that defines its messages"
     with readable(path.name, kind), highlevel.AnyReader([path], default_typestore=latest) as bag:

@@ -39,7 +39,7 @@ class Columns(eqx.Module):
     `sign * gain * torque constant * unit * value`. A unit is one for all joints, or one for each.
 
     Attributes:
-        angles: Joint or motor angles.
+        angles: Joint or motor angles; `{}` stands for the joints' numbers, from 1 or from 0.
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`; None if
             there are none.

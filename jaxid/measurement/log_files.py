@@ -305,8 +305,8 @@ class _Layout(NamedTuple):
             )
         near = difflib.get_close_matches(column, _shortened(names), n=40, cutoff=0)
         raise InputError(
-            f"`{self.source}` has no column `{column}` for `{channel}`: it has, "
-            f"the closest first, `{'`, `'.join(near)}`."
+            f"`{self.source}` has no column `{column}` for `{channel}`: name one of its columns, "
+            f"the closest first: `{'`, `'.join(near)}`."
         )
 
     def read_lines(

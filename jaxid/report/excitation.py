@@ -10,6 +10,7 @@ from jaxid.arrays import double_precision
 from jaxid.excitation.design_result import VAGUE, ExcitationPlan
 from jaxid.io import atomic_folder
 from jaxid.result_table import Column, Remark, Status, Table, significant
+from jaxid.robot.collision import CollisionModel
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .motion import joint_figure, pose_figure, tip_figure
@@ -86,11 +87,12 @@ def write_excitation(
     played: AbstractTrajectory | None = None,
     remarks: Sequence[Remark] = (),
     settings: Mapping[str, Any] | None = None,
+    shapes: CollisionModel | None = None,
 ) -> list[Path]:
     """Write the page of a design; return the file.
 
-    The motion with its leads is drawn where there is one. `settings` tell the origin of the design
-    as in `provenance`.
+    The motion with its leads is drawn where there is one, among the `shapes`. `settings` tell the
+    origin of the design as in `provenance`.
     """
     robot = plan.base.model.robot
     shown = plan.trajectory if played is None else played
@@ -101,10 +103,13 @@ def write_excitation(
     speed, fastest = np.abs(np.asarray(motion.qd)), np.asarray(limits.velocity)
     used = 100.0 * speed / np.where(np.isfinite(fastest), fastest, np.max(speed))
     label = "speed [% of the limit]"
-    space = pose_figure(robot, motion.q, time=time, values=used, label=label)
+    space = pose_figure(robot, motion.q, time=time, values=used, label=label, shapes=shapes)
     figures = [joint_figure(robot, limits, time, motion), tip_figure(robot, time, motion)]
     criteria, deviations, *use = plan.tables()
     every = ordered((*plan_remarks(plan), *remarks))
+    said = "Links are coloured by the speed of their joint."
+    if shapes is not None:
+        said += " Pale shapes are those that were checked for collision; grey ones stand still."
     text = "A random motion that fills the same limits is shown beside this one."
     page = render_page(
         f"{robot.name}: a motion to record",
@@ -112,7 +117,7 @@ def write_excitation(
             ("Verdict", [headline(plan, remarks), every]),
             (
                 "The motion",
-                [picture(space, "Links are coloured by the speed of their joint."), *figures],
+                [picture(space, said), *figures],
             ),
             ("Use of the limits", use),
             ("Gain over a random motion", [text, criteria]),

@@ -4,7 +4,7 @@ import dataclasses
 import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -104,6 +104,29 @@ class Panel:
         return " ".join(filter(None, (self.y, self.unit and f"[{self.unit}]")))
 
 
+class Solids(NamedTuple):
+    """Surfaces of triangles that move with the robot's bodies, or stand on the ground.
+
+    Attributes:
+        vertices: Vertices in the frames of their bodies [m].
+        bodies: Body of each vertex; -1 is the ground.
+        faces: Vertices of each triangle.
+        places: Rotation and origin of each body at the frames of the scene, as [R r].
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    bodies: Int[np.ndarray, " vertices"]
+    faces: Int[np.ndarray, "faces 3"]
+    places: Float[np.ndarray, "frames bodies 3 4"]
+
+    @property
+    def placed(self) -> Float[np.ndarray, "frames vertices 3"]:
+        """Vertices in the frame of the ground [m]."""
+        still = np.broadcast_to(np.eye(3, 4), (len(self.places), 1, 3, 4))
+        places = np.concatenate([self.places, still], axis=1)[:, self.bodies]
+        return np.einsum("fvij,vj->fvi", places[..., :3], self.vertices) + places[..., 3]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
     """Robot along a motion in space.
@@ -116,6 +139,7 @@ class Scene:
         poses: Number of poses on paper.
         values: Values of the joints at the samples, as colours; None for none.
         label: Name of the values, with their unit.
+        solids: Shapes of the robot and around it, on a page; None for none.
     """
 
     time: Float[np.ndarray, " samples"]
@@ -125,6 +149,7 @@ class Scene:
     poses: int = 6
     values: Float[np.ndarray, "samples joints"] | None = None
     label: str = ""
+    solids: Solids | None = None
 
     @property
     def bones(self) -> Float[np.ndarray, "samples points 2 3"]:

@@ -12,7 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from .figure import GREY, ORANGE, PALE, SKY, VERMILION, Curve, Figure, Panel, Scene, decimate
+from .figure import (
+    GREY,
+    ORANGE,
+    PALE,
+    SKY,
+    VERMILION,
+    Curve,
+    Figure,
+    Panel,
+    Scene,
+    Solids,
+    decimate,
+)
 
 PIXELS = 96
 """Pixels of an inch on the page."""
@@ -67,7 +79,10 @@ def _scene(scene: Scene) -> str:
     dots = {"size": 5, "color": PALE, "line": {"color": GREY, "width": 2}}
     thick = {"width": 14, "color": GREY} | scale
     robot = trace | {"mode": "lines+markers", "line": thick, "marker": dots}
-    low, high = scene.bones.min(axis=(0, 1, 2)), scene.bones.max(axis=(0, 1, 2))
+    corners = scene.bones.reshape(-1, 3)
+    if scene.solids is not None:
+        corners = np.concatenate([corners, scene.solids.placed.reshape(-1, 3)])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     margin = 0.06 * float(np.max(high - low))
     ranges = np.stack([low - margin, high + margin], axis=1).tolist()
     axes: dict[str, Any] = {
@@ -76,7 +91,7 @@ def _scene(scene: Scene) -> str:
     }
     axes |= {"aspectmode": "data", "camera": {"eye": {"x": 1.2, "y": -1.5, "z": 0.7}}}
     axes["domain"] = {"x": [0.0, 1.0], "y": [0.12, 1.0]}
-    packed = {
+    packed: dict[str, Any] = {
         "data": [tip, robot],
         "layout": {"scene": axes},
         "frames": {
@@ -84,10 +99,28 @@ def _scene(scene: Scene) -> str:
             "time": scene.time[scene.frames].tolist(),
         },
     }
+    if scene.solids is not None:
+        packed["data"].append(trace | _surface(scene.solids))
+        packed["frames"]["solids"] = {
+            "vertices": scene.solids.vertices.round(4).tolist(),
+            "bodies": scene.solids.bodies.tolist(),
+            "places": scene.solids.places.round(4)
+            .reshape(*scene.solids.places.shape[:2], 12)
+            .tolist(),
+        }
     if coloured:
         colours = np.repeat(values[:, links], 3, axis=1)
         packed["frames"]["colours"] = [_floats(row) for row in colours]
     return pack(_json(packed))
+
+
+def _surface(solids: Solids) -> dict[str, Any]:
+    """Return the trace of surfaces at the first frame: those of the robot, and around it."""
+    still = (solids.bodies[solids.faces[:, 0]] < 0).tolist()
+    colours = [GREY if ground else SKY for ground in still]
+    corners = dict(zip("ijk", solids.faces.T.tolist(), strict=True))
+    look = {"opacity": 0.25, "facecolor": colours, "lighting": {"ambient": 0.9}}
+    return {"type": "mesh3d", **corners, **look, **_coordinates(solids.placed[0])}
 
 
 def _coordinates(points: np.ndarray) -> dict[str, Any]:

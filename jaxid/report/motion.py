@@ -1,24 +1,31 @@
 """Figures of a motion (Figs. 3, 4, 5 and 8): joints, end-effector, and the robot in space."""
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.dispatch import in_numpy
 from jaxid.dynamics.motion import Motion
 from jaxid.excitation.constraints import tip_motion
+from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.forward_and_inverse_kinematics import placements, tip_placement
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 
-from .figure import CYCLE, MEASURED, PREDICTED, VERMILION, Curve, Figure, Panel, Scene
+from .figure import CYCLE, MEASURED, PREDICTED, VERMILION, Curve, Figure, Panel, Scene, Solids
 
 FRAMES = 150
 """Poses of a robot that moves on a page."""
 PATH = 1500
 """Points of the path of its end-effector."""
+SPREAD = 40
+"""Points on the ball at each end of a capsule."""
+_SQUARE = np.array([[0, 1, 2], [1, 2, 3]])
+"""Triangles of a square whose corners are listed row by row."""
 
 
 def joint_figure(
@@ -117,6 +124,7 @@ def pose_figure(
     label: str = "",
     poses: int = 6,
     title: str | None = None,
+    shapes: CollisionModel | None = None,
 ) -> Figure:
     """Return the robot along a motion: moving on a page, in some poses on paper (Figs. 3, 8).
 
@@ -129,6 +137,7 @@ def pose_figure(
         label: Name of these values, with their unit.
         poses: Number of poses on paper, evenly spaced from the first to the last.
         title: Title of the figure; the robot's name if None.
+        shapes: Shapes of robot and surroundings that the page shows.
     """
     q = np.atleast_2d(np.asarray(q, np.float64))
     path = np.unique(np.linspace(0, len(q) - 1, min(PATH, len(q))).round().astype(int))
@@ -151,5 +160,46 @@ def pose_figure(
         poses=poses,
         values=values,
         label=label,
+        solids=None if shapes is None else _solids(robot, shapes, q[path][np.unique(shown)]),
     )
     return Figure(robot.name if title is None else title, height=2.6, width=7.5, scene=scene)
+
+
+def _solids(robot: Robot, shapes: CollisionModel, q: Float[np.ndarray, "frames joints"]) -> Solids:
+    """Return the surfaces of all shapes, and the places of the bodies in some poses."""
+
+    def body_places(x):
+        rotations, origins = placements(robot, x)
+        return jnp.concatenate([rotations, origins[:, :, None]], axis=2)
+
+    with double_precision():
+        places = in_numpy(robot, body_places, q)
+    size = 0.7 * float(np.linalg.norm(places[..., 3], axis=2).max())
+    clouds = [(c.body, _capsule_points(c)) for c in shapes.capsules]
+    clouds += [(GROUND, _obstacle_points(x, size)) for x in shapes.obstacles]
+    vertices, bodies, faces = [], [], []
+    for body, points in clouds:
+        hull = ConvexHull(points) if len(points) > 4 else None
+        faces.append((_SQUARE if hull is None else hull.simplices) + sum(map(len, vertices)))
+        vertices.append(points)
+        bodies.append(np.full(len(points), body))
+    return Solids(np.concatenate(vertices), np.concatenate(bodies), np.concatenate(faces), places)
+
+
+def _capsule_points(capsule: Capsule) -> Float[np.ndarray, "points 3"]:
+    """Return points on two spheres at the ends of a capsule, spread by the golden angle."""
+    turn, z = np.pi * (3 - 5**0.5) * np.arange(SPREAD), 1 - (2 * np.arange(SPREAD) + 1) / SPREAD
+    ring = np.sqrt(1 - z**2)
+    ball = float(capsule.radius) * np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    ends = np.unique(np.stack([capsule.start, capsule.end]), axis=0)
+    return (ends[:, None] + ball).reshape(-1, 3)
+
+
+def _obstacle_points(obstacle: HalfSpace | Box, size: float) -> Float[np.ndarray, "points 3"]:
+    """Return the corners of a box, or of a square in a plane around the ground's origin."""
+    signs = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
+    if isinstance(obstacle, Box):
+        return obstacle.centre + 0.5 * signs * obstacle.size @ obstacle.rotation.T
+    # The other two axes of a frame whose first one is the normal.
+    axes = np.linalg.svd(np.asarray(obstacle.normal)[None])[2][1:]
+    return obstacle.normal * obstacle.height + size * signs[::2, :2] @ axes

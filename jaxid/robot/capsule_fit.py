@@ -43,7 +43,7 @@ def fit_capsules(
     named after its link, with a number from the second on. Bodies are those of `load_urdf` with the
     same arguments; a capsule of a link that stands on the ground belongs to the ground. Grippers
     count even where `tip` leaves their joints out: held, like joints that mimic others, as near to
-    zero as they can be. Meshes of a URDF file are read by the package trimesh (extra `meshes`).
+    zero as they can be.
 
     Args:
         path: URDF or MJCF file.
@@ -58,7 +58,6 @@ def fit_capsules(
 
     Raises:
         FileNotFoundError: If the file or a mesh does not exist.
-        ImportError: If there are meshes and trimesh is not installed.
         InputError: If the file cannot be loaded, or its geometry cannot be read.
     """
     tree = UrdfTree(path, base=base, tip=tip)
@@ -74,7 +73,7 @@ def fit_capsules(
                 shapes = list(_read_shapes(tree, packages, name))
             else:
                 shapes = compiled.get(name, [])
-        except (ImportError, OSError, InputError) as error:
+        except (OSError, InputError) as error:
             if faults is None:
                 raise
             faults[name] = str(error)
@@ -183,13 +182,8 @@ def _read_shape(tree: UrdfTree, packages: str | Path | None, shape: Any) -> Shap
 
 
 def _vertices(tree: UrdfTree, packages: str | Path | None, mesh: Any) -> np.ndarray:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError(
-            f"`{tree.path}` has collision meshes, which trimesh reads: "
-            'install it (`pip install "jaxid-robotics[meshes]"`).'
-        ) from error
+    import trimesh  # loaded where there are meshes
+
     path, name = Path(tree.path), mesh.get("filename") or ""
     scheme, _, rest = name.rpartition("://")
     files, folders = [Path(rest)], [path.parent]

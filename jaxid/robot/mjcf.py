@@ -1,6 +1,5 @@
 """The kinematic tree of an MJCF file, as MuJoCo compiles it (extra `mujoco`), written as a URDF."""
 
-import importlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxid.arrays import Float, Numbers
 from jaxid.errors import InputError
+from jaxid.io import import_extra
 
 from .rotations import axis_rotation, rpy_angles
 
@@ -21,12 +21,7 @@ _KINDS = ("floating", "ball", "prismatic", "revolute")
 
 def import_mujoco() -> Any:
     """Return the module `mujoco`; say how to install it if it is missing."""
-    try:
-        return importlib.import_module("mujoco")
-    except ModuleNotFoundError as missing:
-        raise ModuleNotFoundError(
-            "MuJoCo is not installed: `pip install 'jaxid-robotics[mujoco]'`."
-        ) from missing
+    return import_extra("mujoco", "mujoco", "MJCF files and simulations need")
 
 
 def mjcf_as_urdf(path: str | Path) -> tuple[Any, Float[np.ndarray, "3"], list[Loop]]:
@@ -57,6 +52,9 @@ def mjcf_shapes(path: str | Path) -> dict[str, list[tuple[Float[np.ndarray, "poi
     """Return points and radii [m] of the shapes of all bodies, as `mjcf_as_urdf` names them.
 
     Shapes that cannot collide count only where a body has no others.
+
+    Raises:
+        InputError: If MuJoCo is not installed.
     """
     mujoco = import_mujoco()
     model = mujoco.MjModel.from_xml_path(str(path))

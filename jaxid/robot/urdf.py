@@ -56,8 +56,7 @@ def load_urdf(
     Raises:
         FileNotFoundError: If the file does not exist.
         InputError: If it is no URDF, is no open tree, has a floating or planar joint on the way, or
-            angles or lengths in other units; if `xacro` or MuJoCo cannot read it.
-        ModuleNotFoundError: If it is MJCF, and MuJoCo is not installed.
+            angles or lengths in other units; if `xacro` or MuJoCo cannot read it or is missing.
     """
     tree = UrdfTree(path, base=base, tip=tip)
     limits, limit_notes = _limits(tree)

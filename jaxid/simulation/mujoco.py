@@ -34,8 +34,8 @@ class MujocoRobot(VirtualRobot):
         """Return a simulation of the robot with a time step [s].
 
         Raises:
-            InputError: If the equations of motion contain more than bodies and rotors.
-            ModuleNotFoundError: If MuJoCo is not installed.
+            InputError: If the equations of motion contain more than bodies and rotors, or MuJoCo
+                is not installed.
         """
         library, friction = import_mujoco(), self.present_friction
         text = mjcf_text(
@@ -72,7 +72,7 @@ class MujocoRobot(VirtualRobot):
         MuJoCo's dry friction depends on the solver of its constraints [N m or N].
 
         Raises:
-            ModuleNotFoundError: If MuJoCo is not installed.
+            InputError: If MuJoCo is not installed.
         """
         return self.plant(1e-3).inverse(motion)
 

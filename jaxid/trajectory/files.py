@@ -2,7 +2,9 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -10,12 +12,24 @@ import polars as pl
 
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.io import from_json, json_text, read_json, to_json, write_text
+from jaxid.io import (
+    atomic_folder,
+    from_json,
+    import_extra,
+    json_text,
+    read_json,
+    to_json,
+    write_text,
+)
 from jaxid.robot.robot import Robot
 
 from .trajectory import AbstractTrajectory
 
 FORMAT, VERSION = "jaxid trajectory", 2
+MESSAGE = "trajectory_msgs/msg/JointTrajectory"
+"""Type of the message for ROS 2."""
+TOPIC = "/joint_trajectory_controller/joint_trajectory"
+"""Topic of the controller that plays it."""
 
 
 def save_trajectory(trajectory: AbstractTrajectory, path: str | Path) -> None:
@@ -90,31 +104,68 @@ def write_csv(
 def write_ros(
     trajectory: AbstractTrajectory, robot: Robot, path: str | Path, *, sample_time: float
 ) -> None:
-    """Write the ROS 2 message `trajectory_msgs/JointTrajectory` as YAML.
+    """Write the ROS 2 message `trajectory_msgs/JointTrajectory` as YAML, or as a bag (`.mcap`).
 
-    It begins with comments that say units and cycle, and how to bring the robot to the start and
-    publish the file. Arguments are those of `write_csv`, and so are the errors.
+    The bag holds the message on the topic of a `joint_trajectory_controller`, and needs the extra
+    `logs`. YAML begins with comments that say units and cycle, and how to bring the robot to the
+    start and publish the file. Arguments are those of `write_csv`, and so are the errors.
     """
     times, motion = _sample(trajectory, robot, sample_time)
     rows = (np.asarray(x).tolist() for x in (motion.q, motion.qd, motion.qdd))
-    header = {"header": {"stamp": _ros_time(0.0), "frame_id": ""}, "joint_names": robot.joint_names}
+    names = list(robot.joint_names)
+    message = {"header": {"stamp": _ros_time(0.0), "frame_id": ""}, "joint_names": names}
     keys = ("positions", "velocities", "accelerations", "effort", "time_from_start")
     points = [
-        json.dumps(dict(zip(keys, (*row, [], _ros_time(t)), strict=True)), allow_nan=False)
+        dict(zip(keys, (*row, [], _ros_time(t)), strict=True))
         for t, *row in zip(times.tolist(), *rows, strict=True)
     ]
-    kind = "trajectory_msgs/msg/JointTrajectory"
+    if Path(path).suffix == ".mcap":
+        _write_bag({**message, "points": points}, Path(path))
+        return
     lines = [
-        f"# {kind} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
+        f"# {MESSAGE} of `{robot.name}`: rad (revolute joints) or m (prismatic joints), and s;",
         f"# at most {sample_time:.6g} s from one point to the next.",
         "# Move the robot slowly to the first point, then:",
-        "#   ros2 topic pub --once /joint_trajectory_controller/joint_trajectory \\",
-        f'#     {kind} "$(cat FILE)"',
-        *(f"{key}: {json.dumps(value)}" for key, value in header.items()),
+        f"#   ros2 topic pub --once {TOPIC} \\",
+        f'#     {MESSAGE} "$(cat FILE)"',
+        *(f"{key}: {json.dumps(value)}" for key, value in message.items()),
     ]
     # JSON's values are YAML's values, but YAML 1.1 reads `1e-05`, without a point, as text.
-    lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", f"- {x}") for x in points)]
+    texts = (f"- {json.dumps(point, allow_nan=False)}" for point in points)
+    lines += ["points:", *(re.sub(r"(?<![.\d])(\d+)e", r"\1.0e", x) for x in texts)]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _write_bag(message: dict[str, Any], path: Path) -> None:
+    """Write a message as a bag of ROS 2 in one file (MCAP)."""
+    typesys, rosbag2 = (
+        import_extra(f"rosbags.{name}", "logs", f"`{path.name}` is written by")
+        for name in ("typesys", "rosbag2")
+    )
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+    def typed(name: str, **values: Any) -> Any:
+        return store.types[name](**values)
+
+    header = typed(
+        "std_msgs/msg/Header",
+        stamp=typed("builtin_interfaces/msg/Time", **message["header"]["stamp"]),
+        frame_id=message["header"]["frame_id"],
+    )
+    points = []
+    for point in message["points"]:
+        time = typed("builtin_interfaces/msg/Duration", **point["time_from_start"])
+        arrays = {k: np.array(x, np.float64) for k, x in point.items() if k != "time_from_start"}
+        name = "trajectory_msgs/msg/JointTrajectoryPoint"
+        points.append(typed(name, **arrays, time_from_start=time))
+    whole = typed(MESSAGE, header=header, joint_names=message["joint_names"], points=points)
+    with atomic_folder(path.parent) as folder:
+        bag, plugin = folder / "bag", rosbag2.StoragePlugin.MCAP
+        with rosbag2.Writer(bag, version=9, storage_plugin=plugin) as writer:
+            connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
+            writer.write(connection, 0, store.serialize_cdr(whole, MESSAGE))
+        next(bag.glob("*.mcap")).rename(folder / path.name)
+        shutil.rmtree(bag)
 
 
 def _ros_time(time: float) -> dict[str, int]:

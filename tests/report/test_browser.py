@@ -3,8 +3,13 @@
 import shutil
 import subprocess
 
+import numpy as np
 import pytest
 from browser import CHROMIUM, Browser
+
+from jaxid.report.motion import pose_figure
+from jaxid.robot import library
+from jaxid.robot.collision import Capsule, CollisionModel, HalfSpace
 
 pytest.importorskip("websockets.sync.client")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
@@ -34,6 +39,26 @@ def test_nothing_is_cut_off(browser, pages, name, width, scheme):
     browser.look(width, scheme)
     browser.open(pages[name])
     assert browser.evaluate("drawAll()") == 0
+    assert browser.evaluate("faults()") == []
+    assert browser.errors == []
+
+
+def test_shapes_move_with_the_robot(browser, tmp_path):
+    robot, q = library.panda(), np.linspace(-0.5, 0.5, 30)[:, None] * np.arange(1, 8)
+    ball = Capsule("ball", 6, start=(0.0, 0.0, 0.1), radius=0.1)
+    shapes = CollisionModel(robot, [ball], [HalfSpace("floor")])
+    figure = pose_figure(robot, q, values=np.abs(q), label="load [%]", shapes=shapes)
+    figure.save(tmp_path / "a.html")
+    browser.look(1280)
+    browser.open(tmp_path / "a.html")
+    assert browser.evaluate("drawAll()") == 0
+    browser.evaluate(
+        "{ const s = document.querySelector('.player input'); s.value = 12;"
+        " s.dispatchEvent(new Event('input')); }"
+    )
+    shown = "((d) => [d.x, d.y, d.z].map((a) => [...a]))(document.querySelector('.chart').data[2])"
+    found = np.transpose(browser.evaluate(shown))
+    np.testing.assert_allclose(found, figure.scene.solids.placed[12], atol=4e-4)
     assert browser.evaluate("faults()") == []
     assert browser.errors == []
 

@@ -6,6 +6,7 @@ import gzip
 import json
 import sys
 
+import jax
 import matplotlib
 import numpy as np
 import pytest
@@ -15,8 +16,10 @@ from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.estimates_and_residuals import autocorrelation
 from jaxid.report.figure import BLUE, ORANGE, decimate
 from jaxid.report.interactive import charts, library
+from jaxid.report.motion import pose_figure
 from jaxid.report.parameter_words import in_words
 from jaxid.report.physics import gravity_forces
+from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 
 T = np.linspace(0.0, 2.0, 101)
 
@@ -155,6 +158,37 @@ def test_gaps_in_time_break_the_line_and_missing_values_stay_out(rows):
     times, values = decimate(t, y, 200)
     assert np.isnan(values[times < 0.24]).all()
     assert (values[(times > 0.26) & (times < 0.5)] == 1.0).all()
+
+
+def test_shapes_are_closed_surfaces_that_move_with_the_bodies():
+    robot, q = arm_of(2), np.array([[0.0, 0.0], [0.4, -0.9], [1.1, 0.2]])
+    rod = Capsule("rod", 1, start=(0.1, 0.0, 0.0), end=(0.9, 0.0, 0.0), radius=0.1)
+    ball, turned = Capsule("ball", 0, start=(0.5, 0.1, 0.0), radius=0.2), np.eye(3)[[1, 2, 0]]
+    box = Box("table", centre=(0.0, 3.0, 0.0), size=(0.2, 0.4, 0.6), rotation=turned)
+    floor = HalfSpace("floor", normal=(0.0, 0.6, 0.8), height=-2.0)
+    shapes = CollisionModel(robot, [rod, ball], [box, floor])
+    solids = pose_figure(robot, q, shapes=shapes).scene.solids
+    placed, ends = solids.placed, np.asarray(jax.vmap(lambda x: shapes.ends(robot, x))(q))
+    for pose in range(3):
+        for body, capsule in enumerate(("ball", "rod")):
+            (start, end), points = ends[pose, 1 - body], placed[pose][solids.bodies == body]
+            along = end - start
+            t = np.clip((points - start) @ along / max(along @ along, 1e-9), 0.0, 1.0)
+            far = np.linalg.norm(points - start - t[:, None] * along, axis=1)
+            radius = 0.2 if capsule == "ball" else 0.1
+            assert far.max() == pytest.approx(radius, rel=1e-9)
+            assert (points.min(0) <= np.minimum(start, end) - 0.9 * radius).all()
+    # Corners of the box, and a square in the plane; they stay.
+    still = placed[0][solids.bodies == GROUND]
+    np.testing.assert_array_equal(still, placed[2][solids.bodies == GROUND])
+    corners = (still[:8] - [0.0, 3.0, 0.0]) @ turned
+    np.testing.assert_allclose(np.abs(corners), np.tile([0.1, 0.2, 0.3], (8, 1)), atol=1e-12)
+    np.testing.assert_allclose(still[8:] @ [0.0, 0.6, 0.8], -2.0, atol=1e-12)
+    # Every edge of a closed surface belongs to two triangles; the square's border to one.
+    edges = np.sort(solids.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert sorted(counts)[:5] == [1, 1, 1, 1, 2]
+    assert counts.max() == 2
 
 
 @pytest.fixture(scope="module")

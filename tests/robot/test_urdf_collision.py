@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from forward_kinematics import body_transforms
 from scipy.spatial.transform import Rotation
 from urdf_text import joint, link, robot
@@ -106,7 +107,6 @@ def test_capsules_hold_the_geometry_on_its_bodies(tmp_path):
 
 
 def test_a_mesh_is_held_whole(tmp_path):
-    trimesh = pytest.importorskip("trimesh")
     meshes = tmp_path / "arm_description" / "meshes"
     meshes.mkdir(parents=True)
     mesh = trimesh.creation.cylinder(radius=30.0, height=200.0)

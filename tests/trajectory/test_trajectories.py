@@ -3,12 +3,14 @@
 import csv
 import json
 import math
+import re
 
 import jax
 import numpy as np
 import polars as pl
 import pytest
 
+from jaxid.errors import InputError
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.trajectory import (
@@ -31,7 +33,10 @@ from jaxid.trajectory import (
     with_leads,
     write_csv,
     write_ros,
+    write_rsi,
+    write_urscript,
 )
+from jaxid.trajectory.controllers import CONTROLLERS
 
 PANDA = library.panda()
 ARM = library.planar_arm(2)
@@ -234,6 +239,63 @@ def test_a_table_has_units_and_exact_numbers(tmp_path):
     np.testing.assert_array_equal(table.to_numpy(), expected)
     with pytest.raises(ValueError, match="`trajectory` must move the 6 joints of `UR10`"):
         write_csv(series(), library.ur10(), tmp_path / "t.csv", sample_time=0.1)
+
+
+def test_a_bag_of_ros_2_holds_the_motion_bit_by_bit(tmp_path):
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    robot = library.panda()
+    motion = random_fourier_series(robot, omega=0.8, seed=0)
+    write_ros(motion, robot, tmp_path / "motion.ros.mcap", sample_time=0.01)
+    assert [path.name for path in tmp_path.iterdir()] == ["motion.ros.mcap"]
+    with rosbags.AnyReader([tmp_path / "motion.ros.mcap"]) as bag:
+        ((connection, _, data),) = bag.messages()
+        message = bag.deserialize(data, connection.msgtype)
+    assert connection.topic == "/joint_trajectory_controller/joint_trajectory"
+    assert connection.msgtype == "trajectory_msgs/msg/JointTrajectory"
+    assert tuple(message.joint_names) == robot.joint_names
+    times, expected = motion.sample(0.01)
+    for name, short in (("positions", "q"), ("velocities", "qd"), ("accelerations", "qdd")):
+        found = [getattr(point, name) for point in message.points]
+        np.testing.assert_array_equal(found, getattr(expected, short))
+    found = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
+    np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
+    # The independent reader of MCAP finds the same bytes.
+    reader = pytest.importorskip("mcap.reader")
+    with (tmp_path / "motion.ros.mcap").open("rb") as file:
+        ((schema, channel, single),) = reader.make_reader(file).iter_messages()
+    assert (schema.name, channel.message_encoding) == (connection.msgtype, "cdr")
+    assert single.data == bytes(data)
+
+
+def test_universal_robots_play_every_position_in_turn(tmp_path):
+    robot = library.ur10()
+    motion = random_fourier_series(robot, omega=0.8, seed=0)
+    write_urscript(motion, robot, tmp_path / "motion.script", 0.008)
+    head, *lines = (tmp_path / "motion.script").read_text().splitlines()
+    first, start, *played, stop, end = lines
+    assert head.startswith("# Motion of `UR10`: 983 positions [rad], one in 0.008 s")
+    assert (first, stop, end) == ("def play_motion():", "  stopj(2.0)", "end")
+    pattern = re.compile(r"  servoj\(\[(.*)\], 0, 0, 0\.008, 0\.1, 300\)")
+    rows = [[float(x) for x in pattern.fullmatch(line)[1].split(", ")] for line in played]
+    np.testing.assert_allclose(rows, motion.sample(0.008)[1].q, rtol=0, atol=5.1e-10)
+    assert start == f"  movej({played[0].partition('(')[2].partition(', 0, 0')[0]}, a=0.5, v=0.3)"
+    assert "e-" not in "".join(played)
+
+
+def test_rsi_gets_degrees_from_the_start(tmp_path):
+    robot = library.ur10()
+    motion = random_fourier_series(robot, omega=0.8, seed=0)
+    write_rsi(motion, robot, tmp_path / "motion.rsi.csv", 0.004)
+    table = pl.read_csv(tmp_path / "motion.rsi.csv")
+    assert table.columns == [f"AK.A{k} [deg]" for k in range(1, 7)]
+    q = motion.sample(0.004)[1].q
+    np.testing.assert_allclose(table.to_numpy() * np.pi / 180, q - q[0], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("robot", [library.tx90l_on_rail(), library.panda()])
+def test_a_controller_refuses_another_robot(robot):
+    with pytest.raises(InputError, match="`controller` moves robots of 6 revolute joints, but `"):
+        CONTROLLERS["universal_robots"].require(robot)
 
 
 def test_ros_messages_parse_back(tmp_path):

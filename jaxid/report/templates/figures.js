@@ -109,12 +109,23 @@
     slider.value = "0";
     chart.after(bar);
     let timer = 0;
+    function placed({ vertices, bodies, places }, k) {
+      return [0, 1, 2].map((i) => vertices.map((v, n) => {
+        const at = places[k][bodies[n]];
+        return at ? at[4 * i] * v[0] + at[4 * i + 1] * v[1] + at[4 * i + 2] * v[2] + at[4 * i + 3] : v[i];
+      }));
+    }
     function pose(k) {
       const { x, y, z } = frames.points[k];
       const change = { x: [x], y: [y], z: [z] };
       if (frames.colours) change["line.color"] = [frames.colours[k]];
       clock.textContent = `${frames.time[k].toFixed(1)} s`;
-      return Plotly.restyle(chart, change, [1]);
+      if (frames.solids) {
+        const solid = placed(frames.solids, k);
+        ["x", "y", "z"].forEach((axis, i) => change[axis].push(solid[i]));
+        if (frames.colours) change["line.color"].push(undefined);
+      }
+      return Plotly.restyle(chart, change, frames.solids ? [1, 2] : [1]);
     }
     async function step() {
       if (!timer) return;
