@@ -69,6 +69,7 @@ METHODS = (
     Script("states", 5),
     Script("rollout", 40),
     Script("excitation", 60),
+    Script("safe_motions", 40),
     Script("export", 10),
     Script("virtual_robot", 5),
     Script("demo", 10),

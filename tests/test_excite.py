@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 from jaxid.cli import app as cli
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation import search
 from jaxid.excitation.coefficient_limits import JointLimits
+from jaxid.excitation.constraints import ForceLimits
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.experiment.decoder import keys_of
 from jaxid.experiment.excitation import (
@@ -260,6 +262,28 @@ def test_floor_self_collision_and_forces_are_kept_by_default(tmp_path, run):
         contacts.append(data.ncon)
     assert not any(contacts[:-1])
     assert contacts[-1]
+
+
+def test_friction_that_the_file_claims_counts_in_the_forces(tmp_path):
+    arm(tmp_path)
+    path = tmp_path / "arm.urdf"
+    claim = '<axis xyz="0 1 0"/><dynamics damping="3" friction="2"/>'
+    path.write_text(path.read_text().replace('<axis xyz="0 1 0"/>', claim))
+    experiment = load_experiment(tmp_path / "arm.toml")
+    found = find_nominal(experiment)
+    (limits,) = (
+        c for c in find_constraints(experiment, found).constraints if isinstance(c, ForceLimits)
+    )
+    # Upright, at 1 rad/s, with a margin of 30 %: MuJoCo's forces over what is left of 50 N m.
+    motion = Motion(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3)))
+    worst = np.asarray(limits(experiment.robot, motion)).max(axis=0)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    data.qvel[:] = motion.qd[0]
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    mujoco.mj_inverse(model, data)
+    expected = data.qfrc_inverse[2] + model.dof_frictionloss[2]
+    assert worst[2] == pytest.approx(expected / 35.0 - 1.0, rel=1e-3)
 
 
 def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):

@@ -235,10 +235,10 @@ class RobotSource:
         return np.asarray(urdf_parameters(folder / self.file, **self.chain)).reshape(-1, 10)
 
     def joint_parameters(self, folder: Path) -> dict[str, float]:
-        """Return rotor inertias and friction of an MJCF file, by their names in a model."""
-        if self.mjcf is None:
+        """Return rotor inertias and friction that the file claims, by their names in a model."""
+        if self.file is None:
             return {}
-        claimed = joint_parameters(folder / self.mjcf, **self.chain)
+        claimed = joint_parameters(folder / self.file, **self.chain)
         rows = zip(("Ia", "fv", "fc"), claimed.values(), strict=True)
         return {f"{k}{j}": float(x) for k, row in rows for j, x in enumerate(row, 1) if x > 0.0}
 

@@ -199,7 +199,9 @@ def _obstacle_points(obstacle: HalfSpace | Box, size: float) -> Float[np.ndarray
     """Return the corners of a box, or of a square in a plane around the ground's origin."""
     signs = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
     if isinstance(obstacle, Box):
-        return obstacle.centre + 0.5 * signs * obstacle.size @ obstacle.rotation.T
+        centre, size, R = map(np.asarray, (obstacle.centre, obstacle.size, obstacle.rotation))
+        return centre + 0.5 * signs * size @ R.T
     # The other two axes of a frame whose first one is the normal.
-    axes = np.linalg.svd(np.asarray(obstacle.normal)[None])[2][1:]
-    return obstacle.normal * obstacle.height + size * signs[::2, :2] @ axes
+    normal = np.asarray(obstacle.normal)
+    axes = np.linalg.svd(normal[None])[2][1:]
+    return normal * np.asarray(obstacle.height) + size * signs[::2, :2] @ axes
