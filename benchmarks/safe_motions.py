@@ -15,8 +15,9 @@ on the machine do not matter: they are those of an idle machine.
 
 * first: time from the start of the command to the first motion that keeps all limits, in seconds of
   the clock and of the processor (other programs may share the cores).
-* gap: smallest distance between two links or a link and the floor [mm]; "> 100" if none is nearer.
-* use: largest force over the URDF's effort, of all joints [%].
+* floor, self: smallest distance of a link from the floor and from another link; inf above 200 mm.
+* position: smallest distance from an end of a range; speed, use: largest speed and force of all
+  joints over the URDF's velocity and effort.
 * D: geometric mean of the parameters' standard deviations after `--time` over that of the longest
   search, which goes on for `--more` seconds; below 1 the longer search has found nothing better.
 """

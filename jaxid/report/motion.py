@@ -199,8 +199,8 @@ def _obstacle_points(obstacle: HalfSpace | Box, size: float) -> Float[np.ndarray
     """Return the corners of a box, or of a square in a plane around the ground's origin."""
     signs = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
     if isinstance(obstacle, Box):
-        centre, size, R = map(np.asarray, (obstacle.centre, obstacle.size, obstacle.rotation))
-        return centre + 0.5 * signs * size @ R.T
+        corners = 0.5 * signs * np.asarray(obstacle.size)
+        return np.asarray(obstacle.centre) + corners @ np.asarray(obstacle.rotation).T
     # The other two axes of a frame whose first one is the normal.
     normal = np.asarray(obstacle.normal)
     axes = np.linalg.svd(normal[None])[2][1:]
