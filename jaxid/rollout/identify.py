@@ -79,7 +79,9 @@ def identify_rollout(
     _require_motion(motion)
     names = _joint_names(motion, bodies, joint_names)
     simulator = ServoSimulator(motion if bodies is None else bodies.loads(motion), time_step)
-    search = _Search(simulator)
+    # Commands held or interpolated differ within a sample time only; the rest shows in long steps.
+    coarse = max(time_step, float(motion.sample_time.max()))
+    search = _Search(dataclasses.replace(simulator, time_step=coarse))
     search.start()
     groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
     if bodies is None:
@@ -92,6 +94,7 @@ def identify_rollout(
         search.choose(group)
         if k == 0:
             search.remove_contact()
+    search.simulator = dataclasses.replace(search.simulator, time_step=time_step)
     search.choose_hold()
     if bodies is not None and not bodies.coupled:
         bodies = search.choose_coupling(bodies)
@@ -164,16 +167,15 @@ class _Search:
         self.free = np.tile(mask(BASIC), (joints, 1))
         self.linear = self.x.copy()
 
-    def solve(self, x: np.ndarray, free: np.ndarray, iterations: int = 5) -> Solution:
+    def solve(self, x: np.ndarray, free: np.ndarray, iterations: int = 10) -> Solution:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
 
-        def moments(x):
-            cost, g, H = self.simulator.moments(x)
-            totals = ((w[(...,) + (None,) * k] * y).sum(axis=0) for k, y in enumerate((cost, g, H)))
-            return tuple(totals)
+        def moments(x, k):
+            parts = zip((0, 1, 2), self.simulator.moments(x), strict=True)
+            return tuple((w[(...,) + (None,) * n] * y).sum(axis=0) for n, y in parts)
 
-        def costs(x):
+        def costs(x, k):
             return (w * self.simulator.costs(x)).sum(axis=0)
 
         return minimise(moments, costs, x, free, (LOWER, UPPER), iterations)
@@ -238,10 +240,8 @@ class _Search:
         if len(group) == 1:
             return
         every = {symbol for effects in group for symbol in effects}
-        # Always four candidates: one compilation.
-        filled = [*group, *[group[-1]] * (4 - len(group))]
-        x, free = np.stack([self.x] * 4), np.stack([self.free] * 4)
-        for k, effects in enumerate(filled):
+        x, free = (np.stack([y] * len(group)) for y in (self.x, self.free))
+        for k, effects in enumerate(group):
             free[k, :, mask(tuple(every))] = False
             free[k, :, mask(effects)] = True
             for symbol in every - set(effects):
@@ -309,7 +309,7 @@ class _Search:
         scores, results = [], []
         for simulator, start in pairs:
             self.simulator = simulator
-            found = self.solve(start[None], self.free[None], iterations=3)
+            found = self.solve(start[None], self.free[None], iterations=5)
             scores.append(self.held_out(found, self.free[None]).mean())
             results.append((simulator, found.x[0]))
         last = bool(scores[1] < scores[0])

@@ -7,10 +7,13 @@ import numpy as np
 
 from jaxid.arrays import Bool, Float
 
-Moments = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Function that returns costs, gradients and Gauss-Newton matrices for parameters [..., size]."""
-Costs = Callable[[np.ndarray], np.ndarray]
-"""Function that returns the costs alone."""
+Moments = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+"""Function of parameters [..., size] and of the indices of their problems along the first axis.
+
+It returns costs, gradients and Gauss-Newton matrices.
+"""
+Costs = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Function of the same that returns the costs alone."""
 
 
 class Solution(NamedTuple):
@@ -40,7 +43,8 @@ def minimise(
 ) -> Solution:
     """Minimise sums of squares over the free parameters, each problem with its own damping.
 
-    A parameter at a bound that its gradient would leave is held there for one step.
+    A parameter at a bound that its gradient would leave is held there for one step. Problems of one
+    index along the first axis are left alone as soon as all of them have converged.
 
     Args:
         moments: Costs and their derivatives at parameters of all problems.
@@ -52,25 +56,33 @@ def minimise(
         tolerance: Relative decrease of the cost below which a problem has converged.
     """
     x = np.clip(x, *bounds)
-    damping = np.full(x.shape[:-1], 1e-2)
-    cost, g, H = moments(x)
+    damping, left = np.full(x.shape[:-1], 1e-2), np.arange(len(x))
+    cost, g, H = moments(x, left)
     for _ in range(iterations):
-        decrease = np.zeros_like(cost)
-        for _ in range(5):
-            step = bounded_step(g, H, x, free, bounds, damping)
-            trial = np.clip(x + step, *bounds)
-            found = costs(trial)
-            better = (found < cost) & (decrease == 0.0)
-            decrease = np.where(better, (cost - found) / np.maximum(cost, 1e-300), decrease)
-            x = np.where(better[..., None], trial, x)
-            factor = np.where(better, 0.2, np.where(decrease > 0.0, 1.0, 8.0))
-            damping = np.clip(damping * factor, 1e-9, 1e6)
-            if (decrease > 0.0).mean() > 0.7:
-                break
-        cost, g, H = moments(x)
-        if (decrease < tolerance).all():
+        own = (y[left] for y in (x, cost, g, H, free, damping))
+        x[left], damping[left], converged = _improve(costs, left, *own, bounds, tolerance)
+        cost[left], g[left], H[left] = moments(x[left], left)
+        left = left[~converged.reshape(len(left), -1).all(axis=1)]
+        if not left.size:
             break
     return Solution(x, cost, g, H)
+
+
+def _improve(costs, problems, x, cost, g, H, free, damping, bounds, tolerance):
+    """Return parameters of lower costs, their damping, and which problems have converged."""
+    decrease = np.zeros_like(cost)
+    for _ in range(5):
+        step = bounded_step(g, H, x, free, bounds, damping)
+        trial = np.clip(x + step, *bounds)
+        found = costs(trial, problems)
+        better = (found < cost) & (decrease == 0.0)
+        decrease = np.where(better, (cost - found) / np.maximum(cost, 1e-300), decrease)
+        x = np.where(better[..., None], trial, x)
+        factor = np.where(better, 0.2, np.where(decrease > 0.0, 1.0, 8.0))
+        damping = np.clip(damping * factor, 1e-9, 1e6)
+        if (decrease > 0.0).mean() > 0.7:
+            break
+    return x, damping, decrease < tolerance
 
 
 def bounded_step(

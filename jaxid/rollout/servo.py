@@ -247,106 +247,189 @@ def delayed_command(c: AnyArray, t: Array, hold: AnyArray) -> Array:
     return jnp.where(hold, mean, c[k] + (middle - whole) * (c[k + 1] - c[k]))
 
 
+class Stages(NamedTuple):
+    """Inputs of the implicit Euler stages of a simulation, two for each step [stages, joints].
+
+    Attributes:
+        commands: Mean command of the step, with gain and bias.
+        load: Torque of the bodies [N m or N].
+        inertia: Inertia of the bodies [kg m² or kg].
+        share: Fraction of the step by which the position moves [stages, 1].
+        ahead: Factor of the change of velocity with which the next stage starts.
+    """
+
+    commands: Array
+    load: Array
+    inertia: Array
+    share: Array
+    ahead: Array
+
+    @classmethod
+    def of(cls, theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> "Stages":
+        """Return the stages of one motion with this number of steps in each sample time."""
+        count = motion.commands.shape[-1] - 1
+
+        def repeated(x: AnyArray) -> Array:
+            return jnp.repeat(jnp.asarray(x).T[:-1], 2 * steps, axis=0)
+
+        def alternating(first: float, second: float) -> Array:
+            return jnp.tile(jnp.array([first, second]), count * steps)[:, None]
+
+        commands = jnp.repeat(_commands(theta, motion, steps, hold), 2, axis=0)
+        share = alternating(1.0 - GAMMA, GAMMA)
+        ahead = alternating((1.0 - GAMMA) / GAMMA, 1.0)
+        return cls(commands, repeated(motion.load), repeated(motion.inertia), share, ahead)
+
+
 def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    """Return the command of each step, with gain and bias [samples less one, steps]."""
-    count, (_, _, d, b, *_, g) = len(motion.commands) - 1, theta
-    edges = jnp.asarray(np.arange(count * steps + 1) / steps) - d / motion.sample_time
-    return g * delayed_command(motion.commands, edges, hold).reshape(count, steps) + b
+    """Return the command of each step, with gain and bias [steps, joints]."""
+    delay, bias, gain = (theta[:, INDEX[key]] for key in ("d", "b", "g"))
+    instants = jnp.asarray(np.arange((motion.commands.shape[-1] - 1) * steps + 1) / steps)
+
+    def of_joint(command: Array, delay: Array) -> Array:
+        return delayed_command(command, instants - delay / motion.sample_time, hold)
+
+    commands = jax.vmap(of_joint, out_axes=1)(motion.commands, delay)
+    return gain[None] * commands + bias[None]
 
 
-def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array, Array]:
-    """Simulate one joint from its first measured position; return positions and velocities.
+def _equation(q: Array, w: Array, theta: Array, stages: Stages, h: AnyArray):
+    """Return the force on a joint, its dry friction, its resistance, and partial results.
 
     Args:
-        theta: Parameters of the joint, as in `PARAMETERS`.
-        motion: One joint of one motion: commands, load, initial state.
+        q: Positions.
+        w: Velocities with which the stages start.
+        theta: Parameters [parameters, joints].
+        stages: Inputs of the stages.
+        h: Time of a step [s].
+    """
+    J, B, _, _, a, F, mu, Fs, vs, um, _ = theta
+    load, error, inertia = a * stages.load, stages.commands - q, J + a * stages.inertia
+    inside = jnp.where(jnp.abs(error) < um, 1.0, 0.0)
+    falling = jnp.exp(-((w / vs) ** 2))
+    friction = F + mu * jnp.abs(load) + Fs * falling
+    inertia = inertia / (GAMMA * h)
+    force = inertia * w + jnp.clip(error, -um, um) - load
+    return force, friction, inertia + B + inside * GAMMA * h, (inside, falling, inertia)
+
+
+def _stage(q: Array, w: Array, theta: Array, stage: Stages, h: AnyArray):
+    """Return position and velocity behind a stage, and the velocity in it."""
+    force, friction, resistance, _ = _equation(q, w, theta, stage, h)
+    u = shrink(force, friction) / resistance
+    # A joint that has stopped in the first stage starts the second one at rest.
+    after = jnp.where(u == 0.0, 0.0, w + stage.ahead * (u - w))
+    return q + stage.share * h * u, after, u
+
+
+def _start(motion: ServoMotion) -> tuple[Array, Array]:
+    return jnp.asarray(motion.positions)[:, 0], jnp.asarray(motion.rates)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array, Array]:
+    """Simulate one motion from its first measured positions; return positions and velocities.
+
+    Args:
+        theta: Parameters of each joint, as in `PARAMETERS`.
+        motion: One motion: commands, load, initial state.
         steps: Steps in each sample time.
         hold: Whether commands are held until the next one, instead of interpolated.
+
+    Returns:
+        Both [samples, joints].
     """
     h = motion.sample_time / steps
 
-    def sample(state, inputs):
-        q, v = state
-        command, load, inertia = inputs
-        state = _advance(q, v, theta, command, load, inertia, h)
+    def one(state: tuple[Array, Array], stage: Stages):
+        state = _stage(*state, theta.T, stage, h)[:2]
         return state, state
 
-    start: Any = motion.positions[0], motion.rates
-    inputs = _commands(theta, motion, steps, hold), motion.load[:-1], motion.inertia[:-1]
-    _, path = jax.lax.scan(sample, start, inputs)
-    q, v = (jnp.concatenate([x[None], y]) for x, y in zip(start, path, strict=True))
+    start = _start(motion)
+    _, path = jax.lax.scan(one, start, Stages.of(theta, motion, steps, hold))
+    every = slice(2 * steps - 1, None, 2 * steps)
+    q, v = (jnp.concatenate([x[None], y[every]]) for x, y in zip(start, path, strict=True))
     return q, v
-
-
-def _advance(q, v, theta, commands, load, inertia, h) -> tuple[Array, Array]:
-    """Return position and velocity one sample later, after a step [s] for each command."""
-    J, B, _, _, a, F, mu, Fs, vs, um, _ = theta
-    load, inertia, hg = a * load, J + a * inertia, GAMMA * h
-
-    def stage(q: Array, v: Array, command: Array) -> Array:
-        """Return the velocity at the end of an implicit Euler step."""
-        error = command - q
-        inside = jnp.where(jnp.abs(error) < um, 1.0, 0.0)
-        friction = F + mu * jnp.abs(load) + Fs * jnp.exp(-((v / vs) ** 2))
-        drive = inertia / hg * v + jnp.clip(error, -um, um) - load
-        return shrink(drive, friction) / (inertia / hg + B + inside * hg)
-
-    for command in commands:
-        v1 = stage(q, v, command)
-        # A joint that has stopped in the first stage starts the second one at rest.
-        middle = jnp.where(v1 == 0.0, 0.0, v + (1.0 - GAMMA) / GAMMA * (v1 - v))
-        q = q + (1.0 - GAMMA) * h * v1
-        v = stage(q, middle, command)
-        q = q + hg * v
-    return q, v
-
-
-AXES = ServoMotion(0, 0, 0, 0, 0, 0, None, (), ())  # pyright: ignore[reportArgumentType]
-"""Axis of the joints in one motion."""
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _all_states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    """Return positions and velocities [candidates, joints, samples] of one motion."""
-
-    def one(theta: Array, motion: ServoMotion) -> tuple[Array, Array]:
-        return _states(theta, motion, steps, hold)
-
-    return jax.vmap(jax.vmap(one, (0, AXES)), (0, None))(theta, motion)
-
-
-def _paths(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    return _all_states(theta, motion, steps, hold)[0]
-
-
-@functools.partial(jax.jit, static_argnums=2)
-def _costs(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> Array:
-    y, counted = _paths(theta, motion, steps, hold), motion.counted[None]
-    r = counted * (y - motion.positions[None])
-    return jnp.sum(r**2, axis=-1)
 
 
 @functools.partial(jax.jit, static_argnums=2)
 def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    """Return positions, and their derivatives by the parameters of their own joints, first axis."""
+    """Return positions [samples, joints], and derivatives [samples, parameters, joints].
 
-    def along(direction: Array):
-        return jax.jvp(
-            lambda x: _paths(x, motion, steps, hold),
-            (theta,),
-            (jnp.broadcast_to(direction, theta.shape),),
-        )
+    A joint's position depends on its own parameters. Derivatives of all stages are found at once;
+    only their linear recursion runs in time.
+    """
+    h, stages = motion.sample_time / steps, Stages.of(theta, motion, steps, hold)
 
-    return jax.vmap(along, out_axes=(None, 0))(jnp.eye(theta.shape[-1]))
+    def forward(state: tuple[Array, Array], stage: Stages):
+        *after, u = _stage(*state, theta.T, stage, h)
+        return tuple(after), (*after, u)
+
+    start = _start(motion)
+    _, (*path, u) = jax.lax.scan(forward, start, stages)
+    q, w = (jnp.concatenate([x[None], y[:-1]]) for x, y in zip(start, path, strict=True))
+
+    def tangent(state: tuple[Array, Array], inputs: tuple[Array, ...]):
+        q, w = state
+        for by_q, by_w, share, ahead, runs, own in zip(*inputs, strict=True):
+            u = by_q * q + by_w * w + own
+            q, w = q + share * h * u, runs * (w + ahead * (u - w))
+        return (q, w), q
+
+    def late(delay: Array) -> Array:
+        return _commands(theta.at[:, INDEX["d"]].set(delay), motion, steps, hold)
+
+    delay = theta[:, INDEX["d"]]
+    by_delay = jnp.repeat(jax.jvp(late, (delay,), (jnp.ones_like(delay),))[1], 2, axis=0)
+    by_q, by_w, by_theta = _partials(q, w, u, theta.T[:, None], stages, by_delay, h)
+    runs = jnp.where(u == 0.0, 0.0, 1.0)
+    every_row = (x[:, None] for x in (by_q, by_w, stages.share, stages.ahead, runs))
+    inputs = (*every_row, by_theta)
+    zero = jnp.zeros(theta.T.shape)
+    rows = jax.tree.map(lambda x: x.reshape(-1, 2 * steps, *x.shape[1:]), inputs)
+    _, S = jax.lax.scan(tangent, (zero, zero), rows)
+    path = jnp.concatenate([start[0][None], path[0][2 * steps - 1 :: 2 * steps]])
+    return path, jnp.concatenate([zero[None], S])
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _moments(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    y, S = _sensitivities(theta, motion, steps, hold)
-    r = motion.counted[None] * (y - motion.positions[None])
-    S = motion.counted[None, None] * S
-    gradient = jnp.einsum("pcjt,cjt->cjp", S, r)
-    return jnp.sum(r**2, axis=-1), gradient, jnp.einsum("pcjt,qcjt->cjpq", S, S)
+def _partials(
+    q: Array, w: Array, u: Array, theta: Array, stages: Stages, by_delay: Array, h: AnyArray
+) -> tuple[Array, Array, Array]:
+    """Return derivatives of the velocities in all stages by position, velocity and parameters.
+
+    Args:
+        q: Positions before the stages.
+        w: Velocities before the stages.
+        u: Velocities in the stages.
+        theta: Parameters [parameters, 1, joints].
+        stages: Inputs of the stages.
+        by_delay: Derivatives of the commands by the delay.
+        h: Time of a step [s].
+    """
+    _, _, resistance, (inside, falling, inertia) = _equation(q, w, theta, stages, h)
+    _, _, _, b, a, _, mu, Fs, vs, _, g = theta
+    sign, slope = jnp.sign(u), (w - u) / (GAMMA * h)
+    factor = jnp.abs(sign) / resistance
+    weight = stages.load + sign * mu * jnp.abs(stages.load)
+    slowing = 2.0 * sign * Fs * falling * w / vs**2
+    forces = {
+        "J": slope,
+        "B": -u,
+        "d": inside * by_delay,
+        "b": inside,
+        "a": stages.inertia * slope - weight,
+        "F": -sign,
+        "mu": -sign * jnp.abs(a * stages.load),
+        "Fs": -sign * falling,
+        "vs": -slowing * w / vs,
+        "um": (1.0 - inside) * jnp.sign(stages.commands - q),
+        "g": inside * (stages.commands - b) / g,
+    }
+    # One column at a time: `jnp.stack` takes twenty times as long.
+    by_theta = jnp.zeros((len(q), len(PARAMETERS), q.shape[1]))
+    for symbol, k in INDEX.items():
+        by_theta = by_theta.at[:, k].set(factor * forces[symbol])
+    return -factor * inside, factor * (inertia + slowing), by_theta
 
 
 @dataclasses.dataclass(frozen=True)
@@ -370,38 +453,65 @@ class ServoSimulator:
         """Steps in each sample time."""
         return math.ceil(float(self.motion.sample_time.max()) / self.time_step - 0.05)
 
-    def _map(self, function, theta: AnyArray, *, each: bool = False):
-        """Apply a compiled function to all motions, on all cores."""
+    def _map(self, function, reduce, theta: AnyArray, *, each: bool = False):
+        """Apply a compiled function to all motions and candidates, on all cores.
 
-        def one(k: int):
-            own = theta[k] if each else theta
+        Args:
+            function: Compiled function of the parameters of all joints and one motion.
+            reduce: Function of the motion's index and the results.
+            theta: Parameters.
+            each: Whether the parameters have the motions first.
+        """
+        theta = np.asarray(theta)
+        count = theta.shape[-3]
+
+        def one(index: int):
+            k, c = divmod(index, count)
+            own = theta[k, c] if each else theta[c]
             with double_precision():
                 part = dataclasses.replace(self.motion.part(k), lengths=(), names=())
                 found = function(jnp.asarray(own), part, self.steps, np.array(self.hold))
-                return jax.tree.map(np.asarray, found)
+                return reduce(k, *map(np.asarray, found))
 
         # The first call compiles, and the others wait for it.
-        first = one(0)
-        rest = list(on_cores(one, range(1, self.motion.motions)))
-        return jax.tree.map(lambda *x: np.stack(x), first, *rest)
+        results = [one(0), *on_cores(one, range(1, self.motion.motions * count))]
+        shape = self.motion.motions, count
+        return tuple(np.stack(x).reshape(*shape, *x[0].shape) for x in zip(*results, strict=True))
 
     def paths(self, theta: AnyArray) -> Float[np.ndarray, "motions candidates joints samples"]:
         """Return the simulated positions."""
         return self.states(theta)[0]
 
-    def states(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+    def states(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
         """Return the simulated positions and velocities."""
-        return self._map(_all_states, theta)
+        return self._map(_states, lambda k, q, v: (q.T, v.T), theta)
 
     def costs(self, theta: AnyArray, *, each: bool = False) -> np.ndarray:
         """Return sums of squared errors; with `each`, parameters have the motions first, too."""
-        return self._map(_costs, theta, each=each)
 
-    def moments(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def reduce(k: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray]:
+            return (np.sum(self._errors(k, q) ** 2, axis=0),)
+
+        return self._map(_states, reduce, theta, each=each)[0]
+
+    def moments(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
         """Return costs, gradients and Gauss-Newton matrices, each halved cost's derivatives."""
-        return self._map(_moments, theta)
 
-    def sensitivities(self, theta: AnyArray) -> tuple[np.ndarray, np.ndarray]:
+        def reduce(k: int, q: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, ...]:
+            r = self._errors(k, q)
+            counted = np.asarray(self.motion.counted[k])[:, None]
+            A = np.moveaxis(S, 0, -1).swapaxes(0, 1) * counted
+            gradient = A @ r.T[..., None]
+            return np.sum(r**2, axis=0), gradient[..., 0], A @ A.swapaxes(-1, -2)
+
+        return self._map(_sensitivities, reduce, theta)
+
+    def _errors(self, k: int, q: np.ndarray) -> np.ndarray:
+        """Return simulated less measured positions of one motion [samples, joints]."""
+        return (q - np.asarray(self.motion.positions[k]).T) * np.asarray(self.motion.counted[k]).T
+
+    def sensitivities(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
         """Return the simulated positions and their derivatives by the parameters, last axis."""
-        y, S = self._map(_sensitivities, theta)
-        return y, np.moveaxis(S, 1, -1)
+        return self._map(
+            _sensitivities, lambda k, q, S: (q.T, np.moveaxis(S, (0, 2), (1, 0))), theta
+        )
