@@ -17,7 +17,17 @@ from jaxid.measurement.recording import Recording
 from .contact import contact_rows
 from .least_squares import Solution, bounded_step, minimise
 from .result import ServoFit
-from .servo import INDEX, LOWER, START, UPPER, Bodies, ServoMotion, ServoSimulator
+from .servo import (
+    INDEX,
+    LOWER,
+    START,
+    UPPER,
+    Bodies,
+    ServoMotion,
+    ServoSimulator,
+    coupled_states,
+    settling,
+)
 
 BASIC = ("J", "B", "d", "F", "b")
 """Parameters of every joint, before the choice."""
@@ -39,6 +49,10 @@ SHORTEST = 5.0
 """Shortest part into which a log is divided [s]."""
 LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
+FALL = 0.01
+"""Fall of the logarithm of the mean square error for which the refinement goes on."""
+ROUNDS = 12
+"""Largest number of refinements under loads of the simulated motion."""
 _STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
 """Inertia, damping and delay from which searches may start."""
 
@@ -95,13 +109,14 @@ def identify_rollout(
         if k == 0:
             search.remove_contact()
     search.simulator = dataclasses.replace(search.simulator, time_step=time_step)
-    search.choose_hold()
-    if bodies is not None and not bodies.coupled:
-        bodies = search.choose_coupling(bodies)
-        if bodies.coupled:
-            # Inertial torques tell the stiffness of joints on which no weight acts.
-            search.choose(((), ("a",)))
-    solution = search.final()
+    if bodies is None:
+        search.choose_hold()
+        solution = search.final()
+    else:
+        bodies = bodies if bodies.coupled else search.choose_coupling(bodies)
+        solution = search.refine(bodies)
+        if search.choose_hold():
+            solution = search.refine(bodies)
     found = search.simulator, search.weights, solution, search.free, search.linear
     return ServoFit.of(*found, names, bodies)
 
@@ -286,12 +301,13 @@ class _Search:
         }
         return values[symbol]
 
-    def choose_hold(self) -> None:
-        """Decide whether commands are held or interpolated, for all joints alike."""
-        held = self.x.copy()
-        held[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
-        other = dataclasses.replace(self.simulator, hold=True)
-        self._choose_simulator((self.simulator, self.x), (other, held))
+    def choose_hold(self) -> bool:
+        """Decide whether commands are held or interpolated; return whether that changes."""
+        simulator, x = self.simulator, self.x.copy()
+        half = 0.5 * float(simulator.motion.sample_time.mean())
+        x[:, INDEX["d"]] += half if simulator.hold else -half
+        other = dataclasses.replace(simulator, hold=not simulator.hold)
+        return self._choose_simulator((simulator, self.x), (other, x))
 
     def choose_coupling(self, bodies: Bodies) -> Bodies:
         """Decide whether inertial torques of the bodies act, beside those of gravity."""
@@ -322,3 +338,36 @@ class _Search:
         found = self.solve(self.x[None], self.free[None], iterations=10)
         self.x = found.x[0]
         return found
+
+    def refine(self, bodies: Bodies) -> Solution:
+        """Return the fit under the loads of the simulated motion, and with initial velocities.
+
+        Measured positions tell inertial torques roughly. The loads follow the simulation instead,
+        until its errors no longer fall.
+        """
+        motion = self.simulator.motion
+        early = np.arange(motion.positions.shape[-1]) < settling(motion)[:, None, None]
+        counted = np.where(early, 1.0, motion.counted)
+        simulator = dataclasses.replace(self.simulator, motion=motion.replace(counted=counted))
+        if bodies.coupled:
+            # Inertial torques act on all joints, however badly a log tells them from `J`.
+            self.free[:, INDEX["a"]] = True
+        x, states, best, waited = self.x, simulator.states_of(self.x), np.inf, 0
+        chosen = simulator, x
+        for _ in range(ROUNDS):
+            states = coupled_states(simulator, bodies, x, states, 5)
+            loaded = bodies.loads(simulator.motion, *states)
+            simulator = dataclasses.replace(simulator, motion=loaded).with_better_rates(x)
+            mean = simulator.costs(x[None])[:, 0] / np.maximum(counted.sum(axis=-1), 1.0)
+            score = float(np.log(mean + RESOLUTION**2).mean())
+            waited = 0 if score < best - FALL else waited + 1
+            if score < best:
+                best, chosen = score, (simulator, x)
+            if waited == 2:
+                break
+            self.simulator = simulator
+            self._weigh(x)
+            x = self.solve(x[None], self.free[None], iterations=1).x[0]
+        self.simulator, self.x = chosen
+        self._weigh(self.x)
+        return self.solve(self.x[None], self.free[None], iterations=1)

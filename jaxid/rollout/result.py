@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special, stats
@@ -25,14 +25,9 @@ from .servo import (
     Bodies,
     ServoMotion,
     ServoSimulator,
+    coupled_states,
 )
 
-SWEEPS = 15
-"""Largest number of simulations in which loads and positions must agree."""
-AGREED = 1e-4
-"""Change of the positions at which they agree [rad or m]."""
-DEPTH = 6
-"""Simulations from which the next positions are extrapolated (Anderson's method)."""
 UNDETERMINED = 0.5
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
 SYSTEMATIC = 1.5
@@ -121,11 +116,11 @@ class ServoFit:
         x, motion = solution.x, simulator.motion
         y, S = (y[:, 0] for y in simulator.sensitivities(x))
         r, S = (y - motion.positions) * motion.counted, S * np.asarray(motion.counted)[..., None]
-        moving = free & (x[0] > LOWER) & (x[0] < UPPER)
+        S = without_rates(S, np.maximum(np.mean(r**2, axis=-1), 1e-12))
         covariance, combinations, lacking = np.zeros((*x[0].shape, len(PARAMETERS))), [], []
         for j in range(len(x[0])):
             rows = _JointRows.of(simulator, j, weights[:, j], r[:, j], S[:, j])
-            own, full = _determined(rows, x[0, j], moving[j], j)
+            own, full = _determined(rows, x[0, j], free[j], j)
             combinations += own
             covariance[j] = full
             if (rms := rows.systematic_error()) > 0:
@@ -187,24 +182,12 @@ class ServoFit:
     def paths(self, motion: ServoMotion, parameters: AnyArray | None = None) -> np.ndarray:
         """Return simulated positions [motions, joints, samples], with loads at these positions."""
         x = np.asarray(self.parameters if parameters is None else parameters)
+        simulator = ServoSimulator(motion, self.time_step, self.hold)
         if self.bodies is None:
-            return ServoSimulator(motion, self.time_step, self.hold).paths(x[None])[:, 0]
-        states = self._respond(motion, x, np.asarray(motion.commands), None)
-        tried: list[np.ndarray] = []
-        found: list[np.ndarray] = []
-        for _ in range(SWEEPS):
-            tried.append(states)
-            found.append(self._respond(motion, x, *states))
-            last, states = states, _extrapolated(tried[-DEPTH:], found[-DEPTH:])
-            if np.abs(found[-1] - last)[0].max() < AGREED:
-                break
-        return found[-1][0]
-
-    def _respond(self, motion: ServoMotion, x: np.ndarray, q: Any, v: Any) -> np.ndarray:
-        """Return positions and velocities under the loads of other positions and velocities."""
-        loaded = motion if self.bodies is None else self.bodies.loads(motion, q, v)
-        simulator = ServoSimulator(loaded, self.time_step, self.hold)
-        return np.stack([y[:, 0] for y in simulator.states(x[None])])
+            return simulator.paths(x[None])[:, 0]
+        loaded = self.bodies.loads(motion, np.asarray(motion.commands))
+        states = dataclasses.replace(simulator, motion=loaded).states_of(x)
+        return coupled_states(simulator, self.bodies, x, states)[0][..., :: simulator.steps]
 
     def validate(self, logs: Sequence[Recording] | Recording) -> RolloutErrors:
         """Compare free-running simulations with logs, and with simple baselines.
@@ -320,15 +303,11 @@ class ServoFit:
         return self.summary().text()
 
 
-def _extrapolated(tried: list[np.ndarray], found: list[np.ndarray]) -> np.ndarray:
-    """Return where a fixed-point iteration leads, by Anderson's method."""
-    errors = [(y - x)[0].ravel() for x, y in zip(tried, found, strict=True)]
-    if len(errors) == 1:
-        return found[0]
-    steps = np.stack([e - errors[-1] for e in errors[:-1]], axis=1)
-    weights = np.linalg.lstsq(steps, -errors[-1], rcond=1e-10)[0]
-    changes = (w * (y - found[-1]) for w, y in zip(weights, found[:-1], strict=True))
-    return found[-1] + np.sum(list(changes), axis=0)
+def without_rates(S: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return sensitivities to the parameters less what initial velocities can imitate."""
+    start, own = S[..., -1:], S[..., :-1]
+    known = np.sum(start**2, axis=-2, keepdims=True) + variance[..., None, None]
+    return own - start * np.sum(start * own, axis=-2, keepdims=True) / known
 
 
 class _JointRows(NamedTuple):

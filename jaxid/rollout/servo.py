@@ -31,6 +31,12 @@ GAMMA = 1.0 - math.sqrt(0.5)
 """Fraction of a step that each of its two implicit stages takes."""
 SETTLING = 0.5
 """Time at the start of a log that does not count, because the initial speed is not known [s]."""
+SWEEPS = 15
+"""Largest number of simulations in which loads and positions must agree."""
+AGREED = 1e-4
+"""Change of the positions at which they agree [rad or m]."""
+DEPTH = 6
+"""Simulations from which the next positions are extrapolated (Anderson's method)."""
 PADDED = 500
 """Samples to a multiple of which motions are padded, so that few lengths are compiled."""
 
@@ -74,7 +80,7 @@ class ServoMotion(eqx.Module):
     Attributes:
         commands: Commanded positions [motions, joints, samples].
         positions: Measured positions.
-        load: Torques of the bodies between a sample and the next one [N m or N].
+        load: Torques of the bodies between a sample, or step, and the next one [N m or N].
         inertia: Inertia of the bodies about each joint [kg m² or kg].
         rates: Initial velocities [motions, joints].
         counted: Whether a sample counts in the fit.
@@ -85,8 +91,8 @@ class ServoMotion(eqx.Module):
 
     commands: Float[AnyArray, "motions joints samples"]
     positions: Float[AnyArray, "motions joints samples"]
-    load: Float[AnyArray, "motions joints samples"]
-    inertia: Float[AnyArray, "motions joints samples"]
+    load: Float[AnyArray, "motions joints instants"]
+    inertia: Float[AnyArray, "motions joints instants"]
     rates: Float[AnyArray, "motions joints"]
     counted: Float[AnyArray, "motions joints samples"]
     sample_time: Float[AnyArray, " motions"]
@@ -120,8 +126,8 @@ class ServoMotion(eqx.Module):
 
         positions, times = stacked("angles"), np.array([log.sample_time for log, _, _ in parts])
         index = np.arange(padded)
-        settling = np.ceil(SETTLING / times)[:, None]
-        counted = (index >= settling) & (index < np.array(lengths)[:, None])
+        first = np.ceil(SETTLING / times)[:, None]
+        counted = (index >= first) & (index < np.array(lengths)[:, None])
         early = np.maximum(2, (0.1 / times).astype(int))
         rates = [
             (x[:, k] - x[:, 0]) / (k * dt) for x, k, dt in zip(positions, early, times, strict=True)
@@ -170,6 +176,11 @@ class ServoMotion(eqx.Module):
         return jax.tree.map(lambda x: x[motion], self)
 
 
+def settling(motion: ServoMotion) -> np.ndarray:
+    """Return the number of first samples of each motion that do not count."""
+    return np.ceil(SETTLING / np.asarray(motion.sample_time)).astype(int)
+
+
 @dataclasses.dataclass(frozen=True)
 class Bodies:
     """Bodies that load the joints: a model with its parameters, often from a URDF file.
@@ -193,12 +204,14 @@ class Bodies:
             motion: Motions.
             q: Positions; the measured ones if None.
             v: Velocities of a simulation, whose changes are the mean accelerations; smoothed
-                derivatives of the positions if None.
+                derivatives of the positions if None. Simulations may have several steps in each
+                sample time.
         """
         q = np.asarray(motion.positions if q is None else q)
         load, inertia = np.zeros_like(q), np.zeros_like(q)
         model, p = self.model, np.asarray(self.parameters)
-        for k, dt in enumerate(map(float, motion.sample_time)):
+        steps = (q.shape[-1] - 1) // (motion.positions.shape[-1] - 1)
+        for k, dt in enumerate(map(float, np.asarray(motion.sample_time) / steps)):
             if v is None:
                 rates = smooth_rates(q[k].T, dt)
                 path, qd, qdd = (0.5 * (x[1:] + x[:-1]) for x in rates)
@@ -270,7 +283,8 @@ class Stages(NamedTuple):
         count = motion.commands.shape[-1] - 1
 
         def repeated(x: AnyArray) -> Array:
-            return jnp.repeat(jnp.asarray(x).T[:-1], 2 * steps, axis=0)
+            each = (x.shape[-1] - 1) // count
+            return jnp.repeat(jnp.asarray(x).T[:-1], 2 * steps // each, axis=0)
 
         def alternating(first: float, second: float) -> Array:
             return jnp.tile(jnp.array([first, second]), count * steps)[:, None]
@@ -326,8 +340,10 @@ def _start(motion: ServoMotion) -> tuple[Array, Array]:
     return jnp.asarray(motion.positions)[:, 0], jnp.asarray(motion.rates)
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array, Array]:
+@functools.partial(jax.jit, static_argnums=(2, 4))
+def _states(
+    theta: Array, motion: ServoMotion, steps: int, hold: AnyArray, all_steps: bool
+) -> tuple[Array, Array]:
     """Simulate one motion from its first measured positions; return positions and velocities.
 
     Args:
@@ -335,9 +351,10 @@ def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tu
         motion: One motion: commands, load, initial state.
         steps: Steps in each sample time.
         hold: Whether commands are held until the next one, instead of interpolated.
+        all_steps: Whether all steps are returned, instead of samples.
 
     Returns:
-        Both [samples, joints].
+        Both [samples or steps, joints].
     """
     h = motion.sample_time / steps
 
@@ -347,17 +364,26 @@ def _states(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tu
 
     start = _start(motion)
     _, path = jax.lax.scan(one, start, Stages.of(theta, motion, steps, hold))
-    every = slice(2 * steps - 1, None, 2 * steps)
+    size = 2 if all_steps else 2 * steps
+    every = slice(size - 1, None, size)
     q, v = (jnp.concatenate([x[None], y[every]]) for x, y in zip(start, path, strict=True))
     return q, v
 
 
+def _path(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> tuple[Array]:
+    return (_states(theta, motion, steps, hold, False)[0],)
+
+
+def _all_steps(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
+    return _states(theta, motion, steps, hold, True)
+
+
 @functools.partial(jax.jit, static_argnums=2)
 def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray):
-    """Return positions [samples, joints], and derivatives [samples, parameters, joints].
+    """Return positions [samples, joints], and derivatives [samples, parameters + 1, joints].
 
-    A joint's position depends on its own parameters. Derivatives of all stages are found at once;
-    only their linear recursion runs in time.
+    The last derivative is that by the initial velocity. Loads are held. Derivatives of all stages
+    are found at once; only their linear recursion runs in time.
     """
     h, stages = motion.sample_time / steps, Stages.of(theta, motion, steps, hold)
 
@@ -385,9 +411,9 @@ def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
     runs = jnp.where(u == 0.0, 0.0, 1.0)
     every_row = (x[:, None] for x in (by_q, by_w, stages.share, stages.ahead, runs))
     inputs = (*every_row, by_theta)
-    zero = jnp.zeros(theta.T.shape)
+    zero = jnp.zeros(by_theta.shape[1:])
     rows = jax.tree.map(lambda x: x.reshape(-1, 2 * steps, *x.shape[1:]), inputs)
-    _, S = jax.lax.scan(tangent, (zero, zero), rows)
+    _, S = jax.lax.scan(tangent, (zero, zero.at[-1].set(1.0)), rows)
     path = jnp.concatenate([start[0][None], path[0][2 * steps - 1 :: 2 * steps]])
     return path, jnp.concatenate([zero[None], S])
 
@@ -426,7 +452,7 @@ def _partials(
         "g": inside * (stages.commands - b) / g,
     }
     # One column at a time: `jnp.stack` takes twenty times as long.
-    by_theta = jnp.zeros((len(q), len(PARAMETERS), q.shape[1]))
+    by_theta = jnp.zeros((len(q), len(PARAMETERS) + 1, q.shape[1]))
     for symbol, k in INDEX.items():
         by_theta = by_theta.at[:, k].set(factor * forces[symbol])
     return -factor * inside, factor * (inertia + slowing), by_theta
@@ -480,27 +506,30 @@ class ServoSimulator:
 
     def paths(self, theta: AnyArray) -> Float[np.ndarray, "motions candidates joints samples"]:
         """Return the simulated positions."""
-        return self.states(theta)[0]
+        return self._map(_path, lambda k, q: (q.T,), theta)[0]
 
     def states(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
-        """Return the simulated positions and velocities."""
-        return self._map(_states, lambda k, q, v: (q.T, v.T), theta)
+        """Return the positions and velocities of all steps."""
+        return self._map(_all_steps, lambda k, q, v: (q.T, v.T), theta)
+
+    def states_of(self, theta: AnyArray) -> np.ndarray:
+        """Return both for one candidate, stacked."""
+        return np.stack([x[:, 0] for x in self.states(np.asarray(theta)[None])])
 
     def costs(self, theta: AnyArray, *, each: bool = False) -> np.ndarray:
         """Return sums of squared errors; with `each`, parameters have the motions first, too."""
 
-        def reduce(k: int, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray]:
+        def reduce(k: int, q: np.ndarray) -> tuple[np.ndarray]:
             return (np.sum(self._errors(k, q) ** 2, axis=0),)
 
-        return self._map(_states, reduce, theta, each=each)[0]
+        return self._map(_path, reduce, theta, each=each)[0]
 
     def moments(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
         """Return costs, gradients and Gauss-Newton matrices, each halved cost's derivatives."""
 
         def reduce(k: int, q: np.ndarray, S: np.ndarray) -> tuple[np.ndarray, ...]:
             r = self._errors(k, q)
-            counted = np.asarray(self.motion.counted[k])[:, None]
-            A = np.moveaxis(S, 0, -1).swapaxes(0, 1) * counted
+            A = S[:, :-1].transpose(2, 1, 0) * np.asarray(self.motion.counted[k])[:, None]
             gradient = A @ r.T[..., None]
             return np.sum(r**2, axis=0), gradient[..., 0], A @ A.swapaxes(-1, -2)
 
@@ -511,7 +540,63 @@ class ServoSimulator:
         return (q - np.asarray(self.motion.positions[k]).T) * np.asarray(self.motion.counted[k]).T
 
     def sensitivities(self, theta: AnyArray) -> tuple[np.ndarray, ...]:
-        """Return the simulated positions and their derivatives by the parameters, last axis."""
-        return self._map(
-            _sensitivities, lambda k, q, S: (q.T, np.moveaxis(S, (0, 2), (1, 0))), theta
-        )
+        """Return the simulated positions and their derivatives on the last axis.
+
+        The derivatives are those by the parameters and by the initial velocity.
+        """
+        return self._map(_sensitivities, lambda k, q, S: (q.T, S.transpose(2, 0, 1)), theta)
+
+    def with_better_rates(self, theta: np.ndarray) -> "ServoSimulator":
+        """Return the simulator with initial velocities by a Gauss-Newton step.
+
+        Where the counted samples do not tell them, they stay within about 1 rad/s or m/s.
+        """
+        motion = self.motion
+        y, S = (x[:, 0] for x in self.sensitivities(theta[None]))
+        r = (y - np.asarray(motion.positions)) * np.asarray(motion.counted)
+        s = S[..., -1] * np.asarray(motion.counted)
+        variance = np.sum(r**2, axis=-1) / np.maximum(np.asarray(motion.counted).sum(axis=-1), 1.0)
+        change = np.sum(s * r, axis=-1) / (np.sum(s**2, axis=-1) + variance + 1e-12)
+        other = dataclasses.replace(self, motion=motion.replace(rates=motion.rates - change))
+        better = other.costs(theta[None])[:, 0] < np.sum(r**2, axis=-1)
+        rates = np.where(better, other.motion.rates, motion.rates)
+        return dataclasses.replace(self, motion=motion.replace(rates=rates))
+
+
+def coupled_states(
+    simulator: ServoSimulator,
+    bodies: Bodies,
+    theta: AnyArray,
+    states: np.ndarray,
+    sweeps: int = SWEEPS,
+) -> np.ndarray:
+    """Return positions and velocities of all steps under the loads of this motion itself.
+
+    Args:
+        simulator: Motions and steps.
+        bodies: Bodies that load the joints.
+        theta: Parameters [joints, parameters].
+        states: Positions and velocities from which the iteration starts.
+        sweeps: Largest number of simulations.
+    """
+    tried: list[np.ndarray] = []
+    found: list[np.ndarray] = []
+    for _ in range(sweeps):
+        tried.append(states)
+        loaded = dataclasses.replace(simulator, motion=bodies.loads(simulator.motion, *states))
+        found.append(loaded.states_of(theta))
+        if np.abs(found[-1] - states)[0].max() < AGREED:
+            break
+        states = _extrapolated(tried[-DEPTH:], found[-DEPTH:])
+    return found[-1]
+
+
+def _extrapolated(tried: list[np.ndarray], found: list[np.ndarray]) -> np.ndarray:
+    """Return where a fixed-point iteration leads, by Anderson's method."""
+    errors = [(y - x)[0].ravel() for x, y in zip(tried, found, strict=True)]
+    if len(errors) == 1:
+        return found[0]
+    steps = np.stack([e - errors[-1] for e in errors[:-1]], axis=1)
+    weights = np.linalg.lstsq(steps, -errors[-1], rcond=1e-10)[0]
+    changes = (w * (y - found[-1]) for w, y in zip(weights, found[:-1], strict=True))
+    return found[-1] + np.sum(list(changes), axis=0)

@@ -63,7 +63,7 @@ def test_sensitivities_and_moments_agree_with_differences(hold):
     y, S = simulator.sensitivities(x)
     r = (y - simulator.motion.positions)[0, 0] * simulator.motion.counted[0]
     _, g, H = (z[0, 0, 0] for z in simulator.moments(x))
-    own = S[0, 0, 0] * simulator.motion.counted[0, 0][:, None]
+    own = S[0, 0, 0, :, :-1] * simulator.motion.counted[0, 0][:, None]
     np.testing.assert_allclose(g, own.T @ r[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(H, own.T @ own, rtol=1e-9, atol=1e-12)
     for k in range(len(START)):
@@ -75,6 +75,14 @@ def test_sensitivities_and_moments_agree_with_differences(hold):
         # A kink that lies within a step shifts single samples.
         error = np.sort(np.abs(S[0, 0, 0, :, k] - difference))
         assert error[int(0.95 * len(error))] < 1e-6 * scale, k
+    by_rate = [_with_rate(simulator, 0.2 + d).paths(x)[0, 0, 0] for d in (1e-6, -1e-6)]
+    S = _with_rate(simulator, 0.2).sensitivities(x)[1][0, 0, 0, :, -1]
+    np.testing.assert_allclose(S, (by_rate[0] - by_rate[1]) / 2e-6, atol=1e-6 * np.abs(S).max())
+
+
+def _with_rate(simulator, rate):
+    motion = simulator.motion
+    return ServoSimulator(motion.replace(rates=np.full_like(motion.rates, rate)), 0.01)
 
 
 def test_a_step_is_zero_where_derivatives_have_overflowed():
