@@ -115,8 +115,6 @@ def identify_rollout(
     else:
         bodies = bodies if bodies.coupled else search.choose_coupling(bodies)
         solution = search.refine(bodies)
-        if search.choose_hold():
-            solution = search.refine(bodies)
     found = search.simulator, search.weights, solution, search.free, search.linear
     return ServoFit.of(*found, names, bodies)
 
@@ -301,13 +299,15 @@ class _Search:
         }
         return values[symbol]
 
-    def choose_hold(self) -> bool:
-        """Decide whether commands are held or interpolated; return whether that changes."""
-        simulator, x = self.simulator, self.x.copy()
-        half = 0.5 * float(simulator.motion.sample_time.mean())
-        x[:, INDEX["d"]] += half if simulator.hold else -half
-        other = dataclasses.replace(simulator, hold=not simulator.hold)
-        return self._choose_simulator((simulator, self.x), (other, x))
+    def choose_hold(self) -> None:
+        """Decide whether commands are held or interpolated, for all joints alike."""
+        self._choose_simulator((self.simulator, self.x), self._held())
+
+    def _held(self) -> tuple[ServoSimulator, np.ndarray]:
+        """Return the simulator with held commands, and parameters for it."""
+        x = self.x.copy()
+        x[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
+        return dataclasses.replace(self.simulator, hold=True), x
 
     def choose_coupling(self, bodies: Bodies) -> Bodies:
         """Decide whether inertial torques of the bodies act, beside those of gravity."""
@@ -340,34 +340,41 @@ class _Search:
         return found
 
     def refine(self, bodies: Bodies) -> Solution:
-        """Return the fit under the loads of the simulated motion, and with initial velocities.
-
-        Measured positions tell inertial torques roughly. The loads follow the simulation instead,
-        until its errors no longer fall.
-        """
-        motion = self.simulator.motion
-        early = np.arange(motion.positions.shape[-1]) < settling(motion)[:, None, None]
-        counted = np.where(early, 1.0, motion.counted)
-        simulator = dataclasses.replace(self.simulator, motion=motion.replace(counted=counted))
+        """Return the fit under the loads of the simulated motion, commands held or interpolated."""
         if bodies.coupled:
             # Inertial torques act on all joints, however badly a log tells them from `J`.
             self.free[:, INDEX["a"]] = True
-        x, states, best, waited = self.x, simulator.states_of(self.x), np.inf, 0
-        chosen = simulator, x
+        pairs = (self.simulator, self.x), self._held()
+        _, self.simulator, self.x = min(
+            (self._refined(bodies, *pair) for pair in pairs), key=lambda found: found[0]
+        )
+        self._weigh(self.x)
+        return self.solve(self.x[None], self.free[None], iterations=1)
+
+    def _refined(
+        self, bodies: Bodies, simulator: ServoSimulator, x: np.ndarray
+    ) -> tuple[float, ServoSimulator, np.ndarray]:
+        """Return the mean logarithm of errors, the simulator and the parameters of a refinement.
+
+        Measured positions tell inertial torques roughly. Here the loads follow the simulation, and
+        all samples count, with initial velocities estimated.
+        """
+        motion = simulator.motion
+        early = np.arange(motion.positions.shape[-1]) < settling(motion)[:, None, None]
+        counted = np.where(early, 1.0, motion.counted)
+        simulator = dataclasses.replace(simulator, motion=motion.replace(counted=counted))
+        states, best, waited = simulator.states_of(x), (np.inf, simulator, x), 0
         for _ in range(ROUNDS):
             states = coupled_states(simulator, bodies, x, states, 5)
             loaded = bodies.loads(simulator.motion, *states)
             simulator = dataclasses.replace(simulator, motion=loaded).with_better_rates(x)
             mean = simulator.costs(x[None])[:, 0] / np.maximum(counted.sum(axis=-1), 1.0)
             score = float(np.log(mean + RESOLUTION**2).mean())
-            waited = 0 if score < best - FALL else waited + 1
-            if score < best:
-                best, chosen = score, (simulator, x)
+            waited = 0 if score < best[0] - FALL else waited + 1
+            best = (score, simulator, x) if score < best[0] else best
             if waited == 2:
                 break
             self.simulator = simulator
             self._weigh(x)
             x = self.solve(x[None], self.free[None], iterations=1).x[0]
-        self.simulator, self.x = chosen
-        self._weigh(self.x)
-        return self.solve(self.x[None], self.free[None], iterations=1)
+        return best
