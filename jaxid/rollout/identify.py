@@ -51,6 +51,8 @@ LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
 FALL = 0.01
 """Fall of the logarithm of the mean square error for which the refinement goes on."""
+NEARLY_NONE = 1e-6
+"""Damping of the refinement: more would keep badly known combinations near the search's values."""
 ROUNDS = 12
 """Largest number of refinements under loads of the simulated motion."""
 _STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
@@ -180,7 +182,9 @@ class _Search:
         self.free = np.tile(mask(BASIC), (joints, 1))
         self.linear = self.x.copy()
 
-    def solve(self, x: np.ndarray, free: np.ndarray, iterations: int = 10) -> Solution:
+    def solve(
+        self, x: np.ndarray, free: np.ndarray, iterations: int = 10, damping: float = 1e-2
+    ) -> Solution:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
 
@@ -191,7 +195,7 @@ class _Search:
         def costs(x, k):
             return (w * self.simulator.costs(x)).sum(axis=0)
 
-        return minimise(moments, costs, x, free, (LOWER, UPPER), iterations)
+        return minimise(moments, costs, x, free, (LOWER, UPPER), iterations, damping=damping)
 
     def held_out(self, found: Solution, free: np.ndarray) -> Float[np.ndarray, "candidates joints"]:
         """Return mean logarithms of the mean square errors of motions left out, one at a time.
@@ -349,7 +353,7 @@ class _Search:
             (self._refined(bodies, *pair) for pair in pairs), key=lambda found: found[0]
         )
         self._weigh(self.x)
-        return self.solve(self.x[None], self.free[None], iterations=1)
+        return self.solve(self.x[None], self.free[None], 1, NEARLY_NONE)
 
     def _refined(
         self, bodies: Bodies, simulator: ServoSimulator, x: np.ndarray
@@ -376,5 +380,5 @@ class _Search:
                 break
             self.simulator = simulator
             self._weigh(x)
-            x = self.solve(x[None], self.free[None], iterations=1).x[0]
+            x = self.solve(x[None], self.free[None], 1, NEARLY_NONE).x[0]
         return best

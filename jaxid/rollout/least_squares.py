@@ -40,6 +40,7 @@ def minimise(
     bounds: tuple[np.ndarray, np.ndarray],
     iterations: int = 30,
     tolerance: float = 1e-4,
+    damping: float = 1e-2,
 ) -> Solution:
     """Minimise sums of squares over the free parameters, each problem with its own damping.
 
@@ -54,13 +55,14 @@ def minimise(
         bounds: Lower and upper limits of the parameters.
         iterations: Largest number of steps.
         tolerance: Relative decrease of the cost below which a problem has converged.
+        damping: Damping of the first step, relative to the diagonal of the Gauss-Newton matrix.
     """
     x = np.clip(x, *bounds)
-    damping, left = np.full(x.shape[:-1], 1e-2), np.arange(len(x))
+    dampings, left = np.full(x.shape[:-1], damping), np.arange(len(x))
     cost, g, H = moments(x, left)
     for _ in range(iterations):
-        own = (y[left] for y in (x, cost, g, H, free, damping))
-        x[left], damping[left], converged = _improve(costs, left, *own, bounds, tolerance)
+        own = (y[left] for y in (x, cost, g, H, free, dampings))
+        x[left], dampings[left], converged = _improve(costs, left, *own, bounds, tolerance)
         cost[left], g[left], H[left] = moments(x[left], left)
         left = left[~converged.reshape(len(left), -1).all(axis=1)]
         if not left.size:
