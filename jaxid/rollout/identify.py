@@ -1,7 +1,8 @@
 """Identification of joints behind position servos, from commands and positions alone.
 
-Each choice (gravity, friction by load, Stribeck friction, saturation, commands held or
-interpolated) is made by motions that the fit has not seen: leave one out among those given.
+Each choice of effects (gravity, friction by load, Stribeck friction, saturation, inertial torques)
+is made by motions that the fit has not seen: leave one out among those given. Held and interpolated
+commands have the same parameters: their errors decide.
 """
 
 import dataclasses
@@ -111,12 +112,9 @@ def identify_rollout(
         if k == 0:
             search.remove_contact()
     search.simulator = dataclasses.replace(search.simulator, time_step=time_step)
-    if bodies is None:
-        search.choose_hold()
-        solution = search.final()
-    else:
-        bodies = bodies if bodies.coupled else search.choose_coupling(bodies)
-        solution = search.refine(bodies)
+    if bodies is not None and not bodies.coupled:
+        bodies = search.choose_coupling(bodies)
+    solution = search.refine(bodies)
     found = search.simulator, search.weights, solution, search.free, search.linear
     return ServoFit.of(*found, names, bodies)
 
@@ -303,16 +301,6 @@ class _Search:
         }
         return values[symbol]
 
-    def choose_hold(self) -> None:
-        """Decide whether commands are held or interpolated, for all joints alike."""
-        self._choose_simulator((self.simulator, self.x), self._held())
-
-    def _held(self) -> tuple[ServoSimulator, np.ndarray]:
-        """Return the simulator with held commands, and parameters for it."""
-        x = self.x.copy()
-        x[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
-        return dataclasses.replace(self.simulator, hold=True), x
-
     def choose_coupling(self, bodies: Bodies) -> Bodies:
         """Decide whether inertial torques of the bodies act, beside those of gravity."""
         coupled = dataclasses.replace(bodies, coupled=True)
@@ -320,43 +308,33 @@ class _Search:
         x, a = self.x.copy(), self.x[:, INDEX["a"]] * self.free[:, INDEX["a"]]
         own = a * np.asarray(motion.inertia).mean(axis=(0, 2))
         x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
-        other = dataclasses.replace(self.simulator, motion=motion)
-        better = self._choose_simulator((self.simulator, self.x), (other, x))
-        return coupled if better else bodies
-
-    def _choose_simulator(self, *pairs: tuple[ServoSimulator, np.ndarray]) -> bool:
-        """Take the simulator and start of lower held-out errors; return whether it is the last."""
         scores, results = [], []
-        for simulator, start in pairs:
+        other = dataclasses.replace(self.simulator, motion=motion)
+        for simulator, start in ((self.simulator, self.x), (other, x)):
             self.simulator = simulator
             found = self.solve(start[None], self.free[None], iterations=5)
             scores.append(self.held_out(found, self.free[None]).mean())
             results.append((simulator, found.x[0]))
-        last = bool(scores[1] < scores[0])
-        self.simulator, self.x = results[int(last)]
+        better = bool(scores[1] < scores[0])
+        self.simulator, self.x = results[int(better)]
         self._weigh(self.x)
-        return last
+        return coupled if better else bodies
 
-    def final(self) -> Solution:
-        """Return the fit with the chosen effects."""
-        found = self.solve(self.x[None], self.free[None], iterations=10)
-        self.x = found.x[0]
-        return found
-
-    def refine(self, bodies: Bodies) -> Solution:
+    def refine(self, bodies: Bodies | None) -> Solution:
         """Return the fit under the loads of the simulated motion, commands held or interpolated."""
-        if bodies.coupled:
+        if bodies is not None and bodies.coupled:
             # Inertial torques act on all joints, however badly a log tells them from `J`.
             self.free[:, INDEX["a"]] = True
-        pairs = (self.simulator, self.x), self._held()
-        _, self.simulator, self.x = min(
-            (self._refined(bodies, *pair) for pair in pairs), key=lambda found: found[0]
-        )
+        held = self.x.copy()
+        held[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
+        pairs = (self.simulator, self.x), (dataclasses.replace(self.simulator, hold=True), held)
+        found = [self._refined(bodies, *pair) for pair in pairs]
+        _, self.simulator, self.x = min(found, key=lambda one: one[0])
         self._weigh(self.x)
         return self.solve(self.x[None], self.free[None], 1, NEARLY_NONE)
 
     def _refined(
-        self, bodies: Bodies, simulator: ServoSimulator, x: np.ndarray
+        self, bodies: Bodies | None, simulator: ServoSimulator, x: np.ndarray
     ) -> tuple[float, ServoSimulator, np.ndarray]:
         """Return the mean logarithm of errors, the simulator and the parameters of a refinement.
 
@@ -369,9 +347,11 @@ class _Search:
         simulator = dataclasses.replace(simulator, motion=motion.replace(counted=counted))
         states, best, waited = simulator.states_of(x), (np.inf, simulator, x), 0
         for _ in range(ROUNDS):
-            states = coupled_states(simulator, bodies, x, states, 5)
-            loaded = bodies.loads(simulator.motion, *states)
-            simulator = dataclasses.replace(simulator, motion=loaded).with_better_rates(x)
+            if bodies is not None:
+                states = coupled_states(simulator, bodies, x, states, 5)
+                loaded = bodies.loads(simulator.motion, *states)
+                simulator = dataclasses.replace(simulator, motion=loaded)
+            simulator = simulator.with_better_rates(x)
             mean = simulator.costs(x[None])[:, 0] / np.maximum(counted.sum(axis=-1), 1.0)
             score = float(np.log(mean + RESOLUTION**2).mean())
             waited = 0 if score < best[0] - FALL else waited + 1
