@@ -325,11 +325,12 @@ class _Search:
         if bodies is not None and bodies.coupled:
             # Inertial torques act on all joints, however badly a log tells them from `J`.
             self.free[:, INDEX["a"]] = True
-        held = self.x.copy()
-        held[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
-        pairs = (self.simulator, self.x), (dataclasses.replace(self.simulator, hold=True), held)
-        found = [self._refined(bodies, *pair) for pair in pairs]
-        _, self.simulator, self.x = min(found, key=lambda one: one[0])
+        first = self._refined(bodies, self.simulator, self.x)
+        _, simulator, x = first
+        held = x.copy()
+        held[:, INDEX["d"]] -= 0.5 * float(simulator.motion.sample_time.mean())
+        second = self._refined(bodies, dataclasses.replace(simulator, hold=True), held)
+        _, self.simulator, self.x = min(first, second, key=lambda found: found[0])
         self._weigh(self.x)
         return self.solve(self.x[None], self.free[None], 1, NEARLY_NONE)
 
