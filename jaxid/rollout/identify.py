@@ -50,7 +50,7 @@ SHORTEST = 5.0
 """Shortest part into which a log is divided [s]."""
 LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
-FALL = 0.01
+FALL = 0.002
 """Fall of the logarithm of the mean square error for which the refinement goes on."""
 NEARLY_NONE = 1e-6
 """Damping of the refinement: more would keep badly known combinations near the search's values."""
