@@ -101,6 +101,7 @@ def bounded_step(
     """
     low, high = bounds
     known = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(axis=-1)
+    known = np.asarray(known)
     information = np.where(known[..., None, None], information, 0.0)
     gradient = np.where(known[..., None], gradient, 0.0)
     held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))

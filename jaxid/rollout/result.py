@@ -124,7 +124,9 @@ class ServoFit:
             rows = _Rows(*scaled, counted.mean(axis=1), float(motion.sample_time.mean()))
             own, covariance[j] = _determined(rows, x[0, j], free[j], j)
             combinations += own
-            if (rms := systematic_error(r[:, j], counted > 0, motion.positions[:, j])) > 0:
+            if (
+                rms := systematic_error(r[:, j], counted > 0, np.asarray(motion.positions)[:, j])
+            ) > 0:
                 lacking.append(f"{joint_names[j]} {1e3 * rms:.2g}")
         notes = (
             f"errors are larger than an encoder's rounding and change slowly "

@@ -300,7 +300,7 @@ def _commands(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray) -> 
     delay, bias, gain = (theta[:, INDEX[key]] for key in ("d", "b", "g"))
     instants = jnp.asarray(np.arange((motion.commands.shape[-1] - 1) * steps + 1) / steps)
 
-    def of_joint(command: Array, delay: Array) -> Array:
+    def of_joint(command: AnyArray, delay: Array) -> Array:
         return delayed_command(command, instants - delay / motion.sample_time, hold)
 
     commands = jax.vmap(of_joint, out_axes=1)(motion.commands, delay)
@@ -388,8 +388,8 @@ def _sensitivities(theta: Array, motion: ServoMotion, steps: int, hold: AnyArray
     h, stages = motion.sample_time / steps, Stages.of(theta, motion, steps, hold)
 
     def forward(state: tuple[Array, Array], stage: Stages):
-        *after, u = _stage(*state, theta.T, stage, h)
-        return tuple(after), (*after, u)
+        q, w, u = _stage(*state, theta.T, stage, h)
+        return (q, w), (q, w, u)
 
     start = _start(motion)
     _, (*path, u) = jax.lax.scan(forward, start, stages)
