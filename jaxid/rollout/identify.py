@@ -17,18 +17,9 @@ from jaxid.measurement.recording import Recording
 
 from .contact import contact_rows
 from .least_squares import Solution, bounded_step, minimise
+from .motion import Bodies, ServoMotion, settling
 from .result import ServoFit
-from .servo import (
-    INDEX,
-    LOWER,
-    START,
-    UPPER,
-    Bodies,
-    ServoMotion,
-    ServoSimulator,
-    coupled_states,
-    settling,
-)
+from .servo import INDEX, LOWER, START, UPPER, ServoSimulator, coupled_states
 
 BASIC = ("J", "B", "d", "F", "b")
 """Parameters of every joint, before the choice."""

@@ -16,17 +16,8 @@ from jaxid.result_table import Column, Remark, Status, Table, significant, with_
 from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
 from .errors import RolloutErrors
 from .least_squares import Solution
-from .servo import (
-    INDEX,
-    LOWER,
-    PARAMETERS,
-    SCALE,
-    UPPER,
-    Bodies,
-    ServoMotion,
-    ServoSimulator,
-    coupled_states,
-)
+from .motion import Bodies, ServoMotion
+from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, ServoSimulator, coupled_states
 
 UNDETERMINED = 0.5
 """Standard deviation, relative to a parameter's size, above which it is not determined."""

@@ -9,7 +9,8 @@ import jaxid as jid
 from jaxid.export.servo import export_servo_mjcf, simulator_table, simulator_values
 from jaxid.rollout.contact import contacts
 from jaxid.rollout.least_squares import bounded_step, minimise
-from jaxid.rollout.servo import INDEX, START, ServoMotion, ServoSimulator
+from jaxid.rollout.motion import ServoMotion
+from jaxid.rollout.servo import INDEX, START, ServoSimulator
 
 
 def _one_joint(commands, load=0.0, **parameters):
