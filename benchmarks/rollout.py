@@ -38,7 +38,8 @@ UNSEEN = (
     "backlash_detection",
 )
 COMMANDS = jid.Columns(time="time", angles="position{}", forces="command{}")
-STEP, ENCODER = 0.001, 2 * np.pi / 4096
+STEP, ENCODER = 0.0002, 2 * np.pi / 4096
+FINE = {"friction": False, "saturation": False, "time_step": 0.0025}
 
 
 def so101_file() -> str:
@@ -148,7 +149,7 @@ def arm_text(gain: float, stribeck: bool, axes: int = 6) -> str:
             f'<body name="b{j}" pos="{0.12 * (j > 0)} 0 0"><inertial pos="0.06 0 0" mass="0.15" '
             f'diaginertia="2e-4 2e-4 2e-4"/><joint name="j{j}" axis="{axis}" '
             f'armature="{0.04 + 0.004 * j}" damping="{0.6 + 0.05 * j}" frictionloss="{loss}" '
-            'solreffriction="0.004 1" solimpfriction="0.99 0.9999 0.001"/>'
+            'solreffriction="0.0005 1" solimpfriction="0.99 0.9999 0.001"/>'
         )
         end += "</body>"
     servos = "".join(
@@ -171,15 +172,18 @@ def commanded(seed: int, axes: int, duration: float, rate: float) -> np.ndarray:
 def drive(model, sent: np.ndarray, rate: float, stribeck: bool = False, late: float = 0.01):
     """Return the encoders' positions; with Stribeck friction of a narrow smooth sign."""
     data, every = mujoco.MjData(model), round(1 / rate / STEP)
-    measured, delay = np.zeros_like(sent), round(late / STEP)
-    for k in range(every * len(sent)):
-        if k % every == 0:
-            measured[k // every] = data.qpos
-        data.ctrl[:] = sent[max(0, (k - delay) // every)]
-        if stribeck:
-            v = data.qvel
-            data.qfrc_applied[:] = -np.tanh(v / 0.005) * (0.1 + 0.15 * np.exp(-((v / 0.1) ** 2)))
-        mujoco.mj_step(model, data)
+    measured, (samples, steps) = np.zeros_like(sent), divmod(round(late / STEP), every)
+    for k in range(len(sent)):
+        measured[k] = data.qpos
+        for back, count in ((samples + 1, steps), (samples, every - steps)):
+            data.ctrl[:] = sent[max(0, k - back)]
+            for _ in range(count if stribeck else 0):
+                v = data.qvel
+                drag = 0.1 + 0.15 * np.exp(-((v / 0.1) ** 2))
+                data.qfrc_applied[:] = -np.tanh(v / 0.005) * drag
+                mujoco.mj_step(model, data)
+            if count and not stribeck:
+                mujoco.mj_step(model, data, count)
     return ENCODER * np.round(measured / ENCODER)
 
 
@@ -205,7 +209,9 @@ def truth(gain: float) -> np.ndarray:
     K = gain * (12.0 - j)
     symbols = [p.symbol for p in jid.rollout.PARAMETERS]
     x = np.zeros((6, len(symbols)))
-    values = {"J": (0.04 + 0.004 * j) / K, "B": (0.6 + 0.05 * j) / K, "a": 1 / K}
+    B = (0.6 + 0.05 * j) / K
+    # MuJoCo takes damping at the end of its steps: half a step of it acts as inertia.
+    values = {"J": (0.04 + 0.004 * j) / K + B * STEP / 2, "B": B, "a": 1 / K}
     values |= {"F": (0.1 + 0.02 * j) / K, "d": np.full(6, 0.01 - STEP / 2)}
     for symbol, value in values.items():
         x[:, symbols.index(symbol)] = value
@@ -218,12 +224,12 @@ def inside(fit, x: np.ndarray) -> list[bool]:
 
 
 def coverage(quick: bool) -> None:
-    bodies, draws = arm_bodies(arm_text(1.0, False)), 2 if quick else 25
+    bodies, draws = arm_bodies(arm_text(1.0, False)), 2 if quick else 20
     for stribeck in (False, True):
         hits, warned, start = [], 0, time.time()
         for seed in range(draws):
             logs = arm_logs(seed, stribeck=stribeck)
-            fit = jid.identify_rollout(logs, bodies, friction=False, saturation=False)
+            fit = jid.identify_rollout(logs, bodies, **FINE)
             hits += inside(fit, truth(1.0))
             warned += bool(fit.notes)
         print(
@@ -238,10 +244,7 @@ def gains(quick: bool) -> None:
     """Compare armature, damping, friction, delay of two gains, whose ratio is known."""
     agree, bodies = [], arm_bodies(arm_text(1.0, False))
     for seed in range(1 if quick else 8):
-        one, other = (
-            jid.identify_rollout(arm_logs(seed, g), bodies, friction=False, saturation=False)
-            for g in (1.0, 1.6)
-        )
+        one, other = (jid.identify_rollout(arm_logs(seed, g), bodies, **FINE) for g in (1.0, 1.6))
         second = {(c.joint, c.name): c for c in other.combinations}
         for c in one.combinations:
             if (d := second.get((c.joint, c.name))) is None:
@@ -281,7 +284,7 @@ def quadruped(quick: bool) -> None:
 def band(quick: bool) -> None:
     text, count = arm_text(1.0, False), 10 if quick else 100
     bodies = arm_bodies(text)
-    fit = jid.identify_rollout(arm_logs(0), bodies, friction=False, saturation=False)
+    fit = jid.identify_rollout(arm_logs(0), bodies, **FINE)
     sent = commanded(999, 6, 10.0, 50.0)
     measured = drive(mujoco.MjModel.from_xml_string(text), sent, 50.0)
     with tempfile.TemporaryDirectory() as folder:

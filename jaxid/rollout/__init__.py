@@ -3,8 +3,9 @@
 from .contact import Contact as Contact
 from .errors import RolloutErrors as RolloutErrors
 from .identify import identify_rollout as identify_rollout
+from .motion import Bodies as Bodies
 from .result import Combination as Combination, ServoFit as ServoFit
-from .servo import PARAMETERS as PARAMETERS, Bodies as Bodies
+from .servo import PARAMETERS as PARAMETERS
 from .torque import (
     TorqueRolloutFit as TorqueRolloutFit,
     identify_torque_rollout as identify_torque_rollout,

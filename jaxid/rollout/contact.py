@@ -12,7 +12,7 @@ from scipy.ndimage import (
 
 from jaxid.arrays import Bool, Float
 
-from .servo import ServoMotion
+from .motion import ServoMotion
 
 SUSTAINED = 0.5
 """Time over which errors are averaged: friction and vibration change their sign sooner [s]."""

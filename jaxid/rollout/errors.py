@@ -37,9 +37,11 @@ class RolloutErrors:
     contacts: tuple[Contact, ...]
 
     def rms(self, kind: str = "simulated") -> Float[np.ndarray, "motions joints"]:
-        """Return root mean square errors of `simulated`, `command` or `linear`."""
+        """Return root mean square errors of `simulated`, `command` or `linear`; NaN without any."""
         rows = zip(getattr(self, kind), self.measured, self.counted, strict=True)
-        return np.array([np.sqrt(np.mean((y - q) ** 2, axis=1, where=k)) for y, q, k in rows])
+        sums = np.array([np.sum((y - q) ** 2, axis=1, where=k) for y, q, k in rows])
+        sizes = np.array([k.sum(axis=1) for k in self.counted])
+        return np.sqrt(np.where(sizes > 0, sums / np.maximum(sizes, 1), np.nan))
 
     def total(self, kind: str = "simulated") -> Float[np.ndarray, " joints"]:
         """Return root mean square errors over all motions together."""

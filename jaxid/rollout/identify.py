@@ -1,7 +1,8 @@
 """Identification of joints behind position servos, from commands and positions alone.
 
-Each choice (gravity, friction by load, Stribeck friction, saturation, commands held or
-interpolated) is made by motions that the fit has not seen: leave one out among those given.
+Each choice of effects (gravity, friction by load, Stribeck friction, saturation, inertial torques)
+is made by motions that the fit has not seen: leave one out among those given. Held and interpolated
+commands have the same parameters: their errors decide.
 """
 
 import dataclasses
@@ -16,8 +17,9 @@ from jaxid.measurement.recording import Recording
 
 from .contact import contact_rows
 from .least_squares import Solution, bounded_step, minimise
+from .motion import Bodies, ServoMotion, settling
 from .result import ServoFit
-from .servo import INDEX, LOWER, START, UPPER, Bodies, ServoMotion, ServoSimulator
+from .servo import INDEX, LOWER, START, UPPER, ServoSimulator, coupled_states
 
 BASIC = ("J", "B", "d", "F", "b")
 """Parameters of every joint, before the choice."""
@@ -39,6 +41,12 @@ SHORTEST = 5.0
 """Shortest part into which a log is divided [s]."""
 LIGHT = 0.02
 """Load, relative to the most loaded joint's, below which a joint counts as unloaded."""
+FALL = 0.002
+"""Fall of the logarithm of the mean square error for which the refinement goes on."""
+NEARLY_NONE = 1e-6
+"""Damping of the refinement: more would keep badly known combinations near the search's values."""
+ROUNDS = 12
+"""Largest number of refinements under loads of the simulated motion."""
 _STARTS = [(J, B, d) for J in (2e-4, 2e-3, 1e-2) for B in (0.01, 0.04, 0.15) for d in (0.0, 0.02)]
 """Inertia, damping and delay from which searches may start."""
 
@@ -79,7 +87,9 @@ def identify_rollout(
     _require_motion(motion)
     names = _joint_names(motion, bodies, joint_names)
     simulator = ServoSimulator(motion if bodies is None else bodies.loads(motion), time_step)
-    search = _Search(simulator)
+    # Commands held or interpolated differ within a sample time only; the rest shows in long steps.
+    coarse = max(time_step, float(motion.sample_time.max()))
+    search = _Search(dataclasses.replace(simulator, time_step=coarse))
     search.start()
     groups: list[Sequence[tuple[str, ...]]] = list(EFFECTS)
     if bodies is None:
@@ -92,13 +102,10 @@ def identify_rollout(
         search.choose(group)
         if k == 0:
             search.remove_contact()
-    search.choose_hold()
+    search.simulator = dataclasses.replace(search.simulator, time_step=time_step)
     if bodies is not None and not bodies.coupled:
         bodies = search.choose_coupling(bodies)
-        if bodies.coupled:
-            # Inertial torques tell the stiffness of joints on which no weight acts.
-            search.choose(((), ("a",)))
-    solution = search.final()
+    solution = search.refine(bodies)
     found = search.simulator, search.weights, solution, search.free, search.linear
     return ServoFit.of(*found, names, bodies)
 
@@ -164,19 +171,20 @@ class _Search:
         self.free = np.tile(mask(BASIC), (joints, 1))
         self.linear = self.x.copy()
 
-    def solve(self, x: np.ndarray, free: np.ndarray, iterations: int = 5) -> Solution:
+    def solve(
+        self, x: np.ndarray, free: np.ndarray, iterations: int = 10, damping: float = 1e-2
+    ) -> Solution:
         """Fit candidates [candidates, joints, parameters] to all motions."""
         w = self.weights[:, None, :]
 
-        def moments(x):
-            cost, g, H = self.simulator.moments(x)
-            totals = ((w[(...,) + (None,) * k] * y).sum(axis=0) for k, y in enumerate((cost, g, H)))
-            return tuple(totals)
+        def moments(x, k):
+            parts = zip((0, 1, 2), self.simulator.moments(x), strict=True)
+            return tuple((w[(...,) + (None,) * n] * y).sum(axis=0) for n, y in parts)
 
-        def costs(x):
+        def costs(x, k):
             return (w * self.simulator.costs(x)).sum(axis=0)
 
-        return minimise(moments, costs, x, free, (LOWER, UPPER), iterations)
+        return minimise(moments, costs, x, free, (LOWER, UPPER), iterations, damping=damping)
 
     def held_out(self, found: Solution, free: np.ndarray) -> Float[np.ndarray, "candidates joints"]:
         """Return mean logarithms of the mean square errors of motions left out, one at a time.
@@ -238,10 +246,8 @@ class _Search:
         if len(group) == 1:
             return
         every = {symbol for effects in group for symbol in effects}
-        # Always four candidates: one compilation.
-        filled = [*group, *[group[-1]] * (4 - len(group))]
-        x, free = np.stack([self.x] * 4), np.stack([self.free] * 4)
-        for k, effects in enumerate(filled):
+        x, free = (np.stack([y] * len(group)) for y in (self.x, self.free))
+        for k, effects in enumerate(group):
             free[k, :, mask(tuple(every))] = False
             free[k, :, mask(effects)] = True
             for symbol in every - set(effects):
@@ -286,13 +292,6 @@ class _Search:
         }
         return values[symbol]
 
-    def choose_hold(self) -> None:
-        """Decide whether commands are held or interpolated, for all joints alike."""
-        held = self.x.copy()
-        held[:, INDEX["d"]] -= 0.5 * float(self.simulator.motion.sample_time.mean())
-        other = dataclasses.replace(self.simulator, hold=True)
-        self._choose_simulator((self.simulator, self.x), (other, held))
-
     def choose_coupling(self, bodies: Bodies) -> Bodies:
         """Decide whether inertial torques of the bodies act, beside those of gravity."""
         coupled = dataclasses.replace(bodies, coupled=True)
@@ -300,25 +299,58 @@ class _Search:
         x, a = self.x.copy(), self.x[:, INDEX["a"]] * self.free[:, INDEX["a"]]
         own = a * np.asarray(motion.inertia).mean(axis=(0, 2))
         x[:, INDEX["J"]] = np.maximum(x[:, INDEX["J"]] - own, 1e-5)
-        other = dataclasses.replace(self.simulator, motion=motion)
-        better = self._choose_simulator((self.simulator, self.x), (other, x))
-        return coupled if better else bodies
-
-    def _choose_simulator(self, *pairs: tuple[ServoSimulator, np.ndarray]) -> bool:
-        """Take the simulator and start of lower held-out errors; return whether it is the last."""
         scores, results = [], []
-        for simulator, start in pairs:
+        other = dataclasses.replace(self.simulator, motion=motion)
+        for simulator, start in ((self.simulator, self.x), (other, x)):
             self.simulator = simulator
-            found = self.solve(start[None], self.free[None], iterations=3)
+            found = self.solve(start[None], self.free[None], iterations=5)
             scores.append(self.held_out(found, self.free[None]).mean())
             results.append((simulator, found.x[0]))
-        last = bool(scores[1] < scores[0])
-        self.simulator, self.x = results[int(last)]
+        better = bool(scores[1] < scores[0])
+        self.simulator, self.x = results[int(better)]
         self._weigh(self.x)
-        return last
+        return coupled if better else bodies
 
-    def final(self) -> Solution:
-        """Return the fit with the chosen effects."""
-        found = self.solve(self.x[None], self.free[None], iterations=10)
-        self.x = found.x[0]
-        return found
+    def refine(self, bodies: Bodies | None) -> Solution:
+        """Return the fit under the loads of the simulated motion, commands held or interpolated."""
+        if bodies is not None and bodies.coupled:
+            # Inertial torques act on all joints, however badly a log tells them from `J`.
+            self.free[:, INDEX["a"]] = True
+        first = self._refined(bodies, self.simulator, self.x)
+        _, simulator, x = first
+        held = x.copy()
+        held[:, INDEX["d"]] -= 0.5 * float(simulator.motion.sample_time.mean())
+        second = self._refined(bodies, dataclasses.replace(simulator, hold=True), held)
+        _, self.simulator, self.x = min(first, second, key=lambda found: found[0])
+        self._weigh(self.x)
+        return self.solve(self.x[None], self.free[None], 1, NEARLY_NONE)
+
+    def _refined(
+        self, bodies: Bodies | None, simulator: ServoSimulator, x: np.ndarray
+    ) -> tuple[float, ServoSimulator, np.ndarray]:
+        """Return the mean logarithm of errors, the simulator and the parameters of a refinement.
+
+        Measured positions tell inertial torques roughly. Here the loads follow the simulation, and
+        all samples count, with initial velocities estimated.
+        """
+        motion = simulator.motion
+        early = np.arange(motion.positions.shape[-1]) < settling(motion)[:, None, None]
+        counted = np.where(early, 1.0, motion.counted)
+        simulator = dataclasses.replace(simulator, motion=motion.replace(counted=counted))
+        states, best, waited = simulator.states_of(x), (np.inf, simulator, x), 0
+        for _ in range(ROUNDS):
+            if bodies is not None:
+                states = coupled_states(simulator, bodies, x, states, 5)
+                loaded = bodies.loads(simulator.motion, *states)
+                simulator = dataclasses.replace(simulator, motion=loaded)
+            simulator = simulator.with_better_rates(x)
+            mean = simulator.costs(x[None])[:, 0] / np.maximum(counted.sum(axis=-1), 1.0)
+            score = float(np.log(mean + RESOLUTION**2).mean())
+            waited = 0 if score < best[0] - FALL else waited + 1
+            best = (score, simulator, x) if score < best[0] else best
+            if waited == 2:
+                break
+            self.simulator = simulator
+            self._weigh(x)
+            x = self.solve(x[None], self.free[None], 1, NEARLY_NONE).x[0]
+        return best

@@ -7,10 +7,13 @@ import numpy as np
 
 from jaxid.arrays import Bool, Float
 
-Moments = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""Function that returns costs, gradients and Gauss-Newton matrices for parameters [..., size]."""
-Costs = Callable[[np.ndarray], np.ndarray]
-"""Function that returns the costs alone."""
+Moments = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, ...]]
+"""Function of parameters [..., size] and of the indices of their problems along the first axis.
+
+It returns costs, gradients and Gauss-Newton matrices.
+"""
+Costs = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Function of the same that returns the costs alone."""
 
 
 class Solution(NamedTuple):
@@ -37,10 +40,12 @@ def minimise(
     bounds: tuple[np.ndarray, np.ndarray],
     iterations: int = 30,
     tolerance: float = 1e-4,
+    damping: float = 1e-2,
 ) -> Solution:
     """Minimise sums of squares over the free parameters, each problem with its own damping.
 
-    A parameter at a bound that its gradient would leave is held there for one step.
+    A parameter at a bound that its gradient would leave is held there for one step. Problems of one
+    index along the first axis are left alone as soon as all of them have converged.
 
     Args:
         moments: Costs and their derivatives at parameters of all problems.
@@ -50,27 +55,36 @@ def minimise(
         bounds: Lower and upper limits of the parameters.
         iterations: Largest number of steps.
         tolerance: Relative decrease of the cost below which a problem has converged.
+        damping: Damping of the first step, relative to the diagonal of the Gauss-Newton matrix.
     """
     x = np.clip(x, *bounds)
-    damping = np.full(x.shape[:-1], 1e-2)
-    cost, g, H = moments(x)
+    dampings, left = np.full(x.shape[:-1], damping), np.arange(len(x))
+    cost, g, H = moments(x, left)
     for _ in range(iterations):
-        decrease = np.zeros_like(cost)
-        for _ in range(5):
-            step = bounded_step(g, H, x, free, bounds, damping)
-            trial = np.clip(x + step, *bounds)
-            found = costs(trial)
-            better = (found < cost) & (decrease == 0.0)
-            decrease = np.where(better, (cost - found) / np.maximum(cost, 1e-300), decrease)
-            x = np.where(better[..., None], trial, x)
-            factor = np.where(better, 0.2, np.where(decrease > 0.0, 1.0, 8.0))
-            damping = np.clip(damping * factor, 1e-9, 1e6)
-            if (decrease > 0.0).mean() > 0.7:
-                break
-        cost, g, H = moments(x)
-        if (decrease < tolerance).all():
+        own = (y[left] for y in (x, cost, g, H, free, dampings))
+        x[left], dampings[left], converged = _improve(costs, left, *own, bounds, tolerance)
+        cost[left], g[left], H[left] = moments(x[left], left)
+        left = left[~converged.reshape(len(left), -1).all(axis=1)]
+        if not left.size:
             break
     return Solution(x, cost, g, H)
+
+
+def _improve(costs, problems, x, cost, g, H, free, damping, bounds, tolerance):
+    """Return parameters of lower costs, their damping, and which problems have converged."""
+    decrease = np.zeros_like(cost)
+    for _ in range(5):
+        step = bounded_step(g, H, x, free, bounds, damping)
+        trial = np.clip(x + step, *bounds)
+        found = costs(trial, problems)
+        better = (found < cost) & (decrease == 0.0)
+        decrease = np.where(better, (cost - found) / np.maximum(cost, 1e-300), decrease)
+        x = np.where(better[..., None], trial, x)
+        factor = np.where(better, 0.2, np.where(decrease > 0.0, 1.0, 8.0))
+        damping = np.clip(damping * factor, 1e-9, 1e6)
+        if (decrease > 0.0).mean() > 0.7:
+            break
+    return x, damping, decrease < tolerance
 
 
 def bounded_step(
@@ -87,6 +101,7 @@ def bounded_step(
     """
     low, high = bounds
     known = np.isfinite(information).all(axis=(-1, -2)) & np.isfinite(gradient).all(axis=-1)
+    known = np.asarray(known)
     information = np.where(known[..., None, None], information, 0.0)
     gradient = np.where(known[..., None], gradient, 0.0)
     held = ((x <= low) & (gradient > 0)) | ((x >= high) & (gradient < 0))

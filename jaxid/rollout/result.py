@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special, stats
@@ -16,23 +16,9 @@ from jaxid.result_table import Column, Remark, Status, Table, significant, with_
 from .contact import Contact, contact_rows, contacts, sustained_errors, typical_errors
 from .errors import RolloutErrors
 from .least_squares import Solution
-from .servo import (
-    INDEX,
-    LOWER,
-    PARAMETERS,
-    SCALE,
-    UPPER,
-    Bodies,
-    ServoMotion,
-    ServoSimulator,
-)
+from .motion import Bodies, ServoMotion
+from .servo import INDEX, LOWER, PARAMETERS, SCALE, UPPER, ServoSimulator, coupled_states
 
-SWEEPS = 15
-"""Largest number of simulations in which loads and positions must agree."""
-AGREED = 1e-4
-"""Change of the positions at which they agree [rad or m]."""
-DEPTH = 6
-"""Simulations from which the next positions are extrapolated (Anderson's method)."""
 UNDETERMINED = 0.5
 """Standard deviation, relative to a parameter's size, above which it is not determined."""
 SYSTEMATIC = 1.5
@@ -121,14 +107,17 @@ class ServoFit:
         x, motion = solution.x, simulator.motion
         y, S = (y[:, 0] for y in simulator.sensitivities(x))
         r, S = (y - motion.positions) * motion.counted, S * np.asarray(motion.counted)[..., None]
-        moving = free & (x[0] > LOWER) & (x[0] < UPPER)
+        S = without_rates(S, np.maximum(np.mean(r**2, axis=-1), 1e-12))
         covariance, combinations, lacking = np.zeros((*x[0].shape, len(PARAMETERS))), [], []
         for j in range(len(x[0])):
-            rows = _JointRows.of(simulator, j, weights[:, j], r[:, j], S[:, j])
-            own, full = _determined(rows, x[0, j], moving[j], j)
+            root, counted = np.sqrt(weights[:, j])[:, None], np.asarray(motion.counted)[:, j]
+            scaled = root * r[:, j], root[..., None] * S[:, j]
+            rows = _Rows(*scaled, counted.mean(axis=1), float(motion.sample_time.mean()))
+            own, covariance[j] = _determined(rows, x[0, j], free[j], j)
             combinations += own
-            covariance[j] = full
-            if (rms := rows.systematic_error()) > 0:
+            if (
+                rms := systematic_error(r[:, j], counted > 0, np.asarray(motion.positions)[:, j])
+            ) > 0:
                 lacking.append(f"{joint_names[j]} {1e3 * rms:.2g}")
         notes = (
             f"errors are larger than an encoder's rounding and change slowly "
@@ -187,24 +176,12 @@ class ServoFit:
     def paths(self, motion: ServoMotion, parameters: AnyArray | None = None) -> np.ndarray:
         """Return simulated positions [motions, joints, samples], with loads at these positions."""
         x = np.asarray(self.parameters if parameters is None else parameters)
+        simulator = ServoSimulator(motion, self.time_step, self.hold)
         if self.bodies is None:
-            return ServoSimulator(motion, self.time_step, self.hold).paths(x[None])[:, 0]
-        states = self._respond(motion, x, np.asarray(motion.commands), None)
-        tried: list[np.ndarray] = []
-        found: list[np.ndarray] = []
-        for _ in range(SWEEPS):
-            tried.append(states)
-            found.append(self._respond(motion, x, *states))
-            last, states = states, _extrapolated(tried[-DEPTH:], found[-DEPTH:])
-            if np.abs(found[-1] - last)[0].max() < AGREED:
-                break
-        return found[-1][0]
-
-    def _respond(self, motion: ServoMotion, x: np.ndarray, q: Any, v: Any) -> np.ndarray:
-        """Return positions and velocities under the loads of other positions and velocities."""
-        loaded = motion if self.bodies is None else self.bodies.loads(motion, q, v)
-        simulator = ServoSimulator(loaded, self.time_step, self.hold)
-        return np.stack([y[:, 0] for y in simulator.states(x[None])])
+            return simulator.paths(x[None])[:, 0]
+        loaded = self.bodies.loads(motion, np.asarray(motion.commands))
+        states = dataclasses.replace(simulator, motion=loaded).states_of(x)
+        return coupled_states(simulator, self.bodies, x, states)[0][..., :: simulator.steps]
 
     def validate(self, logs: Sequence[Recording] | Recording) -> RolloutErrors:
         """Compare free-running simulations with logs, and with simple baselines.
@@ -320,72 +297,50 @@ class ServoFit:
         return self.summary().text()
 
 
-def _extrapolated(tried: list[np.ndarray], found: list[np.ndarray]) -> np.ndarray:
-    """Return where a fixed-point iteration leads, by Anderson's method."""
-    errors = [(y - x)[0].ravel() for x, y in zip(tried, found, strict=True)]
-    if len(errors) == 1:
-        return found[0]
-    steps = np.stack([e - errors[-1] for e in errors[:-1]], axis=1)
-    weights = np.linalg.lstsq(steps, -errors[-1], rcond=1e-10)[0]
-    changes = (w * (y - found[-1]) for w, y in zip(weights, found[:-1], strict=True))
-    return found[-1] + np.sum(list(changes), axis=0)
+def without_rates(S: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return sensitivities to the parameters less what initial velocities can imitate."""
+    start, own = S[..., -1:], S[..., :-1]
+    known = np.sum(start**2, axis=-2, keepdims=True) + variance[..., None, None]
+    return own - start * np.sum(start * own, axis=-2, keepdims=True) / known
 
 
-class _JointRows(NamedTuple):
+class _Rows(NamedTuple):
     """Weighted residuals and sensitivities of one joint, in all motions.
 
     Attributes:
         residuals: Residuals [motions, samples].
         sensitivities: Sensitivities [motions, samples, parameters].
-        raw: Residuals without weights.
-        counted: Whether a sample counts.
+        exposure: Fraction of the samples of each motion that count.
         sample_time: Mean sample time [s].
-        resolution: Smallest step of the encoder [rad or m].
     """
 
     residuals: np.ndarray
     sensitivities: np.ndarray
-    raw: np.ndarray
-    counted: np.ndarray
+    exposure: np.ndarray
     sample_time: float
-    resolution: float
-
-    @classmethod
-    def of(cls, simulator, joint, weights, r, S) -> "_JointRows":
-        motion, root = simulator.motion, np.sqrt(weights)[:, None]
-        counted = np.asarray(motion.counted)[:, joint]
-        step = _resolution(np.asarray(motion.positions)[:, joint])
-        return cls(
-            root * r, root[..., None] * S, r, counted, float(motion.sample_time.mean()), step
-        )
-
-    def information(self, own: np.ndarray) -> np.ndarray:
-        """Return the Gauss-Newton matrix of some parameters."""
-        A = self.sensitivities[..., own].reshape(-1, int(own.sum()))
-        return A.T @ A
 
     def covariance(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return covariance and degrees of freedom of some parameters.
 
         The spectral sandwich; where motions differ more than it explains, their scatter.
         """
-        H, count = self.information(own), len(self.residuals)
-        B = _inverse(H)
-        exposure = self.counted.mean(axis=1)
+        S, count = self.sensitivities[..., own], len(self.residuals)
+        A = S.reshape(-1, S.shape[-1])
+        B = _inverse(A.T @ A)
         with double_precision():
             found = sandwich_of_columns(
                 [range(len(B))] * count,
                 np.ones(count),
                 B,
                 np.zeros((1, len(B))),
-                list(np.moveaxis(self.sensitivities[..., own], 1, 2)),
+                list(np.moveaxis(S, 1, 2)),
                 list(self.residuals[:, None]),
-                exposure,
+                self.exposure,
                 self.sample_time,
             )
         variance, dof = (np.asarray(x)[0] for x in found)
         correlation = B / np.sqrt(np.outer(np.diag(B), np.diag(B)))
-        scores = np.einsum("mtp,mt->mp", self.sensitivities[..., own], self.residuals) @ B
+        scores = np.einsum("mtp,mt->mp", S, self.residuals) @ B
         scatter = count / max(count - 1, 1) * (scores**2).sum(axis=0)
         limit = stats.f.ppf(0.95, count - 1, dof) if count > 1 else np.inf
         differ = scatter > limit * variance
@@ -393,22 +348,23 @@ class _JointRows(NamedTuple):
         deviation = np.sqrt(np.where(differ, scatter, variance))
         return correlation * np.outer(deviation, deviation), dof
 
-    def systematic_error(self) -> float:
-        """Return the RMS error [rad or m] if it looks like a missing effect; otherwise 0."""
-        kept = self.counted > 0
-        rms = float(np.sqrt(np.mean(self.raw[kept] ** 2)))
-        both = kept[:, 1:] & kept[:, :-1]
-        neighbours = float(np.mean((self.raw[:, 1:] * self.raw[:, :-1])[both])) / rms**2
-        rounding = self.resolution / np.sqrt(12.0)
-        return 0.0 if rms < SYSTEMATIC * rounding or neighbours < 0.5 else rms
 
+def systematic_error(r: np.ndarray, kept: np.ndarray, q: np.ndarray) -> float:
+    """Return a joint's RMS error [rad or m] if it looks like a missing effect; otherwise 0.
 
-def _resolution(q: np.ndarray) -> float:
-    """Return the smallest step of positions."""
+    Args:
+        r: Residuals [motions, samples].
+        kept: Whether a sample counts.
+        q: Measured positions.
+    """
+    rms = float(np.sqrt(np.mean(r[kept] ** 2)))
+    both = kept[:, 1:] & kept[:, :-1]
+    neighbours = float(np.mean((r[:, 1:] * r[:, :-1])[both])) / rms**2
     steps = np.abs(np.diff(q, axis=-1)).ravel()
     steps = steps[steps > 1e-6]
     # Most steps of a slow joint are the smallest one; interpolated logs have smaller ones, too.
-    return float(np.quantile(steps, 0.1)) if steps.size else 0.0
+    rounding = float(np.quantile(steps, 0.1)) / np.sqrt(12.0) if steps.size else 0.0
+    return 0.0 if rms < SYSTEMATIC * rounding or neighbours < 0.5 else rms
 
 
 def _inverse(H: np.ndarray) -> np.ndarray:
@@ -420,7 +376,7 @@ def _inverse(H: np.ndarray) -> np.ndarray:
 
 
 def _determined(
-    rows: _JointRows, x: np.ndarray, moving: np.ndarray, joint: int
+    rows: _Rows, x: np.ndarray, moving: np.ndarray, joint: int
 ) -> tuple[list[Combination], np.ndarray]:
     """Return the combinations that a joint's rows determine, and the covariance of all."""
     covariance, _ = rows.covariance(moving)
@@ -444,20 +400,9 @@ def _determined(
         if merged:
             others = ", ".join(PARAMETERS[m].meaning for m in merged)
             meaning = f"{meaning} and {others} only together"
-        value = float(coefficients @ x)
-        deviation = float(np.sqrt(reduced[k, k]))
-        found.append(
-            Combination(
-                joint,
-                name,
-                meaning,
-                PARAMETERS[i].unit,
-                coefficients,
-                value,
-                deviation,
-                float(dof[k]),
-            )
-        )
+        numbers = float(coefficients @ x), float(np.sqrt(reduced[k, k])), float(dof[k])
+        unit = PARAMETERS[i].unit
+        found.append(Combination(joint, name, meaning, unit, coefficients, *numbers))
     return found, full
 
 

@@ -326,12 +326,12 @@ def _compiled(
         J[index] = found
         return r, J
 
-    def moments(x):
+    def moments(x, _):
         r, J = linearised(x[0])
         flat = J.reshape(len(J), -1)
         return np.array([np.sum(r**2)]), (flat @ r.ravel())[None], (flat @ flat.T)[None]
 
-    def costs(x):
+    def costs(x, _):
         found = float(cost(jnp.asarray(x[0]), data))
         return np.array([found if np.isfinite(found) else np.inf])
 

@@ -9,7 +9,8 @@ import jaxid as jid
 from jaxid.export.servo import export_servo_mjcf, simulator_table, simulator_values
 from jaxid.rollout.contact import contacts
 from jaxid.rollout.least_squares import bounded_step, minimise
-from jaxid.rollout.servo import INDEX, START, ServoMotion, ServoSimulator
+from jaxid.rollout.motion import ServoMotion
+from jaxid.rollout.servo import INDEX, START, ServoSimulator
 
 
 def _one_joint(commands, load=0.0, **parameters):
@@ -63,7 +64,7 @@ def test_sensitivities_and_moments_agree_with_differences(hold):
     y, S = simulator.sensitivities(x)
     r = (y - simulator.motion.positions)[0, 0] * simulator.motion.counted[0]
     _, g, H = (z[0, 0, 0] for z in simulator.moments(x))
-    own = S[0, 0, 0] * simulator.motion.counted[0, 0][:, None]
+    own = S[0, 0, 0, :, :-1] * simulator.motion.counted[0, 0][:, None]
     np.testing.assert_allclose(g, own.T @ r[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(H, own.T @ own, rtol=1e-9, atol=1e-12)
     for k in range(len(START)):
@@ -75,6 +76,14 @@ def test_sensitivities_and_moments_agree_with_differences(hold):
         # A kink that lies within a step shifts single samples.
         error = np.sort(np.abs(S[0, 0, 0, :, k] - difference))
         assert error[int(0.95 * len(error))] < 1e-6 * scale, k
+    by_rate = [_with_rate(simulator, 0.2 + d).paths(x)[0, 0, 0] for d in (1e-6, -1e-6)]
+    S = _with_rate(simulator, 0.2).sensitivities(x)[1][0, 0, 0, :, -1]
+    np.testing.assert_allclose(S, (by_rate[0] - by_rate[1]) / 2e-6, atol=1e-6 * np.abs(S).max())
+
+
+def _with_rate(simulator, rate):
+    motion = simulator.motion
+    return ServoSimulator(motion.replace(rates=np.full_like(motion.rates, rate)), 0.01)
 
 
 def test_a_step_is_zero_where_derivatives_have_overflowed():
@@ -89,14 +98,14 @@ def test_a_step_is_zero_where_derivatives_have_overflowed():
 def test_the_batch_of_least_squares_respects_bounds():
     targets = np.array([[0.5, 2.0], [-3.0, 0.2]])
 
-    def moments(x):
-        r = x - targets
-        return (r**2).sum(-1), r, np.broadcast_to(np.eye(2), (2, 2, 2))
+    def moments(x, k):
+        r = x - targets[k]
+        return (r**2).sum(-1), r, np.tile(np.eye(2), (len(k), 1, 1))
 
     free = np.array([[True, True], [True, False]])
     bounds = np.full(2, -1.0), np.full(2, 1.0)
     found = minimise(
-        moments, lambda x: moments(x)[0], np.zeros((2, 2)), free, bounds, tolerance=1e-14
+        moments, lambda *x: moments(*x)[0], np.zeros((2, 2)), free, bounds, tolerance=1e-14
     )
     np.testing.assert_allclose(found.x, [[0.5, 1.0], [-1.0, 0.0]], atol=1e-6)
 
@@ -152,15 +161,14 @@ def test_mujoco_moves_like_the_simulation(fit, tmp_path):
 
 def test_stiffness_and_delay_of_a_slow_ramp_are_merged():
     """Without acceleration only the lag is seen: damping over stiffness plus delay."""
-    t = 0.02 * np.arange(1500)
-    sent = 0.8 * np.abs((0.05 * t) % 1.0 - 0.5)
-    simulator, x = _one_joint(sent, J=1e-4, B=0.06, d=0.02, F=0.01)
-    path = simulator.paths(x)[0, 0, 0][: len(sent)]
-    step = servo_arm.ENCODER
-    random = np.random.default_rng(0)
-    measured = step * np.round((path + random.uniform(-step, step, len(path))) / step)
-    log = jid.Recording.of(measured[:, None], sent[:, None], sample_time=0.02)
-    found = jid.identify_rollout(log, friction=False, saturation=False)
+    step, random, logs = servo_arm.ENCODER, np.random.default_rng(0), []
+    for speed in (0.04, -0.04, 0.02, -0.02):
+        sent = speed * 0.02 * np.arange(500)
+        simulator, x = _one_joint(sent, J=1e-4, B=0.06, d=0.02, F=0.01)
+        path = simulator.paths(x)[0, 0, 0][: len(sent)]
+        measured = step * np.round((path + random.uniform(-step, step, len(path))) / step)
+        logs.append(jid.Recording.of(measured[:, None], sent[:, None], sample_time=0.02))
+    found = jid.identify_rollout(logs, friction=False, saturation=False)
     (lag,) = [c for c in found.combinations if "B" in c.name.split()[0]]
     assert " d" in lag.name
     low, high = lag.interval(0.999)
