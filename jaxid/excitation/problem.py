@@ -266,7 +266,8 @@ class ExcitationProblem:
     ) -> tuple[Float[np.ndarray, "starts values"], Float[np.ndarray, "starts values scaled"]]:
         """Return watched values of the constraints of several motions, and their derivatives."""
         coefficients, scale = self.limits.coefficients(x), np.asarray(self.limits.scale)
-        excess, derivatives = [np.zeros((len(x), 0))], [np.zeros((len(x), 0, x.shape[-1]))]
+        excess: list[np.ndarray] = [np.zeros((len(x), 0))]
+        derivatives: list[np.ndarray] = [np.zeros((len(x), 0, x.shape[-1]))]
         for constraint, places in zip(self.constraints, zip(*watched, strict=True), strict=True):
             instants, entries = (np.array(part) for part in zip(*places, strict=True))
             rows = self._rows[:, instants]

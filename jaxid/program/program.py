@@ -114,7 +114,7 @@ class Program:
         varies = np.array([not (isinstance(x, float) and x == 0) for x in self.outputs], bool)
         return self.unpack(varies)
 
-    def split(self, packed: Sequence) -> list[Sequence]:
+    def split(self, packed: Any) -> list[Any]:
         """Split values of the packed entries into those of each output."""
         ends = np.cumsum([math.prod(shape) for shape in self.output_shapes], dtype=int)
         return [packed[a:b] for a, b in zip([0, *ends], ends, strict=False)]

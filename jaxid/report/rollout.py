@@ -86,7 +86,7 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
         rms = f"RMS {significant(float(np.sqrt(np.mean(wrong**2))))} mrad or mm"
         panels.append(Panel(curves, name, rms, y="position", unit="rad or m", below=below))
     title = f"{errors.motions[motion]}: measured and simulated, free-running"
-    return Figure(title, panels, columns=2, height=2.6)
+    return Figure(title, panels, columns=2, height=3.6)
 
 
 def rollout_verdict(errors: RolloutErrors) -> Remark:

@@ -10,7 +10,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -289,10 +289,9 @@ class SpectralTable:
 
     def __call__(self, power: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Return variances and degrees of freedom for periodograms [draws, channels, lines]."""
-        xp, variance, squares = self._xp, 0.0, 0.0
-        for c, C in enumerate(self._maps):
-            variance = variance + power[:, c] @ C.T
-            squares = squares + (power[:, c] * self._scatter[c]) ** 2 @ (C**2).T
+        xp, terms = self._xp, list(enumerate(self._maps))
+        variance: Any = sum(power[:, c] @ C.T for c, C in terms)
+        squares: Any = sum((power[:, c] * self._scatter[c]) ** 2 @ (C**2).T for c, C in terms)
         positive = squares > 0
         dof = xp.where(positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf)
         return variance, dof
