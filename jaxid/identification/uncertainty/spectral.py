@@ -291,7 +291,7 @@ class SpectralTable:
         """Return variances and degrees of freedom for periodograms [draws, channels, lines]."""
         xp, terms = self._xp, list(enumerate(self._maps))
         variance: Any = sum(power[:, c] @ C.T for c, C in terms)
-        squares: Any = sum((power[:, c] * self._scatter[c]) ** 2 @ (C**2).T for c, C in terms)
+        squares: Any = sum((power[:, c] * self._scatter[c][None]) ** 2 @ (C**2).T for c, C in terms)
         positive = squares > 0
         dof = xp.where(positive, 4.0 * variance**2 / xp.where(positive, squares, 1.0), xp.inf)
         return variance, dof
