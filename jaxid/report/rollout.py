@@ -72,9 +72,11 @@ def comparison_table(report: RolloutReport) -> Table:
 def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
     """Return measured and simulated positions of all joints in one motion, and the errors."""
     time, panels = np.asarray(errors.time[motion]), []
-    channels = [np.asarray(x[motion]) for x in (errors.command, errors.measured, errors.simulated)]
-    for name, *rows in zip(errors.joint_names, *channels, strict=True):
-        command, measured, simulated = rows
+    kinds = (errors.command, errors.measured, errors.simulated, errors.counted)
+    channels = [np.asarray(x[motion]) for x in kinds]
+    for name, command, measured, simulated, counted in zip(
+        errors.joint_names, *channels, strict=True
+    ):
         wrong = 1e3 * (simulated - measured)
         curves = [
             Curve(time, command, "commanded", GREY, width=0.6),
@@ -83,8 +85,9 @@ def motion_figure(errors: RolloutErrors, motion: int) -> Figure:
         ]
         error = Curve(time, wrong, "error", ERROR, width=0.7)
         below = [Panel([error], y="error", unit="mrad or mm", share=0.6)]
-        rms = f"RMS {significant(float(np.sqrt(np.mean(wrong**2))))} mrad or mm"
-        panels.append(Panel(curves, name, rms, y="position", unit="rad or m", below=below))
+        rms = np.sqrt(np.mean(wrong[counted > 0] ** 2)) if counted.any() else np.nan
+        said = f"RMS {significant(float(rms))} mrad or mm"
+        panels.append(Panel(curves, name, said, y="position", unit="rad or m", below=below))
     title = f"{errors.motions[motion]}: measured and simulated, free-running"
     return Figure(title, panels, columns=2, height=3.6)
 

@@ -61,7 +61,7 @@ class RolloutErrors:
             )
             for c in self.contacts
         ]
-        title = "errors of free-running simulations [mrad or mm]"
+        title = "errors of free-running simulations, behind the first half second [mrad or mm]"
         return Table(title, Column("motion", self.motions), *columns, remarks=remarks)
 
     def __str__(self) -> str:
