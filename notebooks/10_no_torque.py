@@ -122,13 +122,14 @@ plt.show()
 #
 # ## What a log does not tell
 #
-# On a slow triangle nothing accelerates: the joint is late by damping over stiffness plus delay, and no one can say which. The fit does not split the lag
-# arbitrarily; it names what it knows.
+# A slow ramp in one direction leaves the joint behind its command by delay and by dry friction, and no one can say which. The fit does not split them
+# arbitrarily: it reports what the log tells only together. Inertia and damping show in the first instants, in which the arm sags.
 
 # %%
-slow = 0.8 * np.abs((0.05 * t) % 1.0 - 0.5)
+slow = 0.03 * t
 log = jid.Recording.of(measured(slow)[:, None], slow[:, None], sample_time=0.02, name="slow")
-print(jid.identify_rollout(log, friction=False, saturation=False, joint_names=["lift"]))
+slow_fit = jid.identify_rollout(log, bodies, friction=False, saturation=False, joint_names=["lift"])
+print(slow_fit)
 
 # %% [markdown]
 # ## What you learned
