@@ -64,7 +64,7 @@ def _obstacle(obstacle: HalfSpace | Box) -> dict[str, str]:
 
 
 def positions(trajectory: AbstractTrajectory) -> Float[np.ndarray, "pictures joints"]:
-    """Return the positions of all pictures [rad or m], with a pause at the end."""
+    """Return the positions of all pictures [rad or m]."""
     return np.asarray(trajectory.motion(np.arange(0.0, float(trajectory.duration), 1 / RATE)).q)
 
 
