@@ -519,3 +519,12 @@ def test_refuses_what_does_not_fit(written, run, key, said):
     assert err.count("\n") == 1
     assert said in err
     assert "trajectory.csv" not in listing(written)
+
+
+def test_a_controller_gets_no_motion_that_starts_at_full_speed(written, monkeypatch):
+    one = CONTROLLERS["universal_robots"]._replace(joints=1)
+    monkeypatch.setitem(CONTROLLERS, "universal_robots", one)
+    keys = ('controller = "universal_robots"', "leads = false", "sample_time = 0.008")
+    experiment = load_experiment(with_keys(written, "jump.toml", *keys, text=FREE))
+    with pytest.raises(InputError, match="`controller`"):
+        prepare_design(experiment, None)

@@ -130,6 +130,11 @@ def prepare_design(experiment: Experiment, written: Path | None) -> Preparation:
     with within("excitation", experiment.path.name):
         if controller is not None:
             CONTROLLERS[controller].require(experiment.robot)
+            if not experiment.excitation.rests:
+                raise InputError(
+                    "`controller` plays motions from standstill to standstill: leave "
+                    "`leads = false` out, or set `rest = true`."
+                )
         nominal = find_nominal(experiment)
         limited = find_constraints(experiment, nominal)
     if written is None:
@@ -213,7 +218,7 @@ def write_motion(experiment: Experiment, played: Played, output: Path) -> list[P
         write_ros(played.sampled, robot, folder / names[1], sample_time=step)
         if table.controller is not None:
             own = CONTROLLERS[table.controller]
-            if own.write is not None:
+            if own.write is not None and not played.fault:
                 names.append(f"{output.stem}{own.suffix}")
                 own.write(played.sampled, robot, folder / names[-1], step)
         save_trajectory(jax.tree.map(np.asarray, played.motion), folder / names[2])
@@ -357,7 +362,7 @@ def play(experiment: Experiment, motion: LinearTrajectory) -> Played:
             )
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
-    rests = not fault and (leads is not None or table.rest or table.spline is not None)
+    rests = not fault and table.rests
     sampled = played
     if table.cycle is not None:
         step = table.cycle

@@ -269,6 +269,11 @@ class Excitation:
             return None
         return self.leads if isinstance(self.leads, Leads) else Leads()
 
+    @property
+    def rests(self) -> bool:
+        """Whether the motion starts and ends at standstill, if leads are possible."""
+        return self.chosen_leads is not None or self.rest or self.spline is not None
+
     def basis(self, constrained: bool) -> AbstractBasis:
         """Return the basis of the trajectories; with other constraints, leads are designed too.
 
