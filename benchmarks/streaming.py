@@ -180,9 +180,10 @@ def default_intervals(base, o, repetitions):
     identify(), identification(base, o)
     pairs, peaks = [], []
     for _ in range(repetitions):
+        pairs.append((timed(identify)[0], timed(identification, base, o)[0]))
+        # Apart, since reading the size of the process takes time.
         with Peak() as peak:
-            seconds, _ = timed(identify)
-        pairs.append((seconds, timed(identification, base, o)[0]))
+            identify()
         peaks.append(peak.megabytes)
     default, naive = (statistics.median(x) for x in zip(*pairs, strict=True))
     memory = statistics.median(peaks)

@@ -104,17 +104,22 @@ def namespace(*arrays: AnyArray) -> ModuleType:
 
 
 def on_cores(
-    function: Callable[[Any], Any], items: Iterable, cores: int | None = None
+    function: Callable[[Any], Any],
+    items: Iterable,
+    cores: int | None = None,
+    ahead: int | None = None,
 ) -> Iterator[Any]:
     """Yield the results of a function for some items in their order, computed on all cores.
 
-    The calling thread makes the items, at most one more than there are cores ahead of the results.
+    The calling thread makes the items, until so many wait, or are computed: by default one for each
+    core.
     """
     cores = cores or os.cpu_count() or 1
+    ahead = ahead or cores
     waiting: deque[Future] = deque()
     with ThreadPoolExecutor(cores) as pool:
         for item in items:
-            if len(waiting) >= cores:
+            if len(waiting) >= ahead:
                 yield waiting.popleft().result()
             waiting.append(pool.submit(function, item))
         while waiting:

@@ -18,7 +18,7 @@ from jaxid.arrays import AnyArray
 from .program import Program, Reference
 from .scalar import Operation
 
-_BLOCK = 1024
+_BLOCK = 2048
 """Samples at a time, so that intermediate values stay in the processor's cache."""
 
 

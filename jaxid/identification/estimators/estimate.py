@@ -34,8 +34,9 @@ class Channel(NamedTuple):
     counted: int  # number of rows that count
 
 
-Influence = Callable[[RowChunk, np.ndarray], list[Channel]]
-"""Function from rows and their residuals [rows, joints], in [N m] or [N], to weighted equations."""
+Influence = Callable[[RowChunk, np.ndarray], Iterator[Channel]]
+"""Function from rows and their residuals [rows, joints], in [N m] or [N], to weighted equations,
+one channel for each joint."""
 
 
 def weighted_joints(chunk: RowChunk, weights: AnyArray) -> Iterator[tuple]:
@@ -49,9 +50,9 @@ def weighted_joints(chunk: RowChunk, weights: AnyArray) -> Iterator[tuple]:
 def joint_rows(weights: Float[AnyArray, " joints"]) -> Influence:
     """Return the influence of rows that are weighted by joint: one channel for each joint."""
 
-    def channels(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+    def channels(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
         joints = zip(weighted_joints(chunk, weights), residuals.T, strict=True)
-        return [Channel(own, theta, theta, w * r, n) for (own, theta, w, n), r in joints]
+        return (Channel(own, theta, theta, w * r, n) for (own, theta, w, n), r in joints)
 
     return channels
 

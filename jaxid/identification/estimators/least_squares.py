@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -124,7 +124,7 @@ def whitened_rows(S: np.ndarray, size: int) -> Influence:
     The channels are combinations of joints whose residuals are not correlated.
     """
 
-    def channels(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+    def channels(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
         rows = np.zeros((*residuals.shape, size + 1))
         for j, own in enumerate(chunk.indices):
             rows[:, j, list(own)] = chunk.columns[j]
@@ -138,11 +138,9 @@ def whitened_rows(S: np.ndarray, size: int) -> Influence:
                 root = np.linalg.inv(np.linalg.cholesky(S[np.ix_(own, own)]))
                 at = np.ix_(np.flatnonzero(which.ravel() == k), own)
                 mixed[at] = np.einsum("cj,rjk->rck", root, rows[at])
-        found = []
         for c, mask in enumerate(chunk.mask.T):
             Z, u = mixed[:, c, :-1], mixed[:, c, -1]
-            found.append(Channel(tuple(range(size)), Z, Z, u, int(mask.sum())))
-        return found
+            yield Channel(tuple(range(size)), Z, Z, u, int(mask.sum()))
 
     return channels
 
@@ -255,11 +253,11 @@ class IterativelyReweighted(AbstractEstimator):
         blocks = problem.reweighted(p, self.loss.weight, scale)
         solution = self.solution.choose(blocks, weights)
 
-        def influence(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+        def influence(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
             """Weight the residuals of each row; the equations have the mean slope of the loss."""
             felt = self.loss.weight(residuals / scale) * residuals
             joints = zip(weighted_joints(chunk, weights), slope, felt.T, strict=True)
-            return [Channel(own, Z, k * Z, w * r, n) for (own, Z, w, n), k, r in joints]
+            return (Channel(own, Z, k * Z, w * r, n) for (own, Z, w, n), k, r in joints)
 
         notes = ()
         if change > self.tolerance:
@@ -325,13 +323,13 @@ class InstrumentalVariables(AbstractEstimator):
         triples = zip(recordings, *each, strict=True)
         instruments = [_columns(problem.base, *triple) for triple in triples]
 
-        def influence(chunk: RowChunk, residuals: np.ndarray) -> list[Channel]:
+        def influence(chunk: RowChunk, residuals: np.ndarray) -> Iterator[Channel]:
             joints = weighted_joints(chunk, weights)
             triples = zip(joints, instruments[chunk.recording], residuals.T, strict=True)
-            return [
+            return (
                 Channel(own, w[:, None] * Z[chunk.rows], theta, w * r, count)
                 for (own, theta, w, count), Z, r in triples
-            ]
+            )
 
         information, products = np.zeros((size, size)), np.zeros(size)
         for chunk, forces in problem.residuals(np.zeros(size)):

@@ -9,6 +9,7 @@ with the leverage $h$ of each line: the fit has explained that fraction of the e
 import dataclasses
 import itertools
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ MAX_ROWS = 2**15
 """Largest number of rows of a stretch; longer parts of a log are divided."""
 MAX_SAMPLES = 2**17
 """Samples up to which every stretch is transformed; of longer logs some, evenly spread, that are
-shorter and hold half as many samples together."""
+shorter and hold three eighths as many samples together."""
 MAX_LENGTHS = 4
 """Number of different lengths up to which each has its own lines; of more, similar ones share them,
 so that memory does not grow with the number of gaps."""
@@ -149,16 +150,21 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate):
         for (number, a, b), group in itertools.groupby(pieces_of_stretches(), lambda x: x[0]):
             o, parts = problem.recordings[number], [(chunk, r) for _, chunk, r in group]
             pieces = [estimate.influence(chunk, residuals) for chunk, residuals in parts]
-            new = Lines.empty(lengths[b - a, o.row_time], o, (len(B), len(pieces[0])))
+            new = Lines.empty(lengths[b - a, o.row_time], o, (len(B), parts[0][1].shape[1]))
             lines = found.setdefault((new.length, o.row_time, len(new.frequency)), new)
             r = np.concatenate([np.where(chunk.mask, r, 0.0) for chunk, r in parts])
             lines.residual[...] += np.abs(lines.transform(r.T)) ** 2 / lines.length
             lines.stretches[...] += 1
+            del parts
             for c, own in enumerate(zip(*pieces, strict=True)):
                 yield lines, c, own
 
-    sums = on_cores(lambda x: (*x[:2], _channel(x[0], B, x[2])), channels())
-    for lines, c, (own, energy, leverage, power, exposure, products) in sums:
+    # This thread makes the rows of the next stretch while others transform the channels of one.
+    others = max(1, (os.cpu_count() or 1) - 1)
+    transformed = on_cores(
+        lambda x: (*x[:2], _channel(x[0], B, x[2])), channels(), others, problem.robot.joints
+    )
+    for lines, c, (own, energy, leverage, power, exposure, products) in transformed:
         lines.energy[:, c] += energy
         lines.leverage[c] += leverage
         lines.power[c] += power
@@ -176,23 +182,24 @@ def multiplicity(length: int) -> Float[np.ndarray, " lines"]:
 def _channel(lines: Lines, inverse: np.ndarray, parts: Sequence[Channel]) -> tuple:
     """Return columns, the sums of `Lines`, and products by bins, of one channel of a stretch."""
     n, m = lines.length, lines.multiplicity
-    own, scale = list(parts[0].columns), np.sqrt(m / n)
+    own, scale = list(parts[0].columns), np.repeat(np.sqrt(m / n), 2)
 
     def transform(rows: list[np.ndarray]) -> np.ndarray:
         """Return real and imaginary parts of each line, weighted by how often it counts."""
-        found = scale * lines.transform(np.concatenate(rows).T)
-        return np.stack([np.real(found), np.imag(found)], axis=1)
+        return scale * lines.transform(np.concatenate(rows).T).view(float)
 
     Z = theta = transform([x.instruments for x in parts])
     if any(x.equations is not x.instruments for x in parts):
         theta = transform([x.equations for x in parts])
-    P = (inverse[:, own] @ Z.reshape(len(own), -1)).reshape(-1, 2, len(m))
-    leverage = np.einsum("ikf,ikf->f", P[own], theta) / m
-    energy = np.sum(np.square(P, out=P), axis=1)
+    P = inverse[:, own] @ Z
+    leverage = np.einsum("if,if->f", P[own], theta)
+    leverage = (leverage[::2] + leverage[1::2]) / m
+    np.square(P, out=P)
+    energy = P[:, ::2] + P[:, 1::2]
     products = np.zeros((len(BIN_EDGES) + 1, len(own), len(own)))
     present, starts = np.unique(lines.bins, return_index=True)
     for k, (a, b) in zip(present, itertools.pairwise([*starts, len(m)]), strict=True):
-        both = Z[..., a:b].reshape(len(own), -1)
+        both = Z[:, 2 * a : 2 * b]
         products[k] = both @ both.T
     power = np.abs(lines.transform(np.concatenate([x.disturbance for x in parts]))) ** 2 / n
     return own, energy, leverage, power, sum(x.counted for x in parts) / n, products
@@ -218,7 +225,7 @@ def _divide(problem: RegressionProblem) -> tuple[list[Span], bool]:
                 stretches += [(number, k, min(k + most, b)) for k in range(a, b, most)]
     if complete:
         return stretches, True
-    count = max(1, len(stretches) * (MAX_SAMPLES // 2) // samples)
+    count = max(1, len(stretches) * (3 * MAX_SAMPLES // 8) // samples)
     chosen = (np.arange(count) + 0.5) * len(stretches) / count
     return [stretches[k] for k in np.unique(chosen.astype(int))], False
 
