@@ -7,8 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import tomlkit
 
+from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.model_selection import Candidate, ModelChoice, choose_model
 from jaxid.identification.nonlinear_friction import identify_presliding
@@ -59,12 +61,28 @@ def choose_variant(
             variant = parse_experiment(_changed(experiment.text, own), experiment.path)
         except InputError:
             continue  # an effect that this robot cannot have
-        base = variant.base
-        if base.model.memory is not None:
-            base = identify_presliding(base, observations)
-        candidates.append(Candidate(name, base, variant.estimation.estimator))
+        candidates.append(Candidate(name, variant.base, variant.estimation.estimator))
+    candidates = _with_lengths(candidates, observations)
     choice = choose_model(candidates, observations, progress=progress)
     return choice, _changed(experiment.text, changes[choice.chosen.name])
+
+
+def _with_lengths(
+    candidates: list[Candidate], observations: Sequence[Observations]
+) -> list[Candidate]:
+    """Return candidates with the lengths of presliding of the one with the most parameters."""
+    preslide = [c.base for c in candidates if c.base.model.memory is not None]
+    if not preslide:
+        return candidates
+    found = identify_presliding(max(preslide, key=lambda base: base.size), observations)
+    length = found.model.memory.length
+
+    def with_length(base: BaseParameters) -> BaseParameters:
+        if base.model.memory is None:
+            return base
+        return eqx.tree_at(lambda b: b.model, base, base.model.with_memory(length=length))
+
+    return [c._replace(base=with_length(c.base)) for c in candidates]
 
 
 def _variants(content: dict[str, Any]) -> Iterator[tuple[str, Changes]]:

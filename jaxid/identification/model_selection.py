@@ -14,7 +14,7 @@ from jaxid.measurement.observations import Observations, Progress
 from jaxid.result_table import Column, Remark, Status, Summarised, Table, percent
 
 from .estimators import AbstractEstimator, WeightedLeastSquares
-from .factors import Blocks
+from .factors import Blocks, Factors
 from .problem import RegressionProblem
 
 
@@ -116,9 +116,9 @@ def choose_model(
     first, by_log = candidates[0], len(logs) >= 4
     folds = _folds(first.base, logs, by_log)
     # All candidates are judged with the weights of the first.
-    weights = first.estimator(RegressionProblem(first.base, blocks=_joined(folds))).weights
+    weights = first.estimator(RegressionProblem(first.base, blocks=Blocks(tuple(folds)))).weights
     weights = np.asarray(weights) ** 2
-    total = float(np.mean([weights @ fold.total.force_squares for fold in folds]))
+    total = float(np.mean([weights @ fold.force_squares for fold in folds]))
     tables = []
     for number, candidate in enumerate(candidates):
         folds = folds if number == 0 else _folds(candidate.base, logs, by_log)
@@ -143,31 +143,29 @@ def choose_model(
     )
 
 
-def _folds(base: BaseParameters, logs: Sequence[Observations], by_log: bool) -> list[Blocks]:
+def _folds(base: BaseParameters, logs: Sequence[Observations], by_log: bool) -> list[Factors]:
     """Return the factors of the parts that are left out in turn."""
     if by_log:
-        return [RegressionProblem(base, [log]).blocks for log in logs]
+        return [RegressionProblem(base, [log]).factors for log in logs]
     blocks = RegressionProblem(base, logs).blocks
     count = len(blocks.parts)
     if count < 3:
         raise InputError("a choice of models needs at least three blocks of rows: record longer.")
-    return [blocks.select(part) for part in np.array_split(np.arange(count), min(5, count))]
+    return [blocks.select(part).total for part in np.array_split(np.arange(count), min(5, count))]
 
 
-def _joined(folds: Sequence[Blocks]) -> Blocks:
-    return Blocks(tuple(itertools.chain(*(fold.parts for fold in folds))))
-
-
-def _held_out_squares(candidate: Candidate, folds: list[Blocks], weights: np.ndarray) -> np.ndarray:
+def _held_out_squares(
+    candidate: Candidate, folds: list[Factors], weights: np.ndarray
+) -> np.ndarray:
     """Return the squared errors on the second part of fits without both [parts, parts].
 
     On the diagonal only that part was left out.
     """
     found = np.zeros((len(folds), len(folds)))
     for i, k in itertools.combinations_with_replacement(range(len(folds)), 2):
-        rest = [fold for number, fold in enumerate(folds) if number not in (i, k)]
-        p = candidate.estimator(RegressionProblem(candidate.base, blocks=_joined(rest))).parameters
-        found[i, k], found[k, i] = (weights @ folds[n].total.residual_squares(p) for n in (k, i))
+        rest = Blocks(tuple(x for number, x in enumerate(folds) if number not in (i, k)))
+        p = candidate.estimator(RegressionProblem(candidate.base, blocks=rest)).parameters
+        found[i, k], found[k, i] = (weights @ folds[n].residual_squares(p) for n in (k, i))
     return found
 
 
