@@ -106,6 +106,7 @@ def kr300():
 def promise(name, splits):
     """Compare the errors that the choice promises with those on what comes."""
     import jaxid as jid
+    from jaxid.identification.problem import RegressionProblem
 
     experiment, (log, *_) = measured(name)
     ratios = []
@@ -113,7 +114,9 @@ def promise(name, splits):
         train, later = log.split(float(share))
         choice, fit = chosen_fit(experiment, [train])
         before, after = jid.validate(fit, [train, later]).errors
-        size = np.asarray(fit.weights)
+        # The choice weights the joints as its first candidate does.
+        first = choice.candidates[0]
+        size = np.asarray(first.estimator(RegressionProblem(first.base, [train])).weights)
         came = np.nanmean((after.errors * size) ** 2)
         forces = np.nanmean((np.where(before.counted, before.measured, np.nan) * size) ** 2)
         ratios.append(float(np.sqrt(came / forces)) / choice.promise)

@@ -107,7 +107,7 @@ class TorqueErrors(eqx.Module):
 
         Then means of unexplained errors over classes of speed agree between blocks of time: more
         than after nearly any change of the blocks' signs, which leaves noise as it is
-        (randomization test, Fisher).
+        (randomization test, Fisher). They make up a tenth of the squared errors at least.
         """
         limit = FALSE_ALARM / self.errors.shape[1]
         pairs = zip(*(np.asarray(x).T for x in (self.unexplained, self.speeds)), strict=True)
@@ -139,7 +139,10 @@ class TorqueErrors(eqx.Module):
 
 
 def _chance(errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows"]) -> float:
-    """Return the probability of errors whose means over classes of speed agree as much."""
+    """Return the probability of errors whose means over classes of speed agree as much.
+
+    It is one if these means make up less than a tenth of the squared errors.
+    """
     counted = np.isfinite(errors)
     e, v = errors[counted], speeds[counted]
     if len(e) < BLOCKS or not v.any() or not e.any():
@@ -150,6 +153,8 @@ def _chance(errors: Float[np.ndarray, " rows"], speeds: Float[np.ndarray, " rows
     np.add.at(sums, (np.arange(len(e)) * BLOCKS // len(e), classes), e)
     sums /= np.sqrt(np.maximum(np.bincount(classes, minlength=sums.shape[1]), 1))
     products = np.triu(sums @ sums.T, 1)
+    if 2.0 * products.sum() * BLOCKS / (BLOCKS - 1) < 0.1 * np.sum(e**2):
+        return 1.0
     signs = np.array(list(itertools.product((1.0, -1.0), repeat=BLOCKS - 1)))
     signs = np.column_stack([np.ones(len(signs)), signs])
     agreement = np.sum((signs @ products) * signs, axis=1)

@@ -250,7 +250,8 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
     """Report forces that depart from the model for one moment, and at no other time nearly as far.
 
     Such a departure exceeds half of its joint's RMS force, and lasts a hundredth of the log at
-    most, beside what the filter spreads. Uncertain parameters do not explain it.
+    most, beside what the filter spreads. Uncertain parameters do not explain it: where they matter
+    more than usual errors, the motion is one that the fit does not know.
     """
     o, robot = observations, fit.base.model.robot
     motion, forces = o.motion[o.instants], np.asarray(o.reduced_forces)
@@ -263,7 +264,8 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
         others = error[np.abs(o.instants - o.instants[k]) > length]
         row = np.asarray(fit.base.regressor(motion[k]))[j]
         deviation = _deviation(fit, row)
-        if error[k] > max(0.5 * size[j], 5.0 * (deviation + others.max(initial=0.0))):
+        usual = others.max(initial=0.0)
+        if deviation <= usual and error[k] > max(0.5 * size[j], 5.0 * (deviation + usual)):
             found.append(
                 f"the force of joint `{name}` departs from the model by {error[k]:.3g} "
                 f"{robot.force_unit(j)} at {o.time[o.instants[k]]:.5g} s, and at no other time by "
