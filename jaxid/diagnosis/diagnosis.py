@@ -276,18 +276,29 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
 
 
 def _deviation(fit: Fit, row: np.ndarray) -> float:
-    """Return the standard deviation of a combination of parameters; infinite if undetermined."""
+    """Return the standard deviation of a combination of parameters; infinite if undetermined.
+
+    Deviations are those of the block jackknife where these are larger: where one part of a log
+    decides.
+    """
     used = np.flatnonzero(row)
     covariance = np.asarray(fit.covariance)[np.ix_(used, used)]
     if not np.isfinite(covariance).all():
         return np.inf
-    return float(np.sqrt(row[used] @ covariance @ row[used]))
+    size, jackknife = np.sqrt(np.diag(covariance)), fit.uncertainty.jackknife
+    if jackknife is not None:
+        ratio = np.asarray(jackknife)[used] / np.where(size > 0, size, np.inf)
+        row = row[used] * np.maximum(ratio, 1.0)
+    else:
+        row = row[used]
+    return float(np.sqrt(row @ covariance @ row))
 
 
 def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:
     """Report joints that friction drives, beyond doubt: the model or a log is wrong.
 
-    A single parameter may be negative, as where friction falls with speed.
+    A single parameter may be negative, as where friction falls with speed. Velocities count less
+    their mean: in one direction dry friction cannot be told from an offset of the force.
     """
     base, robot = fit.base, fit.base.model.robot
     p = np.asarray(fit.parameters)
@@ -300,7 +311,8 @@ def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]
         ]
         power, columns = np.zeros(base.size), [own[k] for k in friction]
         for motion, each in zip(motions, rows, strict=True):
-            power[columns] += np.asarray(motion.qd)[:, j] @ each[j][:, friction]
+            velocity = np.asarray(motion.qd)[:, j]
+            power[columns] += (velocity - velocity.mean()) @ each[j][:, friction]
         if power @ p < -SURE * _deviation(fit, power):
             named = " and ".join(base.names[i] for i in columns if p[i] < 0)
             found.append(
