@@ -91,10 +91,10 @@ def robots(folder):
     files = {name: Path(folder) / f"{name}.urdf" for name in KINDS}
     for name, joints in KINDS.items():
         files[name].write_text(_urdf(name, joints, [0.0] * len(joints)))
-        # Motors that are twice as strong as a motion needs.
+        # Motors that are five times as strong as an ideal motion needs: friction needs more.
         model = pin.buildModelFromUrdf(str(files[name]))
         _, forces, _ = _ideal(model, *reference(model, 10.0, 0.01, 0))
-        files[name].write_text(_urdf(name, joints, 2 * np.abs(forces).max(axis=0)))
+        files[name].write_text(_urdf(name, joints, 5 * np.abs(forces).max(axis=0)))
     data = Path(next(iter(cmeel.__path__))).parent / "cmeel.prefix/share/example-robot-data/robots"
     return files | {
         "ur3": data / "ur_description/urdf/ur3_joint_limited_robot.urdf",
