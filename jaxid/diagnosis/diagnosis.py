@@ -276,22 +276,12 @@ def departures(fit: Fit, observations: Observations) -> tuple[str, ...]:
 
 
 def _deviation(fit: Fit, row: np.ndarray) -> float:
-    """Return the standard deviation of a combination of parameters; infinite if undetermined.
-
-    Deviations are those of the block jackknife where these are larger: where one part of a log
-    decides.
-    """
+    """Return the standard deviation of a combination of parameters; infinite if undetermined."""
     used = np.flatnonzero(row)
     covariance = np.asarray(fit.covariance)[np.ix_(used, used)]
     if not np.isfinite(covariance).all():
         return np.inf
-    size, jackknife = np.sqrt(np.diag(covariance)), fit.uncertainty.jackknife
-    if jackknife is not None:
-        ratio = np.asarray(jackknife)[used] / np.where(size > 0, size, np.inf)
-        row = row[used] * np.maximum(ratio, 1.0)
-    else:
-        row = row[used]
-    return float(np.sqrt(row @ covariance @ row))
+    return float(np.sqrt(row[used] @ covariance @ row[used]))
 
 
 def negative_friction(fit: Fit, logs: Sequence[Observations]) -> tuple[str, ...]:

@@ -75,7 +75,7 @@ def _with_lengths(
     if not preslide:
         return candidates
     found = identify_presliding(max(preslide, key=lambda base: base.size), observations)
-    length = found.model.memory.length
+    length = getattr(found.model.memory, "length", None)
 
     def with_length(base: BaseParameters) -> BaseParameters:
         if base.model.memory is None:

@@ -158,6 +158,25 @@ def test_long_logs_in_stretches_agree_with_the_whole(base, monkeypatch):
     assert np.median(whole.uncertainty.ratios) > 2
 
 
+def test_errors_in_the_part_that_decides_make_intervals_wider(base):
+    """A quick part at the start, with larger errors, decides the inertias of a slow log."""
+    random, p = np.random.default_rng(5), standard_parameters(base.model)
+    quick = np.where(np.arange(2000) < 100, 10.0, 1.0)[:, None]
+    q, qd, qdd = random.standard_normal((3, 2000, 2)) * quick * [[[1.0]], [[0.1]], [[1.0]]]
+    forces = np.asarray(base.model.inverse_dynamics(p, jid.Motion(q, qd, qdd)))
+    held, alone = [], []
+    for _ in range(30):
+        noisy = forces + 0.1 * quick**2 * random.standard_normal(forces.shape)
+        o = jid.Observations.of(q, qd, qdd, noisy, sample_time=0.01)
+        fit = jid.identify(base, o, ESTIMATOR)
+        errors = np.abs(fit.parameters - base.from_standard(p))
+        held.append(errors <= fit.uncertainty.half_widths())
+        covariance, *_ = sandwich(*row_spectra(base, [o])[0])
+        alone.append(errors <= 1.96 * np.sqrt(np.diag(covariance)))
+    assert np.mean(alone) < 0.75
+    assert 0.88 < np.mean(held) < 0.99
+
+
 def test_intervals_and_whiteness_of_a_fit(base):
     o = long_one(base)
     white = np.random.default_rng(0).standard_normal((1000, 2))

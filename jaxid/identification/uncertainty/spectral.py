@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import fft
+from scipy import fft, stats
 
 from jaxid.arrays import AnyArray, Float, on_cores
 from jaxid.measurement.observations import Observations
@@ -42,13 +42,15 @@ class SpectralSandwich(AbstractUncertainty):
     """Spectral sandwich: right for errors that are correlated from row to row (default).
 
     Errors are assumed stationary and independent between joints, recordings, and parts of a log on
-    both sides of a gap. It needs one pass over the rows. Of logs of more than a million samples
-    some evenly spread stretches are transformed: these give the ratio to the naive values. Where
-    only factors are known, the block jackknife takes its place.
+    both sides of a gap. Where the errors are larger in the part of a log that decides a parameter,
+    the block jackknife gives more than chance allows: then its deviation counts. It needs one pass
+    over the rows. Of logs of more than `MAX_SAMPLES` some evenly spread stretches are transformed:
+    these give the ratio to the naive values. Where only factors are known, the block jackknife
+    takes the place of all.
     """
 
     def __call__(self, problem, estimate, naive):
-        """Return the sandwich, with the jackknife as a cross-check."""
+        """Return the sandwich, wider where the jackknife contradicts it."""
         if not problem.recordings:
             found, _ = BlockJackknife()(problem, estimate, naive)
             note = "standard deviations come from the block jackknife: only factors were given."
@@ -63,7 +65,24 @@ class SpectralSandwich(AbstractUncertainty):
         unknown = np.isinf(exact)
         covariance[unknown, unknown] = np.inf
         found = Uncertainty(covariance, dof, naive, jackknife(estimate))
-        return found, residual_spectra(lines)
+        return _widened(found, estimate), residual_spectra(lines)
+
+
+def _widened(found: Uncertainty, estimate: Estimate) -> Uncertainty:
+    """Take the jackknife's deviations where chance allows them once in ten thousand times."""
+    if found.jackknife is None:
+        return found
+    # The fewer blocks decide a parameter, the more its jackknife scatters.
+    parts = [part.weighted(estimate.weights)[0] for part in estimate.blocks.parts]
+    shares = np.array([np.sum((R @ estimate.inverse) ** 2, axis=0) for R in parts])
+    deciding = shares.sum(axis=0) ** 2 / np.maximum((shares**2).sum(axis=0), 1e-300)
+    size, dof = found.standard_deviations, np.asarray(found.dof)
+    known = np.isfinite(size) & (size > 0)
+    ratio = np.divide(found.jackknife, size, out=np.ones_like(size), where=known)
+    wider = ratio**2 > stats.f.ppf(0.9999, np.maximum(deciding, 1.0), dof)
+    scale = np.where(wider, ratio, 1.0)
+    covariance = np.asarray(found.covariance) * scale * scale[:, None]
+    return dataclasses.replace(found, covariance=covariance)
 
 
 class Lines(NamedTuple):
