@@ -67,7 +67,7 @@ METHODS = (
     Script("friction", 60),
     Script("stepwise", 10),
     Script("states", 5),
-    Script("rollout", 40),
+    Script("rollout", 55),
     Script("excitation", 60),
     Script("safe_motions", 40),
     Script("export", 10),
