@@ -283,7 +283,7 @@ def load_experiment(path: str | Path) -> Experiment:
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except ValueError as error:
-        raise InputError(f"{path.name} is no TOML in UTF-8: {error}.") from error
+        raise InputError(f"{path.name}: the file is no TOML in UTF-8: {error}.") from error
     return parse_experiment(text, path)
 
 
@@ -293,7 +293,7 @@ def parse_experiment(text: str, path: Path) -> Experiment:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         said = str(error).rstrip(".")
-        raise InputError(f"{path.name} is no TOML in UTF-8: {said}.") from error
+        raise InputError(f"{path.name}: the file is no TOML in UTF-8: {said}.") from error
     try:
         experiment = Experiment(path=path, text=text, **_build(content, path.parent))
     except InputError as error:
