@@ -237,7 +237,11 @@ def clock_findings(recording: Recording) -> list[str]:
         before, own, after = steps[:-2], steps[1:-1], steps[2:]
         usual = 0.5 * (before + after)
         noise = 1.4826 * np.median(np.abs(own - usual), axis=0)
-        moving = noise > 0
+        # Encoders round to half an increment; smaller differences are those of rounded numbers.
+        sizes, rounding = np.abs(steps), 1e-9 * np.abs(recording.angles).max(axis=0)
+        increment = np.where(sizes > rounding, sizes, np.inf).min(axis=0)
+        noise = np.maximum(noise, 0.5 * increment)
+        moving = np.isfinite(noise)
         if not moving.any():
             continue
         usual, own, bend = (x[:, moving] / noise[moving] for x in (usual, own, after - before))

@@ -154,6 +154,12 @@ def test_lost_and_repeated_rows_are_named_and_nothing_else(count):
         assert said.startswith("rows seem to be repeated at 1 instant, first at 3.5 s")
 
 
+def test_slow_motion_in_increments_of_an_encoder_loses_no_rows():
+    """Steps of one increment, at times of two: their second differences are rounding alone."""
+    increments = np.round(1.03 * np.arange(len(Q)))
+    assert lost(2 * np.pi / 2**17 * np.outer(increments, np.arange(7) == 0)) == []
+
+
 @pytest.mark.parametrize(
     ("samples", "factor", "words"), [(0, 1, ""), (8, 1, " ms later"), (0, 2, "are 2 times")]
 )
