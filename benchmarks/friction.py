@@ -59,13 +59,13 @@ NOISE = 0.01
 
 def chosen_fit(experiment, train):
     """Return what `jaxid choose` finds for some observations, and its fit to them."""
+    import jaxid as jid
     from jaxid.experiment.choose import choose_variant  # private: experiment files
     from jaxid.experiment.experiment import parse_experiment
-    from jaxid.identification.problem import RegressionProblem
 
     choice, text = choose_variant(experiment, train)
     variant = parse_experiment(text, experiment.path)
-    return choice, variant.fit(RegressionProblem(variant.base, train))
+    return choice, variant.fit(jid.RegressionProblem(variant.base, train))
 
 
 @functools.cache
@@ -106,7 +106,6 @@ def kr300():
 def promise(name, splits):
     """Compare the errors that the choice promises with those on what comes."""
     import jaxid as jid
-    from jaxid.identification.problem import RegressionProblem
 
     experiment, (log, *_) = measured(name)
     ratios = []
@@ -116,7 +115,7 @@ def promise(name, splits):
         before, after = jid.validate(fit, [train, later]).errors
         # The choice weights the joints as its first candidate does.
         first = choice.candidates[0]
-        size = np.asarray(first.estimator(RegressionProblem(first.base, [train])).weights)
+        size = np.asarray(first.estimator(jid.RegressionProblem(first.base, [train])).weights)
         came = np.nanmean((after.errors * size) ** 2)
         forces = np.nanmean((np.where(before.counted, before.measured, np.nan) * size) ** 2)
         ratios.append(float(np.sqrt(came / forces)) / choice.promise)
@@ -316,7 +315,6 @@ def load(name, draws):
     """Measure coefficients of simulated friction by load, and the coverage of their intervals."""
     import jaxid as jid
     from jaxid.experiment.experiment import parse_experiment
-    from jaxid.identification.problem import RegressionProblem
 
     path, robot, _, torques = arm(name)
     experiment = parse_experiment(f'[robot]\nurdf = "{path}"\n[model]\nload = true\n', path)

@@ -68,6 +68,7 @@ METHODS = (
     Script("stepwise", 10),
     Script("states", 5),
     Script("rollout", 55),
+    Script("transients", 1),
     Script("excitation", 60),
     Script("safe_motions", 40),
     Script("export", 10),

@@ -111,8 +111,8 @@ def on_cores(
 ) -> Iterator[Any]:
     """Yield the results of a function for some items in their order, computed on all cores.
 
-    The calling thread makes the items, until so many wait, or are computed: by default one for each
-    core.
+    The calling thread makes the items, and at most `ahead` of them before it takes a result: by
+    default one for each core.
     """
     cores = cores or os.cpu_count() or 1
     ahead = ahead or cores
